@@ -10,7 +10,7 @@ import workspaces
 from cli import grounded
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
-from grounded_trials.logs.inspect_evidence import velocities
+from grounded_trials.logs.inspect_pairs import velocities
 from grounded_trials.starting.begin import begin
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, path_target
@@ -127,6 +127,34 @@ def test_nothing_is_overwritten_and_nothing_half_made_is_left(tmp_path, mine):
 def test_rates_are_found_in_any_model(mine, tmp_path):
     begin(tmp_path / "w", arm_bag(tmp_path / "bag"), model=mine)
     assert velocities(Workspace(tmp_path / "w").base_model) == {"q1": "w1", "q2": "w2"}
+
+
+TURNING = """
+from grounded import Model
+model = Model(
+    states={"psi": "rad", "w": "rad/s"}, inputs={"u": "N"}, angles=("psi",),
+    derivative=lambda s, a, p: {"psi": s.w, "w": a.u - s.w}, name="turning",
+)
+"""
+
+
+@pytest.mark.parametrize("named", [0.0, 1.0])
+def test_a_rate_that_a_name_gives_and_the_numbers_refute_is_sought_among_the_others(
+    tmp_path, named
+):
+    """A quaternion and a twist have a w, too: `w` was read from a number that is always 0."""
+    (tmp_path / "turning.py").write_text(TURNING)
+    rng, t = np.random.default_rng(0), 0.02 * np.arange(1500)
+    psi, gyro = 0.6 * np.sin(1.3 * t) + 0.3 * np.sin(3 * t), 0.78 * np.cos(1.3 * t)
+    gyro += 0.9 * np.cos(3 * t)
+    rows = np.column_stack([t, psi, named * np.sin(7 * t), gyro, np.cos(2 * t), np.sin(5 * t)])
+    rows[:, 1:3] += 1e-4 * rng.standard_normal((len(t), 2)) * [1, named]
+    head = "t,psi,pose.w,imu.rate_z,u,battery"
+    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header=head, comments="")
+    found = begin(tmp_path / "w", tmp_path / "log.csv", model=tmp_path / "turning.py")
+    by = {g.name: g for g in (*found.states, *found.inputs)}
+    assert by["w"].path == "/csv.imu_rate_z" and not by["w"].sure
+    assert by["psi"].path == "/csv.psi" and by["u"].path == "/csv.u"
 
 
 def test_the_real_car_of_a_laboratory(tmp_path):

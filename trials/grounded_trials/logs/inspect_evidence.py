@@ -16,23 +16,26 @@ unsure.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import islice, product
-from pathlib import Path
 
 import numpy as np
 
-from grounded.errors import GroundedError
-from grounded.instruments.kinematics import integrals
 from grounded.model import Model
 from grounded_trials.formats.messages import Floats
-from grounded_trials.logs.following import DEGREE, SAME, follows, scale_of
+from grounded_trials.logs.following import follows
 from grounded_trials.logs.inspect_guess import SIMULATED_S, Guess
 from grounded_trials.logs.inspect_log import LogReport
+from grounded_trials.logs.inspect_pairs import (
+    COMBINATIONS,
+    FOLLOWS,
+    Signals,
+    moved_to,
+    paired,
+    velocities,
+)
 from grounded_trials.logs.joint_names import JOINT_UNITS, in_order, joint_names, of_joint
-from grounded_trials.logs.samples import Samples, tidy
-from grounded_trials.logs.signals import Series, SignalSpec, read_signals
 from grounded_trials.logs.stated_units import Stated, factor_between
 
 UNITS = (  # what the end of a path measures, in ROS's conventions (REP 103)
@@ -42,11 +45,7 @@ UNITS = (  # what the end of a path measures, in ROS's conventions (REP 103)
     (r"linear_acceleration\.[xyz]$|accel\.linear\.[xyz]$", "m/s^2"),
     (r"linear\.[xyz]$|drive\.speed$", "m/s"),
 )
-SLOPE = 0.01
-FOLLOWS = 0.8  # correlation of a rate with the derivative of its position
 BETTER = 0.9  # of the rival's error: less decides
-COMBINATIONS, LONGEST = 64, 20_000  # tried at most; samples of a grid
-FEW = 8  # numbers without a name that are tried as a position or a rate
 
 
 def weigh(
@@ -75,11 +74,11 @@ def weigh(
     turning = [guesses[name] for name in model.state_names if units[name] in ("rad", "deg")]
     stated = Stated.by(log.files)
     angles = {p for g in turning for p in (g.path, *g.others)}
-    signals = _Signals(log, guesses.values(), angles, stated)
+    signals = Signals(log, guesses.values(), angles, stated)
     guesses |= _speed(guesses, model, signals)
     pairs = [(q, w) for q, w in velocities(model).items() if q in guesses and w in guesses]
     for pair in sorted(pairs, key=lambda qw: not any(guesses[name].path for name in qw)):
-        guesses |= _paired(guesses, pair, signals, units, log)
+        guesses |= paired(guesses, pair, signals, units, log)
     guesses |= _steps(model, guesses, signals)
     guesses |= _taken_by_inputs(guesses, model)
     guesses = {name: _as_logged(guess, log) for name, guess in guesses.items()}
@@ -150,72 +149,6 @@ def _unit(guess: Guess, unit: str) -> Guess:
     return replace(guess, sure=False, reasons=(*guess.reasons, why))
 
 
-class _Signals:
-    """The samples of everything that was guessed, read once, and put on one grid when asked."""
-
-    def __init__(
-        self, log: LogReport, guesses: Iterable[Guess], angles: Collection[str], stated: Stated
-    ) -> None:
-        self.stated = stated
-        self._clocks = {t.topic: "header" if t.stamped else "log" for t in log.topics}
-        if any(t.skew_s is not None and abs(t.skew_s) > SIMULATED_S for t in log.topics):
-            self._clocks = dict.fromkeys(self._clocks, "log")
-        self._files, self._angles = log.files, angles
-        self.found: dict[str, Samples] = {}
-        self.read([p for g in guesses for p in (g.path, *g.others) if p])
-
-    def read(self, paths: Iterable[str]) -> None:
-        """The samples of these as well."""
-        more = (p for p in paths if p not in self.found)
-        specs = {p: SignalSpec(p, clock=_clock(p, self._clocks)) for p in more}  # type: ignore[arg-type]
-        try:
-            series = read_signals(self._files, specs) if specs else {}
-        except GroundedError:
-            series = _one_by_one(self._files, specs)
-        for path, one in series.items():
-            try:
-                found = tidy(path, one, unwrap="@rpy" in path)
-            except GroundedError:
-                continue
-            self.found[path] = _unwound(found) if path in self._angles else found
-
-    def grid(self, paths: Sequence[str]) -> tuple[float, list[Floats]] | None:
-        """These signals on a common grid: its step [s] and the columns; None if they don't meet."""
-        if not all(path in self.found and len(self.found[path].t) > 20 for path in paths):
-            return None
-        samples = [self.found[path] for path in paths]
-        start, stop = max(s.t[0] for s in samples), min(s.t[-1] for s in samples)
-        step = max(s.interval for s in samples)
-        step = max(step, (stop - start) * 1e-9 / LONGEST)
-        t = np.arange(start, stop, round(step * 1e9), dtype=np.int64)
-        if len(t) < 20:
-            return None
-        at = (t - start) * 1e-9
-        return step, [np.interp(at, (s.t - start) * 1e-9, s.y) for s in samples]
-
-
-def _unwound(angle: Samples) -> Samples:
-    """An angle whose values jump by a turn, in radians or degrees, without the jumps."""
-    jump, width = np.abs(np.diff(angle.y)).max(initial=0.0), np.ptp(angle.y)
-    turns = [turn for turn in (2 * np.pi, 360.0) if 0.9 * turn < jump <= width < 1.02 * turn]
-    return replace(angle, y=np.unwrap(angle.y, period=turns[0])) if turns else angle
-
-
-def _clock(path: str, clocks: Mapping[str, str]) -> str:
-    topic = max((t for t in clocks if path.strip('"').startswith(t)), key=len, default="")
-    return clocks.get(topic, "log")
-
-
-def _one_by_one(files: Sequence[Path], specs: Mapping[str, SignalSpec]) -> dict[str, Series]:
-    found: dict[str, Series] = {}
-    for path, spec in specs.items():
-        try:
-            found |= read_signals(files, {path: spec})
-        except GroundedError:
-            continue
-    return found
-
-
 def _speed_asked(guesses: Mapping[str, Guess], model: Model, log: LogReport) -> dict[str, Guess]:
     """A speed that no name gives, with the numbers of the log that have no name as its rivals."""
     name = str(model.roles.get("speed", ""))
@@ -227,7 +160,7 @@ def _speed_asked(guesses: Mapping[str, Guess], model: Model, log: LogReport) -> 
     return {name: replace(guesses[name], others=tuple(bare[:COMBINATIONS]))}
 
 
-def _speed(guesses: Mapping[str, Guess], model: Model, signals: _Signals) -> dict[str, Guess]:
+def _speed(guesses: Mapping[str, Guess], model: Model, signals: Signals) -> dict[str, Guess]:
     """The number without a name that goes with the speed of the position."""
     name, position = str(model.roles.get("speed", "")), model.roles.get("position", ())
     axes = [guesses[axis].path for axis in position if axis in guesses]
@@ -256,99 +189,7 @@ def _speed(guesses: Mapping[str, Guess], model: Model, signals: _Signals) -> dic
     return {name: replace(guesses[name], path=path, others=rivals[:3], reasons=(why,))}
 
 
-def velocities(model: Model) -> dict[str, str]:
-    """Which state's rate is another state, as the model has it: {q: w}."""
-    names = model.state_names
-    own = [r for r in integrals(model) if r.exact and abs(r.c - 1) < SLOPE]
-    return {names[r.i]: names[r.j] for r in own}
-
-
-def _paired(
-    guesses: Mapping[str, Guess],
-    pair: tuple[str, str],
-    signals: _Signals,
-    units: Mapping[str, str],
-    log: LogReport,
-) -> dict[str, Guess]:
-    """A position and its rate; what no name gives is sought among the numbers nobody has taken."""
-    taken = {guess.path for guess in guesses.values()}
-    free = [f.path for t in log.topics for f in t.fields if f.low != f.high and f.path not in taken]
-    own = {name: guesses[name] for name in pair}
-    bare = [name for name, guess in own.items() if not guess.path and not guess.others]
-    if not bare:
-        return _derivative(own[pair[0]], own[pair[1]], signals, units)
-    if not 0 < len(free) <= FEW or not any(guess.path for guess in guesses.values()):
-        return {}
-    tried = {
-        name: replace(own[name], others=tuple(free)) if name in bare else own[name] for name in pair
-    }
-    signals.read(free)
-    found = _derivative(tried[pair[0]], tried[pair[1]], signals, units)
-    if len(found) < 2:
-        return {}
-    known = len(bare) == 1 and all(own[name].sure for name in pair if name not in bare)
-    why = "no name says it" + "; of what is left only this pair fits" * (len(bare) == 2)
-    for name in bare:
-        reasons = (why, *found[name].reasons)
-        found[name] = replace(found[name], sure=known and found[name].scale == 1, reasons=reasons)
-    return found
-
-
-def _derivative(
-    q: Guess, w: Guess, signals: _Signals, units: Mapping[str, str]
-) -> dict[str, Guess]:
-    """Both guesses, after trying which pair of candidates are a position and its rate.
-
-    Their scales are beside the units that the log states: those are multiplied in by `as_stated`.
-    """
-    stated = signals.stated
-    tried = []
-    pairs = product([p for p in (q.path, *q.others) if p], [p for p in (w.path, *w.others) if p])
-    for rank, (a, b) in enumerate(islice(pairs, COMBINATIONS)):
-        gridded = signals.grid((a, b)) if a != b else None
-        if gridded is not None:
-            step, (position, rate) = gridded
-            found = follows(position, rate, step)
-            tried.append((abs(found.correlation) - 0.02 * rank, found, a, b))
-    if not tried:
-        return {}
-    _, best, a, b = max(tried, key=lambda one: one[0])
-    by = stated.factor(a, units[q.name]), stated.factor(b, units[w.name])
-    logged, best = best, replace(best, slope=best.slope * by[1] / by[0])
-    if abs(best.correlation) < FOLLOWS:
-        why = f"it does not follow the derivative of {q.path} (correlation {best.correlation:.2f})"
-        return {w.name: replace(w, sure=False, reasons=(*w.reasons, why))}
-    scale, what = scale_of(best.slope)
-    why = f"follows the derivative of {a}, correlation {best.correlation:.3f}{what}"
-    fits = abs(best.slope * scale - 1) < SAME
-    found_q, found_w = _moved(q, a), _moved(w, b)
-    if fits or scale != 1.0:
-        if scale in (DEGREE, -DEGREE):  # the position is in degrees
-            found_q = replace(found_q, scale=1 / DEGREE, sure=False)
-            scale /= DEGREE
-        found_w = replace(found_w, scale=scale, sure=found_w.sure or fits)
-    elif abs(abs(logged.slope) - 1) < SAME and bool(stated.unit(a)) != bool(stated.unit(b)):
-        why += ", as large as it is logged: both are taken to be in one unit"
-        if stated.unit(a):
-            found_w = replace(found_w, scale=scale * by[0], sure=False)
-        else:
-            found_q = replace(found_q, scale=by[1], sure=False)
-            found_w = replace(found_w, scale=scale, sure=False)
-    else:
-        why += f", but {best.slope:.3g} times as large"
-        found_w = replace(found_w, sure=False)
-    return {q.name: found_q, w.name: replace(found_w, reasons=(*found_w.reasons, why))}
-
-
-def _moved(guess: Guess, path: str) -> Guess:
-    """The guess at another of its candidates."""
-    if path == guess.path:
-        return guess
-    rest = tuple(p for p in (guess.path, *guess.others) if p not in ("", path))
-    return replace(guess, path=path, others=rest[:3], field=None, reasons=())
-
-
-def _steps(model: Model, guesses: Mapping[str, Guess], signals: _Signals) -> dict[str, Guess]:
+def _steps(model: Model, guesses: Mapping[str, Guess], signals: Signals) -> dict[str, Guess]:
     """Inputs that are unsure, decided by the model's one-step predictions where they can."""
     unsure = [n for n in model.input_names if guesses[n].path and guesses[n].others]
     known = [*model.state_names, *model.input_names]
@@ -371,7 +212,7 @@ def _steps(model: Model, guesses: Mapping[str, Guess], signals: _Signals) -> dic
     found = {}
     for name, path in zip(unsure, ranked[0], strict=True):
         why = f"with it the model's steps fit {gain:.0f} % better than with the next best"
-        moved = _moved(guesses[name], path)
+        moved = moved_to(guesses[name], path)
         found[name] = replace(moved, sure=True, reasons=(*moved.reasons, why))
     return found
 

@@ -27,7 +27,7 @@ from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded_trials.formats.bags import standard_types
-from grounded_trials.logs.inspect_evidence import velocities
+from grounded_trials.logs.inspect_pairs import velocities
 from grounded_trials.report.scene import Scene, scene_of
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.exporting import Exported

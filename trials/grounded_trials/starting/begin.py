@@ -21,9 +21,10 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Result
 from grounded_trials.formats.tables import column_units
-from grounded_trials.logs.inspect_evidence import as_stated, velocities, weigh
+from grounded_trials.logs.inspect_evidence import as_stated, weigh
 from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated, mapping_toml
 from grounded_trials.logs.inspect_log import LogReport, inspect_log
+from grounded_trials.logs.inspect_pairs import velocities
 from grounded_trials.logs.joint_names import joint_names
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
