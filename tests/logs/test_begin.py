@@ -149,11 +149,12 @@ def test_a_rate_that_a_name_gives_and_the_numbers_refute_is_sought_among_the_oth
     gyro += 0.9 * np.cos(3 * t)
     rows = np.column_stack([t, psi, named * np.sin(7 * t), gyro, np.cos(2 * t), np.sin(5 * t)])
     rows[:, 1:3] += 1e-4 * rng.standard_normal((len(t), 2)) * [1, named]
-    head = "t,psi,pose.w,imu.rate_z,u,battery"
+    head = "t,psi,w,imu.rate_z,u,battery"
     np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header=head, comments="")
     found = begin(tmp_path / "w", tmp_path / "log.csv", model=tmp_path / "turning.py")
     by = {g.name: g for g in (*found.states, *found.inputs)}
-    assert by["w"].path == "/csv.imu_rate_z" and not by["w"].sure
+    assert (by["w"].path, by["w"].sure) == ("/csv.imu_rate_z", False)
+    assert "/csv.w" in by["w"].others
     assert by["psi"].path == "/csv.psi" and by["u"].path == "/csv.u"
 
 
