@@ -15,61 +15,14 @@ from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace import foreign, ingest
-from workspaces import CONFIG, make
-
-LOGGED = CONFIG + "".join(
-    f'[log.{kind}.{name}]\npath = "/csv.{name}"\n'
-    for kind, name in (("state", "x"), ("state", "v"), ("input", "force"))
-)
-RATE = 100  # [Hz]
-
-
-def record(w, path, policy, before, seed=0, until=None, after=1.0, jog=0.0, late=0):
-    """Runs a policy on the model, with a load the policy fights, and logs all of it as a table.
-
-    `late`: rows by which the program and the log get the position late.
-    """
-    model, dt, rng = w.task.model, policy.dt, np.random.default_rng(seed)
-    z, force, rows, sent = np.array(w.task.start, float), 0.0, [], policy.past.copy()
-    past = []
-    every, begin = round(dt * RATE), round(before * RATE)
-    end = begin + every * policy.horizon if until is None else begin + round(until * RATE)
-    last = end + round(after * RATE) if until is None else end
-    for k in range(last):
-        felt = z + rng.normal(0, [0.002, 0.01])
-        past.append(felt[0])
-        felt[0] = past[max(0, k - late)]
-        step, part = divmod(k - begin, every)
-        if 0 <= step < policy.horizon and part == 0:
-            force = float(follow(policy, step, felt, sent)[0])
-        if step >= policy.horizon:
-            force = 0.0
-        if k < begin:
-            force = jog * np.sin(k / RATE * 4) if k < 0.4 * begin else 0.0
-        rows.append([1000 + k / RATE, *felt, force])
-        push = 0.7 * force - 0.4 * np.tanh(20 * z[1]) if k >= begin else 0.0
-        z = model.system.step(z[None], np.array([[push]]), model.values, 1 / RATE)[0]
-    np.savetxt(path, rows, "%.5f", ",", header="t,x,v,force", comments="")
-    return path
-
-
-def follow(policy, step, state, past):
-    """One command of a policy, from its published law."""
-    if policy.gain is None:
-        return policy.feedforward[step]
-    z = np.concatenate([state, past[: policy.gain.shape[2] - len(state)]])
-    u = policy.feedforward[step] + policy.gain[step] @ (z - policy.reference[step])
-    past[:] = u = np.clip(u, policy.low, policy.high)
-    return u
+from recorded import LOGGED, RATE, record, waiting
+from workspaces import make
 
 
 @pytest.fixture
 def w(tmp_path):
     """It waits for c0002; c0001 was run."""
-    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
-    w.ingest(record(w, tmp_path / "first.csv", w.propose().candidate.policy, 0.0, seed=9))
-    w.propose()
-    return w
+    return waiting(tmp_path)
 
 
 @pytest.mark.parametrize("forced", [False, True])
@@ -176,71 +129,6 @@ def test_a_start_is_no_surer_than_its_states_are_the_controller_s(w, tmp_path):
     w.propose()
     own = record(w, tmp_path / "c.csv", w.candidate("c0003")[0].policy, 1.0)
     assert not any("known to" in one for one in w.ingest(own).warnings)
-
-
-ONLY_POSITIONS = LOGGED.replace('[log.state.v]\npath = "/csv.v"\n', "") + (
-    "[estimate]\nmeasured = { x = 0.002 }\n"
-)
-
-
-@pytest.fixture
-def blind(tmp_path):
-    """Nothing measures its speed; it waits for c0002, and its controller had its own estimate."""
-    w = Workspace(make(tmp_path / "w", config=ONLY_POSITIONS).folder)
-    w.ingest(record(w, tmp_path / "first.csv", w.propose().candidate.policy, 0.0, seed=9))
-    w.propose()
-    return w
-
-
-@pytest.mark.parametrize("before", [0.0, 0.1, 0.8])
-def test_a_run_is_found_where_speeds_are_estimated(blind, tmp_path, before):
-    """With [estimate] no start was sought: "somebody drove" of every log with a lead-in."""
-    policy = blind.candidate("c0002")[0].policy
-    path = record(blind, tmp_path / "a.csv", policy, before)
-    found = blind.ingest(path)
-    assert found.candidate == "c0002" and bool(found.notes) == bool(before)
-    table = np.loadtxt(path, delimiter=",", skiprows=1)
-    k = round(before * RATE) + 5 * np.arange(policy.horizon)
-    np.testing.assert_allclose(blind.trials()[-1].trial.inputs[:, 0], table[k, 3], atol=1e-4)
-    assert {one.name for one in found.signals} == {"x", "force"}  # what was logged
-
-
-def test_what_nobody_sent_is_refused_where_speeds_are_estimated(blind, tmp_path):
-    policy = blind.candidate("c0002")[0].policy
-    other = replace(policy, feedforward=np.roll(policy.feedforward, 12, axis=0))
-    path = record(blind, tmp_path / "a.csv", other, 0.8)
-    with pytest.raises(GroundedError, match="did not run c0002"):
-        blind.ingest(path)
-
-
-def test_an_estimated_speed_knows_what_came_before_the_run_and_after_it(blind, tmp_path):
-    """The load drives another way than the model says: the first speeds were off by 0.1 m/s."""
-    policy, off = blind.candidate("c0002")[0].policy, []
-    for seed in range(3):
-        path = record(blind, tmp_path / f"{seed}.csv", policy, 0.8, seed=seed)
-        blind.ingest(path, candidate="c0002")
-        table = np.loadtxt(path, delimiter=",", skiprows=1)
-        truth = table[80 + 5 * np.arange(policy.horizon + 1), 2]  # measured, to 0.01 m/s
-        off.append(blind.trials()[-1].trial.states[:, 1] - truth)
-    assert np.abs(np.mean(off, axis=0)[[0, -1]]).max() < 0.03
-    assert np.sqrt(np.mean(np.square(off))) < 0.03
-
-
-@pytest.mark.parametrize("row", [0.007, 0.011, 0.013])
-def test_rows_out_of_step_with_the_commands_tell_together_when_a_run_begins(w, tmp_path, row):
-    """Each row shows a change late by another part of it: 10 ms were left, of a row of 10 ms."""
-    policy = w.candidate("c0002")[0].policy
-    path = record(w, tmp_path / "a.csv", policy, 0.8)
-    table = np.loadtxt(path, delimiter=",", skiprows=1)
-    t = np.arange(table[0, 0] + 0.003, table[-1, 0], row)
-    at = np.floor((t - table[0, 0]) * RATE + 1e-6).astype(int)
-    rows = [t, *(np.interp(t, table[:, 0], table[:, k]) for k in (1, 2)), table[at, 3]]
-    named = {"header": "t,x,v,force", "comments": ""}
-    np.savetxt(tmp_path / "b.csv", np.transpose(rows), "%.5f", ",", **named)
-    found = w.ingest(tmp_path / "b.csv")
-    assert found.candidate == "c0002" and not any("known to" in one for one in found.warnings)
-    begun = w.trials()[-1].meta["start_ns"]
-    assert int(begun) * 1e-9 - table[0, 0] == pytest.approx(0.8, abs=0.0025)
 
 
 def test_the_operator_jogged_the_cart_first(w, tmp_path):
@@ -449,25 +337,6 @@ def test_one_log_is_one_trial(w, tmp_path):
     assert w.ingest(path, candidate="c0002").known and len(w.trials()) == 2
     w.discard(first.trial)
     assert w.ingest(path, data=True).candidate == ""
-
-
-@pytest.mark.parametrize("phase", [0, 3, 6, 9])
-def test_a_run_begins_between_the_rows_that_show_it(w, tmp_path, monkeypatch, phase):
-    """Rows of 100 Hz show a command up to 10 ms late: a score went from -0.13 to -3, or refused."""
-    monkeypatch.setitem(globals(), "RATE", 1000)
-    policy, every = w.candidate("c0002")[0].policy, round(w.task.dt * 1000)
-    fine = np.loadtxt(record(w, tmp_path / "fine.csv", policy, 0.5), delimiter=",", skiprows=1)
-    rows = fine[phase::10]
-    np.savetxt(tmp_path / "b.csv", rows, "%.5f", ",", header="t,x,v,force", comments="")
-    found = w.ingest(tmp_path / "b.csv")
-    assert found.candidate == "c0002" and found.verdict != "data"
-    stored = w.trials()[-1].trial
-    k = 500 + every * np.arange(policy.horizon)
-    np.testing.assert_allclose(stored.inputs[:, 0], fine[k, 3], atol=1e-4)
-    off = float(
-        np.mean((stored.states[:-1, 0] - fine[k, 1]) * fine[k, 2]) / np.mean(fine[k, 2] ** 2)
-    )
-    assert abs(off) < 0.0025  # [s]; a quarter of a row
 
 
 def recorded_in_motion(path, change=0.3, begun=0.13):

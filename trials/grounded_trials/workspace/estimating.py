@@ -13,7 +13,7 @@ run and after its end says how fast the robot was there.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,12 +23,14 @@ from grounded.estimate.record import Record
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task
+from grounded_trials.formats.messages import Ints
 from grounded_trials.logs.samples import Samples, tidy
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.toml_table import Table
 
 FINEST = 8  # rows of the smoother in a control step
-PIECE_S = 10.0  # of the log in one call: half an hour costs little more than a minute
+PIECE_S = 5.0  # of the log are filtered in step with others: half an hour costs little more
+OVERLAP_S = 1.5  # by which they know of each other
 LEAST = 3  # rows that can be smoothed
 MARGIN_S = 0.5  # of motion after the last change of a command
 WIDE = 10.0  # times as large as a state gets in a log: what is known of its first value
@@ -115,16 +117,15 @@ class _Clock:
         rows = int(np.ceil((int(last) + margin - origin) * 1e-9 / step)) + 1
         return cls(origin, step, max(rows, 0))
 
-    def stamps(self, times: Array) -> Array:
-        stamps: Array = self.origin + np.round(times * 1e9).astype(np.int64)
-        return stamps
+    def stamps(self, times: Array) -> Ints:
+        return self.origin + np.round(times * 1e9).astype(np.int64)
 
 
 def _records(
     samples: Sequence[Samples], sent: Sequence[Samples], clock: _Clock, dt: float
 ) -> list[Record]:
     """The stretches of a log in which nothing is lost for long, every sample at the nearest row."""
-    times = np.arange(clock.rows) * clock.step
+    times: Array = np.arange(clock.rows, dtype=np.float64) * clock.step
     measured, known = np.full((len(times), len(samples)), np.nan), np.ones(len(times), bool)
     for column, s in zip(measured.T, samples, strict=True):
         t = (s.t - clock.origin) * 1e-9
@@ -180,15 +181,30 @@ def _smoothed(
     for name, std in table.process.items():
         process[model.state_names.index(name)] = std * np.sqrt(found.noise.dt / task.dt)
     noise = NoiseStd(process=process, measurement=known, dt=found.noise.dt)
-    smooth = smooth_trials(model, records, noise, **options)  # type: ignore[arg-type]
-    states = np.concatenate([one.states for one in smooth])
+    parts = [one for record in records for one in _overlapping(record)]
+    smooth = smooth_trials(model, [one for one, _ in parts], noise, **options)  # type: ignore[arg-type]
+    kept = [one.states[core] for one, (_, core) in zip(smooth, parts, strict=True)]
+    states = np.concatenate(kept)
     if not np.isfinite(states).all():
         raise GroundedError(
             f"the smoother finds no finite states for this log ({smooth[0].status}): the crude "
             "model is too far off to tell what was not measured; check its units and the [log] "
             "mapping"
         )
-    return np.concatenate([record.times for record in records]), states
+    return np.concatenate([one.times[core] for one, core in parts]), states
+
+
+def _overlapping(record: Record) -> Iterator[tuple[Record, slice]]:
+    """Pieces that begin before what is kept of them and end after it, and the rows to keep."""
+    from grounded.estimate.record import part
+
+    h = float(record.times[1] - record.times[0])
+    each, more, rows = max(1, round(PIECE_S / h)), round(OVERLAP_S / h), len(record.times)
+    for first in range(0, rows, each):
+        a, b = max(0, first - more), min(rows, first + each + more)
+        piece = part(record, a, b - 1)
+        if np.isfinite(piece.measured).any(axis=0).all():
+            yield piece, slice(first - a, min(first + each, rows) - a)
 
 
 def _moving(records: Sequence[Record]) -> list[Record]:

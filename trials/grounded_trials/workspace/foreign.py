@@ -135,7 +135,7 @@ class ForeignLog:
         """The log where its run may begin anywhere; None where [log.span] is set."""
         if self.workspace.config.log.sub("span").names():
             return None
-        return recording(self.whole, self.workspace.task, self.complete)
+        return recording(self.series, self.workspace.task, self.complete, self.whole)
 
 
 def mapping_of(workspace: Folder, path: Path) -> LogMapping:

@@ -73,6 +73,7 @@ class Recording:
     """A foreign log, to be cut anywhere; on a grid of `parts` instants a control step."""
 
     series: Mapping[str, Series]  # of every state and input
+    logged: Mapping[str, Series]  # those of them that nothing estimated
     complete: Complete
     names: tuple[tuple[str, ...], tuple[str, ...]]
     angles: tuple[str, ...]
@@ -217,14 +218,21 @@ def _close(policy: Policy, trial: Trial) -> bool:
     return bool((np.abs(sent - asked).mean(axis=0) <= UNLIKE * usual + finest).all())
 
 
-def recording(series: Mapping[str, Series], task: Task, complete: Complete) -> Recording | None:
+def recording(
+    logged: Mapping[str, Series],
+    task: Task,
+    complete: Complete,
+    series: Mapping[str, Series] | None = None,
+) -> Recording | None:
     """A log whose run may begin anywhere; None where it can't be cut.
 
     Args:
-        series: the samples of every state and input.
+        logged: the samples that it has.
         task: whose steps it is cut into.
-        complete: how they come of those that were logged.
+        complete: how those of every state and input come of them.
+        series: those, where they are known.
     """
+    series = complete(logged) if series is None else series
     model, dt = task.model, task.dt
     names = (model.state_names, model.input_names)
     every = [float(np.median(np.diff(np.sort(s.t)))) for s in series.values() if len(s.t) > 1]
@@ -240,6 +248,7 @@ def recording(series: Mapping[str, Series], task: Task, complete: Complete) -> R
     changes, late = (at - whole.origin_ns) * 1e-9, late * 1e-9
     return Recording(
         series,
+        logged,
         complete,
         names,
         model.angles,
@@ -262,7 +271,8 @@ def pace_of(log: Recording, task: Task, policy: Policy) -> float | None:
         policy: what is sought.
     """
     for pace in PACES:
-        if _run_in(log, {n: _paced(one, pace) for n, one in log.series.items()}, task, policy):
+        paced = {name: _paced(one, pace) for name, one in log.logged.items()}
+        if _run_in(recording(paced, task, log.complete), policy):
             return pace
     return None
 
@@ -275,23 +285,25 @@ def unit_of(log: Recording, task: Task, policy: Policy) -> tuple[tuple[str, ...]
         task: whose steps it is cut into.
         policy: what is sought.
     """
-    for names, by in units_tried(task.model):
-        series = {
-            name: replace(one, values=one.values * by) if name in names else one
-            for name, one in log.series.items()
-        }
-        run = _run_in(log, series, task, policy)
+    tried = set[tuple[tuple[str, ...], float]]()
+    for group, by in units_tried(task.model):
+        names = tuple(name for name in group if name in log.logged)
+        if not names or (names, by) in tried:
+            continue
+        tried.add((names, by))
+        scaled = {n: replace(log.logged[n], values=log.logged[n].values * by) for n in names}
+        known = None  # what was estimated does not hang on the size of what was sent
+        if set(names) <= set(task.model.input_names):
+            known = {**log.series, **scaled}
+        run = _run_in(recording({**log.logged, **scaled}, task, log.complete, known), policy)
         fit = run and follows(policy, run.until(policy.horizon), 0)
         if fit and fit.error < NEARLY:
-            return tuple(names), by
+            return names, by
     return (), 1.0
 
 
-def _run_in(
-    whole: Recording, series: Mapping[str, Series], task: Task, policy: Policy
-) -> Trial | None:
-    """The run of a policy that begins in these samples, wherever; None where none does."""
-    log = recording(whole.complete(series), task, whole.complete)
+def _run_in(log: Recording | None, policy: Policy) -> Trial | None:
+    """The run of a policy that begins in a log, wherever; None where none does."""
     found = log.start_of(policy) if log else None
     return log.trial_from(found.seconds) if log and found and found.alike else None
 

@@ -1,0 +1,59 @@
+"""A cart with feedback and noisy sensors, recorded as a table by somebody who begins early."""
+
+import numpy as np
+
+from grounded_trials import Workspace
+from workspaces import CONFIG, make
+
+LOGGED = CONFIG + "".join(
+    f'[log.{kind}.{name}]\npath = "/csv.{name}"\n'
+    for kind, name in (("state", "x"), ("state", "v"), ("input", "force"))
+)
+RATE = 100  # [Hz]
+
+
+def record(w, path, policy, before, seed=0, until=None, after=1.0, jog=0.0, rate=RATE, late=0):
+    """Runs a policy on the model, with a load the policy fights, and logs all of it as a table.
+
+    `late`: rows by which the program and the log get the position late.
+    """
+    model, dt, rng = w.task.model, policy.dt, np.random.default_rng(seed)
+    z, force, rows, sent = np.array(w.task.start, float), 0.0, [], policy.past.copy()
+    past = []
+    every, begin = round(dt * rate), round(before * rate)
+    end = begin + every * policy.horizon if until is None else begin + round(until * rate)
+    last = end + round(after * rate) if until is None else end
+    for k in range(last):
+        felt = z + rng.normal(0, [0.002, 0.01])
+        past.append(felt[0])
+        felt[0] = past[max(0, k - late)]
+        step, part = divmod(k - begin, every)
+        if 0 <= step < policy.horizon and part == 0:
+            force = float(follow(policy, step, felt, sent)[0])
+        if step >= policy.horizon:
+            force = 0.0
+        if k < begin:
+            force = jog * np.sin(k / rate * 4) if k < 0.4 * begin else 0.0
+        rows.append([1000 + k / rate, *felt, force])
+        push = 0.7 * force - 0.4 * np.tanh(20 * z[1]) if k >= begin else 0.0
+        z = model.system.step(z[None], np.array([[push]]), model.values, 1 / rate)[0]
+    np.savetxt(path, rows, "%.5f", ",", header="t,x,v,force", comments="")
+    return path
+
+
+def follow(policy, step, state, past):
+    """One command of a policy, from its published law."""
+    if policy.gain is None:
+        return policy.feedforward[step]
+    z = np.concatenate([state, past[: policy.gain.shape[2] - len(state)]])
+    u = policy.feedforward[step] + policy.gain[step] @ (z - policy.reference[step])
+    past[:] = u = np.clip(u, policy.low, policy.high)
+    return u
+
+
+def waiting(folder, config=LOGGED):
+    """A workspace that waits for c0002; c0001 was run."""
+    w = Workspace(make(folder / "w", config=config).folder)
+    w.ingest(record(w, folder / "first.csv", w.propose().candidate.policy, 0.0, seed=9))
+    w.propose()
+    return w

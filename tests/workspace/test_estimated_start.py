@@ -1,0 +1,67 @@
+"""Where a run begins in a log without speeds, and how fast the robot was there.
+
+With [estimate] no start was sought: "somebody drove" was said of every log with a lead-in.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded.errors import GroundedError
+from recorded import LOGGED, RATE, record, waiting
+
+ONLY_POSITIONS = LOGGED.replace('[log.state.v]\npath = "/csv.v"\n', "") + (
+    "[estimate]\nmeasured = { x = 0.002 }\n"
+)
+
+
+@pytest.fixture
+def blind(tmp_path):
+    """Nothing measures its speed; it waits for c0002, and its controller had its own estimate."""
+    return waiting(tmp_path, ONLY_POSITIONS)
+
+
+@pytest.mark.parametrize("before", [0.0, 0.1, 0.8])
+def test_a_run_is_found_where_speeds_are_estimated(blind, tmp_path, before):
+    """With [estimate] no start was sought: "somebody drove" of every log with a lead-in."""
+    policy = blind.candidate("c0002")[0].policy
+    path = record(blind, tmp_path / "a.csv", policy, before)
+    found = blind.ingest(path)
+    assert found.candidate == "c0002" and bool(found.notes) == bool(before)
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    k = round(before * RATE) + 5 * np.arange(policy.horizon)
+    np.testing.assert_allclose(blind.trials()[-1].trial.inputs[:, 0], table[k, 3], atol=1e-4)
+    assert {one.name for one in found.signals} == {"x", "force"}  # what was logged
+
+
+def test_what_nobody_sent_is_refused_where_speeds_are_estimated(blind, tmp_path):
+    policy = blind.candidate("c0002")[0].policy
+    other = replace(policy, feedforward=np.roll(policy.feedforward, 12, axis=0))
+    path = record(blind, tmp_path / "a.csv", other, 0.8)
+    with pytest.raises(GroundedError, match="did not run c0002"):
+        blind.ingest(path)
+
+
+@pytest.mark.parametrize("column, by", [(1, 1000.0), (3, 0.001)])
+def test_another_unit_is_told_where_speeds_are_estimated(blind, tmp_path, column, by):
+    path = record(blind, tmp_path / "a.csv", blind.candidate("c0002")[0].policy, 0.8)
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    table[:, column] *= by
+    np.savetxt(tmp_path / "b.csv", table, "%.6f", ",", header="t,x,v,force", comments="")
+    name = {1: "x", 3: "force"}[column]
+    with pytest.raises(GroundedError, match=f"ran c0002, with {name} 1000 times"):
+        blind.ingest(tmp_path / "b.csv")
+
+
+def test_an_estimated_speed_knows_what_came_before_the_run_and_after_it(blind, tmp_path):
+    """The load drives another way than the model says: the first speeds were off by 0.1 m/s."""
+    policy, off = blind.candidate("c0002")[0].policy, []
+    for seed in range(3):
+        path = record(blind, tmp_path / f"{seed}.csv", policy, 0.8, seed=seed)
+        blind.ingest(path, candidate="c0002")
+        table = np.loadtxt(path, delimiter=",", skiprows=1)
+        truth = table[80 + 5 * np.arange(policy.horizon + 1), 2]  # measured, to 0.01 m/s
+        off.append(blind.trials()[-1].trial.states[:, 1] - truth)
+    assert np.abs(np.mean(off, axis=0)[[0, -1]]).max() < 0.03
+    assert np.sqrt(np.mean(np.square(off))) < 0.03

@@ -1,0 +1,47 @@
+"""When a run begins, to less than the time between the rows of a table that shows it."""
+
+import numpy as np
+import pytest
+
+from recorded import RATE, record, waiting
+
+
+@pytest.fixture
+def w(tmp_path):
+    return waiting(tmp_path)
+
+
+@pytest.mark.parametrize("phase", [0, 3, 6, 9])
+def test_a_run_begins_between_the_rows_that_show_it(w, tmp_path, phase):
+    """Rows of 100 Hz show a command up to 10 ms late: a score went from -0.13 to -3, or refused."""
+    policy, every = w.candidate("c0002")[0].policy, round(w.task.dt * 1000)
+    path = record(w, tmp_path / "fine.csv", policy, 0.5, rate=1000)
+    fine = np.loadtxt(path, delimiter=",", skiprows=1)
+    rows = fine[phase::10]
+    np.savetxt(tmp_path / "b.csv", rows, "%.5f", ",", header="t,x,v,force", comments="")
+    found = w.ingest(tmp_path / "b.csv")
+    assert found.candidate == "c0002" and found.verdict != "data"
+    stored = w.trials()[-1].trial
+    k = 500 + every * np.arange(policy.horizon)
+    np.testing.assert_allclose(stored.inputs[:, 0], fine[k, 3], atol=1e-4)
+    off = float(
+        np.mean((stored.states[:-1, 0] - fine[k, 1]) * fine[k, 2]) / np.mean(fine[k, 2] ** 2)
+    )
+    assert abs(off) < 0.0025  # [s]; a quarter of a row
+
+
+@pytest.mark.parametrize("row", [0.007, 0.011, 0.013])
+def test_rows_out_of_step_with_the_commands_tell_together_when_a_run_begins(w, tmp_path, row):
+    """Each row shows a change late by another part of it: 10 ms were left, of a row of 10 ms."""
+    policy = w.candidate("c0002")[0].policy
+    path = record(w, tmp_path / "a.csv", policy, 0.8)
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    t = np.arange(table[0, 0] + 0.003, table[-1, 0], row)
+    at = np.floor((t - table[0, 0]) * RATE + 1e-6).astype(int)
+    rows = [t, *(np.interp(t, table[:, 0], table[:, k]) for k in (1, 2)), table[at, 3]]
+    named = {"header": "t,x,v,force", "comments": ""}
+    np.savetxt(tmp_path / "b.csv", np.transpose(rows), "%.5f", ",", **named)
+    found = w.ingest(tmp_path / "b.csv")
+    assert found.candidate == "c0002" and not any("known to" in one for one in found.warnings)
+    begun = w.trials()[-1].meta["start_ns"]
+    assert int(begun) * 1e-9 - table[0, 0] == pytest.approx(0.8, abs=0.0025)
