@@ -124,7 +124,9 @@ def _moved(claims: Claims) -> str:
     for name in named[:NAMED]:
         old = params[name].value
         change = 100 * (known[name].value - old) / abs(old) if old else 0.0
-        part = f" ({change:+.{0 if abs(change) >= 1 else 1}f}%)" if old else ""
+        beside = [f"{change:+.{0 if abs(change) >= 1 else 1}f}%"] * bool(old)
+        beside += ["at its bound: the data ask for more"] * params[name].at_bound(known[name].value)
+        part = f" ({', '.join(beside)})" * bool(beside)
         texts.append(f"{name} should be {quantity(known[name])}{part}")
     more = len(named) - NAMED
     return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
