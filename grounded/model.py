@@ -69,6 +69,11 @@ class Param:
         given = self.low is not None or self.high is not None or self.std is not None
         return given and self.low != (np.nan if self.high is None else self.high)
 
+    def at_bound(self, value: float) -> bool:
+        """Whether a value is one of its bounds, which it would pass if it could."""
+        ends = [end for end in (self.low, self.high) if self.uncertain and end is not None]
+        return any(abs(value - end) <= 1e-6 * self.spread for end in ends)
+
     @property
     def spread(self) -> float:
         """Prior standard deviation [unit]: 0 of a constant; half its value beside one bound."""

@@ -74,6 +74,7 @@ def command(
     """
     workspace = open_workspace()
     from grounded.errors import GroundedError
+    from grounded_trials.workspace.diagnosing import unheld_in
 
     chosen = names_in(trials)
     if trials is not None and not chosen:
@@ -88,10 +89,12 @@ def command(
         )
     if instruments:
         findings = workspace.preflight(chosen)
+        alone = unheld_in(workspace, chosen)
         if json_:
-            return show_json({"preflight": [one.to_json() for one in findings]})
+            odd = [one.to_json() for one in findings]
+            return show_json({"preflight": odd, "unheld": list(alone)})
         _instruments(findings)
-        return None if findings else show("the sensors show nothing odd")
+        return _unheld(alone, bool(findings))
     families = [name for text in without for name in names_in(text)]
     with stages() as tell:
         found = workspace.diagnose(
@@ -165,6 +168,16 @@ def _instruments(findings: Sequence[Finding]) -> None:
 
     for k, line in enumerate(instrument_lines(findings)):
         show(field("sensors" if k == 0 else "", line))
+
+
+def _unheld(alone: Sequence[str], odd: bool) -> None:
+    """What the instruments can't know: of a sensor that no other one can be held against."""
+    if alone:
+        of = "its" if len(alone) == 1 else "their"
+        text = f"{', '.join(alone)}: no other sensor to hold against, so {of} sign, unit and delay"
+        show(field("unchecked", f"{text} are not known"))
+    if not odd:
+        show("the sensors show nothing odd" + " by themselves" * bool(alone))
 
 
 def _note(text: str) -> None:

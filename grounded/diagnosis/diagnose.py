@@ -58,7 +58,7 @@ from grounded.diagnosis.validation.limits import (
 from grounded.diagnosis.validation.measured import Measured, root_mean_square
 from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.diagnosis.verdict import next_trial, verdict
+from grounded.diagnosis.verdict import at_bounds, next_trial, verdict
 from grounded.effects import Library, acting_order, wrapping_order
 from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError
@@ -287,7 +287,16 @@ class _Writer:
             unconfirmed=seen,
             correction=correction(predictor, self.best, self.left, where),
             next_trial=next_trial(
-                self.claims, look, groups, seen, same, lost, worse, adopted, further
+                self.claims,
+                look,
+                groups,
+                seen,
+                same,
+                lost,
+                worse,
+                adopted,
+                further,
+                at_bounds(self.claims),
             ),
             unknowable=self.known.sentences,
             noise=self.noise(),

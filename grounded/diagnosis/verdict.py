@@ -117,6 +117,12 @@ def _off(claims: Claims) -> list[str]:
     return [claims.data.model.param_names[one.index] for one in claims.moved]
 
 
+def at_bounds(claims: Claims) -> bool:
+    """Whether parameters have to differ, and all of them by more than they may."""
+    params, known, named = claims.data.model.params, claims.parameters(), _off(claims)
+    return bool(named) and all(params[n].at_bound(known[n].value) for n in named)
+
+
 def _moved(claims: Claims) -> str:
     """`L should be 0.166 m (+11 %)` of the parameters that have to differ."""
     params, known = claims.data.model.params, claims.parameters()
@@ -124,7 +130,9 @@ def _moved(claims: Claims) -> str:
     for name in named[:NAMED]:
         old = params[name].value
         change = 100 * (known[name].value - old) / abs(old) if old else 0.0
-        part = f" ({change:+.{0 if abs(change) >= 1 else 1}f}%)" if old else ""
+        beside = [f"{change:+.{0 if abs(change) >= 1 else 1}f}%"] * bool(old)
+        beside += ["at its bound: the data ask for more"] * params[name].at_bound(known[name].value)
+        part = f" ({', '.join(beside)})" * bool(beside)
         texts.append(f"{name} should be {quantity(known[name])}{part}")
     more = len(named) - NAMED
     return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
@@ -140,6 +148,7 @@ def next_trial(
     worse: bool = False,
     adopted: Collection[str] = (),
     further: bool = False,
+    ended: bool = False,
 ) -> str:
     """A sentence; `excitation.probe` makes the trial itself.
 
@@ -153,6 +162,7 @@ def next_trial(
         worse: predictions get worse with what is claimed (`Diagnosis.contested`).
         adopted: the effects whose numbers are parameters of the model.
         further: more effects are to be looked for first (`Verdict.look_for`).
+        ended: all parameters that moved are at their bounds (`at_bounds`).
     """
     from grounded.effects import places
 
@@ -180,6 +190,8 @@ def next_trial(
         return f"Nothing is tied, but predictions get worse with {_it(claims)}: {REPEAT}."
     if further:
         return "None is needed yet: nothing is tied, and more effects have to be looked for first."
+    if ended:
+        return "Nothing is tied, but the parameters are at their bounds: are the sensors right?"
     if _own_numbers(claims, adopted):
         return "Nothing is tied: fit the model's parameters."
     return f"Nothing is tied: adopt {_it(claims)}."

@@ -166,7 +166,7 @@ def told_by(model: Model, pair: Sequence[str]) -> set[str]:
     tied |= tied.T | np.eye(len(names), dtype=bool)
     found = np.isin(names, pair)
     for _ in names:
-        found = tied[found].any(axis=0)
+        found = np.asarray(tied[found].any(axis=0))
     return {name for name, at in zip(model.state_names, found, strict=False) if at} - set(pair)
 
 

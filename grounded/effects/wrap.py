@@ -370,8 +370,8 @@ def _sensor_delay_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, 
         found = dict(after)
         for n, past in memory.items():
             line = [after[n], *[s[z] for z in past]]
-            parts = [np.maximum(1 - np.abs(behind - i), 0.0) for i in range(len(line))]
-            found |= {n: sum(part * value for part, value in zip(parts, line, strict=True))}
+            part = [np.maximum(1 - np.abs(behind - i), 0.0) for i in range(len(line))]
+            found[n] = sum(part[i] * value for i, value in enumerate(line))
             found |= dict(zip(past, line, strict=False))
         return found
 
@@ -381,9 +381,7 @@ def _sensor_delay_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, 
 def _true_name(model: Model, target: str) -> str:
     """What the state is called that the log of `target` shows late; its log may be late twice."""
     name = f"{target}_true"
-    while name in model.states:
-        name += "_true"
-    return name
+    return _true_name(model, name) if name in model.states else name
 
 
 def _sensor_lag_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:

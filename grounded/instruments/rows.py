@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded.effects import places
 from grounded.frozen import Array, wrapped
-from grounded.instruments.kinematics import SHORT, pieces
+from grounded.instruments.kinematics import SHORT, integrals, pieces
 from grounded.model import Model
 from grounded.trial import Trial
 
@@ -81,6 +81,19 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
         if fixed[i] and i not in by and set(by) <= set(shown):
             found.append(Row(i, by))
     return found
+
+
+def unheld(model: Model, trials: Sequence[Trial]) -> tuple[str, ...]:
+    """The logged states that no other sensor can be held against: of them nothing is known.
+
+    Args:
+        model: whose kinematics tie sensors together.
+        trials: of this model's states.
+    """
+    shown = [i for i in range(model.n) if any(np.isfinite(t.states[:, i]).any() for t in trials)]
+    held = {i for row in kinematic_rows(model, shown) for i in row.states}
+    held |= {i for one in integrals(model) if {one.i, one.j} <= {*shown} for i in (one.i, one.j)}
+    return tuple(model.state_names[i] for i in shown if i not in held)
 
 
 def tied(rows: Sequence[Row]) -> list[Row]:

@@ -1,19 +1,24 @@
 """A late or filtered sensor: the filter's likelihood is the exact one, the log comes back."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+import grounded as gr
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.validation.held_out import held_out_errors
+from grounded.diagnosis.validation.limits import knowable
 from grounded.diagnosis.validation.prediction_error import horizon, normalised
 from grounded.effects import Library
 from grounded.filter import kernels
 from grounded.filter.augmented import Delayed, coloured
 from grounded.filter.kalman import Adjoint, LinearSystem, gains, innovations, smoother
+from grounded.models.cart_pole import model as cart_pole
 from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
 
@@ -217,6 +222,56 @@ def test_samples_of_what_was_before_a_trial_count_like_those_of_a_state_that_dri
     assert delays.before(noise, None, still, white, certain) == pytest.approx(
         max(exact, -1.0 * whole * 2)
     )
+
+
+def hanging(late, trials=4, steps=200, dt=0.025):
+    """Swings of a pole that hangs from a cart, its camera `late` steps late, by the model."""
+    rng, found = np.random.default_rng(5), []
+    for _ in range(trials):
+        t, w, fine = np.arange(steps) * dt, rng.uniform(1.5, 5.0, 3), 5
+        u = (2.0 * np.sin(np.outer(t, w) + rng.uniform(0, 6, 3))).sum(axis=1)[:, None]
+        x = [np.array([0.0, np.pi, 0.0, 0.0])]
+        for k in range(fine * steps):
+            pushed = u[k // fine][None]
+            after = cart_pole.system.step(x[-1][None], pushed, cart_pole.values, dt / fine)[0]
+            x.append(after + [0, 0, 0.002, 0.003] * rng.standard_normal(4))
+        log = np.array(x)
+        log[:, [1, 3]] = np.stack([delayed(log[:, i], fine * late) for i in (1, 3)], axis=1)
+        log = log[::fine] + [1e-3, 1e-3, 5e-3, 1e-2] * rng.standard_normal((steps + 1, 4))
+        names = cart_pole.state_names, cart_pole.input_names
+        found.append(Trial(log, u, dt, *names, start_inputs=np.zeros(1)))
+    return found
+
+
+def test_two_states_of_one_sensor_are_late_together_where_a_third_is_seen():
+    trials, pair = hanging(0.0, trials=2, steps=60), "sensor_delay:theta+theta_vel"
+    data = prepare(cart_pole, trials)
+    assert pair in {e.name for e in knowable(data, Library().candidates(cart_pole, data.scales))}
+    blind = [replace(t, states=t.states * [np.nan, 1, np.nan, 1]) for t in trials]
+    data = prepare(cart_pole, blind)
+    offered = {e.name for e in knowable(data, Library().candidates(cart_pole, data.scales))}
+    assert "sensor_delay:theta" in offered and pair not in offered
+
+
+def test_sensors_that_filter_count_among_the_late_ones_of_a_fit():
+    """Hypotheses are filtered side by side by how many sensors are late, the instruments' too."""
+    data = prepare(cart_pole, hanging(1.8, trials=2, steps=60))
+    data = replace(data, filters={3: 0.05})
+    names = ("sensor_delay:x+x_vel", "sensor_delay:theta+theta_vel", "sensor_delay:theta")
+    late = [Library().effect(name, cart_pole, data.scales) for name in names]
+    search = HypothesisSearch(data, ())
+    starts = [search.fresh(Hypothesis().plus(effect, {"d": 0.045})) for effect in late]
+    assert [len(delays_of(h, data).channel) for h, _, _ in starts] == [3, 2, 2]
+    assert all(np.isfinite(fit.loglik) for fit in search.refined(starts, 2))
+
+
+@pytest.mark.slow
+def test_a_camera_that_is_late_with_an_angle_and_its_rate_is_found():
+    found = gr.diagnose(cart_pole, hanging(1.8))
+    assert found.effects == ("sensor_delay:theta+theta_vel",)
+    assert found.ranking[0].params["d"].value == pytest.approx(0.045, abs=0.003)
+    none = gr.diagnose(cart_pole, hanging(0.0))
+    assert not none.effects
 
 
 def delayed(x, steps):

@@ -7,7 +7,7 @@ from grounded import Model, Param
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.instruments.preflight import preflight
-from grounded.instruments.rows import Row, gaps, kinematic_rows
+from grounded.instruments.rows import Row, gaps, kinematic_rows, unheld
 from grounded.trial import Trial
 
 DT = 0.1
@@ -120,6 +120,15 @@ def test_a_state_without_a_sensor_or_an_uncertain_parameter_makes_no_row():
         derivative=lambda s, a, p: {"x": p.R * s.w, "w": a.F - p.c * s.w},
     )
     assert kinematic_rows(geared, [0, 1]) == []
+
+
+def test_states_that_no_other_sensor_is_held_against_are_named():
+    def without(*states):
+        return logged(BOAT, lambda y: np.where(np.isin(NAMES, states), np.nan, y))
+
+    assert not unheld(BOAT, without())
+    assert unheld(BOAT, without("v")) == ("x", "y", "u")
+    assert unheld(BOAT, without("u", "v", "r")) == ("x", "y", "psi")
 
 
 def test_a_constant_drift_that_was_adopted_leaves_the_rows():

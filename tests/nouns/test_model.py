@@ -74,6 +74,9 @@ def test_a_parameter_lies_between_its_bounds():
         Param(0.5, "1", 1.0, 0.0)
     with pytest.raises(GroundedError):
         Param(0.5, std=0.0)
+    two = Param(0.5, "1", 0.0, 1.0)
+    assert two.at_bound(0.0) and two.at_bound(1.0) and not two.at_bound(0.999)
+    assert not Param(0.5, std=0.1).at_bound(0.5) and not Param(0.5).at_bound(0.5)
     assert not Param(0.5).uncertain and not Param(0.5, "1", 0.5, 0.5).uncertain
     assert Param(0.5, "1", 0.0, 1.0).spread == pytest.approx(1 / 12**0.5)
     assert Param(0.5, std=0.1).spread == 0.1 and Param(0.5, std=0.1).uncertain

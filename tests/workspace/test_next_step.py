@@ -113,6 +113,18 @@ def test_numbers_that_are_wrong_are_fitted(cart, tmp_path):
     assert last(grounded("-C", folder, "status")) == "grounded fit"
 
 
+@pytest.mark.parametrize(
+    ("part", "then"), [(0.9, "adopt viscous_friction:v"), (1.0, "diagnose --instruments")]
+)
+def test_what_is_calibrated_to_its_bound_is_not_to_be_adopted(cart, tmp_path, part, then):
+    folder = copied(cart, tmp_path / "w")
+    high = Workspace(folder).base_model.params["mass"].high
+    mass = {"value": part * high, "std": 0.02, "interval": [part * high] * 2, "unit": "kg"}
+    verdict = {**DIAGNOSIS["verdict"], "parameters": ["mass"]}
+    diagnosed(folder, verdict=verdict, parameters={"mass": mass})
+    assert last(grounded("-C", folder, "status")) == f"grounded {then}"
+
+
 def test_a_diagnosis_of_another_model_is_made_again(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     diagnosed(folder, diagnosed={"trials": [], "adopted": [], "params": {"mass": 9.0}})

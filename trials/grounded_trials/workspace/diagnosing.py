@@ -177,6 +177,13 @@ def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Findi
     return where_to_mend(workspace, used, found)
 
 
+def unheld_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[str, ...]:
+    """The logged states that the stored trials have no other sensor for, see `unheld`."""
+    from grounded.instruments.rows import unheld
+
+    return unheld(workspace.planner.task.model, _chosen(workspace, trials))
+
+
 def _keep(workspace: Folder, found: Diagnosis) -> None:
     workspace.reports.mkdir(exist_ok=True)
     write_document(workspace.reports / FILE, found.to_json())

@@ -105,7 +105,11 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
         return None  # adopted, and undone: whoever did that is not asked to do it again
     if most := diagnosis.verdict.look_for:
         return _with_more(most, diagnosis.made or Made())
-    own = {f"parameter:{name}" for name in workspace.base_model.params}
+    params = workspace.base_model.params
+    moved = [n for n in diagnosis.verdict.parameters if n in params and n in diagnosis.parameters]
+    if moved and all(params[n].at_bound(diagnosis.parameters[n].value) for n in moved):
+        return NextCommand("diagnose", ("--instruments",))  # they ask for more than can be
+    own = {f"parameter:{name}" for name in params}
     if own.issuperset(new):
         return NextCommand("fit")  # the model's form is right: all of its numbers at once
     return NextCommand("adopt", new)
