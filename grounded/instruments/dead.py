@@ -53,13 +53,13 @@ def dead_rates(
         known = rate[np.isfinite(rate)]
         if len(known) < LEAST or np.ptp(known) > 0:
             continue
-        value, moved, noise, way = float(known[0]), 0.0, 0.0, 0.0
+        value, moved, noise, own, way = float(known[0]), 0.0, 0.0, 0.0, 0.0
         for piece in pieces([trial], [relation.i, relation.j]):
             said = relation.c * value * trial.dt * np.arange(len(piece))
             moved = max(moved, float(np.ptp(piece[:, 0] - said)))
-            way = max(way, float(np.ptp(piece[:, 0])), float(np.ptp(said)))
+            own, way = max(own, float(np.ptp(piece[:, 0]))), max(way, float(np.ptp(said)))
             noise = max(noise, float(np.std(np.diff(piece[:, 0], n=2))) / np.sqrt(6))
-        if moved > max(MOVED * noise, SHARE * way):
+        if min(moved, own) > max(MOVED * noise, SHARE * way, SHARE * own):
             found.append(Dead(relation, value, moved))
     return found
 
