@@ -1,6 +1,7 @@
 """Where `grounded` starts: an interrupt while modules are imported ends it without a traceback."""
 
 import gc
+
 # of the interpreter itself: `signal` imports `enum` first, and may be interrupted there
 from _signal import SIG_DFL, SIGINT, signal  # type: ignore[import-not-found]
 
