@@ -1,5 +1,7 @@
 """What a sensor does is mended in [log], or in the program that writes grounded's own trials."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -63,6 +65,17 @@ def test_a_late_sensor_of_a_foreign_log_is_mended_in_its_table(tmp_path):
     ingest_log(w, tmp_path / "log.csv", data=True)
     one = found_in(w)
     assert one.log.startswith("delay_s = 0.1") and not one.advice
+
+
+def test_sensors_that_nothing_is_held_against_are_named_and_not_called_right(tmp_path):
+    w, trial = make(tmp_path / "w"), late()
+    blind = replace(trial, states=trial.states * [1.0, np.nan])
+    write_trial(tmp_path / "blind.mcap", blind, {"kind": "data"})
+    ingest_log(w, tmp_path / "blind.mcap", data=True)
+    found = grounded("-C", w.folder, "diagnose", "--instruments", "--json").json
+    assert found["unheld"] == ["x"]
+    said = grounded("-C", w.folder, "diagnose", "--instruments").out
+    assert holds(said, "unchecked", "x", "sign", "delay")
 
 
 def keys_of(log: str) -> dict[str, float]:
