@@ -86,6 +86,11 @@ class Param:
         return (self.high - self.low) / 12**0.5
 
 
+def all_at_bounds(params: Mapping[str, Param], values: Mapping[str, float]) -> bool:
+    """Whether there are values, and each is one of its parameter's bounds (`Param.at_bound`)."""
+    return bool(values) and all(params[n].at_bound(v) for n, v in values.items())
+
+
 @dataclass(frozen=True, eq=False)
 class Model:
     """Named states and inputs with units, parameters, and the dynamics.

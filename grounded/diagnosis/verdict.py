@@ -16,12 +16,12 @@ from grounded.diagnosis.error_report import (
 )
 from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
 from grounded.diagnosis.ruler_words import floor, improvement, rest, worsened
+from grounded.model import Model, all_at_bounds
 from grounded.result import percent
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.validation.claims import Claims
     from grounded.effects import Effect
-    from grounded.model import Model
 
 LOG, LOST = "is a log that no candidate made", "was lost"  # why a trial can't be run again
 MOST_EFFECTS, FURTHER = 6, 2  # that may be blamed at once; so many more are looked for next
@@ -119,8 +119,8 @@ def _off(claims: Claims) -> list[str]:
 
 def at_bounds(claims: Claims) -> bool:
     """Whether parameters have to differ, and all of them by more than they may."""
-    params, known, named = claims.data.model.params, claims.parameters(), _off(claims)
-    return bool(named) and all(params[n].at_bound(known[n].value) for n in named)
+    known = claims.parameters()
+    return all_at_bounds(claims.data.model.params, {n: known[n].value for n in _off(claims)})
 
 
 def _moved(claims: Claims) -> str:

@@ -184,6 +184,10 @@ class Family:
     vague: float = 0.0
     turned: str = ""
 
+    def at(self, site: Site) -> Effect:
+        """The effect of this family there, with the quantities that it estimates there."""
+        return Effect(self, site, self.quantities(site))
+
 
 @dataclass(frozen=True)
 class InputFamily(Family):

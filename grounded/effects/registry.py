@@ -147,8 +147,7 @@ class Library:
 
 
 def _build(family: Family, target: str, model: Model, scales: Scales) -> Effect:
-    site = Site(model, tuple(target.split("+")), scales)
-    return Effect(family, site, family.quantities(site))
+    return family.at(Site(model, tuple(target.split("+")), scales))
 
 
 def derived_states(model: Model) -> set[str]:

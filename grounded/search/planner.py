@@ -147,9 +147,7 @@ def planner_with(
         if families[i].name == "delay":
             reached = [_input(task, name, one) for one in targets]
             site = Site(task.model, targets, Scales())
-            latency[reached] += checked(
-                Effect(families[i], site, families[i].quantities(site)), values
-            )["d"]
+            latency[reached] += checked(families[i].at(site), values)["d"]
             continue
         effect = library.effect(name, model)
         model = wrap(effect, checked(effect, values), task.dt)

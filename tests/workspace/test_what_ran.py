@@ -5,6 +5,7 @@ Every test here fails on 0.1, which compared nothing and knew no `discard`.
 
 import json
 import re
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -144,39 +145,42 @@ def test_a_named_candidate_overrides_with_a_warning(waiting):
     assert found.candidate == "c0002" and "force" in found.warnings[0]
 
 
+def said_to_have_run(candidate, run, to, steps=sys.maxsize):
+    """The file `to`, with a run's trial, or its first steps, as one that names this candidate."""
+    trial, _, _ = read_trial(run)
+    write_trial(to, replace(trial.until(steps), candidate=candidate), {"kind": "trial"})
+    return to
+
+
 def test_the_log_of_another_candidate_says_so(waiting, tmp_path):
     w, ran, _ = waiting
-    trial, _, _ = read_trial(ran)
-    write_trial(tmp_path / "again.mcap", replace(trial, candidate=""), {"kind": "trial"})
+    again = said_to_have_run("", ran, tmp_path / "again.mcap")
     with pytest.raises(GroundedError, match="those of c0001") as refused:
-        w.ingest(tmp_path / "again.mcap")
-    arguments = (str(tmp_path / "again.mcap"), "--candidate", "c0001")
+        w.ingest(again)
+    arguments = (str(again), "--candidate", "c0001")
     assert refused.value.then == NextCommand("ingest", arguments)
-    done = grounded("-C", w.folder, "next", tmp_path / "again.mcap", "--candidate", "c0001")
+    done = grounded("-C", w.folder, "next", again, "--candidate", "c0001")
     assert done.code == 0, done.err
-    assert w.ingest(tmp_path / "again.mcap", candidate="c0001").candidate == "c0001"
+    assert w.ingest(again, candidate="c0001").candidate == "c0001"
 
 
 def test_a_trial_that_names_its_candidate_is_not_given_to_another(waiting, tmp_path):
     """A run of another workspace's c0002 was said to be one of c0001, and refused as that."""
     w, ran, _ = waiting
-    trial, _, _ = read_trial(ran)
-    write_trial(tmp_path / "x.mcap", replace(trial, candidate="c0002"), {"kind": "trial"})
+    other = said_to_have_run("c0002", ran, tmp_path / "x.mcap")
     with pytest.raises(GroundedError, match="another workspace") as refused:
-        w.ingest(tmp_path / "x.mcap")
+        w.ingest(other)
     assert "says that it ran c0002" in str(refused.value)
     assert "--candidate c0001" not in str(refused.value)  # which would be refused in turn
-    assert refused.value.then == NextCommand("ingest", (str(tmp_path / "x.mcap"), "--data"))
-    assert w.ingest(tmp_path / "x.mcap", candidate="c0002").candidate == "c0002"
+    assert refused.value.then == NextCommand("ingest", (str(other), "--data"))
+    assert w.ingest(other, candidate="c0002").candidate == "c0002"
 
 
 def test_a_cut_log_of_a_candidate_that_ran_well_says_how_to_take_it_back(waiting, tmp_path):
     w, ran, _ = waiting
-    trial, _, _ = read_trial(ran)
-    for name, candidate in (("c0001", "c0001"), ("c0002", "c0002")):
-        short = replace(trial.until(20), candidate="")
-        write_trial(tmp_path / f"{name}.mcap", short, {"kind": "trial"})
-        found = w.ingest(tmp_path / f"{name}.mcap", candidate=candidate)
+    for candidate in ("c0001", "c0002"):
+        short = said_to_have_run("", ran, tmp_path / f"{candidate}.mcap", steps=20)
+        found = w.ingest(short, candidate=candidate)
         (said,) = [one for one in found.warnings if "ended after 20" in one]
         assert (f"`discard` {found.trial}" in said) == (candidate == "c0001")
         assert found.verdict == "crashed" or candidate == "c0001"

@@ -16,7 +16,6 @@ from typing import Any
 from grounded.effects.family import Effect, Family, Scales, Site, joining_order
 from grounded.effects.registry import Library
 from grounded.errors import GroundedError
-from grounded.model import Model
 from grounded.search.planner import Planner, planner_with
 from grounded.task import Task
 
@@ -104,7 +103,7 @@ def _bounds(effect: Effect) -> dict[str, tuple[float, float]]:
     model, targets = effect.site.model, effect.site.targets
     names = (*model.state_names, *model.input_names)
     small, large = (
-        _effect(effect.family, model, targets, scales)
+        effect.family.at(Site(model, targets, scales))
         for scales in (
             Scales(),
             Scales(dict.fromkeys(names, -1e3), dict.fromkeys(names, 1e3), dt=1.0, duration=1e4),
@@ -115,8 +114,3 @@ def _bounds(effect: Effect) -> dict[str, tuple[float, float]]:
         for q, p in zip(small.quantities, large.quantities, strict=True)
         if not q.fixed
     }
-
-
-def _effect(family: Family, model: Model, targets: Sequence[str], scales: Scales) -> Effect:
-    site = Site(model, tuple(targets), scales)
-    return Effect(family, site, family.quantities(site))

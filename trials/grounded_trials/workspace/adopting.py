@@ -81,6 +81,8 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     they are adopted with those: the effects' values hold beside them. An effect that it does not
     claim was fitted in place of those, without them.
     """
+    from grounded_trials.workspace.adopted import in_order
+
     found = read_diagnosis(workspace.reports)
     if found is None:
         raise GroundedError("nothing was diagnosed yet: diagnose first", then=AGAIN)
@@ -94,7 +96,9 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
         for family, _, target in (name.partition(":") for name in names)
         if family == "parameter"
     }
-    own, adopted = joined(found, names, workspace.config.model.effects, nominal, calibrated)
+    old = workspace.config.model.effects
+    own, both = joined(found, names, old, nominal, calibrated)
+    adopted = in_order(both[: len(old)], both[len(old) :])
     whole = dict(workspace.config.model.params) | own
     earlier, _ = _kept(workspace)  # or nothing is written
     set_in_model(workspace.config.file, params=whole if own else None, effects=adopted or None)
@@ -199,12 +203,10 @@ def joined(
     Args:
         found: the diagnosis.
         names: of its effects, in any order: they join in that in which they were fitted.
-        effects: that the model has already.
+        effects: that the model has already; they stay in front.
         nominal: the value from which each parameter that is adopted by name counts.
         calibrated: the parameters that come along.
     """
-    from grounded_trials.workspace.adopted import in_order
-
     before = {} if found.made is None else found.made.effects
     adopted, new = [dict(effect) for effect in effects], list[Effect]()
     params = {key: _rounded(estimate.value) for key, estimate in calibrated.items()}
@@ -219,7 +221,7 @@ def joined(
             adopted = [e | values if e["name"] == name else e for e in adopted]
         else:
             new.append({"name": name, **values})
-    return settled(params, in_order(adopted, new))
+    return settled(params, [*adopted, *new])
 
 
 def _curves(found: Diagnosis) -> list[str]:
@@ -350,17 +352,16 @@ def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | Non
     Raises:
         GroundedError: if the diagnosis names an effect or a quantity that is not known.
     """
+    adopted = workspace.config.model.effects
+    new = _new(diagnosis, {str(effect["name"]) for effect in adopted})
+    values = _parameters(workspace, diagnosis)
+    if not (values or new):
+        return Better(workspace.planner, "with adopted effects") if adopted else None
     from grounded_trials.workspace.adopted import in_order, planner_of
 
-    adopted = [dict(effect) for effect in workspace.config.model.effects]
-    new = _new(diagnosis, {str(effect["name"]) for effect in adopted})
-    effects = in_order(adopted, new)
-    values = _parameters(workspace, diagnosis)
-    if diagnosis is None or not (values or len(effects) > len(adopted)):
-        return Better(workspace.planner, "with adopted effects") if adopted else None
     task = workspace.task
     estimated = task.with_model(task.model.with_values(values))
-    return Better(planner_of(estimated, effects), "as diagnosed")
+    return Better(planner_of(estimated, in_order(adopted, new)), "as diagnosed")
 
 
 def _new(diagnosis: Diagnosis | None, adopted: set[str]) -> list[Effect]:

@@ -130,7 +130,7 @@ class ForeignLog:
         seen = {n: replace(s, spec=replace(s.spec, delay_s=0.0)) for n, s in late.items()}
         return replace(self, series={**self.series, **seen}) if seen else None
 
-    @property
+    @cached_property
     def recording(self) -> Recording | None:
         """The log where its run may begin anywhere; None where [log.span] is set."""
         if self.workspace.config.log.sub("span").names():

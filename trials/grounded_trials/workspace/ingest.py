@@ -205,8 +205,9 @@ class _Look:
         task: Task,
     ) -> None:
         ran, judged = read.trial.candidate, partial(suspicion, task, own=own, others=candidates)
+        apart = None if log is read.log else log  # judged otherwise than it is stored
         self.read, self.found = read, None
-        self.whole = interpolate_gaps(read.trial if log is read.log else self._cut(log, ran)).trial
+        self.whole = interpolate_gaps(apart.cut(ran)[0] if apart else read.trial).trial
         seen = judged(self.whole)
         if read.bare and (alone := judged(self.whole, others=())).why:
             seen = alone  # it may be of another workspace: that it looks like one of these is luck
@@ -214,12 +215,11 @@ class _Look:
         if log and read.log and self.log:
             self.found = found = self.log.start_of(own.policy)
             if found and elsewhere(self.log, found, own.policy, seen.why):
-                begins = found.seconds + (0 if log is read.log else self._sooner(log, read.log))
+                begins = found.seconds + (_sooner(apart, read.log) if apart else 0)
                 note = f"the log begins {begins:.3f} s before {ran} does: it is taken from there"
                 self.read = replace(_cut(read.log, ran, begins), notes=(note,))
-                self.whole = interpolate_gaps(
-                    self.read.trial if log is read.log else self._cut(log, ran, found.seconds)
-                ).trial
+                cut = apart.cut(ran, found.seconds)[0] if apart else self.read.trial
+                self.whole = interpolate_gaps(cut).trial
                 seen = judged(self.whole)
             if (rival := rival_in(self.log, found, ran, candidates)) is not None:
                 there = judged(rival)  # as it lies where that one fits best
@@ -233,16 +233,11 @@ class _Look:
         ran = self.suspicion.ran
         return bool(self.suspicion.why), math.inf if ran is None else ran.error
 
-    @staticmethod
-    def _cut(log: ForeignLog | None, ran: str, start: float | None = None) -> Trial:
-        assert log is not None
-        return log.cut(ran, start)[0]
 
-    @staticmethod
-    def _sooner(log: ForeignLog, stored: ForeignLog) -> float:
-        """By how much the first sample of the log that is stored comes sooner [s]."""
-        first, other = (one.cut("")[1].origin_ns for one in (log, stored))
-        return (first - other) * 1e-9
+def _sooner(log: ForeignLog, stored: ForeignLog) -> float:
+    """By how much the first sample of the log that is stored comes sooner [s]."""
+    assert log.recording is not None and stored.recording is not None
+    return (log.recording.whole.origin_ns - stored.recording.whole.origin_ns) * 1e-9
 
 
 def _latest(workspace: Folder) -> list[Candidate]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import GroundedError, NextCommand
+from grounded.model import all_at_bounds
 from grounded.search.standing import Standing
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.diagnosing import diagnosable
@@ -106,8 +107,8 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     if most := diagnosis.verdict.look_for:
         return _with_more(most, diagnosis.made or Made())
     params = workspace.base_model.params
-    moved = [n for n in diagnosis.verdict.parameters if n in params and n in diagnosis.parameters]
-    if moved and all(params[n].at_bound(diagnosis.parameters[n].value) for n in moved):
+    known = {n: e.value for n, e in diagnosis.parameters.items() if n in params}
+    if all_at_bounds(params, {n: known[n] for n in diagnosis.verdict.parameters if n in known}):
         return NextCommand("diagnose", ("--instruments",))  # they ask for more than can be
     own = {f"parameter:{name}" for name in params}
     if own.issuperset(new):

@@ -45,9 +45,7 @@ SHORT = 4  # at least 1 / SHORT of a run tells that it was one
 ALIGNED = 0.75  # of the time between samples: a start nearer than that is as good
 CLEARLY = 0.7  # of the commands' difference at the first command: the start is elsewhere
 KNOWN = 0.25  # of a row: the standard deviation from which feedback tells when in it a run began
-EXACT = (
-    0.1  # of what a row's lateness does to the commands: with less, the states were the policy's
-)
+EXACT = 0.1  # of what a row's lateness does to commands: with less, the states were the policy's
 LOOSE = 0.1  # of a step: a start that is known no better is told
 PACES = (2.0, 0.5)  # of a recording that was played twice as fast, or half
 BATCH = 256  # instants compared at once

@@ -32,6 +32,7 @@ def warnings_about(
             the control grid.
     """
     from grounded.instruments.dead import dead_rates
+    from grounded.instruments.kinematics import integrals
     from grounded.instruments.swapped import exchanged, swapped_columns
 
     task = workspace.task
@@ -49,13 +50,14 @@ def warnings_about(
             f"'{name}' is not a finite number at {step * trial.dt:.2f} s: the trial counts as "
             "ended there"
         )
-    if pair := swapped_columns(workspace.base_model, whole.until(whole.known_steps)):
-        found.append(exchanged(pair))
     model = workspace.base_model
+    relations = integrals(model)
+    if pair := swapped_columns(model, whole.until(whole.known_steps), relations=relations):
+        found.append(exchanged(pair))
     found += [
         f"{model.state_names[one.relation.j]} {one.told(model)}: is [log] its column, is its "
         "sensor on?"
-        for one in dead_rates(model, whole)
+        for one in dead_rates(model, whole, relations)
     ]
     if not trial.candidate:
         return (*found, *_beyond(task, whole))
