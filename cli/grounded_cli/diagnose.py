@@ -39,9 +39,8 @@ if TYPE_CHECKING:
 @click.option(
     "--max-effects",
     type=click.IntRange(1, 6),
-    default=3,
     metavar="K",
-    help="Blame at most K effects at once, 1 to 6 (default: 3).",
+    help="Blame at most K effects at once, 1 to 6 (default: 3, more where they leave a gap).",
 )
 @click.option("--without", multiple=True, metavar="F1,F2,...", help="Families not to blame.")
 @click.option(
@@ -58,7 +57,7 @@ if TYPE_CHECKING:
 @as_json
 def command(
     trials: str | None,
-    max_effects: int,
+    max_effects: int | None,
     without: tuple[str, ...],
     compare: tuple[str, str] | None,
     probe: bool,

@@ -33,7 +33,7 @@ from grounded.diagnosis.error_report import (
     UtilityPrediction,
     Where,
 )
-from grounded.diagnosis.hypotheses.attribution import attribute, so_far
+from grounded.diagnosis.hypotheses.attribution import attribute, grown, so_far
 from grounded.diagnosis.hypotheses.correction import correction
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
@@ -75,7 +75,7 @@ class DiagnosisOptions:
 
     Args:
         library: the families that may be blamed.
-        max_effects: at most so many at once.
+        max_effects: at most so many at once; None: 3, and more where those leave more than noise.
         horizon: how far ahead predictions are judged [s].
         hidden: states that no sensor has: the memory of effects that were adopted.
         but: effects that are not blamed, by name: adopted ones, whose numbers are parameters now.
@@ -84,7 +84,7 @@ class DiagnosisOptions:
     """
 
     library: Library = field(default_factory=Library)
-    max_effects: int = 3
+    max_effects: int | None = None
     horizon: float = 1.0
     hidden: tuple[str, ...] = ()
     but: Collection[str] = ()
@@ -160,19 +160,25 @@ def diagnose(
     candidates = knowable(data, [e for e in offered if e.name not in settled])
     joints = options.library.joints(data.model, data.scales)
     joints = knowable(data, [e for e in joints if e.name not in settled])
+    most = options.max_effects or USUAL_EFFECTS
     with running(engine):
-        most = options.max_effects
         search, best = attribute(data, candidates, max_effects=most, tick=tick, joints=joints)
-    tick("predict")
     used = [trial for trial in trials if trial.known_steps >= 2]
-    here = interruptible(lambda: so_far(search, options.max_effects))
+    task = subject if isinstance(subject, Task) else None
+    here = interruptible(lambda: so_far(search, most))
     with np.errstate(all="ignore"), here, running(engine):
-        decision = decide(
-            search, best, ruler := Ruler(search.predictor, options.origin), options.max_effects
-        )
-        tick("leftover")
-        task = subject if isinstance(subject, Task) else None
-        found = _Writer(decision, ruler, known, options, tick, task, used, exact).diagnosis()
+        while True:
+            tick("predict")
+            ruler = Ruler(search.predictor, options.origin)
+            decision = decide(search, best, ruler, most)
+            tick("leftover")
+            writer = _Writer(decision, ruler, known, options, most, tick, task, used, exact)
+            found = writer.diagnosis()
+            if options.max_effects or not found.verdict.look_for:
+                break
+            most = found.verdict.look_for
+            tick("more effects")
+            best = grown(search, best, most)
         groups = [k < first for k in range(data.count)]
         return replace(
             found,
@@ -182,6 +188,7 @@ def diagnose(
         )
 
 
+USUAL_EFFECTS = 3  # that are looked for at first
 MOST_NAMES = 50  # of 36 and 12 come 1,649 effects, of 20 and 100 as many; each is filtered
 USUAL = 160  # stages of a diagnosis, and hypotheses that are refined together
 FIRST_LOOK = 6  # iterations of the fit by whose noise the parameters are found identifiable
@@ -213,13 +220,14 @@ class _Writer:
         ruler: Ruler,
         known: Limits,
         options: DiagnosisOptions,
+        most: int,
         tick: Callable[[str], None],
         task: Task | None,
         trials: Sequence[Trial],
         exact: bool,
     ) -> None:
         self.decision, self.ruler, self.known, self.options = decision, ruler, known, options
-        self.tick, self.task, self.trials = tick, task, trials
+        self.most, self.tick, self.task, self.trials = most, tick, task, trials
         self.search, self.best = decision.search, decision.fit
         self.predictor, self.data = self.search.predictor, self.search.data
         self.shown = list(zip(ruler.shown, ruler.names, strict=True))
@@ -254,8 +262,8 @@ class _Writer:
         seen = unconfirmed(self.claims, self.decision.doubtful, groups)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         worse, adopted = contested(rows, agreement, named), self.options.but
-        lost, most = self.unrepeatable(), self.options.max_effects
-        said = verdict(self.claims, ranking, groups, remainder, rows, credit, seen, same, most)
+        lost = self.unrepeatable()
+        said = verdict(self.claims, ranking, groups, remainder, rows, credit, seen, same, self.most)
         further = said.look_for > 0
         return Diagnosis(
             verdict=said,

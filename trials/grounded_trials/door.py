@@ -229,7 +229,7 @@ class Workspace(Folder):
         self,
         trials: Sequence[str] = (),
         *,
-        max_effects: int = 3,
+        max_effects: int | None = None,
         without: Sequence[str] = (),
         library: Library | None = None,
         compare: Sequence[str] = (),
@@ -241,7 +241,8 @@ class Workspace(Folder):
 
         Args:
             trials: short names, t0007; none: all that can be used.
-            max_effects: blame at most so many effects at once.
+            max_effects: blame at most so many effects at once; None: 3, and more where those
+                leave more than noise.
             without: families not to blame.
             compare: a second group of trials; what changed from the first is `changed`.
             probe: write the most instructive candidate also where nothing ties.

@@ -60,8 +60,7 @@ def attribute(
         interruptible(lambda: so_far(search, max_effects)),
     ):
         search, best = _searched(search)
-        _grow(search, best, max_effects)
-    return search, search.chosen(max_effects)
+        return search, grown(search, best, max_effects)
 
 
 def so_far(search: HypothesisSearch, most: int) -> str:
@@ -195,8 +194,8 @@ def _halves(search: HypothesisSearch, starts: Sequence[Fitted]) -> list[Fitted]:
     return [f for f in likely if f not in starts and score(f) > score(null) + LARGE_GAIN]
 
 
-def _grow(search: HypothesisSearch, best: Fitted, most: int) -> None:
-    """Second and further effects: add, then swap each for what goes better with the others."""
+def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
+    """The likeliest of up to `most` effects: add one, then swap each for what goes better."""
     size = len(best.hypothesis.effects)
     while 1 <= size < most:
         starts = _starts(search, size, best)
@@ -213,9 +212,10 @@ def _grow(search: HypothesisSearch, best: Fitted, most: int) -> None:
             search.calibrated(fit)
         larger = search.of_size(size + 1)
         if not larger or search.score(larger[0]) < search.score(best) + CLAIM:
-            return
+            break
         best = larger[0]
         for name in best.hypothesis.names:  # what goes better with the others?
             search.extended(search.without(best, name), 6)
         best = search.of_size(size + 1)[0]
         size += 1
+    return search.chosen(most)

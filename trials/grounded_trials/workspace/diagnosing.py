@@ -43,7 +43,7 @@ def diagnose_in(
     workspace: Folder,
     *,
     trials: Sequence[str] = (),
-    max_effects: int = 3,
+    max_effects: int | None = None,
     without: Sequence[str] = (),
     library: Library | None = None,
     compare: Sequence[str] = (),
