@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 from grounded.result import Document
 
+DEGREES = 57.29577951308232  # in a radian
+
 
 @dataclass(frozen=True, eq=False)
 class Finding(Document):
@@ -14,8 +16,9 @@ class Finding(Document):
     Args:
         signal: a state or an input, or several joined by "+".
         finding: one clause.
-        kind: delay, lag, scale, sign, degrees, wrapped, offset, stuck, held, dropout, missing,
-            quantised, saturated, beyond (its limits), constant, copy or mismatch (with others).
+        kind: delay, lag, smoothed, scale, sign, degrees, wrapped, offset, stuck, held, dropout,
+            missing, quantised, saturated, beyond (its limits), constant, copy or mismatch (with
+            others).
         delay_s: how late the signal is [s].
         std_s: standard deviation of that.
         scale: what the signal shows, over what it should.
@@ -35,3 +38,23 @@ class Finding(Document):
     corrected: bool = False
     log: str = field(default="", metadata={"brief": True})
     advice: str = field(default="", metadata={"brief": True})
+
+
+def put_right(
+    name: str,
+    text: str,
+    kind: str,
+    log: str,
+    *,
+    delay_s: float = 0.0,
+    std_s: float = float("nan"),
+    scale: float = 1.0,
+) -> Finding:
+    """A finding that the trials were corrected for."""
+    return Finding(name, text, kind, delay_s, std_s, scale, corrected=True, log=log)
+
+
+def in_degrees(name: str, unit: str) -> Finding:
+    """A finding of a signal that was put into radians."""
+    text, log = f"is in degrees, not in {unit}", f"scale = {1 / DEGREES:.8g}"
+    return put_right(name, text, "degrees", log, scale=DEGREES)

@@ -6,6 +6,8 @@ others find instead adds to its uncertainty. The ratio of sizes only brackets s 
 makes <a b> / <a a> too small, noise in b makes <b b> / <a b> too large. A first-order filter is
 told from a delay by a = b + tau b', where that fits better than any delay, or as well and leaves
 nothing of a difference in size: what a filter takes from fast swings passes for a scale of a delay.
+Beside a delay b may be smoothed: the mean over T has a = b - T^2 / 24 b''. Noise in b makes that T
+too short, and noise in a does nothing to it.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ SAME, ROUNDED = 0.01, 0.003  # of a scale: what matters, what steps of time may 
 SURELY = 3.0  # standard deviations that it is sure by
 FILTER = 0.9  # of the misfit of a delay: below it a filter is what it is
 EVEN, PLAIN = 1.05, 1 / 3  # of it, where a scale has to be so much nearer 1 to be one
+TOLD = 0.1  # of a: with less left, b smoothed is all that there is to say of it
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,7 @@ class Lag:
         high: upper bracket of the scale.
         coherence: 0 to 1, how much of both is the same.
         scale_std: standard deviation of the scale.
+        mean: b is the mean of a over so long [s], its middle `delay` ago; 0 where none is sure.
     """
 
     delay: float
@@ -58,6 +62,7 @@ class Lag:
     high: float
     coherence: float
     scale_std: float = np.inf
+    mean: float = 0.0
 
     @property
     def one_size(self) -> bool:
@@ -182,6 +187,7 @@ def _measured(pieces: _Pieces, reach: int, dt: float) -> Lag | None:
     rest, pull = a - s * b, s * slope
     force = max(_scatter(rest * pull, group) for group in pieces.groups)
     std = force / max(_dot(pull, pull), 1e-300)
+    mean = _mean(pieces, a, b, d) * dt
     behind = _filter(pieces, a, _dot(rest, rest), s) if d > 0 else None
     if behind is not None:
         d, b = behind  # the size is that of what went into the filter
@@ -192,7 +198,10 @@ def _measured(pieces: _Pieces, reach: int, dt: float) -> Lag | None:
     size_std = max(_scatter(rest * b, group) for group in pieces.groups) / max(_dot(b, b), 1e-300)
     sign, coherence = 1 if s > 0 else -1, min(low / high, 1.0)
     scale_std = size_std / max(s * s, 1e-300)
-    return Lag(d * dt, std * dt, behind is not None, sign, low, high, coherence, scale_std)
+    smoothed = mean * (behind is None)
+    return Lag(
+        d * dt, std * dt, behind is not None, sign, low, high, coherence, scale_std, smoothed
+    )
 
 
 def _dot(a: Array, b: Array) -> float:
@@ -214,6 +223,19 @@ def _filter(pieces: _Pieces, a: Array, misfit: float, scale: float) -> tuple[flo
     off, plain = (abs(np.log(max(abs(size), 1e-300))) for size in (scale, s))
     better = rest < FILTER * misfit or (rest < EVEN * misfit and plain < PLAIN * off)
     return (float(both / s), b + both / s * slope) if better and both / s > 0 else None
+
+
+def _mean(pieces: _Pieces, a: Array, b: Array, d: float) -> float:
+    """The length [samples] of the mean that b is of a, d samples ago; 0 where none is sure."""
+    curve = pieces.moved(d + 1) - 2 * b + pieces.moved(d - 1)
+    bent = curve - _dot(curve, b) / max(_dot(b, b), 1e-300) * b
+    size = max(_dot(bent, bent), 1e-300)
+    scale, part = _dot(a, b) / max(_dot(b, b), 1e-300), _dot(a, bent) / size
+    s = scale - part * _dot(curve, b) / max(_dot(b, b), 1e-300)
+    rest = a - s * b - part * curve
+    std = max(_scatter(rest * bent, group) for group in pieces.groups) / size
+    sure = -np.sign(s) * part > SURE * std and _dot(rest, rest) < TOLD**2 * _dot(a, a)
+    return float(np.sqrt(24 * -part / s)) if sure else 0.0
 
 
 def at_samples(x: Array, at: Any) -> Array:

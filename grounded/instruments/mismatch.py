@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import wrapped
-from grounded.instruments.finding import Finding
+from grounded.instruments.finding import DEGREES, Finding
 from grounded.instruments.kinematics import (
     AGREE,
     TURNED_AWAY,
@@ -24,7 +24,7 @@ from grounded.instruments.kinematics import (
     integrals,
     turned,
 )
-from grounded.instruments.odd_trial import DEGREES, Odd, missed, spread
+from grounded.instruments.odd_trial import Odd, missed, spread
 from grounded.instruments.other_units import FACTORS, described, unusable
 from grounded.instruments.rows import Gap, Row, gaps, per_step
 from grounded.instruments.swapped import exchanged

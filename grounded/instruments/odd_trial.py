@@ -18,6 +18,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
+from grounded.instruments.finding import DEGREES
 from grounded.instruments.kinematics import Integral, integrals, over_steps, pieces
 from grounded.model import Model
 from grounded.trial import Trial
@@ -27,7 +28,7 @@ STARTS = 200
 LARGE = 20.0  # times what the others do
 SIMILAR = 3.0
 BETTER = 0.9  # of the error with commands as they are, or a third, or three times as large
-STAMPS, DEGREES = 1000.0, 180 / np.pi
+STAMPS = 1000.0
 NEAR = 0.1  # relative, of these factors
 TOGETHER = 0.95  # cosine of what a position moves and its velocity says, over the best window
 TURNS = (2 * np.pi, 360.0)  # by which a wrapped angle jumps

@@ -27,7 +27,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.instruments.constant import constant_of
 from grounded.instruments.dead import judge_dead
-from grounded.instruments.finding import Finding
+from grounded.instruments.finding import DEGREES, Finding, in_degrees, put_right
 from grounded.instruments.inputs import judge_inputs
 from grounded.instruments.kinematics import (
     AGREE,
@@ -68,8 +68,8 @@ from grounded.trial import Trial
 LEAST_STEPS = 0.1  # of a time step: less is a matter of time stamps
 ALIKE = 0.9  # coherence from which two sensors are compared at all
 OFF = 0.03  # of a scale, beyond both of its brackets
-DEGREES = 180 / np.pi
 UNIT = 0.1  # relative, from which a scale is taken for one of degrees
+SMOOTH = 2.0  # time steps: a velocity that is a mean over less still tells when something happens
 SAME_WAY = 0.95  # of a speed and the way: below it something drifts or slips
 
 
@@ -179,10 +179,10 @@ class _Bench:
             if one.change.factor > 0:
                 text = f"is in degrees{where}, not in {self.model.states[name]}"
                 log = f"scale = {1 / DEGREES:.8g}" * (not where)
-                yield _mended(name, text, "degrees", log, scale=DEGREES)
+                yield put_right(name, text, "degrees", log, scale=DEGREES)
             else:
                 text = f"has the wrong sign{where}: only so do positions move as the others say"
-                yield _mended(name, text, "sign", "scale = -1" * (not where), scale=-1.0)
+                yield put_right(name, text, "sign", "scale = -1" * (not where), scale=-1.0)
 
     def dead(self) -> Iterator[Finding]:
         """With the samples of velocities that show nothing missing."""
@@ -202,7 +202,7 @@ class _Bench:
         for odd in all_in_degrees(self.model, self.trials, shown):
             self.trials[odd.trial] = odd.mended(self.trials[odd.trial])
             if odd.trial == 0:
-                yield from (_in_degrees(n, unit) for n, unit in self.named(odd))
+                yield from (in_degrees(n, unit) for n, unit in self.named(odd))
         for odd in list(odd_commands(self.model, self.trials, shown)):
             yield from self.in_unit(odd)
 
@@ -218,7 +218,7 @@ class _Bench:
         degrees = abs(abs(np.log(odd.factor)) - np.log(DEGREES)) < UNIT
         for name, _ in self.named(odd):
             kind = "degrees" if degrees else "scale"
-            yield _mended(name, text, kind, "", scale=odd.factor)
+            yield put_right(name, text, kind, "", scale=odd.factor)
 
     def named(self, odd: Odd) -> list[tuple[str, str]]:
         """Names and units of its signals."""
@@ -246,6 +246,7 @@ class _Bench:
                 yield from self.late(relation, lag)
             if relation.exact:
                 yield from self.constant(relation)
+                yield from self.smoothed(relation, lag)
 
     def unit(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """Sign and unit, which are put right; a scale, which may be either sensor's."""
@@ -266,13 +267,13 @@ class _Bench:
     def turned_round(self, i: int, text: str) -> Finding:
         """With the sign of state i changed."""
         self.put(i, [-x for x in self.column(i)])
-        return _mended(self.model.state_names[i], text, "sign", "scale = -1", scale=-1.0)
+        return put_right(self.model.state_names[i], text, "sign", "scale = -1", scale=-1.0)
 
     def from_degrees(self, i: int) -> Finding:
         """With state i in radians."""
         self.put(i, [x / DEGREES for x in self.column(i)])
         name = self.model.state_names[i]
-        return _in_degrees(name, self.model.states[name])
+        return in_degrees(name, self.model.states[name])
 
     def late(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """A delay: no sensor is early, so it is the later one's."""
@@ -301,10 +302,24 @@ class _Bench:
         d, name = float(abs(lag.delay)), self.model.state_names[i]
         if lag.filtered:
             text = f"follows {other} through a filter of {d:.3g} s"
-            return _mended(name, text, "lag", "", delay_s=d, std_s=lag.std)
+            return put_right(name, text, "lag", "", delay_s=d, std_s=lag.std)
         self.put(i, [_earlier(x, d / self.dt) for x in self.column(i)])
         text, log = f"{d:.3g} s later than {other}", f"delay_s = {d:.3g}"
-        return _mended(name, text, "delay", log, delay_s=d, std_s=lag.std)
+        return put_right(name, text, "delay", log, delay_s=d, std_s=lag.std)
+
+    def smoothed(self, relation: Integral, lag: Lag | None) -> Iterator[Finding]:
+        """Without a velocity that is a mean over several steps: a difference of its position.
+
+        It says no more than the position does, and where something stops it is wrong as long.
+        """
+        if lag is None or lag.coherence <= ALIKE or lag.mean < SMOOTH * self.dt:
+            return
+        q, w = (self.model.state_names[k] for k in (relation.i, relation.j))
+        self.put(relation.j, [np.full_like(x, np.nan) for x in self.column(relation.j)])
+        self.shown.remove(relation.j)
+        text = f"shows a mean over {lag.mean:.2g} s, as a difference of {q} does; left out here: "
+        text += f"{q} says as much"
+        yield Finding(w, text, "smoothed", corrected=True)
 
     def positions(self) -> Iterator[Finding]:
         """Of both positions of a plane that are late together."""
@@ -363,25 +378,6 @@ class _Bench:
             size = float(np.sqrt(lag.low * lag.high))
             text = f"shows {100 * size:.3g} % of the speed of {where}: a sensor, or slip"
             yield Finding(name, text, "scale", scale=size)
-
-
-def _mended(
-    name: str,
-    text: str,
-    kind: str,
-    log: str,
-    *,
-    delay_s: float = 0.0,
-    std_s: float = np.nan,
-    scale: float = 1.0,
-) -> Finding:
-    """A finding that the trials were corrected for."""
-    return Finding(name, text, kind, delay_s, std_s, scale, corrected=True, log=log)
-
-
-def _in_degrees(name: str, unit: str) -> Finding:
-    text, log = f"is in degrees, not in {unit}", f"scale = {1 / DEGREES:.8g}"
-    return _mended(name, text, "degrees", log, scale=DEGREES)
 
 
 def _earlier(x: Array, steps: float) -> Array:

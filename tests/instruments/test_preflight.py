@@ -1,5 +1,6 @@
 """The instruments, judged from their own signals: known faults of generated ones, real ones."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -86,6 +87,42 @@ def test_a_velocity_is_held_against_its_position(fault, signal, kind, delay, sca
         assert all((a.states == b.states).all() for a, b in zip(found.trials, sent, strict=True))
     elif one.corrected:
         assert all(abs(f.delay_s) < 0.2 * delay for f in preflight(ARM, found.trials).findings)
+
+
+def differenced(x, steps):
+    before = np.concatenate([np.full(steps, x[0]), x])
+    return (x - before[:-steps]) / (steps * DT)
+
+
+@pytest.mark.parametrize("moved_back", [0, 1.5])
+def test_a_velocity_that_is_a_difference_of_its_position_says_no_more_than_that(moved_back):
+    """Taken for a sensor, it made 0.41 rad/s^2 of a friction of 0.5: it goes on where q stops."""
+
+    def fault(y):
+        w = differenced(y[:, 0], 3)
+        return np.stack([y[:, 0], at_samples(w, np.arange(len(w)) + moved_back)], axis=1)
+
+    trials = arm(fault, friction=0.5)
+    looked = preflight(ARM, trials)
+    (found,) = [one for one in looked.findings if one.kind == "smoothed"]
+    assert found.signal == "w" and found.corrected and "q" in found.finding
+    assert abs(float(re.search("over ([0-9.]+) s", found.finding)[1]) - 3 * DT) < DT
+    assert all(np.isnan(trial.states[:, 1]).all() for trial in looked.trials)
+    (late,) = [f.delay_s for f in looked.findings if f.kind == "delay"] or [0.0]
+    assert abs(late - (1.5 - moved_back) * DT) < 0.05 * DT
+    diagnosis = diagnose(ARM, trials)
+    assert diagnosis.effects == ("coulomb_friction:w",)
+    (friction,) = diagnosis.ranking[0].params.values()
+    assert abs(friction.value - 0.5) < 0.01
+    assert "w" not in diagnosis.prediction_error[0].crude
+
+
+@pytest.mark.parametrize("w", [lambda x: late(x, 1.5), lambda x: lagged(x, 0.08), lambda x: x])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_a_sensor_of_its_own_is_used_however_late_or_noisy(w, noise):
+    rng = np.random.default_rng(5)
+    trials = arm(columns(w=lambda x: w(x) + noise * rng.standard_normal(len(x))))
+    assert not any(f.kind == "smoothed" for f in preflight(ARM, trials).findings)
 
 
 def test_sound_sensors_are_left_alone():
@@ -313,9 +350,9 @@ def test_a_late_sensor_is_not_counted_against_the_effects():
 @needs_data
 def test_the_late_velocity_registers_of_real_joints():
     """Published beside the data: about 20 ms (BAM) and 15 ms (the double pendulum)."""
-    for parts, columns, step, late in (
-        (("bam_xl330_servo", "bam_xl330_pendulum"), (0, 1), 0.005, 0.020),
-        (("dfki_double_pendulum", "acrobot_mcpilco"), (1, 3), 0.03, 0.015),
+    for parts, columns, step, late, kinds in (
+        (("bam_xl330_servo", "bam_xl330_pendulum"), (0, 1), 0.005, 0.020, ["delay", "smoothed"]),
+        (("dfki_double_pendulum", "acrobot_mcpilco"), (1, 3), 0.03, 0.015, ["delay"]),
     ):
         log, trials = np.load(data(parts[0], f"{parts[1]}.npz"), allow_pickle=True), []
         for name in (n for n in log.files if n.startswith("run") and not n.endswith("_t")):
@@ -325,7 +362,7 @@ def test_the_late_velocity_registers_of_real_joints():
             none = np.zeros((len(grid) - 1, 1))
             trials.append(Trial(states, none, step, ("q", "w"), ("u",)))
         found = preflight(ARM, trials).findings
-        assert [(one.signal, one.kind) for one in found] == [("w", "delay")]
+        assert [(one.signal, one.kind) for one in found] == [("w", kind) for kind in kinds]
         assert found[0].delay_s == pytest.approx(late, abs=0.001)
 
 

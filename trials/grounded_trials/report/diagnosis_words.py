@@ -138,7 +138,7 @@ def instrument_lines(findings: Iterable[Finding]) -> list[str]:
     """Each finding with its signal, whether it was corrected, and what does so in the logs, too."""
     lines = []
     for one in findings:
-        done = "; corrected here" * one.corrected
+        done = "; corrected here" * (one.corrected and one.kind != "smoothed")
         more = f", in [log]: {one.log}" * bool(one.log) + f"; {one.advice}" * bool(one.advice)
         lines.append(f"{one.signal}: {one.finding}{done}{more}")
     return lines
