@@ -6,7 +6,8 @@ For each: the published cause, what is named, and held-out open-loop errors in u
 calibrated, as diagnosed, noise floor, beside the best model that was made by hand (SOURCE.md of
 each folder of ../shared/data; its split of the runs and its resampling are not quite ours). Models
 and logs are those of tests/support/real_systems.py. Tuned on: EMPS, SERVO, DART_*. Kept back: BAM_*
-(volts in; in BAM_KP goal, gain and torque_enable) and the double pendulum (ACROBOT, SYSID).
+(volts in; in BAM_KP goal, gain and torque_enable; that the w of BAM_QW is a mean was found on it)
+and the double pendulum (ACROBOT, SYSID).
 """
 
 from __future__ import annotations

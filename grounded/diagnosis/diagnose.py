@@ -147,7 +147,7 @@ def diagnose(
     data = prepare(model, trials, latency, past, options.hidden)
     filters = {model.state_names.index(name): tau for name, tau in looked.filters.items()}
     data = replace(data, filters=filters)
-    known = limits(data)
+    known = limits(data, looked.left_out)
     known = replace(known, sentences=(*known.sentences, *copies))
     tick("candidates")
     uncertain = Predictor(data)

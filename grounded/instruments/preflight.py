@@ -88,6 +88,11 @@ class Preflight:
         return {f.signal: f.delay_s for f in self.findings if f.corrected and f.kind == "lag"}
 
     @property
+    def left_out(self) -> frozenset[str]:
+        """States whose sensors say no more than others do."""
+        return frozenset(f.signal for f in self.findings if f.kind == "smoothed")
+
+    @property
     def settled(self) -> frozenset[str]:
         """Sensor effects that can't be blamed any more, by name: corrected, or refuted."""
         mended = {f.signal for f in self.findings if f.corrected and f.kind in ("delay", "lag")}

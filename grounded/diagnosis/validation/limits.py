@@ -46,8 +46,13 @@ class Limits:
     no_cause: bool
 
 
-def limits(data: Data) -> Limits:
-    """What the trials are too few or too quiet for."""
+def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
+    """What the trials are too few or too quiet for.
+
+    Args:
+        data: the trials.
+        left_out: states whose sensors say no more than others do.
+    """
     found, no_cause = [], False
     if data.count < 2 and len(data.valid) < PIECES:
         found.append("one trial alone confirms nothing; run a second one, or a longer one")
@@ -69,7 +74,7 @@ def limits(data: Data) -> Limits:
     if data.skipped:
         found.append(f"{data.skipped} stretches of the trials were left out, to bound memory")
     empty = [n for i, n in enumerate(data.model.state_names) if not data.seen[..., i].any()]
-    for name in empty:
+    for name in (name for name in empty if name not in left_out):
         found.append(f"state {name} was never measured")
     if len(unmoved) + len(empty) + len(data.hidden) == data.model.n:
         no_cause = True
