@@ -6,7 +6,7 @@ there may exist and can't be known, so it is not offered and the reader is told.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
