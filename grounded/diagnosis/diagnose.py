@@ -176,7 +176,7 @@ def diagnose(
             found = writer.diagnosis()
             if options.max_effects or not found.verdict.look_for:
                 break
-            most = found.verdict.look_for
+            most += 1
             tick("more effects")
             best = grown(search, best, most)
         groups = [k < first for k in range(data.count)]
