@@ -18,7 +18,7 @@ from grounded.trial import Trial
 
 DELAYS = (0.0, 0.05, 0.1, 0.2)  # [s], of all commands
 LEAST = 20  # samples that tell enough
-LITTLE = 1e-3  # of a state's spread: no smaller error counts
+LITTLE, TINY = 1e-3, 1e-12  # of a state's spread, and in its unit: no smaller error counts
 ROUNDS, DAMPING, SLOPE = 5, (1.0, 0.3, 0.1), 0.02
 ENOUGH = 0.01  # [nats]: a round that gains less is the last
 
@@ -62,7 +62,7 @@ class Ahead:
         at = at[(at >= max(self.delays)) & (at + self.steps <= len(self.sent))]
         self.at = at[:: -(-len(at) // starts)] if len(at) else at
         self.first, self.last = logged[self.at], logged[self.at + self.steps]
-        self.least = LITTLE * np.nanstd(logged[:, self.shown], axis=0) + 1e-300
+        self.least = LITTLE * np.nanstd(logged[:, self.shown], axis=0) + TINY
         params = list(model.params.values())
         self.moving = [k for k, param in enumerate(params) if param.uncertain]
         self.spread = np.array([params[k].spread for k in self.moving])
@@ -79,10 +79,9 @@ class Ahead:
         """Whether there are samples to tell anything by."""
         return len(self.at) >= LEAST and bool(self.shown)
 
-    def plain(self) -> Fit:
-        """As the model is."""
-        ones = np.ones(self.model.m)
-        return self._fit(self._size(self._off(ones, self.model.values, 0)), ones)
+    def plain(self, gains: Array) -> Fit:
+        """As the model is, with some gains (m,) of its inputs."""
+        return self._fit(self._size(self._off(gains, self.model.values, 0)), gains)
 
     def still(self) -> Fit:
         """Calibrated, with every command at its mean throughout: what commands do is missing."""
@@ -126,6 +125,8 @@ class Ahead:
         for _ in range(ROUNDS if len(theta) else 0):
             each = [(off(theta + SLOPE * e) - r) / size / SLOPE for e in np.eye(len(theta))]
             J, white = np.array([one.ravel() for one in each]).T, (r / size).ravel()
+            if not (np.isfinite(J).all() and np.isfinite(white).all()):
+                break  # it runs away
             H = J.T @ J + np.diag(prior + 1e-9 * len(white))
             step = -np.linalg.lstsq(H, J.T @ white + prior * theta, rcond=None)[0]
             for part in DAMPING:
@@ -149,7 +150,8 @@ class Ahead:
         return np.asarray(off - off.mean(axis=0))
 
     def _size(self, off: Array) -> Array:
-        return np.asarray(np.maximum(np.sqrt((off**2).mean(axis=0)), self.least))
+        size = np.sqrt((off**2).mean(axis=0))
+        return np.asarray(np.maximum(np.where(np.isfinite(size), size, FAR), self.least))
 
     def _fit(self, size: Array, gains: Array) -> Fit:
         rms = np.ones(self.model.n)

@@ -30,8 +30,9 @@ HALF = 0.5  # of the error of one state at least
 HINT = 0.5  # [nats], of the model as it is: less is not looked into
 LIKE = 4.0  # times what the model says, or a part of it: what gain an exchanged input may have
 SEEN = 0.5  # [nats] by which commands in their own unit must do better than none
-STARTS, FEWER = 120, 40  # samples of a trial, and where many pairs are asked about
-MANY = 8  # trials, and pairs
+STARTS, FEWER = 120, 40  # samples of a trial, and where many changes are asked about
+TRIALS = 4  # that are asked
+MANY = 8  # changes
 MOST = 10  # states of which all mirror images are tried
 WHOLE = {100.0: "percent", 255.0: "counts of 8 bits", 1000.0: "thousandths"}  # full scale
 OPENED, OVER = 0.05, 1.03  # of full scale: what the largest command of a log reaches
@@ -101,7 +102,7 @@ def mistaken(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Tol
         shown: states that a sensor has.
     """
     changes = [*_exchanges(model, shown), *_units(model, trials)]
-    some = range(0, len(trials), -(-len(trials) // MANY))
+    some = range(0, len(trials), -(-len(trials) // TRIALS))
     starts = STARTS if len(changes) < MANY else FEWER
     found: dict[Mistake, dict[int, tuple[Fit, Fit]]] = {}
     sound: dict[Mistake, set[int]] = {}
@@ -185,7 +186,8 @@ def _exchanges(model: Model, shown: Sequence[int]) -> Iterator[Mistake]:
             yield Mistake(inputs=pair)
     exact = [r for r in integrals(model) if r.exact and {r.i, r.j} <= set(shown)]
     for a, b in combinations(exact, 2):
-        if kinds[a.i] == kinds[b.i] and kinds[a.j] == kinds[b.j] and a.c == b.c:
+        like = kinds[a.i] == kinds[b.i] and kinds[a.j] == kinds[b.j]
+        if like and np.isclose(a.c, b.c):
             yield Mistake(states=((a.i, b.i), (a.j, b.j)))
 
 
@@ -217,10 +219,12 @@ def _each(
     logged = Ahead(model, trial, known, starts)
     if not logged.enough or not np.isfinite(trial.inputs).all():
         return
-    plain = logged.plain()
+    plain = logged.plain(np.ones(model.m)).score
     for change in changes:
         mended = Ahead(model, change.mended(trial), known, starts)
-        gain = plain.score - mended.plain().score if mended.enough else np.nan
+        if not mended.enough:
+            continue
+        gain = plain - min(mended.plain(gains).score for gains in _signed(model, change))
         if gain < -HINT:
             yield change, None
         elif gain > HINT:
@@ -232,16 +236,17 @@ def _compared(
     model: Model, logged: Ahead, mended: Ahead, change: Mistake
 ) -> tuple[Fit, Fit] | None:
     """Both calibrated; None where the change is not clearly better then."""
-    ones = np.ones(model.m)
-    after, still = mended.best([ones]), mended.still().score
+    signed, still = _signed(model, change), mended.still().score
+    after = mended.best([min(signed, key=lambda gains: mended.plain(gains).score)])
     if not _plausible(change, after) or after.score > still - (CLEAR if change.swap else SEEN):
         return None
-    before = logged.best([ones], free=False)
+    before = logged.best(signed[:1], free=False)
     if not change.swap:
-        after = mended.best([ones], free=False)
+        after = mended.best(signed[:1], free=False)
         return (before, after) if before.score > still + CLEAR and _better(before, after) else None
     if _better(before, after):
-        before = logged.best(_signed(model, change))
+        turned = [*signed, -signed[0]] if change.inputs else signed
+        before = logged.best([*turned, np.zeros(model.m)])
     return (before, after) if _better(before, after) else None
 
 
@@ -262,14 +267,11 @@ def _signs(change: Mistake, fit: Fit) -> tuple[float, ...]:
 
 
 def _signed(model: Model, change: Mistake) -> list[Array]:
-    """Gains to begin with: as they are, of either sign of each input that changes, none."""
-    some = change.inputs or tuple(range(model.m))[:2]
-    found = []
-    for signs in product((1.0, -1.0), repeat=len(some)):
-        gains = np.ones(model.m)
-        gains[list(some)] = signs
-        found.append(gains)
-    return [*found, np.zeros(model.m)]
+    """Gains to begin with: as the model has them, and one of two exchanged inputs turned round."""
+    found = [np.ones(model.m)]
+    for j in change.inputs if change.swap else ():
+        found.append(np.where(np.arange(model.m) == j, -1.0, 1.0))
+    return found
 
 
 def _best(found: Mapping[Mistake, Mapping[int, tuple[Fit, Fit]]]) -> Told:

@@ -23,6 +23,7 @@ FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth
 SURE = 3.0  # if it is so many standard deviations of the sensor's noise off, too
 LATEST = 3  # steps by which inputs may be logged late, and are told so
 WHITE = 0.6745 * 6**0.5  # the median of its second differences, in its standard deviations
+WIDEN = "no plan will ask for that; widen them if the robot may get it"
 
 
 def warnings_about(
@@ -205,12 +206,12 @@ def _mistaken(model: Model, trial: Trial) -> tuple[list[str], tuple[str, ...]]:
 
 def _beyond(task: Task, trial: Trial, scaled: Sequence[str]) -> list[str]:
     """Where data show that the robot got more than a plan may ask for: [limits] of one log."""
-    from grounded.instruments.inputs import beyond_limits, limits_of, span
+    from grounded.instruments.inputs import beyond_limits, in_percent, limits_of, span
 
     past = np.any(beyond_limits(task, trial.inputs), axis=0)
     return [
         f"{name} goes from {span(trial.inputs[:, i])} in this log, beyond its [limits], "
-        f"{limits_of(task, i)}: no plan will ask for that; widen them if the robot may get it"
+        f"{limits_of(task, i)}: {in_percent(task, trial.inputs, i) or WIDEN}"
         for i, name in enumerate(trial.input_names)
         if past[i] and name not in scaled
     ]
