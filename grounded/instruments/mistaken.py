@@ -36,7 +36,7 @@ MANY = 8  # changes
 MOST = 10  # states of which all mirror images are tried
 WHOLE = {100.0: "percent", 255.0: "counts of 8 bits", 1000.0: "thousandths"}  # full scale
 OPENED, OVER = 0.05, 1.03  # of full scale: what the largest command of a log reaches
-ANGULAR = ("rad", "rad/s")
+ANGULAR, LENGTHS = ("rad", "rad/s"), ("m", "m/s")
 
 
 @dataclass(frozen=True)
@@ -200,6 +200,8 @@ def _units(model: Model, trials: Sequence[Trial]) -> Iterator[Mistake]:
             yield Mistake(inputs=same, factor=DEGREES, unit="degrees")
         elif unit != "1":
             yield Mistake(inputs=same, factor=1000.0, unit=f"thousandths of {unit}")
+            if unit in LENGTHS:
+                yield Mistake(inputs=same, factor=100.0, unit=f"c{unit}")
         else:
             most = max(float(np.abs(t.inputs[:, same]).max(initial=0.0)) for t in trials)
             full = next((f for f in WHOLE if OPENED * f < most < OVER * f), None)
