@@ -102,7 +102,7 @@ def mistaken(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Tol
         shown: states that a sensor has.
     """
     changes = [*_exchanges(model, shown), *_units(model, trials)]
-    some = range(0, len(trials), -(-len(trials) // TRIALS))
+    some = range(0, len(trials), max(1, -(-len(trials) // TRIALS)))
     starts = STARTS if len(changes) < MANY else FEWER
     found: dict[Mistake, dict[int, tuple[Fit, Fit]]] = {}
     sound: dict[Mistake, set[int]] = {}

@@ -184,6 +184,7 @@ def test_gaps_hidden_states_and_short_logs_are_no_obstacle():
     assert told is not None and told.state != vessel().state_names.index("north")
     assert mistaken(vessel(), [trial.until(12)], every(vessel())) is None
     assert mistaken(vessel(), [trial.until(0)], every(vessel())) is None
+    assert mistaken(vessel(), [], every(vessel())) is None
 
 
 def test_a_diagnosis_stops_at_exchanged_commands():
