@@ -101,7 +101,7 @@ def mistaken(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Tol
         trials: of its states and inputs.
         shown: states that a sensor has.
     """
-    changes = [*_exchanges(model, shown), *_units(model, trials)]
+    changes = [*_exchanges(model, shown), *_units(model, trials)] if trials else []
     some = range(0, len(trials), max(1, -(-len(trials) // TRIALS)))
     starts = STARTS if len(changes) < MANY else FEWER
     found: dict[Mistake, dict[int, tuple[Fit, Fit]]] = {}
