@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 @click.option("--from", "log", metavar="LOG", help="A log of your robot, of any format.")
 @click.option("--model", metavar="FILE", help="Your model.py, beside --from or --blank.")
 @click.option("--blank", is_flag=True, help="No log yet: a workspace of --model, to fill in.")
-@click.option("--kind", help="Of the model skeleton: car, rover, drone, arm, pendulum, generic.")
+@click.option(
+    "--kind",
+    help="Of the model skeleton: car, rover, differential, drone, arm, pendulum, generic.",
+)
 @click.option("--inputs", metavar="A,B,...", help="Columns that are inputs (kind generic).")
 @click.option(
     "--dt",

@@ -62,6 +62,7 @@ from grounded.diagnosis.verdict import at_bounds, next_trial, verdict
 from grounded.effects import Library, acting_order, wrapping_order
 from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError
+from grounded.instruments.mistaken import judge_commands
 from grounded.instruments.preflight import preflight
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
@@ -145,6 +146,7 @@ def diagnose(
     looked = preflight(subject, [*trials, *compare], options.hidden)
     trials = looked.trials
     data = prepare(model, trials, latency, past, options.hidden)
+    judge_commands(model, trials, options.hidden)
     filters = {model.state_names.index(name): tau for name, tau in looked.filters.items()}
     data = replace(data, filters=filters)
     known = limits(data, looked.left_out)

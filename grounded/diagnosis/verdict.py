@@ -78,6 +78,7 @@ def verdict(
     words = [sentence(map(str.__add__, causes, shares)), improvement(rows), worsened(rows)]
     words.append(runaway(rows))
     words += [f"{told_apart(group, same)}." for group in groups[:1]]
+    words += [one.sentence() for one in claims.one_clock[:1]]
     more = 0
     if remainder and len(claims.names) == most:
         words.append(f"More is left: {left}; beyond {most} effects nothing was looked for.")

@@ -19,6 +19,7 @@ from grounded.trial import Trial
 
 OFTEN = 0.1  # of the time
 COPY = 0.99  # coherence of two inputs that are one: two motors of one vehicle have 0.96
+FAR, FULL = 20.0, 103.0  # times a limit, and the most that something in percent shows
 ROUNDED = 0.01  # of the largest command: so much beyond a limit is a matter of digits
 
 
@@ -42,15 +43,32 @@ def judge_limits(task: Task, inputs: Array) -> Iterator[Finding]:
     for j, name in enumerate(task.model.input_names):
         share = float(past[:, j].mean())
         if share > OFTEN:
+            mend = in_percent(task, inputs, j) or "widen [limits] if the robot may get that"
             text = (
                 f"beyond its limits, {limits_of(task, j)}, {100 * share:.0f} % of the time "
-                f"({span(inputs[:, j])}): widen [limits] if the robot may get that"
+                f"({span(inputs[:, j])}): {mend}"
             )
             yield Finding(name, text, "beyond", share=share)
         share = float(at[:, j].mean())
         if share > OFTEN:
             text = f"at its limits {100 * share:.0f} % of the time"
             yield Finding(name, text, "saturated", share=share)
+
+
+def in_percent(task: Task, inputs: Array, j: int) -> str:
+    """What to do where a pure number seems to be logged in percent; "" where it doesn't.
+
+    Args:
+        task: whose limits hold.
+        inputs: the commands (T, m) of a log.
+        j: the input.
+    """
+    name, unit = list(task.model.inputs.items())[j]
+    most = float(np.nanmax(np.abs(inputs[:, j]), initial=0.0))
+    limit = float(max(abs(task.low[j]), abs(task.high[j])))
+    if unit != "1" or not FAR * limit < most <= FULL:
+        return ""
+    return f"in percent? then [log.input.{name}] scale = 0.01, times what is there"
 
 
 def limits_of(task: Task, j: int) -> str:

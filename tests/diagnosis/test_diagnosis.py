@@ -274,7 +274,7 @@ def test_the_cause_that_makes_most_is_named_first(effect_first):
     claims = SimpleNamespace(
         known=known, blamed=(), best=best, parameters=lambda: {"m": Estimate(1.2, 0.01, None, "kg")}
     )
-    claims.data = SimpleNamespace(model=pendulum)
+    claims.data, claims.one_clock = SimpleNamespace(model=pendulum), ()
     claims.moved = (Blame(pendulum.param_names.index("m"), 9.0),)
     credit = [Credit(effect.name, 0.9), Credit("calibration", 0.004)]
     credit = credit if effect_first else [Credit("calibration", 0.9), Credit(effect.name, 0.1)]
@@ -334,6 +334,7 @@ def test_where_as_many_as_were_looked_for_leave_more_than_noise_more_are_looked_
         moved=(),
         names=claimed,
         data=SimpleNamespace(model=pendulum),
+        one_clock=(),
         best=SimpleNamespace(hypothesis=SimpleNamespace(effects=())),
         parameters=dict,
     )

@@ -122,7 +122,7 @@ def test_nothing_is_said_where_nothing_lost_or_only_within_the_noise():
 
 def _claims(**more):
     known = SimpleNamespace(no_cause=False)
-    return SimpleNamespace(**{"known": known, "names": (), "blamed": (), **more})
+    return SimpleNamespace(**{"known": known, "names": (), "blamed": (), "one_clock": (), **more})
 
 
 def test_down_to_the_noise_is_said_at_the_floor_alone():

@@ -263,6 +263,25 @@ def test_inputs_are_known_by_their_name_or_by_being_held(wheels, tmp_path, names
     assert [t.trial.steps > 1000 for t in Workspace(tmp_path / "w").trials()] == [True]
 
 
+@pytest.mark.parametrize("names", ["left,right", "motor_right,motor_left"])
+def test_a_robot_whose_wheels_have_a_command_each_gets_its_equations(wheels, tmp_path, names):
+    """It was "generic": six numbers that follow left and right with a lag."""
+    found = begin(tmp_path / "w", wheels(names))
+    assert found.kind == "differential" and not found.unsure
+    model = Workspace(tmp_path / "w").base_model
+    assert sorted(model.input_names) == sorted(names.split(","))
+    at = {name: float("left" in name) for name in model.input_names}  # the left wheel alone
+    u = np.array([[at[name] for name in model.input_names]])
+    x = model.system.step(np.zeros((1, 5)), u, model.values, 0.01)[0]
+    moved = dict(zip(model.states, x, strict=True))
+    assert moved["v"] > 0 > moved["omega"] and {"gain", "track", "tau"} == set(model.params)
+
+
+@pytest.mark.parametrize("names", ["left_encoder,right_encoder", "port,right"])
+def test_what_is_measured_on_both_sides_drives_nothing(wheels, tmp_path, names):
+    assert begin(tmp_path / "w", wheels(names)).kind == "generic"
+
+
 def test_what_is_left_out_is_said_and_inputs_can_be_named(wheels, tmp_path):
     log = wheels("aa,bb")
     rows = np.loadtxt(log, delimiter=",", skiprows=1)

@@ -8,6 +8,7 @@ From the question to what remains:
     search        what to try next
     plainest      the plain dry friction of a joint, beside what has more numbers
     lookalike     what acts nearly the same on these data
+    one_clock     late commands, or late sensors: one thing
     leftover      what no effect explains
     correction    a curve that predicts what no effect explains
 """

@@ -23,6 +23,7 @@ import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import TIE, parametric
 from grounded.diagnosis.hypotheses.lookalike import lookalikes, of_parameters, one_thing
+from grounded.diagnosis.hypotheses.one_clock import one_clock
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.hypotheses.stand_in import moving, swap, twins
 from grounded.diagnosis.likelihood.data import Data
@@ -138,6 +139,7 @@ class Claims:
         off = [blame.index for blame in self.blamed[:2]]
         candidates = search.candidates
         self.alike = () if known.no_cause else lookalikes(self.predictor, best, candidates)
+        self.one_clock = one_clock(self.data.model, best.hypothesis.effects, ruler.names)
         swap(search, best, self.alike)  # what ties is asked of fits that are at their top
         self.like_parameters = (
             of_parameters(self.predictor, self.null, off, candidates) if off else ()
@@ -282,7 +284,11 @@ class Claims:
         """Of the groups, those that are one thing in the model: no trial helps."""
         effects = {e.name: e for e in self.search.candidates}
         model, found = self.data.model, []
+        late = {(one.effect, one.like) for one in self.one_clock}
         for first, *others in groups:
+            if all((first, other) in late for other in others):
+                found.append((first, *others))
+                continue
             name = first.removeprefix("parameter:")
             if first in self.names and all(self._one_thing(first, other) for other in others):
                 found.append((first, *others))
@@ -345,8 +351,11 @@ class Claims:
         if self.known.no_cause:
             return ()
         tied = {(group[0], other) for group in groups for other in group[1:]}
-        found = self.alike + self.like_parameters
-        return tuple(one for one in found if (one.effect, one.like) not in tied)
+        late = {
+            (one.effect, one.like): Likeness(one.effect, one.like, 1.0) for one in self.one_clock
+        }
+        found = {(one.effect, one.like): one for one in self.alike + self.like_parameters}
+        return tuple(one for key, one in (late | found | late).items() if key not in tied)
 
     def parameters(self) -> dict[str, Estimate]:
         """Values of the model's parameters where they were calibrated beside the effects."""

@@ -23,6 +23,10 @@ COMMANDED = re.compile(
     r"|goal|control|_con|_ref"
 )
 
+HEADING = re.compile(r"(^|[/._])(yaw|psi|heading|theta|th|orientation)([/._\d]|$)")
+SENSED = re.compile(
+    "encoder|tick|position|current|effort|bumper|cliff|range|sonar|feedback|measured"
+)
 FLYING = re.compile(
     r"(^|[/_])(cf\d*|crazyflie|quad(rotor|copter)?|drone|uav|mavros|copter)([/_]|$)"
 )
@@ -126,6 +130,24 @@ ROVER = Skeleton(
     ),
     ("psi",),
     PLANE | {"heading_rate": "omega"},
+)
+DIFFERENTIAL = Skeleton(
+    "differential",
+    "A robot on two driven wheels, each with its own command, whose speed it follows with a lag",
+    ROVER.states,
+    {"left": "1", "right": "1"},
+    {
+        "gain": '1.0, "m/s", 0.02, 20.0',
+        "track": '0.3, "m", 0.05, 2.0',
+        "tau": '0.2, "s", 0.01, 2.0',
+    },
+    (
+        '"v": (p.gain * (a.right + a.left) / 2 - s.v) / p.tau',
+        '"omega": (p.gain * (a.right - a.left) / p.track - s.omega) / p.tau',
+        *ROVER.lines[2:],
+    ),
+    ROVER.angles,
+    ROVER.roles,
 )
 DRONE = Skeleton(
     "drone",
@@ -263,7 +285,7 @@ def _word(path: str) -> str:
     return name if name.isidentifier() else f"s_{name}"
 
 
-KINDS = ("car", "rover", "drone", "arm", "pendulum", "generic")
+KINDS = ("car", "rover", "differential", "drone", "arm", "pendulum", "generic")
 
 
 def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
@@ -287,11 +309,26 @@ def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
             if _says(topic, wanted):
                 return kind, f"{topic.topic} {what}"
     words = {_word(one.path).lower() for topic in log.topics for one in topic.fields}
+    if both := _both_sides(log):
+        return "differential", f"{' and '.join(both)} drive it, and it has a heading"
     if words & {"theta", "angle", "q", "q_rad", "position"} and words & {"torque", "tau", "u"}:
         return "pendulum", "an angle and a torque"
     if flat := next((t.topic for t in log.topics if _in_the_plane(t)), None):
         return "rover", f"{flat} moves in the plane and no steering is named"
     return "generic", "nothing tells what kind of robot it is, --kind does: the names are the log's"
+
+
+def _both_sides(log: LogReport) -> tuple[str, ...]:
+    """A command of the left and one of the right, in a log that has a heading too; () for none."""
+    found = moving(log)
+    if not any(HEADING.search(one.path.lower()) for one in found.values()):
+        return ()
+    for name in found:
+        other = name.lower().replace("left", "right")
+        pair = next((n for n in found if n.lower() == other != name.lower()), None)
+        if pair and not any(SENSED.search(found[n].path.lower()) for n in (name, pair)):
+            return name, pair
+    return ()
 
 
 def _in_the_plane(topic: TopicReport) -> bool:
@@ -321,5 +358,12 @@ def skeleton(
     if kind == "car" and not ackermann and any(_says(t, ("throttle",)) for t in log.topics):
         lines = [line.replace("a.speed", "a.throttle") for line in CAR.lines]
         return replace(CAR, inputs={"steering": "1", "throttle": "1"}, lines=lines)
-    fixed = {"car": CAR, "rover": ROVER, "drone": DRONE, "pendulum": PENDULUM}
+    if kind == "differential" and (both := _both_sides(log)):
+        named = dict(zip(DIFFERENTIAL.inputs, both, strict=True))
+        lines = [
+            re.sub(r"a\.(left|right)", lambda m: f"a.{named[m[1]]}", line)
+            for line in DIFFERENTIAL.lines
+        ]
+        return replace(DIFFERENTIAL, inputs=dict.fromkeys(both, "1"), lines=lines)
+    fixed = {one.kind: one for one in (CAR, ROVER, DIFFERENTIAL, DRONE, PENDULUM)}
     return fixed[kind] if kind in fixed else generic(log, inputs, units)

@@ -168,13 +168,15 @@ def _paid(found: Diagnosis) -> bool:
 
 def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
     """What the stored trials say of the instruments, before any physics."""
+    from grounded.instruments.mistaken import judge_commands
     from grounded.instruments.preflight import preflight
 
     planner = workspace.planner
     memory = planner.plan.model.state_names[planner.task.model.n :]
     used = _chosen(workspace, trials)
-    found = preflight(planner.plan, [planner.lift(trial) for trial in used], memory).findings
-    return where_to_mend(workspace, used, found)
+    found = preflight(planner.plan, [planner.lift(trial) for trial in used], memory)
+    judge_commands(planner.plan.model, found.trials, memory)
+    return where_to_mend(workspace, used, found.findings)
 
 
 def unheld_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[str, ...]:

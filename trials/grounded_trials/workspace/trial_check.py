@@ -5,8 +5,13 @@ Whether it ran its candidate at all is asked in `who_drove.py`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
+
 import numpy as np
 
+from grounded.errors import GroundedError
+from grounded.model import Model
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
@@ -18,6 +23,7 @@ FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth
 SURE = 3.0  # if it is so many standard deviations of the sensor's noise off, too
 LATEST = 3  # steps by which inputs may be logged late, and are told so
 WHITE = 0.6745 * 6**0.5  # the median of its second differences, in its standard deviations
+WIDEN = "no plan will ask for that; widen them if the robot may get it"
 
 
 def warnings_about(
@@ -59,8 +65,10 @@ def warnings_about(
         "sensor on?"
         for one in dead_rates(model, whole, relations)
     ]
+    sent, scaled = _mistaken(model, whole)
+    found += sent
     if not trial.candidate:
-        return (*found, *_beyond(task, whole))
+        return (*found, *_beyond(task, whole, scaled))
     if whole.steps < task.horizon:
         ends = f"after {whole.steps} of {task.horizon} steps ({whole.steps * trial.dt:.2f} s)"
         found.append(
@@ -178,14 +186,32 @@ def _inputs(task: Task, trial: Trial) -> list[str]:
     ]
 
 
-def _beyond(task: Task, trial: Trial) -> list[str]:
+def _mistaken(model: Model, trial: Trial) -> tuple[list[str], tuple[str, ...]]:
+    """What the model says of exchanged commands or other units, and the inputs in other units."""
+    from grounded.instruments.mistaken import described, mended_by, mistaken
+    from grounded.instruments.preflight import preflight
+
+    known = trial.until(trial.known_steps)
+    told = mistaken(model, [known], range(model.n))
+    with suppress(GroundedError):  # of other instruments: the diagnosis tells
+        if told is not None:
+            mended = preflight(model, [known]).trials
+            told = mistaken(model, mended, range(model.n))
+    if told is None:
+        return [], ()
+    again = f"{mended_by(model, told)}, and ingest it again, without {trial.id or 'this one'}"
+    scaled = () if told.mistake.swap else told.mistake.inputs
+    return [f"{described(model, told)}. {again}"], tuple(model.input_names[j] for j in scaled)
+
+
+def _beyond(task: Task, trial: Trial, scaled: Sequence[str]) -> list[str]:
     """Where data show that the robot got more than a plan may ask for: [limits] of one log."""
-    from grounded.instruments.inputs import beyond_limits, limits_of, span
+    from grounded.instruments.inputs import beyond_limits, in_percent, limits_of, span
 
     past = np.any(beyond_limits(task, trial.inputs), axis=0)
     return [
         f"{name} goes from {span(trial.inputs[:, i])} in this log, beyond its [limits], "
-        f"{limits_of(task, i)}: no plan will ask for that; widen them if the robot may get it"
+        f"{limits_of(task, i)}: {in_percent(task, trial.inputs, i) or WIDEN}"
         for i, name in enumerate(trial.input_names)
-        if past[i]
+        if past[i] and name not in scaled
     ]

@@ -30,7 +30,7 @@ ROUGH = 4.0  # steps over which noise keeps its sign: what strays for longer, so
 FINE = 1e-4  # of an input's size: how finely commands are logged at best
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # steps: states of the log older than those acted on
 AGES = 1.0  # steps by which that varies in a run: packets are lost, clocks drift and jitter
-THOUSAND = (1e-3, 1e3)
+THOUSAND, PERCENT = (1e-3, 1e3), (1e-2, 1e2)
 ANGULAR = (("rad", "rad/s"), ("rad",), ("rad/s",))  # groups of units that may be in degrees
 NEARLY = 0.1  # of an input's size: what other units must leave of the difference
 OTHERS = 20  # candidates to compare with, the latest
@@ -213,7 +213,9 @@ def units_tried(model: Model) -> Iterator[tuple[Sequence[str], float]]:
     angular = [[n for n, u in model.states.items() if u in units] for units in ANGULAR]
     angular += [[n] for n, u in (*model.states.items(), *model.inputs.items()) if u in ANGULAR[0]]
     single = [[name] for name in (*model.state_names, *model.input_names)]
+    pure = [name for name, unit in model.inputs.items() if unit == "1"]
     yield from ((names, f) for f in (np.pi / 180, 180 / np.pi) for names in angular if names)
+    yield from ((pure, f) for f in PERCENT if pure)
     yield from ((names, f) for f in (*THOUSAND, -1.0) for names in single)
 
 
@@ -225,11 +227,13 @@ def units_told(names: Sequence[str], by: float, mapped: bool) -> str:
         alone = "append it times -1 and run it again, or take it in with --data"
         return f"with {which} of the other sign: {mend if mapped else alone}"
     size = f"{max(by, 1 / by):.4g} times too {'large' if by < 1 else 'small'}"
-    degrees = "" if by in THOUSAND else " (in degrees)" if by < 1 else " (radians for degrees)"
+    unit = (" (in degrees)", " (radians for degrees)")
+    unit = (" (in percent)", " (not in percent)") if by in PERCENT else unit
+    told = "" if by in THOUSAND else unit[by > 1]
     mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (1 where none is given)"
     if not mapped:
         mend = f"append {which} times {by:.6g} and run it again, or take it in with --data"
-    return f"with {which} {size}{degrees}: {mend}"
+    return f"with {which} {size}{told}: {mend}"
 
 
 def latest(task: Task) -> int:

@@ -1,0 +1,159 @@
+"""What a model makes of one trial a quarter of a second ahead, from many of its samples at once.
+
+Its uncertain parameters and a gain on every input may move, all commands may be late, and a
+constant rate of each state is left out: what remains no plain calibration takes away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.instruments.odd_trial import AHEAD, FAR
+from grounded.model import Model
+from grounded.trial import Trial
+
+DELAYS = (0.0, 0.05, 0.1, 0.2)  # [s], of all commands
+LEAST = 20  # samples that tell enough
+LITTLE, TINY = 1e-3, 1e-12  # of a state's spread, and in its unit: no smaller error counts
+ROUNDS, DAMPING, SLOPE = 5, (1.0, 0.3, 0.1), 0.02
+ENOUGH = 0.01  # [nats]: a round that gains less is the last
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A calibrated model on one trial.
+
+    Args:
+        rms: of each state's error (n,), in its unit; 1 of those without a sensor.
+        gains: of each input (m,).
+    """
+
+    rms: Array
+    gains: Array
+
+    @property
+    def score(self) -> float:
+        """The logarithms of the errors, added up [nats]: what exchanged columns don't change."""
+        return float(np.log(self.rms).sum())
+
+
+class Ahead:
+    """Predictions of one trial.
+
+    Args:
+        model: however crude.
+        trial: of its states and inputs.
+        shown: states that a sensor has.
+        starts: samples to predict from, at most.
+    """
+
+    def __init__(self, model: Model, trial: Trial, shown: Sequence[int], starts: int) -> None:
+        self.model, self.shown, self.sent, self.dt = model, list(shown), trial.inputs, trial.dt
+        self.steps = max(1, round(AHEAD / trial.dt))
+        self.delays = tuple(dict.fromkeys(round(d / trial.dt) for d in DELAYS))
+        logged = np.array(trial.states)
+        logged[:, [i for i in range(model.n) if i not in self.shown]] = 0.0  # nobody knows
+        good = np.asarray(np.isfinite(logged).all(axis=1))
+        at = np.flatnonzero(good[: -self.steps] & good[self.steps :])
+        at = at[(at >= max(self.delays)) & (at + self.steps <= len(self.sent))]
+        self.at = at[:: -(-len(at) // starts)] if len(at) else at
+        self.first, self.last = logged[self.at], logged[self.at + self.steps]
+        self.least = LITTLE * np.nanstd(logged[:, self.shown], axis=0) + TINY
+        params = list(model.params.values())
+        self.moving = [k for k, param in enumerate(params) if param.uncertain]
+        self.spread = np.array([params[k].spread for k in self.moving])
+        self.low, self.high = (
+            np.array([other if end is None else end for end in ends])
+            for ends, other in (
+                ([params[k].low for k in self.moving], -np.inf),
+                ([params[k].high for k in self.moving], np.inf),
+            )
+        )
+
+    @property
+    def enough(self) -> bool:
+        """Whether there are samples to tell anything by."""
+        return len(self.at) >= LEAST and bool(self.shown)
+
+    def plain(self, gains: Array) -> Fit:
+        """As the model is, with some gains (m,) of its inputs."""
+        return self._fit(self._size(self._off(gains, self.model.values, 0)), gains)
+
+    def still(self) -> Fit:
+        """Calibrated, with every command at its mean throughout: what commands do is missing."""
+        mean = np.broadcast_to(self.sent.mean(axis=0), self.sent.shape)
+        return self._with(mean)._fitted(np.ones(self.model.m), 0, free=False)
+
+    def best(self, starts: Sequence[Array], *, free: bool = True) -> Fit:
+        """The best of the fits from several gains, each with the delay that is best for those."""
+        fits = [self._fitted(gains, self._late(gains), free=free) for gains in starts]
+        return min(fits, key=lambda fit: fit.score)
+
+    def _late(self, gains: Array) -> int:
+        """Steps by which the commands, of these gains, seem to be late."""
+
+        def left(late: int) -> float:
+            return float(np.log(self._size(self._off(gains, self.model.values, late))).sum())
+
+        return min(self.delays, key=left)
+
+    def _with(self, sent: Array) -> Ahead:
+        other = object.__new__(Ahead)
+        other.__dict__.update(self.__dict__ | {"sent": sent})
+        return other
+
+    def _fitted(self, gains: Array, late: int, *, free: bool) -> Fit:
+        """Gauss-Newton over gains (where free) and parameters, each state by its own error."""
+        m = self.model.m if free else 0
+        prior = np.concatenate([np.zeros(m), np.ones(len(self.moving))])
+        theta = np.zeros(len(prior))
+
+        def off(theta: Array) -> Array:
+            moved = gains.copy()
+            moved[:m] += theta[:m]
+            values = np.array(self.model.values, float)
+            shifted = values[self.moving] + theta[m:] * self.spread
+            values[self.moving] = np.clip(shifted, self.low, self.high)
+            return self._off(moved, values, late)
+
+        r = off(theta)
+        size = self._size(r)
+        for _ in range(ROUNDS if len(theta) else 0):
+            each = [(off(theta + SLOPE * e) - r) / size / SLOPE for e in np.eye(len(theta))]
+            J, white = np.array([one.ravel() for one in each]).T, (r / size).ravel()
+            if not (np.isfinite(J).all() and np.isfinite(white).all()):
+                break  # it runs away
+            H = J.T @ J + np.diag(prior + 1e-9 * len(white))
+            step = -np.linalg.lstsq(H, J.T @ white + prior * theta, rcond=None)[0]
+            for part in DAMPING:
+                new = off(theta + part * step)
+                if np.log(self._size(new) / size).sum() < -ENOUGH:
+                    break
+            else:
+                break
+            theta, r, size = theta + part * step, new, self._size(new)
+        found = gains.copy()
+        found[:m] += theta[:m]
+        return self._fit(size, found)
+
+    def _off(self, gains: Array, values: Array, late: int) -> Array:
+        """Errors (N, shown) without their means."""
+        x, sent = self.first, self.sent * gains
+        for j in range(self.steps):
+            x = self.model.system.step(x, sent[self.at + j - late], values, self.dt)
+            x = np.fmax(np.fmin(x, FAR), -FAR)
+        off = self.model.difference(x, self.last)[:, self.shown]
+        return np.asarray(off - off.mean(axis=0))
+
+    def _size(self, off: Array) -> Array:
+        size = np.sqrt((off**2).mean(axis=0))
+        return np.asarray(np.maximum(np.where(np.isfinite(size), size, FAR), self.least))
+
+    def _fit(self, size: Array, gains: Array) -> Fit:
+        rms = np.ones(self.model.n)
+        rms[self.shown] = size
+        return Fit(rms, gains)

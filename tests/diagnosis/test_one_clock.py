@@ -1,0 +1,85 @@
+"""Late commands and late sensors are one thing to a model, and that is said."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import grounded as gr
+from facts import holds
+from grounded import Model
+from grounded.diagnosis.diagnose import DiagnosisOptions
+from grounded.diagnosis.hypotheses.one_clock import one_clock
+from grounded.effects import Library
+from grounded.models.car import model as car
+from grounded.models.cart_pole import model as cart_pole
+from grounded.models.pendulum import model as pendulum
+from grounded.trial import Trial
+
+AXES = Model(
+    name="axes",
+    states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"},
+    inputs={"F": "N", "G": "N"},
+    derivative=lambda s, a, p: {"x": s.vx, "y": s.vy, "vx": a.F - s.vx, "vy": 2 * a.G - s.vy},
+)
+
+
+def found(model, *names, shown=None):
+    effects = [Library().effect(name, model) for name in names]
+    return one_clock(model, effects, shown or model.state_names)
+
+
+@pytest.mark.parametrize("model", [pendulum, cart_pole, car, AXES])
+def test_a_delay_of_every_command_is_one_of_every_sensor(model):
+    (one,) = found(model, f"delay:{'+'.join(model.input_names)}")
+    assert one.like == f"sensor_delay:{'+'.join(model.state_names)}" and one.whole
+    assert holds(one.sentence(), "all sensors", "one clock")
+
+
+def test_a_part_that_hangs_on_nothing_else_is_late_by_itself():
+    (one,) = found(AXES, "delay:G")
+    assert one.like == "sensor_delay:y+vy" and not one.whole
+    assert holds(one.sentence(), "Commands of G", "sensors of y and vy")
+    (hidden,) = found(AXES, "delay:G", shown=("x", "vx", "y"))
+    assert hidden.states == ("y",)
+    (back,) = found(AXES, "sensor_delay:y", shown=("x", "vx", "y"))
+    assert back.like == "delay:G" and back.inputs == ("G",)
+
+
+def test_one_command_of_several_or_some_sensors_are_something_else():
+    assert not found(car, f"delay:{car.input_names[0]}")
+    assert not found(pendulum, "sensor_delay:omega") and not found(pendulum, "dead_zone:torque")
+    (one,) = found(pendulum, "sensor_delay:omega", shown=("omega",))  # the only one that there is
+    assert one.like == "delay:torque"
+
+
+def late(steps: int, seed: int = 0, count: int = 240) -> Trial:
+    """A pendulum whose commands arrive some steps late."""
+    rng, x, states = np.random.default_rng(seed), np.zeros(2), []
+    sent = np.repeat(rng.uniform(-1, 1, count // 6), 6)[:, None]
+    for k in range(count):
+        states.append(x)
+        u = sent[k - steps] if k >= steps else np.zeros(1)
+        x = pendulum.system.step(x[None], u[None], pendulum.values, 0.05)[0]
+    names = (pendulum.state_names, pendulum.input_names)
+    return Trial(np.array([*states, x]), sent, 0.05, *names, id=f"t{seed:04}")
+
+
+def test_logs_of_either_are_the_same_to_the_last_bit():
+    commands, sensors = late(2), late(0)
+    shown = np.vstack([np.zeros((2, 2)), sensors.states[:-2]])
+    np.testing.assert_array_equal(commands.states, shown)
+
+
+@pytest.mark.slow
+def test_a_diagnosis_that_claims_the_one_says_the_other():
+    rng, trials = np.random.default_rng(1), [late(2, k) for k in range(2)]
+    trials = [
+        replace(t, states=t.states + rng.normal(0, [2e-3, 1e-2], t.states.shape)) for t in trials
+    ]
+    library = Library(tuple(map(Library().family, ("delay", "input_gain", "viscous_friction"))))
+    diagnosis = gr.diagnose(pendulum, trials, DiagnosisOptions(library=library))
+    assert diagnosis.effects == ("delay:torque",)
+    alike = {(one.effect, one.like): one.share for one in diagnosis.lookalikes}
+    assert alike["delay:torque", "sensor_delay:theta+omega"] == 1.0
+    assert any(holds(line, "all sensors", "one clock") for line in diagnosis.verdict.sentences)

@@ -1,0 +1,196 @@
+"""Commands and joints in each other's column, and commands in percent, by what a model makes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import grounded as gr
+from facts import holding, holds
+from grounded import Model, Param
+from grounded.errors import GroundedError
+from grounded.instruments.mistaken import Mistake, described, judge_commands, mistaken
+from grounded.trial import Trial
+
+
+def vessel(gain=1.0, arm=0.6, drag=0.8, **params):
+    """A catamaran with a thruster on each hull."""
+
+    def rates(s, a, p):
+        push, turn = p.gain * (a.port + a.starboard), p.gain * p.arm * (a.starboard - a.port)
+        return {
+            "u": push - p.drag * s.u,
+            "r": turn - 1.5 * p.drag * s.r,
+            "north": s.u * np.cos(s.psi),
+            "east": s.u * np.sin(s.psi),
+            "psi": s.r,
+        }
+
+    return Model(
+        name="vessel",
+        states={"u": "m/s", "r": "rad/s", "north": "m", "east": "m", "psi": "rad"},
+        inputs={"port": "1", "starboard": "1"},
+        params={
+            "gain": Param(gain, "m/s^2", 0.2, 3.0),
+            "arm": Param(arm, "rad/m", 0.1, 2.0),
+            "drag": Param(drag, "1/s", 0.1, 3.0),
+        },
+        angles=("psi",),
+        derivative=rates,
+    )
+
+
+def two_joints(coupling=0.3):
+    """A planar arm whose shoulder is heavier than its elbow."""
+
+    def rates(s, a, p):
+        return {
+            "q1": s.w1,
+            "q2": s.w2,
+            "w1": 1.2 * a.t1 - 4.0 * np.sin(s.q1) - 0.3 * s.w1 - p.c * s.w2,
+            "w2": 5.0 * a.t2 - 9.0 * np.sin(s.q1 + s.q2) - 0.5 * s.w2 - p.c * s.w1,
+        }
+
+    return Model(
+        name="arm",
+        states={"q1": "rad", "q2": "rad", "w1": "rad/s", "w2": "rad/s"},
+        inputs={"t1": "N m", "t2": "N m"},
+        params={"c": Param(coupling, "1/s", 0.0, 1.0)},
+        derivative=rates,
+    )
+
+
+def driven(model, seed=0, *, late=0, gains=1.0, noise=0.01, steps=400, dt=0.05):
+    """Under commands that change every 0.4 s, from rest."""
+    rng, x, states = np.random.default_rng(seed), np.zeros(model.n), []
+    sent = np.repeat(rng.uniform(-0.5, 1.0, (steps // 8, model.m)), 8, axis=0)
+    for k in range(steps):
+        states.append(x)
+        u = sent[max(k - late, 0)] * gains
+        x = model.system.step(x[None], u[None], model.values, dt)[0]
+    logged = np.array([*states, x])
+    logged += noise * np.std(logged, axis=0) * rng.normal(size=logged.shape)
+    return Trial(logged, sent, dt, model.state_names, model.input_names, id=f"t{seed:04}")
+
+
+def every(model):
+    return range(model.n)
+
+
+SWAPPED = Mistake(inputs=(0, 1))
+CRUDE = [vessel(), vessel(gain=0.6, drag=1.4), vessel(arm=1.1)]
+
+
+@pytest.mark.parametrize("crude", CRUDE)
+@pytest.mark.parametrize("late", [0, 2])
+def test_exchanged_commands_are_named_and_a_crude_model_is_no_exchange(crude, late):
+    trials = [driven(vessel(), k, late=late, gains=np.array([0.8, 1.1])) for k in range(2)]
+    assert mistaken(crude, trials, every(crude)) is None
+    told = mistaken(crude, [SWAPPED.mended(t) for t in trials], every(crude))
+    assert told is not None and told.mistake.inputs == (0, 1) and told.mistake.signs == (1, 1)
+    assert told.mended < told.logged / 2 and not told.others
+    said = described(crude, told)
+    assert holds(said, "port and starboard", "r, east and psi")  # the mirror image does it, too
+
+
+def test_an_exchange_with_a_sign_says_whose():
+    odd = SWAPPED.mended(driven(vessel(), gains=np.array([-1.0, 1.0])))
+    told = mistaken(vessel(), [odd], every(vessel()))
+    assert told is not None and told.mistake.inputs == (0, 1) and told.mistake.signs == (-1, 1)
+    assert holds(described(vessel(), told), "sign of port")
+
+
+@pytest.mark.parametrize("gains", [(-1.0, 1.0), (-1.0, -1.0), (0.0, 1.0), (0.3, 2.5)])
+def test_a_turned_dead_or_weak_input_is_no_exchange(gains):
+    trials = [driven(vessel(), k, gains=np.array(gains)) for k in range(2)]
+    assert mistaken(vessel(), trials, every(vessel())) is None
+
+
+def test_two_commands_that_do_the_same_tell_nothing():
+    straight = Model(
+        name="cart",
+        states={"x": "m", "v": "m/s"},
+        inputs={"front": "N", "rear": "N"},
+        derivative=lambda s, a, p: {"x": s.v, "v": a.front + a.rear - 0.5 * s.v},
+    )
+    trial = driven(straight)
+    for one in (trial, SWAPPED.mended(trial)):
+        assert mistaken(straight, [one], every(straight)) is None
+
+
+def test_one_trial_that_is_right_as_it_is_refutes_an_exchange():
+    trials = [driven(vessel(), k) for k in range(3)]
+    trials[1] = SWAPPED.mended(trials[1])
+    assert mistaken(vessel(), trials, every(vessel())) is None
+    assert mistaken(vessel(), trials[1:2], every(vessel())) is not None
+
+
+def test_exchanged_joints_with_their_velocities_are_named_in_one_run():
+    arm, joints = two_joints(), Mistake(states=((0, 1), (2, 3)))
+    trial = driven(two_joints(0.1))
+    assert mistaken(arm, [trial], every(arm)) is None
+    told = mistaken(arm, [joints.mended(trial)], every(arm))
+    assert told is not None and joints in (told.mistake, *told.others)
+    assert holds(described(arm, told), "q1 and q2", "w1 and w2")
+    told = mistaken(arm, [SWAPPED.mended(trial)], every(arm))
+    assert told is not None and holds(described(arm, told), "t1 and t2")
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(100.0, "percent"), (255.0, "8 bits"), (1000.0, "thousandths")]
+)
+def test_commands_of_another_unit_are_named_with_their_scale(factor, unit):
+    trials = [driven(vessel(), k, gains=0.8) for k in range(2)]
+    odd = [replace(t, inputs=factor * t.inputs) for t in trials]
+    told = mistaken(CRUDE[1], odd, every(CRUDE[1]))
+    assert told is not None and told.mistake.inputs == (0, 1)
+    assert told.mistake.factor == factor and unit in told.mistake.unit
+    with pytest.raises(GroundedError, match=holding("[log.input.port]", f"{1 / factor:.6g}")) as no:
+        judge_commands(CRUDE[1], odd)
+    assert no.value.then is not None and no.value.then.arguments == ("t0000", "t0001")
+
+
+def test_commands_that_are_large_in_the_model_too_are_in_no_other_unit():
+    def rates(s, a, p):
+        return {"v": 0.01 * a.duty - s.v}
+
+    model = Model(name="m", states={"v": "m/s"}, inputs={"duty": "1"}, derivative=rates)
+    trial = driven(model)
+    large = driven(model, gains=100.0)
+    large = replace(large, inputs=100 * large.inputs)
+    for one in (trial, large, replace(large, states=0 * large.states)):
+        assert mistaken(model, [one], every(model)) is None
+
+
+def test_an_angle_that_is_sent_in_degrees_is_named():
+    def rates(s, a, p):
+        return {"psi": s.r, "r": 4.0 * (0.8 * np.sin(a.rudder) - s.r)}
+
+    states = {"psi": "rad", "r": "rad/s"}
+    model = Model(name="m", states=states, inputs={"rudder": "rad"}, derivative=rates)
+    trial = driven(model, gains=0.5)
+    trial = replace(trial, inputs=0.5 * trial.inputs)
+    assert mistaken(model, [trial], every(model)) is None
+    told = mistaken(model, [replace(trial, inputs=np.rad2deg(trial.inputs))], every(model))
+    assert told is not None and told.mistake.factor == pytest.approx(180 / np.pi)
+
+
+def test_gaps_hidden_states_and_short_logs_are_no_obstacle():
+    trial = SWAPPED.mended(driven(vessel()))
+    states = np.array(trial.states)
+    states[40:60] = np.nan
+    states[:, 2] = np.nan
+    told = mistaken(vessel(), [replace(trial, states=states)], every(vessel()))
+    assert told is not None and told.state != vessel().state_names.index("north")
+    assert mistaken(vessel(), [trial.until(12)], every(vessel())) is None
+    assert mistaken(vessel(), [trial.until(0)], every(vessel())) is None
+    assert mistaken(vessel(), [], every(vessel())) is None
+
+
+def test_a_diagnosis_stops_at_exchanged_commands():
+    trials = [SWAPPED.mended(driven(vessel(), k)) for k in range(2)]
+    with pytest.raises(
+        GroundedError, match=holding("port and starboard", "every trial")
+    ) as stopped:
+        gr.diagnose(vessel(), trials)
+    assert stopped.value.then is not None and stopped.value.then.verb == "discard"

@@ -1,0 +1,119 @@
+"""Logs with two commands exchanged, or in percent: told at ingest, and before a diagnosis."""
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from facts import holds
+from grounded.errors import GroundedError
+from grounded_trials import Workspace
+from grounded_trials.store.trial_file import read_trial
+from workspaces import make
+
+MODEL = """import numpy as np
+from grounded import Model, Param
+model = Model(
+    states={"v": "m/s", "r": "rad/s", "psi": "rad"},
+    inputs={"port": "1", "starboard": "1"},
+    params={"gain": Param(1.0, "m/s^2", 0.2, 3.0), "arm": Param(0.6, "1/m", 0.1, 2.0)},
+    angles=("psi",),
+    derivative=lambda s, a, p: {
+        "v": p.gain * (a.port + a.starboard) - 0.8 * s.v,
+        "r": p.gain * p.arm * (a.starboard - a.port) - 1.2 * s.r,
+        "psi": s.r,
+    },
+)
+"""
+CONFIG = """[model]
+file = "model.py"
+[task]
+dt = 0.05
+horizon = 100
+target = "target.csv"
+[reward]
+state = { v = 1.0, psi = 1.0 }
+input = { port = 0.01, starboard = 0.01 }
+input_change = { port = 0.01, starboard = 0.01 }
+[limits]
+port = [-1.0, 1.0]
+starboard = [-1.0, 1.0]
+[system]
+model = "model.py"
+[log]
+state = { v = { path = "/csv.v" }, r = { path = "/csv.r" }, psi = { path = "/csv.psi" } }
+input = { port = { path = "/csv.port" }, starboard = { path = "/csv.starboard" } }
+"""
+T = np.arange(101) * 0.05
+TARGET = "t,v,psi\n" + "\n".join(f"{t:.2f},{0.3 * t:.4f},{0.2 * t:.4f}" for t in T) + "\n"
+
+
+@pytest.fixture
+def w(tmp_path):
+    return Workspace(make(tmp_path / "w", config=CONFIG, model=MODEL, target=TARGET).folder)
+
+
+def log(w, path, scale=1.0, columns=("port", "starboard"), seed=0):
+    """300 steps of the robot, whose parameters are a little off, as a table."""
+    model, rng = w.base_model, np.random.default_rng(seed)
+    sent = np.repeat(rng.uniform(-0.6, 1.0, (30, 2)), 10, axis=0)
+    x, rows = np.zeros(3), []
+    for k, u in enumerate(sent):
+        rows.append([0.05 * k, *(x + rng.normal(0, 2e-3, 3)), *(scale * u)])
+        x = model.system.step(x[None], u[None] * [0.9, 1.1], model.values, 0.05)[0]
+    np.savetxt(path, rows, "%.6f", ",", header=f"t,v,r,psi,{','.join(columns)}", comments="")
+    return path
+
+
+def test_a_sound_log_is_taken_in_without_a_word(w, tmp_path):
+    found = w.ingest(log(w, tmp_path / "a.csv"), data=True)
+    assert not found.warnings and w.preflight() == ()
+
+
+def test_exchanged_commands_are_told_at_once_and_stop_a_diagnosis(w, tmp_path):
+    for k in range(2):
+        path = log(w, tmp_path / f"{k}.csv", columns=("starboard", "port"), seed=k)
+        (warning,) = w.ingest(path, data=True).warnings
+        assert holds(warning, "port and starboard", "exchanged", "paths in [log]", f"t000{k + 1}")
+    done = grounded("-C", w.folder, "diagnose")
+    assert done.code == 1 and holds(done.err, "port and starboard", "discard t0001 t0002")
+    with pytest.raises(GroundedError, match="exchanged"):
+        Workspace(w.folder).preflight()
+
+
+def test_percent_is_told_with_the_scale_and_a_scale_mends_it(w, tmp_path):
+    path = log(w, tmp_path / "a.csv", scale=100.0)
+    (warning,) = w.ingest(path, data=True).warnings
+    assert holds(warning, "100 times", "percent", "[log.input.port]", "by 0.01", "[limits]")
+    with pytest.raises(GroundedError) as stopped:
+        w.diagnose()
+    assert stopped.value.then is not None and stopped.value.then.verb == "discard"
+    w.discard("t0001")
+    toml = w.folder / "grounded.toml"
+    text = toml.read_text()
+    for name in ("port", "starboard"):
+        text = text.replace(f'"/csv.{name}" }}', f'"/csv.{name}", scale = 0.01 }}')
+    toml.write_text(text)
+    again = Workspace(w.folder)
+    assert not again.ingest(path, data=True).warnings and again.preflight() == ()
+
+
+def test_percent_far_beyond_limits_is_told_where_the_model_tells_nothing(w, tmp_path):
+    path = log(w, tmp_path / "a.csv", scale=100.0)
+    rows = np.loadtxt(path, delimiter=",", skiprows=1)
+    rows[:, 1:4] = 0.0  # its motors are off
+    np.savetxt(path, rows, "%.6f", ",", header="t,v,r,psi,port,starboard", comments="")
+    told = w.ingest(path, data=True).warnings
+    assert len(told) == 2 and all(holds(one, "-1 to 1", "percent", "0.01") for one in told)
+
+
+def test_a_run_whose_commands_are_in_percent_is_its_candidate_s(w, tmp_path):
+    plan = w.propose().candidate
+    w.run()
+    trial = read_trial(next((w.folder / "runs").iterdir()))[0]
+    t = trial.dt * np.arange(trial.steps)
+    table = np.column_stack([t, trial.states[:-1], 100 * trial.inputs])
+    path = tmp_path / "run.csv"
+    np.savetxt(path, table, "%.9f", ",", header="t,v,r,psi,port,starboard", comments="")
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(path)
+    assert holds(str(refused.value), plan.id, "port and starboard 100", "in percent", "by 0.01")
