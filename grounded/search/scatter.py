@@ -13,7 +13,7 @@ nu is the number of repeats. mu is what the parts add: the effective degrees of 
 (Satterthwaite, "An approximate distribution of estimates of variance components", Biometrics
 Bulletin 2, 1946), less nu, and at most PIECES - 1, so that many repeats outweigh the assumption
 that parts scatter independently of each other. This is a conjugate prior on the variance (Gelman
-et al., *Bayesian Data Analysis*, 2013, section 2.6), and Student's t has nu + mu degrees of freedom.
+et al., *Bayesian Data Analysis*, 2013, section 2.6); Student's t has nu + mu degrees of freedom.
 """
 
 from __future__ import annotations
