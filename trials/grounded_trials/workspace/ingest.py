@@ -164,9 +164,11 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
     units = () if other else units
     if not why and not units:
         return read
-    if log and not units and not other:
+    slow = pace_of(log, workspace.task, own.policy) if log else None
+    if slow:
+        units, by = (), 1.0  # a run that is drawn out may pass for one in another unit
+    elif log and not units and not other:
         units, by = unit_of(log, workspace.task, own.policy)
-    slow = pace_of(log, workspace.task, own.policy) if log and not units else None
     pace = slow and (
         f"a second of its stamps is {slow:g} s of the run (a recording played at another rate?): "
         f"correct the stamps, times {slow:g}, and ingest it again"
