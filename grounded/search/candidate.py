@@ -50,6 +50,7 @@ class Candidate(Result):
     caution: int = 0  # how often the first policy, or its gains, were designed more gently
     way: Way = ""  # how it was made
     slopes: Slopes = ""  # of the model that it was planned in
+    base_as_run: float = float("nan")  # what the model gives its base from where its trials began
     likely_off: float = 0.0  # of predicted_gain, as trials that were left out say; 0: not known
 
     @property

@@ -67,6 +67,10 @@ class About:
             self.real, self.corrected, self.missed = found.problem, found.corrected, found.missed
         already = predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
+        began = self.real.start.copy()
+        began[: own.states.shape[1]] = own.states[0]
+        as_run = predicted(replace(self.real, start=began), incumbent.candidate.policy)
+        self.as_run = as_run.utility  # theta's from where its trial began
         self.least = options.tolerance * abs(self.already)
         self.plain = plan.problem(exact=True)  # no trial in it, hence no noise and no start
         self.plainly = predicted(self.plain, incumbent.candidate.policy).utility
@@ -101,7 +105,7 @@ class About:
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
         """A candidate with what this model promises of it, and how far that is likely to be off."""
         made = self.make.candidate(policy, self.real, step, self.already, way)
-        made = replace(made, slopes=self.slopes)
+        made = replace(made, slopes=self.slopes, base_as_run=self.as_run)
         return self._steadied(made) if made.predicted_gain > self.least else made
 
     def _steadied(self, made: Candidate) -> Candidate:

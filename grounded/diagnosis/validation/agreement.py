@@ -205,7 +205,7 @@ def _compared(fit: Fitted, data: Data, first: Sequence[bool]) -> Compared:
 def _units(trial_of: Array, group: Array) -> Array:
     """What is left out in turn, (B,): trials; where a group has one, the pieces of its record."""
     alone = [len(np.unique(trial_of[group == g])) < 2 for g in (0, 1)]
-    return np.arange(len(trial_of)) if any(alone) else trial_of
+    return np.asarray(np.arange(len(trial_of)) if any(alone) else trial_of, float)
 
 
 @dataclass(frozen=True)
