@@ -360,7 +360,7 @@ def _write(
         "",
         "[reward]                      # quadratic weights: 1 / (range in the target)^2; `target`",
         "                              # sets them anew until you change one; of a column that",
-        "                              # stays: the range of its unit's, 1 where all of them stay",
+        "                              # stays at 0: the largest of its unit, else 1",
         f"state = {_inline(weights)}",
         "# terminal, of the last step alone: where the run is to END at rest on its target",
         "# (docking, parking) and overshoots, 10 to 100 times state, the speeds' too",

@@ -248,14 +248,17 @@ def replace_target(config: Config, columns: Mapping[str, Array], units: Mapping[
 def equal_weights(columns: Mapping[str, Array], units: Mapping[str, str]) -> dict[str, float]:
     """Weights by which an error as large as a column's range, at least LEAST, costs 1.
 
-    A column that is constant has no range. It gets the largest range of its unit (a y that stays
-    while x moves), where there is none UNKNOWN: what is small for it nobody has said.
+    A column that is constant has no range: its size counts, as of a step. One that is zero gets the
+    largest range of its unit (a y that stays while x moves), where there is none UNKNOWN: what is
+    small for it nobody has said.
 
     Args:
         columns: of the target, by state.
         units: of the model's states.
     """
-    ranges = {name: float(np.ptp(values)) for name, values in columns.items()}
+    ranges = {
+        name: float(np.ptp(values) or np.abs(values).max()) for name, values in columns.items()
+    }
     size: dict[str, float] = {}
     for name, own in ranges.items():
         unit = units.get(name, "")
