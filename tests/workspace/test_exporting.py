@@ -15,7 +15,7 @@ from cli import grounded
 from facts import holding
 from grounded.errors import GroundedError
 from grounded.policy import load
-from grounded_trials.store.trial_file import read_trial, trial_bytes
+from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.exporting import RUNNER, export_candidate
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.ingest import ingest_log
@@ -147,10 +147,10 @@ def test_what_became_of_a_candidate_is_said_with_its_export(tmp_path):
     w = make(tmp_path / "w")
     ingest_log(w, run_candidate(w, propose_in(w).candidate.id).trial_file)
     second = propose_in(w).candidate.id
-    trial, meta, policy = read_trial(run_candidate(w, second).trial_file)
+    trial = read_trial(run_candidate(w, second).trial_file)[0]
     far = replace(trial, states=trial.states + np.array([9.0, 0.0]))
-    (tmp_path / "far.mcap").write_bytes(trial_bytes(far, meta, policy))
-    lost = ingest_log(w, tmp_path / "far.mcap")
+    write_trial(tmp_path / "far.mcap", far, {"kind": "trial"})
+    lost = ingest_log(w, tmp_path / "far.mcap", second)
     assert lost.verdict == "no better"
     (note,) = export_candidate(Folder(w.folder), second, path=tmp_path / "a.json").notes
     assert all(part in note for part in (second, "lost", "c0001"))
