@@ -134,8 +134,7 @@ def _copied(workspace: Folder, path: Path, read: _Read, wanted: str | None) -> _
     known = sha256(read.data)[:DIGITS] in workspace.store.digests()
     if known or (read.log and read.log.stored):
         return read
-    one = same_recording(workspace, path, read.data, read.log)
-    if one is None:
+    if (one := same_recording(workspace, path, read.data, read.log)) is None:
         return read
     refuse_as_another(path, (one,), wanted)
     note = f"its rows are those of {one.stored.id}: it is the same recording, or a part of it"
@@ -165,8 +164,8 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
     if not why and not units:
         return read
     slow = pace_of(log, workspace.task, own.policy) if log else None
-    if slow:
-        units, by = (), 1.0  # a run that is drawn out may pass for one in another unit
+    if slow:  # drawn out, it may pass for one in another unit
+        units = ()
     elif log and not units and not other:
         units, by = unit_of(log, workspace.task, own.policy)
     pace = slow and (
