@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 MOST = 3  # target states whose range is told
 LAST = 3  # predictions whose misses are told
+LUCKY = 2.0  # standard errors
 UNLIKE = 0.2  # of a promised gain: how much luckier a trial is than the model says, to be told
 
 
@@ -75,12 +76,27 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
 
 
 def _so_far(candidate: Candidate, best: Tried) -> str:
-    """The best one's utility; beside it what the model gives it, where its runs were luckier."""
+    """The best one's utility; beside it what the model gives it, and why, as far as that is known.
+
+    The model's own run of it starts at s_0: what that is worth is known, and so is the scatter of
+    its runs once something near it was repeated. What is left, the model does not replay.
+    """
     text = f"{number(best.utility)} by {best.candidate.id}"
-    same, gain = candidate.expected_of_base, candidate.predicted_gain
-    if candidate.base != best.candidate.id or not abs(same - best.utility) > UNLIKE * abs(gain):
+    same, told = candidate.expected_of_base, UNLIKE * abs(candidate.predicted_gain)
+    if candidate.base != best.candidate.id or not abs(same - best.utility) > told:
         return text
-    return f"{text}, to which the same model gives {number(same)}; the rest was luck or its start"
+    text = f"{text}, to which the same model gives {number(same)}"
+    if not math.isfinite(candidate.base_as_run):
+        return text
+    start, rest = same - candidate.base_as_run, candidate.base_as_run - best.utility
+    why = []
+    if abs(start) > told:
+        why.append(f"{number(start)} of that because its runs began elsewhere than [task] start")
+    if abs(rest) > told and math.isfinite(best.standard_error):
+        within = abs(rest) <= LUCKY * best.standard_error
+        known = "within the scatter of its runs" if within else "more than its runs scatter"
+        why.append(f"{number(rest)} is {known}")
+    return "; ".join([text, *why])
 
 
 def _what(candidate: Candidate, standing: Standing, task: Task) -> str:

@@ -8,7 +8,7 @@ import click
 
 from grounded.errors import NextCommand
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
-from grounded_cli.terminal import field, number, sentence, show, show_json
+from grounded_cli.terminal import field, number, remark, sentence, show, show_json
 from grounded_trials.wording import with_unit
 
 if TYPE_CHECKING:
@@ -72,6 +72,14 @@ def command(
     if weights != before:
         told = ", ".join(f"{name} = {number(weight)}" for name, weight in weights.items())
         sentence(f"[reward] state is new, 1 for an error as large as a range here: {told}")
+    moving = {model.states[name] for name, ends in ranges.items() if ends != (0, 0)}
+    if still := [name for name in ranges if model.states[name] not in moving]:
+        remark(
+            "note",
+            f"{' and '.join(still)} {'stay' if len(still) > 1 else 'stays'} at 0 in the target, "
+            "which says nothing of what is a small error there: choose the weight in "
+            "[reward] state",
+        )
     show(f"\n{next_line(NextCommand('propose'))}")
 
 

@@ -43,7 +43,7 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Diagnosis, Estimate, Identifiable, NoiseLevels
 from grounded.diagnosis.ruler_words import contested, open_noise
 from grounded.diagnosis.unconfirmed import another_look, unconfirmed, unrepeatable
-from grounded.diagnosis.validation.agreement import by_trial, changed
+from grounded.diagnosis.validation.agreement import by_trial, compared
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision, decide
 from grounded.diagnosis.validation.held_out import shrinkage, utility_prediction
@@ -182,11 +182,13 @@ def diagnose(
             tick("more effects")
             best = grown(search, best, most)
         groups = [k < first for k in range(data.count)]
+        apart = compared(search, decision.fit, groups) if compare else None
         return replace(
             found,
             identifiable=tuple(_identified(uncertain, decision.fit, found.parameters)),
             preflight=looked.findings,
-            changed=changed(search, decision.fit, groups) if compare else None,
+            changed=apart.changed if apart else None,
+            unchanged=apart.unchanged if apart else (),
         )
 
 

@@ -181,7 +181,7 @@ class Agreement(Document):
 
 @dataclass(frozen=True, eq=False)
 class Changed(Document):
-    """A value that differs between two groups of trials, and the evidence [nats] that it does."""
+    """A value in each of two groups of trials, and the evidence [nats] that it differs."""
 
     effect: str
     quantity: str = ""
@@ -269,6 +269,7 @@ class Diagnosis(Document):
     per_trial: tuple[TrialValue, ...] = ()
     agreement: tuple[Agreement, ...] = ()  # of the trials in each of these values
     changed: tuple[Changed, ...] | None = field(metadata=BRIEF, default=None)  # of two groups
+    unchanged: tuple[Changed, ...] = field(metadata=BRIEF, default=())  # alike in both groups
     trials: int = 0
     steps: int = 0
     candidates: int = 0

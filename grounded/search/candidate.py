@@ -50,6 +50,7 @@ class Candidate(Result):
     caution: int = 0  # how often the first policy, or its gains, were designed more gently
     way: Way = ""  # how it was made
     slopes: Slopes = ""  # of the model that it was planned in
+    base_as_run: float = float("nan")  # what the model gives its base from where its trials began
     likely_off: float = 0.0  # of predicted_gain, as trials that were left out say; 0: not known
 
     @property
@@ -95,13 +96,15 @@ class Candidate(Result):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tried(Result):
-    """A candidate with its trials: mean utility and, for two trials or more, its standard error."""
+    """A candidate with its trials: mean utility and, once repeats tell, its standard error."""
 
     candidate: Candidate
     trials: tuple[Trial, ...]
     utilities: tuple[float, ...]
     accepted: bool | None  # None: not decided, trials are missing
     in_doubt: bool = False  # its own trials are there: the incumbent's are missing
+    pieces: Array | None = None  # (runs, PIECES) of its utilities, see `scatter`; if repeated
+    deviation: float = float("nan")  # of a single run, as repeats near it tell (`scatter`)
 
     @cached_property
     def utility(self) -> float:
@@ -110,10 +113,10 @@ class Tried(Result):
 
     @cached_property
     def standard_error(self) -> float:
-        """Of the mean; nan for fewer than two trials, or where one of them failed."""
-        if len(self.utilities) < 2 or not np.isfinite(self.utilities).all():
+        """Of the mean; nan where nothing near it was repeated, or where one of its runs failed."""
+        if not self.utilities or not np.isfinite(self.utilities).all():
             return float("nan")
-        return float(np.std(self.utilities, ddof=1) / np.sqrt(len(self.utilities)))
+        return float(self.deviation / np.sqrt(len(self.utilities)))
 
     def verdict(self, last: bool = True) -> str:
         """What became of the candidate: first, better, no better, crashed; or why not decided.

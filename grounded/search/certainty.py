@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.search.candidate import Candidate, Tried
+from grounded.search.scatter import Repeats, by_pieces, with_errors
 from grounded.task import Task
 from grounded.trial import Trial, scattered
 
@@ -49,7 +50,8 @@ def judged(
             continue
         better = incumbent is None or float(np.mean(utilities)) > incumbent.utility
         accepted = better and not failed
-        tried = Tried(candidate, own, utilities, accepted)
+        pieces = by_pieces(task, own) if len(own) > 1 and np.isfinite(utilities).all() else None
+        tried = Tried(candidate, own, utilities, accepted, pieces=pieces)
         if accepted:
             iteration += incumbent is not None
             incumbent, losses = tried, 0
@@ -61,11 +63,13 @@ def judged(
             if (
                 options.rerun_incumbent
                 and not (spent or exact)
-                and in_doubt(incumbent, tried, losses + options.repeats)
+                and in_doubt(incumbent, tried, history, losses + options.repeats)
             ):
                 tried = replace(tried, accepted=None, in_doubt=True)
         history.append(tried)
-    return tuple(history), incumbent, iteration
+    told = with_errors(history)
+    best = next((t for t in told if incumbent and t.candidate is incumbent.candidate), None)
+    return told, best, iteration
 
 
 def repeated_exactly(trials: Sequence[Trial]) -> bool:
@@ -73,46 +77,28 @@ def repeated_exactly(trials: Sequence[Trial]) -> bool:
     return any(a.repeats(b) for a, b in pairwise(trials))
 
 
-def in_doubt(incumbent: Tried, loser: Tried, most: int) -> bool:
+def in_doubt(incumbent: Tried, loser: Tried, history: Sequence[Tried], most: int) -> bool:
     """Whether a loss may be luck: the incumbent's, whose trials were the best of several.
 
-    A lucky winner blocks every step from there on. So a loss within two standard errors of the
-    incumbent's own scatter sends it out once more, until it has `most` trials: one for each loss.
-    After one trial the scatter is taken to be half of the utility, that of chi-squared with eight
+    A lucky winner blocks every step from there on. So a loss within two standard errors sends the
+    incumbent out once more, until it has `most` trials: one for each loss. Where nothing near it
+    was repeated, a run is taken to scatter by half of its utility, that of chi-squared with eight
     degrees of freedom: a loss by more than 1.4 times the best cost is believed at once. Where
     trials repeat themselves exactly, it costs one trial a winner.
     """
     if not np.isfinite(loser.utility) or len(incumbent.trials) >= most:
         return False
-    scatter = incumbent.standard_error * np.sqrt(len(incumbent.trials))
-    if len(incumbent.trials) == 1:
-        scatter = 0.5 * abs(incumbent.utility)
-    error = scatter * np.sqrt(1 / len(incumbent.trials) + 1 / len(loser.trials))
+    scatter = Repeats((*history, loser)).near(incumbent.utility)
+    each = math.sqrt(scatter.variance) if scatter.known else 0.5 * abs(incumbent.utility)
+    error = each * np.sqrt(1 / len(incumbent.trials) + 1 / len(loser.trials))
     return not incumbent.utility - loser.utility > 2 * error
-
-
-def utility_noise(history: Sequence[Tried]) -> tuple[float, int]:
-    """Standard deviation of a single trial's utility, pooled, and its degrees of freedom.
-
-    It stands in for a candidate's own where that was run once. `Tried.standard_error` is every
-    other error: that of tables, bands and dots.
-    """
-    square, freedom = 0.0, 0
-    for tried in history:
-        known = [u for u in tried.utilities if math.isfinite(u)]
-        if len(known) > 1:
-            square += float(np.var(known, ddof=1)) * (len(known) - 1)
-            freedom += len(known) - 1
-    return (math.sqrt(square / freedom) if freedom else float("nan")), freedom
 
 
 def last_improvement(history: Sequence[Tried], again: str = "run the best one again") -> str:
     """How sure the last accepted improvement is, as a sentence; "" before there is one.
 
-    Welch's t-test of the two candidates' own trials, whose standard errors stand beside them in the
-    table. Where one was run once, the other's scatter stands in for its own; where both were, that
-    of the other candidates, but not of the model's own policies: how wildly those scatter says
-    nothing of those that came after them.
+    Student's t-test with the scatter of all repeats near the two (`scatter`), of which their
+    standard errors in the table are made.
     """
     accepted = [t for t in history if t.accepted]
     if len(accepted) < 2:
@@ -122,8 +108,8 @@ def last_improvement(history: Sequence[Tried], again: str = "run the best one ag
     error, freedom = error_between(before, after, history)
     if not freedom:
         return (
-            f"the last gain is {gain:.3g}; both candidates were run once, so the noise of a "
-            f"trial is unknown: {again}"
+            f"the last gain is {gain:.3g}; all candidates near it were run once, so the noise of "
+            f"a trial is unknown: {again}"
         )
     if error == 0:
         return f"the last gain is {gain:.3g}; repeated trials agree exactly"
@@ -147,12 +133,19 @@ def student(x: float, freedom: float) -> float:
 
 
 def error_between(before: Tried, after: Tried, history: Sequence[Tried]) -> tuple[float, float]:
-    """Standard error of the difference of two means, and its degrees of freedom; 0 for unknown."""
-    each = [(t.standard_error**2, len(t.utilities)) for t in (before, after)]
-    if all(count > 1 and math.isfinite(square) for square, count in each):
-        total = sum(square for square, _ in each)
-        parts = sum(square**2 / (count - 1) for square, count in each)
-        return math.sqrt(total), total**2 / parts if parts else 1.0
-    own = [t for t in (before, after) if math.isfinite(t.standard_error)]
-    noise, freedom = utility_noise(own or [t for t in history if t.candidate.base])
-    return noise * math.sqrt(sum(1 / count for _, count in each)), float(freedom)
+    """Standard error of the difference of two means, and its degrees of freedom; 0 for unknown.
+
+    The later one's scatter speaks for both where the earlier one has none near it. Two estimates
+    that differ are added as Welch (1947) does.
+    """
+    repeats = Repeats(history)
+    later = repeats.near(after.utility)
+    if not later.known:
+        return math.nan, 0.0
+    earlier = repeats.near(before.utility)
+    earlier = earlier if earlier.known else later
+    squares = earlier.error(len(before.utilities)) ** 2, later.error(len(after.utilities)) ** 2
+    error = math.sqrt(sum(squares))
+    if earlier == later or not error:
+        return error, later.freedom
+    return error, error**4 / (squares[0] ** 2 / earlier.freedom + squares[1] ** 2 / later.freedom)

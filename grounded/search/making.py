@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 GENTLER = 1e3  # factor on the price of inputs from which gentler gains are designed
 NEAR = 0.2  # of the way that one that lost would go: a step that ends so near is the same one
+REFUTED = 2  # steps by corrected slopes that lost too much: then the model's own are believed
 FORETOLD = 0.2  # of the incumbent's cost: a plain model that is off by more there is no judge
 SWINGS = 6  # of an input about its plan, each as large as the plan's own range: a limit cycle
 
@@ -60,11 +61,16 @@ class About:
         if options.damps and len(make.now.history) > 1 and not self._kept():
             from grounded.search.mispredictions import believed
 
-            found = believed(planner, incumbent, make.now.history, self.real)
+            trusted = self._refuted() < REFUTED
+            found = believed(planner, incumbent, make.now.history, self.real, trusted)
             self.alternatives = found.alternatives
             self.real, self.corrected, self.missed = found.problem, found.corrected, found.missed
         already = predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
+        began = self.real.start.copy()
+        began[: own.states.shape[1]] = own.states[0]
+        as_run = predicted(replace(self.real, start=began), incumbent.candidate.policy)
+        self.as_run = as_run.utility  # theta's from where its trial began
         self.least = options.tolerance * abs(self.already)
         self.plain = plan.problem(exact=True)  # no trial in it, hence no noise and no start
         self.plainly = predicted(self.plain, incumbent.candidate.policy).utility
@@ -85,10 +91,21 @@ class About:
         lost = losers_of(history, made.id, made.model)
         return not lost and abs(off) <= (1 - KEPT) * made.predicted_gain
 
+    def _refuted(self) -> int:
+        """How many steps by corrected slopes lost by more than they were likely to be off by."""
+        best, model = self.incumbent, self.make.fingerprint
+        lost = losers_of(self.make.now.history, best.candidate.id, model)
+        corrected = {candidate.id for candidate in lost if candidate.slopes}
+        return sum(
+            tried.utility - best.utility < expected(tried.candidate)
+            for tried in self.make.now.history
+            if tried.candidate.id in corrected
+        )
+
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
         """A candidate with what this model promises of it, and how far that is likely to be off."""
         made = self.make.candidate(policy, self.real, step, self.already, way)
-        made = replace(made, slopes=self.slopes)
+        made = replace(made, slopes=self.slopes, base_as_run=self.as_run)
         return self._steadied(made) if made.predicted_gain > self.least else made
 
     def _steadied(self, made: Candidate) -> Candidate:

@@ -23,7 +23,10 @@ Which slopes are believed, the crude ones or those of the laws, is decided by le
 nearest trials in turn: each model, fitted to the others, runs the policy of the one left out, and
 `Believed.missed` is the share of what that trial did otherwise than the incumbent's (`apart`, in
 the units of the cost) that it does not foretell. The least wins. As much of a new step is likely to
-be missed, so one that would lose by that is put last (`making.About`).
+be missed, so one that would lose by that is put last (`making.About`). Left out in turn as well are
+steps that corrected slopes have made and that lost, however far they went: laws that such a trial
+refutes foretell those nearby. And where two of them lost from the incumbent by more than they were
+likely to be off by, the crude slopes are believed (`making.REFUTED`).
 A single other trial can't be left out: there, it is at least the share of the mispredictions that
 law 1 leaves in parts of the run that it was not fitted to.
 """
@@ -78,7 +81,11 @@ class Believed:
 
 
 def believed(
-    planner: Planner, incumbent: Tried, history: Sequence[Tried], grounded: Problem
+    planner: Planner,
+    incumbent: Tried,
+    history: Sequence[Tried],
+    grounded: Problem,
+    trusted: bool = True,
 ) -> Believed:
     """The grounded model, with corrected slopes where those foretell trials better.
 
@@ -87,19 +94,22 @@ def believed(
         incumbent: whose trial the model replays.
         history: all candidates with their trials.
         grounded: the exact model with the incumbent's bias.
+        trusted: whether corrected slopes may be believed; False: they are an alternative alone.
     """
     own = seen(planner, incumbent, grounded)
     if own is None:
         return Believed(grounded)
     told = [t for t in history[-LATEST:] if t is not incumbent and np.isfinite(t.utility)]
-    others = [o for o in (seen(planner, t, grounded) for t in told) if o is not None]
-    moved = [apart(grounded, o.run, own.run) for o in others]
-    others = [others[j] for j in np.argsort(moved, kind="stable") if moved[j] > 0]
-    if not others:
+    ran = [(o, t) for t in told if (o := seen(planner, t, grounded)) is not None]
+    moved = [apart(grounded, o.run, own.run) for o, _ in ran]
+    nearest = [ran[j] for j in np.argsort(moved, kind="stable") if moved[j] > 0]
+    if not nearest:
         return Believed(grounded)
+    others = [o for o, _ in nearest]
+    refuting = [o for o, t in nearest[ASKED:] if t.candidate.slopes and t.accepted is False]
 
     crude, corrected = [], []
-    for other in others[:ASKED]:
+    for other in others[:ASKED] + refuting[:ASKED]:
         rest = [o for o in others if o is not other]
         law, left = laws(own, rest or others, grounded)
         crude.append(unforetold(grounded, own, other))
@@ -118,8 +128,9 @@ def believed(
         Alternative(share, grounded, off),
         Alternative(1.0 - share, made.problem, unexplained),
     )
-    model = Believed(grounded) if misses[0] <= misses[1] else made
-    return replace(model, missed=min(misses), alternatives=both)
+    plain = misses[0] <= misses[1] or not trusted
+    model, missed = (Believed(grounded), misses[0]) if plain else (made, misses[1])
+    return replace(model, missed=missed, alternatives=both)
 
 
 def _with(law: Array | None, own: Seen, grounded: Problem) -> Believed:

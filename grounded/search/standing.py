@@ -278,8 +278,7 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
     """The ending where the last candidates of this model gained too little for what they cost.
 
     Too little is less than the tolerance each, or less in all than the standard error of that gain,
-    where repeats tell it: a search under noise would go from one lucky run to the next. How the
-    model's own policy scatters says nothing of the policies that came after it.
+    where repeats tell it: a search under noise would go from one lucky run to the next.
     """
     before = [t for t in history[:-PATIENCE] if t.accepted]
     last = history[-PATIENCE:]
@@ -293,7 +292,7 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
     if gained < PATIENCE * tolerance * abs(best.utility):
         return "too little gained", f"{told} {100 * tolerance:g} % each ([search] tolerance)"
     error, known = error_between(old, best, history)
-    if old.candidate.base and known and gained < error:
+    if known and gained < error:
         return "too little gained", f"{told} its standard error, {error:.2g} by repeats"
     return None
 

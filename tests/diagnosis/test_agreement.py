@@ -55,8 +55,13 @@ def test_what_changed_between_two_groups(first, second, effect, values):
     for one in found.changed:
         assert (one.first.value, one.second.value) == pytest.approx(values, abs=0.06)
         assert one.evidence > 20 and one.chance < 1e-6
+        assert abs(one.first.value - one.second.value) > 3 * np.hypot(one.first.std, one.second.std)
+    for one in found.unchanged:
+        assert abs(one.first.value - one.second.value) < 4 * np.hypot(one.first.std, one.second.std)
+    assert not {c.quantity for c in found.changed} & {c.quantity for c in found.unchanged}
     again = Diagnosis.from_json(json.loads(json.dumps(found.to_json())))
     assert again == found and again.changed == found.changed
+    assert again.unchanged == found.unchanged
 
 
 def test_groups_that_overlap_are_refused(workspace_of):

@@ -14,7 +14,7 @@ from grounded_trials.logs.inspect_pairs import velocities
 from grounded_trials.starting.begin import begin
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, path_target
-from grounded_trials.workspace.task_file import read_target
+from grounded_trials.workspace.task_file import equal_weights, read_target
 from ros_bags import arm_bag, car_bag
 from shared_data import data
 
@@ -392,6 +392,16 @@ def test_weights_belong_to_the_target_until_somebody_chooses_them(wheels, tmp_pa
     assert values[-1, names.index("psi")] == pytest.approx(2 * np.pi)
     cells = (tmp_path / "w/target.csv").read_text().replace(",", " ").split()
     assert "-0" not in cells
+
+
+def test_a_column_that_stays_has_the_range_of_its_unit():
+    """Seen: 100 each for a sway, a speed and a rate that were to stay zero."""
+    t = np.linspace(0, 1, 21)
+    units = {"x": "m", "y": "m", "psi": "rad", "v": "m/s"}
+    columns = {"x": 2 * t, "y": 0 * t, "psi": 0 * t, "v": 0.01 * t}
+    weights = equal_weights(columns, units)
+    assert weights == pytest.approx({"x": 0.25, "y": 0.25, "psi": 1.0, "v": 100.0})
+    assert equal_weights({"x": 5 + 0 * t}, units) == pytest.approx({"x": 0.04})  # a step
 
 
 def test_a_path_keeps_to_its_speeds_and_starts_from_rest(tmp_path):

@@ -10,6 +10,7 @@ from cli import grounded
 from facts import holds
 from grounded.search import pictures
 from grounded.search.pictures import few, search_figure
+from grounded.search.scatter import with_errors
 from grounded_trials import Workspace
 from grounded_trials.report import gathering
 from grounded_trials.report.page import tables
@@ -66,9 +67,11 @@ def test_the_band_and_the_table_have_one_standard_error():
     """The band pooled the wild first candidates: 0.54 where the table said 3e-4."""
     now = many_flights(4).standing
     worth = [(-4200.0, -300.0), (-60.0, -20.0), (-5.0,), (-2.47, -2.49)]
-    history = tuple(
-        replace(tried, utilities=u, trials=tried.trials * len(u), accepted=True)
-        for tried, u in zip(now.history, worth, strict=True)
+    history = with_errors(
+        [
+            replace(tried, utilities=u, trials=tried.trials * len(u), accepted=True)
+            for tried, u in zip(now.history, worth, strict=True)
+        ]
     )
     best = history[-1]
     figure = search_figure(replace(now, history=history, incumbent=best))

@@ -8,7 +8,7 @@ from scipy.stats import t, ttest_ind
 
 from facts import holds
 from grounded.search.candidate import Tried
-from grounded.search.certainty import last_improvement, student, utility_noise
+from grounded.search.certainty import error_between, last_improvement, student
 from grounded.search.standing import _hardly
 
 
@@ -32,9 +32,9 @@ def test_single_trials_say_nothing_about_noise():
 def test_the_probability_is_the_t_tests():
     a, b = (-5.0, -5.4, -4.9), (-4.2, -4.6, -4.5)
     found = last_improvement([tried(*a), tried(*b)])
-    p = ttest_ind(b, a, alternative="less", equal_var=False).pvalue
+    p = ttest_ind(b, a, alternative="less").pvalue
     assert holds(found, f"probability {p:.2f}")
-    assert utility_noise([tried(*a), tried(*b)])[1] == 4
+    assert error_between(tried(*a), tried(*b), [tried(*a), tried(*b)])[1] == 4
 
 
 @pytest.mark.parametrize("freedom", [1.0, 1.7, 4.0, 30.5, 7500.0])
@@ -45,8 +45,8 @@ def test_student_s_t_is_scipy_s(x, freedom):
 
 def test_noise_of_a_repeated_candidate_stands_in_for_the_others():
     history = [tried(-9.0), tried(-5.0, -5.2, accepted=False), tried(-4.0), tried(-3.9)]
-    noise, freedom = utility_noise(history)
-    assert (noise, freedom) == (pytest.approx(np.std([-5.0, -5.2], ddof=1)), 1)
+    error, freedom = error_between(history[-2], history[-1], history)
+    assert (error, freedom) == (pytest.approx(2**0.5 * np.std([-5.0, -5.2], ddof=1)), 1)
     assert holds(last_improvement(history), "0.1 +- 0.2")
 
 
@@ -77,7 +77,8 @@ def test_a_gain_within_its_own_standard_error_ends_a_search():
 
 
 def test_failed_runs_are_left_out_and_trials_that_agree_say_so():
-    assert utility_noise([tried(-5.0, -np.inf)])[1] == 0
+    failed = tried(-5.0, -np.inf)
+    assert error_between(tried(-5.0), tried(-4.0), [failed])[1] == 0
     found = last_improvement([tried(-5.0, -5.0), tried(-4.0, -4.0)])
     assert holds(found, 1, "exactly") and "+-" not in found and "probability" not in found
 

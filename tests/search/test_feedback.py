@@ -162,3 +162,42 @@ def test_a_plan_with_dry_friction_is_followed_from_a_wider_kink(monkeypatch):
     _, plain = first_policy(planner.plan)
     _, followed = planner.first_policy()
     assert followed.cost < plain.cost - 0.2
+
+
+def test_what_the_incumbent_lost_by_its_start_is_known(noisy):
+    """Seen: "the rest was luck or its start", where the model had it which of the two."""
+    about = noisy.about
+    run = about.candidate(about.theta, Step(), "")
+    trial = noisy.now.incumbent.trials
+    assert np.isfinite(run.base_as_run) and len(trial) >= 1
+    began = np.mean([one.states[0] for one in trial], axis=0)
+    start = about.real.start.copy()
+    start[:2] = began
+    told = predicted(replace(about.real, start=start), noisy.now.incumbent.candidate.policy)
+    assert run.base_as_run == pytest.approx(told.utility)
+
+
+@pytest.mark.parametrize(
+    ("as_run", "error", "parts", "never"),
+    [
+        (-9.0, 0.1, ("1.000", "start"), ("scatter",)),
+        (-8.0, 0.6, ("within the scatter",), ("start",)),
+        (-8.0, 0.1, ("more than its runs scatter",), ("start",)),
+        (-8.0, np.nan, (), ("scatter", "start")),  # one run: nobody knows
+        (np.nan, 0.1, (), ("scatter", "start")),  # of an older version
+    ],
+)
+def test_of_what_the_model_gives_otherwise_only_known_reasons_are_told(as_run, error, parts, never):
+    from grounded_cli.propose import _so_far
+
+    made = SimpleNamespace(
+        base="c0001", expected_of_base=-8.0, predicted_gain=1.0, base_as_run=as_run
+    )
+    best = SimpleNamespace(
+        candidate=SimpleNamespace(id="c0001"), utility=-9.0, standard_error=error
+    )
+    text = _so_far(made, best)
+    assert "-8.000" in text and "luck" not in text
+    assert all(part in text for part in parts) and not any(word in text for word in never)
+    near = SimpleNamespace(candidate=best.candidate, utility=-8.1, standard_error=error)
+    assert "same model" not in _so_far(made, near)

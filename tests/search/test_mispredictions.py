@@ -9,8 +9,10 @@ import pytest
 from grounded.plant import Plant
 from grounded.rollout import simulate
 from grounded.search.ask_tell import Search
+from grounded.search.making import About, Maker
 from grounded.search.mispredictions import apart, believed, shared
 from grounded.search.planner import Planner, predicted
+from grounded.search.standing import SearchOptions
 from grounded.solve import ddp
 from grounded.solve.bias import ground
 from small_tasks import cart_task, drive, other, rover_task
@@ -138,3 +140,52 @@ def test_slopes_that_kept_their_promise_are_not_corrected():
     assert found.search.ask().slopes == ""
     wrong = searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 2)
     assert wrong.search.ask().slopes == "corrected"
+
+
+def lost(found, utility=-100.0, **changes):
+    """A step from the best candidate by corrected slopes that lost."""
+    first, best = found.search.standing.history[0], found.best
+    fields = {"base": best.candidate.id, "slopes": "corrected", "model": best.candidate.model}
+    made = replace(first.candidate, predicted_gain=1.0, **fields)
+    return replace(first, candidate=made, utilities=(utility,), accepted=False, **changes)
+
+
+@pytest.mark.parametrize(("slopes", "believes"), [("", True), ("corrected", False)])
+def test_a_step_by_corrected_slopes_that_lost_far_away_refutes_them(slopes, believes):
+    """Seen: the laws foretold the near trials, and lost 6 and 10 with each step they made."""
+    task = cart_task()
+    found = searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 2)
+    first = found.search.standing.history[0]
+    near = [replace(first, candidate=replace(first.candidate, id=f"n{k}")) for k in range(3)]
+    policy = found.best.candidate.policy
+    bump = 2.0 * np.sin(np.linspace(0, 9, task.horizon))[:, None]
+    policy = replace(policy, feedforward=policy.feedforward + bump)
+    run = predicted(found.problem, policy)  # as the model's own slopes say
+    trial = replace(found.own, states=run.states, inputs=run.inputs)
+    made = replace(first.candidate, id="far", policy=policy, slopes=slopes)
+    far = replace(first, candidate=made, trials=(trial,), accepted=False)
+    told = believed(Planner(task, task), found.best, (*near, found.best, far), found.problem)
+    assert (told.corrected is not None) is believes
+
+
+@pytest.mark.parametrize(
+    ("utilities", "slopes"), [((), "corrected"), ((-100.0,), "corrected"), ((-99.0, -98.0), "")]
+)
+def test_after_two_lost_more_than_foretold_steps_are_by_the_models_own_slopes(utilities, slopes):
+    task = cart_task()
+    found = searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 2)
+    now, planner = found.search.standing, Planner(task, task)
+    history = (*now.history, *(lost(found, u) for u in utilities))
+    named = [
+        replace(t, candidate=replace(t.candidate, id=f"c{k}")) if k > 1 else t
+        for k, t in enumerate(history)
+    ]
+    now = replace(now, history=tuple(named), incumbent=found.best)
+    maker = Maker(planner, now, "c0099", found.best.candidate.model)
+    assert About(maker, found.best, SearchOptions(), "").slopes == slopes
+    doubted = [
+        replace(t, candidate=replace(t.candidate, likely_off=1000.0)) if k > 1 else t
+        for k, t in enumerate(named)
+    ]  # it was said that they may well lose so much
+    maker = replace(maker, now=replace(now, history=tuple(doubted)))
+    assert About(maker, found.best, SearchOptions(), "").slopes == "corrected"

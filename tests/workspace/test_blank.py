@@ -200,6 +200,9 @@ def test_a_plan_whose_inputs_cost_nearly_all_says_so_and_a_target_tells_its_weig
     """A stranger's figure-8 stayed 3 cm off: 93 % of its cost was the drive's effort."""
     done = grounded("-C", blank.folder, "target", "step", "--to", "x=1")
     assert holds(done.out, "[reward] state", "x = 1")
+    stays = grounded("-C", blank.folder, "target", "step", "--to", "x=0")
+    assert holds(stays.err, "x stays", "[reward] state")
+    grounded("-C", blank.folder, "target", "step", "--to", "x=1")
     file = blank.folder / "grounded.toml"
     text = file.read_text()
     assert "input = { }" in text

@@ -6,13 +6,16 @@ import math
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from cli import grounded
 from facts import holding
 from grounded.errors import GroundedError
 from grounded.policy import load
+from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.exporting import RUNNER, export_candidate
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.ingest import ingest_log
@@ -137,3 +140,21 @@ def test_a_candidate_is_exported_beside_a_damaged_file_of_another(tmp_path):
     assert done.file.is_file() and done.named == ("--candidate", "c0001")
     with pytest.raises(GroundedError, match="damaged"):  # which one is best, nobody knows
         export_candidate(Folder(w.folder), "best", "json", tmp_path / "b.json")
+
+
+def test_what_became_of_a_candidate_is_said_with_its_export(tmp_path):
+    """A lost candidate, and one whose run was set aside, were written without a word."""
+    w = make(tmp_path / "w")
+    ingest_log(w, run_candidate(w, propose_in(w).candidate.id).trial_file)
+    second = propose_in(w).candidate.id
+    trial = read_trial(run_candidate(w, second).trial_file)[0]
+    far = replace(trial, states=trial.states + np.array([9.0, 0.0]))
+    write_trial(tmp_path / "far.mcap", far, {"kind": "trial"})
+    lost = ingest_log(w, tmp_path / "far.mcap", second)
+    assert lost.verdict == "no better"
+    (note,) = export_candidate(Folder(w.folder), second, path=tmp_path / "a.json").notes
+    assert all(part in note for part in (second, "lost", "c0001"))
+    assert not export_candidate(Folder(w.folder), "c0001", path=tmp_path / "b.json").notes
+    assert grounded("-C", w.folder, "discard", lost.trial, "--why", "wheel off").code == 0
+    (note,) = export_candidate(Folder(w.folder), second, path=tmp_path / "c.json").notes
+    assert all(part in note for part in (lost.trial, "wheel off"))

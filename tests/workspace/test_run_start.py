@@ -82,10 +82,12 @@ def test_a_log_that_ends_a_row_early_says_by_how_much_and_what_that_costs(w, tmp
     rows = path.read_text().splitlines()
     whole = w.ingest(path)
     assert whole.candidate == "c0002" and not any("steps" in one for one in whole.warnings)
+    w.discard(whole.trial)  # which is the same recording
     (tmp_path / "b.csv").write_text("\n".join(rows[:-1]))
     short = w.ingest(tmp_path / "b.csv", candidate="c0002")
     (said,) = [one for one in short.warnings if "after 39 of 40 steps" in one]
     assert states in said and "one more row" in said and np.isfinite(short.utility)
+    w.discard(short.trial)
     (tmp_path / "c.csv").write_text("\n".join(rows[:-4]))
     (said,) = [
         one

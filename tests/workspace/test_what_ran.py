@@ -145,9 +145,10 @@ def test_a_named_candidate_overrides_with_a_warning(waiting):
     assert found.candidate == "c0002" and "force" in found.warnings[0]
 
 
-def said_to_have_run(candidate, run, to, steps=sys.maxsize):
+def said_to_have_run(candidate, run, to, steps=sys.maxsize, nudge=0.0):
     """The file `to`, with a run's trial, or its first steps, as one that names this candidate."""
     trial, _, _ = read_trial(run)
+    trial = replace(trial, states=trial.states + nudge)  # no two runs are the same recording
     write_trial(to, replace(trial.until(steps), candidate=candidate), {"kind": "trial"})
     return to
 
@@ -179,7 +180,7 @@ def test_a_trial_that_names_its_candidate_is_not_given_to_another(waiting, tmp_p
 def test_a_cut_log_of_a_candidate_that_ran_well_says_how_to_take_it_back(waiting, tmp_path):
     w, ran, _ = waiting
     for candidate in ("c0001", "c0002"):
-        short = said_to_have_run("", ran, tmp_path / f"{candidate}.mcap", steps=20)
+        short = said_to_have_run("", ran, tmp_path / f"{candidate}.mcap", 20, nudge=1e-9)
         found = w.ingest(short, candidate=candidate)
         (said,) = [one for one in found.warnings if "ended after 20" in one]
         assert (f"`discard` {found.trial}" in said) == (candidate == "c0001")

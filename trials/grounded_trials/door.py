@@ -167,7 +167,8 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.task_file import replace_target
 
-        path = replace_target(self._afresh().config, columns)
+        here = self._afresh()
+        path = replace_target(here.config, columns, here.base_model.states)
         self.forget()
         return path
 

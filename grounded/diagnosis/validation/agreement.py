@@ -10,8 +10,13 @@ all other values as they are. That the groups share one value is tested by
     chi2 = sum_g s_g^2 / G_g - (sum_g s_g)^2 / sum_g G_g,    groups - 1 degrees of freedom.
 
 A model that is not quite right makes more of it than chance, so trials disagree only where the
-chance is small and the values are far apart. Between two groups that is the evidence of a change;
-the greatest is taken first, and what it explains of the others is taken off them.
+chance is small and the values are far apart.
+
+Between two groups the difference of their values, by its standard error, is the evidence of a
+change. The error is at least what leaving each trial out in turn says of it (Efron & Stein, "The
+jackknife estimate of variance", Annals of Statistics 9, 1981), and trials that are left out must be
+likelier with the change. The greatest is taken first, and what it explains of the others is taken
+off them.
 """
 
 from __future__ import annotations
@@ -135,7 +140,15 @@ def _goes_with(data: Data, some: Any, own: Array) -> str:
     return f"{'rises' if ties[best] > 0 else 'falls'} with {best}"
 
 
-def changed(search: HypothesisSearch, best: Fitted, first: Sequence[bool]) -> tuple[Changed, ...]:
+@dataclass(frozen=True)
+class Compared:
+    """Two groups of trials: the values that differ, and those that do not."""
+
+    changed: tuple[Changed, ...]
+    unchanged: tuple[Changed, ...]
+
+
+def compared(search: HypothesisSearch, best: Fitted, first: Sequence[bool]) -> Compared:
     """What differs between two groups of trials, the greatest evidence first.
 
     What one group alone has may be too little for all trials together: so every hypothesis that
@@ -148,51 +161,131 @@ def changed(search: HypothesisSearch, best: Fitted, first: Sequence[bool]) -> tu
     """
     fits = [best, search.best_null()]
     fits += [fit for size in (1, 2) for fit in search.of_size(size)[:RIVALS]]
-    found = [_changes(fit, search.data, first) for fit in fits]
+    found = [_compared(fit, search.data, first) for fit in fits]
     worth = [
-        search.score(fit) + sum(one.evidence - CHANGE for one in some)
+        search.score(fit) + sum(one.evidence - CHANGE for one in some.changed)
         for fit, some in zip(fits, found, strict=True)
     ]
     return found[int(np.nanargmax(worth))]
 
 
-def _changes(fit: Fitted, data: Data, first: Sequence[bool]) -> tuple[Changed, ...]:
-    """The same of one hypothesis."""
+def _compared(fit: Fitted, data: Data, first: Sequence[bool]) -> Compared:
+    """The same of one hypothesis; a change must be told by the trials that are left out, too."""
     from scipy.special import chdtrc
 
-    s, G = _by_group(fit, np.where(np.asarray(first)[data.trial_of], 0, 1), 2)
+    group = np.where(np.asarray(first)[data.trial_of], 0, 1)
+    units = _units(data.trial_of, group)
     every = [f"parameter:{name}" for name in data.model.param_names]
     values, found = {v.column: v for v in _values(fit, data, every)}, []
     taken: list[int] = []
-    while len(taken) < len(values):
-        left = _unexplained(s, G, taken)
-        k = max((c for c in values if c not in taken), key=lambda c: float(left[c]))
-        if not left[k] > 2 * CHANGE:
-            break
-        one, taken = values[k], [*taken, k]
-        own = [np.linalg.pinv(G[g][np.ix_(taken, taken)], hermitian=True) for g in (0, 1)]
+    left = {k: _difference(fit, group, taken, k, units) for k in values}
+    while left:
+        k = max(left, key=lambda c: left[c].evidence)
+        if not (left[k].evidence > CHANGE and _pays(fit, group, taken, k, units)):
+            left = {c: d for c, d in left.items() if c != k and d.evidence > CHANGE}
+            continue
+        found.append(k)
+        taken = [*taken, k]
+        left = {c: _difference(fit, group, taken, c, units) for c in values if c not in taken}
+    told = {k: _difference(fit, group, [c for c in taken if c != k], k, units) for k in values}
+
+    def row(k: int) -> Changed:
+        one, seen = values[k], told[k]
         a, b = (
-            Estimate(
-                one.value - one.scale * float((own[g] @ s[g][taken])[-1]),
-                one.scale * float(np.sqrt(own[g][-1, -1])),
-                unit=one.unit,
-            )
-            for g in (0, 1)
+            Estimate(one.value + one.scale * shift, one.scale * std, unit=one.unit)
+            for shift, std in zip(seen.shifts, seen.stds, strict=True)
         )
-        evidence, chance = 0.5 * float(left[k]), float(chdtrc(1, left[k]))
-        found.append(Changed(one.effect, one.quantity, a, b, evidence, chance))
-    return tuple(found)
+        chance = float(chdtrc(1, 2 * seen.evidence))
+        return Changed(one.effect, one.quantity, a, b, seen.evidence, chance)
+
+    known = [k for k in values if k not in found and np.isfinite(told[k].stds).all()]
+    return Compared(tuple(map(row, found)), tuple(map(row, known)))
 
 
-def _unexplained(s: Array, G: Array, taken: Sequence[int]) -> Array:
-    """Chi-squared (C,) of each column's difference, beside columns that differ already."""
-    total = np.zeros(s.shape[1])
-    for score, info in zip(s, G, strict=True):
-        rest, own = score.copy(), np.diag(info).copy()
-        if taken:
-            inside = np.linalg.pinv(info[np.ix_(taken, taken)], hermitian=True)
-            cross = info[:, taken] @ inside
-            rest = score - cross @ score[taken]
-            own = own - np.einsum("ij,ij->i", cross, info[:, taken])
-        total += rest**2 / np.maximum(own, 1e-12 * np.maximum(np.diag(info), 1e-300))
-    return np.asarray(total)
+def _units(trial_of: Array, group: Array) -> Array:
+    """What is left out in turn, (B,): trials; where a group has one, the pieces of its record."""
+    alone = [len(np.unique(trial_of[group == g])) < 2 for g in (0, 1)]
+    return np.asarray(np.arange(len(trial_of)) if any(alone) else trial_of, float)
+
+
+@dataclass(frozen=True)
+class _Difference:
+    """Of one column between the groups, beside those that differ already."""
+
+    shifts: Array  # (2,) from the common value
+    stds: Array  # (2,)
+
+    @property
+    def evidence(self) -> float:
+        """Half of chi-squared with one degree of freedom [nats]."""
+        square = float((self.stds**2).sum())
+        apart = float(self.shifts[0] - self.shifts[1]) ** 2
+        return 0.5 * apart / square if 0 < square < np.inf else 0.0
+
+
+def _difference(
+    fit: Fitted, group: Array, taken: Sequence[int], k: int, units: Array
+) -> _Difference:
+    """A column's own value in each group; as uncertain as leaving units out says, at least."""
+    columns = [*taken, k]
+    shifts, stds = np.zeros(2), np.full(2, np.inf)
+    for g in (0, 1):
+        own = group == g
+        G = fit.gram[own][:, columns][:, :, columns]
+        s = fit.score[own][:, columns]
+        total, score = G.sum(axis=0), s.sum(axis=0)
+        if not total[-1, -1] > 0:
+            continue
+        inverse = np.linalg.pinv(total, hermitian=True)
+        shifts[g] = -float((inverse @ score)[-1])
+        without = []
+        for unit in np.unique(units[own]):
+            kept = units[own] != unit
+            if kept.any():
+                less = np.linalg.pinv(G[kept].sum(axis=0), hermitian=True)
+                without.append(-float((less @ s[kept].sum(axis=0))[-1]))
+        count = len(without)
+        jackknife = (count - 1) * float(np.var(without)) if count > 1 else 0.0
+        stds[g] = np.sqrt(max(float(inverse[-1, -1]), jackknife))
+    return _Difference(shifts, stds)
+
+
+def _pays(fit: Fitted, group: Array, taken: Sequence[int], k: int, units: Array) -> bool:
+    """Whether units that are left out are likelier where the groups differ in a column, too."""
+    if min(len(np.unique(units[group == g])) for g in (0, 1)) < 2:
+        return True  # nothing can be left out
+    gain = 0.0
+    for unit in np.unique(units):
+        out = units == unit
+        g = int(group[out][0])
+        G, s = fit.gram[out].sum(axis=0), fit.score[out].sum(axis=0)
+        with_, without = (
+            _fitted(fit, group, ~out, common, apart, g)
+            for common, apart in (([], [*taken, k]), ([k], [*taken]))
+        )
+        gain += float(s @ (without - with_)) + 0.5 * float(
+            without @ G @ without - with_ @ G @ with_
+        )
+    return gain > 0
+
+
+def _fitted(
+    fit: Fitted, group: Array, used: Array, common: list[int], apart: list[int], g: int
+) -> Array:
+    """The values (C,) of a group where some columns are common to both and some are not."""
+    C = fit.score.shape[1]
+    count = len(common) + 2 * len(apart)
+    N, b = np.zeros((count, count)), np.zeros(count)
+    for other in (0, 1):
+        at = [*range(len(common))]
+        at += [len(common) + other * len(apart) + i for i in range(len(apart))]
+        own = used & (group == other)
+        columns = [*common, *apart]
+        N[np.ix_(at, at)] += fit.gram[own].sum(axis=0)[np.ix_(columns, columns)]
+        b[at] -= fit.score[own].sum(axis=0)[columns]
+    found = np.linalg.pinv(N, hermitian=True) @ b
+    delta = np.zeros(C)
+    delta[common] = found[: len(common)]
+    begin = len(common) + g * len(apart)
+    delta[apart] = found[begin : begin + len(apart)]
+    return delta

@@ -114,7 +114,13 @@ def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
             )
             for one in diagnosis.changed
         ]
-        return rows or [("changed", "nothing that these trials show")]
+        rows = rows or [("changed", "nothing that these trials show")]
+        same = [
+            f"{one.effect}: {one.quantity}, by {figure(one.second.value - one.first.value, 2)} "
+            f"+- {figure(math.hypot(one.first.std, one.second.std), 2)}"
+            for one in diagnosis.unchanged
+        ]
+        return [*rows, ("unchanged", f"within its +-: {'; '.join(same)}")] if same else rows
     found = []
     for one in diagnosis.agreement:
         if not one.agrees:

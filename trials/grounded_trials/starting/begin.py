@@ -338,7 +338,7 @@ def _write(
 ) -> None:
     dt, whose = grid
     write_target(folder / "target.csv", dt, dict(columns))
-    weights = equal_weights(columns)
+    weights = equal_weights(columns, model.states)
     limits = [
         f"{name} = [{found[0]:.6g}, {found[1]:.6g}]"
         for name in model.input_names
@@ -359,7 +359,8 @@ def _write(
         "latency = { }                 # [s] transport delay of inputs: `fit --latency` finds it",
         "",
         "[reward]                      # quadratic weights: 1 / (range in the target)^2; `target`",
-        "                              # sets them anew until you change one",
+        "                              # sets them anew until you change one; of a column that",
+        "                              # stays at 0: the largest of its unit, else 1",
         f"state = {_inline(weights)}",
         "# terminal, of the last step alone: where the run is to END at rest on its target",
         "# (docking, parking) and overshoots, 10 to 100 times state, the speeds' too",

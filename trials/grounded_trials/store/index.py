@@ -24,7 +24,7 @@ from grounded_trials.store.known import KnownTrial, Worth
 from grounded_trials.store.store import Stored
 
 KEPT = 2**20  # [bytes] numbers of a longer trial are read from its own file
-_VERSION = 2  # of the tables, and of what `_about` says
+_VERSION = 3  # of the tables, and of what `_about` says
 _TABLES = """
 CREATE TABLE files (name TEXT PRIMARY KEY, stamp TEXT, about TEXT, proof BLOB);
 CREATE TABLE numbers (name TEXT PRIMARY KEY, states BLOB, inputs BLOB, proof BLOB);

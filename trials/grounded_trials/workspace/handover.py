@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -27,6 +28,8 @@ from grounded.policy import Policy
 from grounded.search.candidate import LITTLE, Candidate
 from grounded.task import Task
 from grounded.trial import Trial
+from grounded_trials.store.store import Stored
+from grounded_trials.store.trial_file import read_trial
 from grounded_trials.wording import with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial, candidate_of, sha256
@@ -244,6 +247,7 @@ class Check:
                 f"and its model is likely to be off by {made.likely_off:.3g} there, as it was for "
                 f"earlier trials{stop}"
             )
+        yield from self._became()
         if "sha256" not in self.meta:
             yield f"{name} was written by an older version: its file has no checksum of its own"
         if not self.same_task:
@@ -253,6 +257,24 @@ class Check:
             yield f"the model was changed since {name} was made; {again}"
         if self.same_task and not any(tried.trials for tried in self.standing.history):
             yield from self._untried()
+
+    def _became(self) -> Iterator[str]:
+        """That it lost, or that its trials were set aside, for a hand that types its name."""
+        name, best = self.candidate.id, self.standing.incumbent
+        tried = next((t for t in self.standing.history if t.candidate.id == name), None)
+        if tried is not None and tried.accepted is False and best is not None:
+            lost = "crashed" if tried.utility == -np.inf else f"lost with {tried.utility:.4g}"
+            yield f"{name} {lost}; the best so far is {best.candidate.id}, {best.utility:.4g}"
+        aside = self.workspace.discarded()
+        for stored in self.workspace.store.list() if aside else ():
+            if stored.id in aside and self._ran(stored) == name:
+                why = aside[stored.id]
+                yield f"its trial {stored.id} is set aside{why and ': ' + why}"
+
+    def _ran(self, stored: Stored) -> str:
+        with suppress(GroundedError):
+            return read_trial(self.workspace.store.read(stored))[0].candidate
+        return ""
 
     def _untried(self) -> Iterator[str]:
         """How near the first run comes to [safety], which nothing but the bare model says."""

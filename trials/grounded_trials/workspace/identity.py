@@ -44,6 +44,7 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "caution": int,
     "way": str,
     "slopes": str,
+    "base_as_run": float,
     "likely_off": float,
 }
 _ABSENT = {
@@ -52,6 +53,7 @@ _ABSENT = {
     "caution": "0",
     "way": "",
     "slopes": "",
+    "base_as_run": "nan",
     "likely_off": "0.0",
 }
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -33,7 +32,7 @@ from grounded_trials.workspace.identity import READ_BY, ROWS, sha256
 from grounded_trials.workspace.ingested import Ingested
 from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of
-from grounded_trials.workspace.proposing import candidate_named, standing_in
+from grounded_trials.workspace.proposing import candidate_named, latest_candidates, standing_in
 from grounded_trials.workspace.run_start import (
     LOOSE,
     elsewhere,
@@ -46,6 +45,7 @@ from grounded_trials.workspace.stored_before import (
     as_stored,
     refuse_as_another,
     repeated,
+    same_recording,
     what_repeats,
 )
 from grounded_trials.workspace.trial_check import warnings_about
@@ -59,6 +59,7 @@ class _Read:
     warnings: tuple[str, ...] = ()
     signals: tuple[SignalReport, ...] = ()
     notes: tuple[str, ...] = ()
+    copy: bool = False  # of a stored trial, or a part of one
     bare: bool = False  # it ran a candidate, and carries no copy of it
     log: ForeignLog | None = None
     last_s: float = math.nan  # its last sample of every state, since the start; of a foreign log
@@ -88,10 +89,11 @@ def ingest_log(
         read = _own(workspace, path, candidate, data)
     else:
         read = _foreign(workspace, path, candidate, data)
+    read = _copied(workspace, path, read, "" if data else candidate)
     read = _recognised(workspace, path, read, candidate)
     if read.log and read.log.stored:
         read = replace(read, data=as_stored(workspace, read.log, read.trial, read.data))
-    before = repeated(workspace, path, read.trial, read.data)
+    before = "" if read.copy else repeated(workspace, path, read.trial, read.data)
     added = workspace.store.add(read.data, again=before != "")
     if read.bare:  # what it ran is kept beside it
         ran = sha256(workspace.candidate_bytes(read.trial.candidate))
@@ -127,6 +129,18 @@ def ingest_log(
     )
 
 
+def _copied(workspace: Folder, path: Path, read: _Read, wanted: str | None) -> _Read:
+    """The stored trial in place of a file that is a copy of it, or a part."""
+    known = sha256(read.data)[:DIGITS] in workspace.store.digests()
+    if known or (read.log and read.log.stored):
+        return read
+    if (one := same_recording(workspace, path, read.data, read.log)) is None:
+        return read
+    refuse_as_another(path, (one,), wanted)
+    note = f"its rows are those of {one.stored.id}: it is the same recording, or a part of it"
+    return _Read(one.trial, workspace.store.read(one.stored), notes=(note,), copy=True)
+
+
 def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | None) -> _Read:
     """Refuses a log whose commands are not its candidate's; with a warning if one was named.
 
@@ -135,7 +149,7 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
     ran = read.trial.candidate
     if not ran or sha256(read.data)[:DIGITS] in workspace.store.digests():
         return read
-    (own, _), candidates = workspace.candidate(ran), _latest(workspace)
+    (own, _), candidates = workspace.candidate(ran), latest_candidates(workspace, OTHERS)
     logs = [read.log]
     if read.log and (late := read.log.as_seen):  # its program may have acted on these
         logs.append(late)
@@ -149,9 +163,11 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
     units = () if other else units
     if not why and not units:
         return read
-    if log and not units and not other:
+    slow = pace_of(log, workspace.task, own.policy) if log else None
+    if slow:  # drawn out, it may pass for one in another unit
+        units = ()
+    elif log and not units and not other:
         units, by = unit_of(log, workspace.task, own.policy)
-    slow = pace_of(log, workspace.task, own.policy) if log and not units else None
     pace = slow and (
         f"a second of its stamps is {slow:g} s of the run (a recording played at another rate?): "
         f"correct the stamps, times {slow:g}, and ingest it again"
@@ -240,16 +256,6 @@ def _sooner(log: ForeignLog, stored: ForeignLog) -> float:
     return (log.recording.whole.origin_ns - stored.recording.whole.origin_ns) * 1e-9
 
 
-def _latest(workspace: Folder) -> list[Candidate]:
-    """The latest candidates of the task, probes and void ones too: any may have been run."""
-    found = []
-    for identity in workspace.candidate_ids()[-OTHERS:]:
-        with suppress(GroundedError):  # a damaged file was not run now
-            candidate, meta = workspace.candidate(identity)
-            found += [candidate] * (meta.get("task") == workspace.task.hash)
-    return found
-
-
 def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:
     if tried is None:
         return "probe" if trial.candidate else ""
@@ -336,7 +342,7 @@ def _foreign(workspace: Folder, path: Path, candidate: str | None, data: bool) -
     """Somebody else's log, through [log]."""
     log = read_foreign(workspace, path, mapping_of(workspace, path))
     ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
-    refuse_as_another(log, "" if data else candidate)
+    refuse_as_another(path, log.stored, "" if data else candidate)
     chosen = "" if data else ran or _outstanding(workspace, path)
     if chosen:
         _check_candidate(workspace, path, chosen)

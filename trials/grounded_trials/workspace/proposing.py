@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -297,3 +298,13 @@ def candidate_named(workspace: Folder, name: str | None, now: Standing | None = 
     if best is None:
         raise GroundedError("there is no best candidate yet: no trial was ingested")
     return best.candidate.id
+
+
+def latest_candidates(workspace: Folder, most: int) -> list[Candidate]:
+    """The latest candidates, those of the task, probes and void ones too: any may have been run."""
+    found = []
+    for identity in workspace.candidate_ids()[-most:]:
+        with suppress(GroundedError):  # a damaged file was not run now
+            candidate, meta = workspace.candidate(identity)
+            found += [candidate] * (meta.get("task") == workspace.task.hash)
+    return found

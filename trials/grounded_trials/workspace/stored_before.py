@@ -6,36 +6,43 @@ repeats the first with other numbers, which no diagnosis survives.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.trial import Trial, scattered
 from grounded_trials.logs.log_files import log_files
+from grounded_trials.logs.resample import ABSOLUTE_S
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.foreign import ForeignLog
-from grounded_trials.workspace.identity import sha256
+from grounded_trials.workspace.identity import StoredTrial, sha256
 from grounded_trials.workspace.proposing import standing_in
 
+EDGE = 2  # last rows of a cut log, which its end may have changed
+LEAST = 10  # rows that two recordings must share to be told as one
 
-def refuse_as_another(log: ForeignLog, wanted: str | None) -> None:
+
+def refuse_as_another(path: Path, stored: Sequence[StoredTrial], wanted: str | None) -> None:
     """Refuses a log that is stored as a run of another candidate, or as data.
 
     Args:
-        log: as it was read.
+        path: the log.
+        stored: the trials that were made from it.
         wanted: the candidate that it is to be a run of, "" for data, None: whatever it was.
 
     Raises:
         GroundedError: with the trial to discard.
     """
-    if not log.stored or wanted in (None, *(one.trial.candidate for one in log.stored)):
+    if not stored or wanted in (None, *(one.trial.candidate for one in stored)):
         return
-    identity, as_run = log.stored[-1].stored.id, log.stored[-1].trial.candidate
+    identity, as_run = stored[-1].stored.id, stored[-1].trial.candidate
     raise GroundedError(
-        f"{log.path} is stored already, as {identity}, {_what(as_run)}: one log is one trial. To "
+        f"{path} is stored already, as {identity}, {_what(as_run)}: one log is one trial. To "
         f"have it as {_what(wanted)} instead, discard {identity} first",
         NextCommand("discard", (identity,)),
     )
@@ -70,12 +77,90 @@ def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> 
     names = tuple(name for name, (a, b) in spans.items() if a < end and start < b)
     if not names:
         return data  # another part of a long recording
+    raise _read_otherwise(log.path, names)
+
+
+def _read_otherwise(path: Path, names: tuple[str, ...]) -> GroundedError:
     which = names[0] if len(names) == 1 else "them"
-    raise GroundedError(
-        f"{log.path}: the same recording is stored as {', '.join(names)}, read in another way "
+    return GroundedError(
+        f"{path}: the same recording is stored as {', '.join(names)}, read in another way "
         f"(another [log], [estimate] or [task] dt): discard {which}, then ingest it again",
         NextCommand("discard", names),
     )
+
+
+def same_recording(
+    workspace: Folder, path: Path, data: bytes, log: ForeignLog | None
+) -> StoredTrial | None:
+    """The stored trial that a file is a copy of, or a part: what is left of a damaged one, say.
+
+    The bytes of the file don't tell. That at the same times of its clock all rows are the same
+    does; whole runs whose clock begins at zero may be alike where a simulator repeats itself.
+
+    Args:
+        workspace: that may have stored it.
+        path: the file.
+        data: the trial in it, as it would be stored.
+        log: which that was read from; None: the file is a trial of ours.
+
+    Raises:
+        GroundedError: if it has more of the recording than what is stored.
+    """
+    trial, meta, _ = read_trial(data)
+    begin, end = _span(meta, trial)
+    for one in workspace.whole_trials():
+        first, last = _span(one.meta, one.measured)
+        foreign = "source" in one.meta
+        if foreign != (log is not None) or not (first < end and begin < last):
+            continue
+        here = trial
+        if one.meta["start_ns"] != meta["start_ns"]:
+            if log is None or (there := _from(log, int(one.meta["start_ns"]))) is None:
+                continue
+            here = there
+        alike = _alike(one, here)
+        stamped = first > ABSOLUTE_S  # else every log's clock may begin at zero
+        if alike == "none" or (alike == "some" and not stamped):
+            continue
+        if alike == "some":
+            raise _read_otherwise(path, (one.stored.id,))
+        if here.finite_steps > one.measured.finite_steps:
+            raise GroundedError(
+                f"{path}: {one.stored.id} is a part of the same recording, which goes on here: "
+                f"discard {one.stored.id}, then ingest it again",
+                NextCommand("discard", (one.stored.id,)),
+            )
+        if stamped or here.finite_steps < one.measured.finite_steps:
+            return one
+    return None
+
+
+def _from(log: ForeignLog, start_ns: int) -> Trial | None:
+    """A log as a trial that begins at a time of its clock; None where it can't be cut there."""
+    with suppress(GroundedError):
+        _, found = log.cut("")
+        return log.cut("", 1e-9 * (start_ns - found.origin_ns))[0]
+    return None
+
+
+def _alike(one: StoredTrial, here: Trial) -> Literal["all", "some", "none"]:
+    """Which signals are the same row by row: all; the inputs and some states, read in another way.
+
+    A signal that stays, and one that was estimated, tells nothing.
+    """
+    before = one.measured
+    names = (before.state_names, before.input_names)
+    rows = min(before.finite_steps, here.finite_steps) - EDGE
+    if rows < LEAST or names != (here.state_names, here.input_names):
+        return "none"
+    guessed = one.meta.get("estimated", "").split(",")
+    known = [i for i, name in enumerate(here.state_names) if name not in guessed]
+    states, inputs = before.states[:rows, known], before.inputs[:rows]
+    same = (states == here.states[:rows, known]).all(axis=0)
+    telling = np.ptp(states, axis=0) > 0
+    if not np.array_equal(inputs, here.inputs[:rows]) or not (same & telling).any():
+        return "none"
+    return "all" if same.all() else "some"
 
 
 def _span(meta: Mapping[str, str], trial: Trial) -> tuple[float, float]:

@@ -113,6 +113,8 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
 
 
 ROW_LIMIT = 200_002
+LEAST = 0.1  # range of a column of the target that weights go by
+UNKNOWN = 1.0  # in its own unit: that of a column that is constant, as all of its unit
 
 
 def read_target(path: Path) -> tuple[list[str], Array]:
@@ -227,7 +229,7 @@ def target_arrays(
     return target, np.stack(columns, axis=1)
 
 
-def replace_target(config: Config, columns: Mapping[str, Array]) -> Path:
+def replace_target(config: Config, columns: Mapping[str, Array], units: Mapping[str, str]) -> Path:
     """Writes target.csv and its length to grounded.toml, see `Workspace.target`."""
     name = config.task.target or "target.csv"
     path = config.file.parent / name
@@ -235,17 +237,37 @@ def replace_target(config: Config, columns: Mapping[str, Array]) -> Path:
     if path.is_file():
         with suppress(GroundedError, ValueError):  # one that can't be read is replaced
             names, values = read_target(path)
-            before = equal_weights(dict(zip(names[1:], values.T[1:], strict=True)))
+            before = equal_weights(dict(zip(names[1:], values.T[1:], strict=True)), units)
         path.replace(path.with_name(path.name + ".bak"))
     write_target(path, config.task.dt, dict(columns))
-    weights = {state: round(w, 6) for state, w in equal_weights(columns).items()}
+    weights = {state: round(w, 6) for state, w in equal_weights(columns, units).items()}
     set_target(config.file, name, len(next(iter(columns.values()))) - 1, weights, before)
     return path
 
 
-def equal_weights(columns: Mapping[str, Array]) -> dict[str, float]:
-    """Weights by which an error as large as a column's range, at least 0.1, costs 1."""
-    return {name: max(float(np.ptp(v)), 0.1) ** -2 for name, v in columns.items()}
+def equal_weights(columns: Mapping[str, Array], units: Mapping[str, str]) -> dict[str, float]:
+    """Weights by which an error as large as a column's range, at least LEAST, costs 1.
+
+    A column that is constant has no range: its size counts, as of a step. One that is zero gets the
+    largest range of its unit (a y that stays while x moves), where there is none UNKNOWN: what is
+    small for it nobody has said.
+
+    Args:
+        columns: of the target, by state.
+        units: of the model's states.
+    """
+    ranges = {
+        name: float(np.ptp(values) or np.abs(values).max()) for name, values in columns.items()
+    }
+    size: dict[str, float] = {}
+    for name, own in ranges.items():
+        unit = units.get(name, "")
+        size[unit] = max(size.get(unit, 0.0), own)
+    widths = {
+        name: max(own or size[units.get(name, "")] or UNKNOWN, LEAST)
+        for name, own in ranges.items()
+    }
+    return {name: width**-2 for name, width in widths.items()}
 
 
 def write_target(path: Path, dt: float, columns: dict[str, Array]) -> None:
