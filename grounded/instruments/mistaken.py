@@ -19,8 +19,8 @@ import numpy as np
 from grounded.effects import places
 from grounded.frozen import Array
 from grounded.instruments.ahead import Ahead, Fit
+from grounded.instruments.finding import DEGREES
 from grounded.instruments.kinematics import integrals
-from grounded.instruments.odd_trial import DEGREES
 from grounded.instruments.other_units import unusable
 from grounded.model import Model
 from grounded.trial import Trial

@@ -242,8 +242,7 @@ class Workspace(Folder):
 
         Args:
             trials: short names, t0007; none: all that can be used.
-            max_effects: blame at most so many effects at once; None: 3, and more where those
-                leave more than noise.
+            max_effects: blame at most so many at once; None: 3, and more where those leave a gap.
             without: families not to blame.
             compare: a second group of trials; what changed from the first is `changed`.
             probe: write the most instructive candidate also where nothing ties.
