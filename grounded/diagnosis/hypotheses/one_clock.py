@@ -41,11 +41,7 @@ class OneClock:
         """What a person should know of it."""
         commands = "Commands" if self.whole else f"Commands of {_and(self.inputs)}"
         sensors = "all sensors" if self.whole else f"the sensors of {_and(self.states)}"
-        return (
-            f"{commands} or {sensors} late by as much are one thing to a model: only one clock "
-            "that stamps both a command and what it does tells which. Plans, and feedback on "
-            "what these sensors show, are the same either way."
-        )
+        return f"{commands} or {sensors} late by as much: no run tells which; plans are the same."
 
 
 def one_clock(
