@@ -140,6 +140,8 @@ def joined(
     parts: Sequence[tuple[LinearSystem, Delayed | None]],
 ) -> tuple[LinearSystem, Delayed | None]:
     """Systems with as many delayed channels each as one, their runs one after the other."""
+    if len(parts) == 1:
+        return parts[0]
     systems = [system for system, _ in parts]
     A, Q, R, seen = (np.concatenate([one[k] for one in systems], axis=1) for k in range(4))
     entries = [one.G for one in systems if one.G is not None]

@@ -54,6 +54,7 @@ from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.tracing import Signature, Trace, Variant
 from grounded.frozen import Array
 
+Words = ctypes.c_int64 * len(BATCH)
 SMALL = 600  # operations of a model that need not be counted with their derivatives
 MAX_PLACES = 8_000  # of a Jacobian that a kernel keeps on its stack, 4 MB of it
 FORMAT = 1  # raise when kernels change their words or their meaning
@@ -184,10 +185,10 @@ class CompiledSystem(TracedSystem):
         x, u, p, dt, eps = point
         if len(x) == 0:
             return
-        kept = {"x": plain(x), "u": plain(u), "p": plain(p), **out}
-        at = {name: address(array) for name, array in kept.items()}
-        at |= {"dt": word(float(dt)), "eps": word(float(eps)), "N": len(x)}
-        run(kernel, (ctypes.c_int64 * len(BATCH))(*[at.get(name, 0) for name in BATCH]))
+        x, u, p = plain(x), plain(u), plain(p)
+        first = address(x), address(u), address(p), word(float(dt)), word(float(eps)), len(x)
+        results = (address(out[name]) if name in out else 0 for name in BATCH[len(first) :])
+        run(kernel, Words(*first, *results))
 
     def rollout(
         self,

@@ -104,6 +104,8 @@ class Data:
 
     def delayed(self, inputs: Array, held: Array) -> Array:
         """What arrives of (S, T_max, m), `held` (S, m) before, after the latency of the task."""
+        if not self.latency.any():
+            return inputs
         out = np.empty_like(inputs)
         for j, latency in enumerate(self.latency):
             out[:, :, j] = shifted(inputs[:, :, j], held[:, j], latency / self.dt)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -72,6 +73,23 @@ class Hypothesis:
         kept = [(effect, values) for effect, values in self.pairs if effect.name != name]
         effects, values = tuple(e for e, _ in kept), tuple(v for _, v in kept)
         return replace(self, effects=effects, values=values)
+
+
+def by_row(hypotheses: Sequence[Hypothesis], which: Any) -> Hypothesis:
+    """One whose numbers are arrays: row i has those of hypothesis `which[i]`, (M,) of int.
+
+    Of the same effects, to step many rows (M, n) at once; shifts are (M, k).
+    """
+    first = hypotheses[0]
+    if len(hypotheses) == 1:
+        return first
+    values = [
+        {q: np.array([h.values[i][q] for h in hypotheses])[which] for q in own}
+        for i, own in enumerate(first.values)
+    ]
+    shifts = [h.shift for h in hypotheses if h.shift is not None]
+    shift = np.stack(shifts)[which] if shifts else None
+    return replace(first, values=tuple(values), shift=shift)
 
 
 def param_scale(model: Model) -> Array:

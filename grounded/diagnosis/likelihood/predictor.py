@@ -106,18 +106,25 @@ class Predictor(SentOnce):
         return [h.pairs[i] for i in acting_order([effect.family for effect in h.effects])]
 
     def params(self, h: Hypothesis) -> Array:
-        """The model's parameters under a hypothesis (k,)."""
+        """The model's parameters under a hypothesis (k,), or of each row (M, k)."""
         p = np.array(self.data.model.values)
         if h.shift is not None:
             p = p + h.shift
         names = self.data.model.param_names
         for effect, values in h.pairs:
             if isinstance(effect.family, ParamFamily):
-                p[names.index(effect.site.target)] += values["d"]
+                k, d = names.index(effect.site.target), np.asarray(values["d"])
+                p = np.broadcast_to(p, (*(d.shape or p.shape[:-1]), len(names))).copy()
+                p[..., k] += d
         return p
 
     def step(self, x: Array, u: Array, p: Array, dt: float | None = None) -> Array:
-        """The model's own step at any leading shape."""
+        """The model's own step at any leading shape; of rows where each has its parameters."""
+        if p.ndim > 1:
+            after = np.empty_like(x)
+            for one, own in _alike(p):
+                after[own] = self.step(x[own], u[own], one, dt)
+            return after
         rows, system = self.flat(x, u), self.data.model.system
         if not simulated(self.data.model):
             return system.step(*rows, p, dt or self.data.dt).reshape(x.shape)
@@ -175,9 +182,9 @@ class Predictor(SentOnce):
 
     def stepper(self, h: Hypothesis) -> Callable[[Array, Array, Array], Array]:
         """`advance` of many steps one after the other: from x (M, n) with u (M, m) at t (M,)."""
-        if rates_of(h) or limits_of(h) or losses_of(h):
-            return lambda x, u, t: self.advance(h, x, u, t)
         step, p, dt = self.data.model.system.step, self.params(h), self.data.dt
+        if p.ndim > 1 or rates_of(h) or limits_of(h) or losses_of(h):
+            return lambda x, u, t: self.advance(h, x, u, t)
         return lambda x, u, t: step(x, u, p, dt)
 
     def marched(self, h: Hypothesis, x: Array, u: Array) -> Array | None:
@@ -320,6 +327,14 @@ class Predictor(SentOnce):
             i = names.index(effect.site.target)
             total[..., i] += sensor_offset(effect, values, shown[..., i], self.data.dt)
         return total
+
+
+def _alike(p: Array) -> list[tuple[Array, Any]]:
+    """Parameters (M, k) that are not the same, each (k,) with the indices of its rows."""
+    rows: dict[bytes, list[int]] = {}
+    for i, one in enumerate(p):
+        rows.setdefault(one.tobytes(), []).append(i)
+    return [(p[own[0]], np.array(own)) for own in rows.values()]
 
 
 def rates_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:

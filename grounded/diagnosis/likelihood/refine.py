@@ -54,6 +54,7 @@ HALVED = 4  # iterations after which only the better half of rivals goes on
 CLOSE = 10.0  # nats behind the best within which all go on
 LITTLE = 0.1  # nats that part of a step must promise to be tried where the step fails
 NOTHING = 0.01  # nats: what promises less, after it hardly rose, is not tried at all
+LEAST = 1.0  # nats: less is hardly a rise
 
 
 @dataclass(eq=False)
@@ -130,10 +131,10 @@ def refine(
     wide = n if works[0].noise.structure.tau is None else 2 * n
     size = max(1, int(MOST_NUMBERS / (L * B * wide * wide)))
     if worth is not None and iterations > HALVED:
-        works = _after(predictor, works, HALVED, size, fixed_noise, tick)
+        works = _after(predictor, works, (HALVED, fixed_noise, False), size, tick)
         _halve(works, worth)
         iterations -= HALVED
-    works = _after(predictor, works, iterations, size, fixed_noise, tick)
+    works = _after(predictor, works, (iterations, fixed_noise, True), size, tick)
     fits = [(work.best, work.still and not fixed_noise) for work in works if work.best is not None]
     return [replace(fit, settled=True) if top and not fit.settled else fit for fit, top in fits]
 
@@ -141,16 +142,18 @@ def refine(
 def _after(
     predictor: Predictor,
     works: list[Work],
-    iterations: int,
+    how: tuple[int, bool, bool],
     size: int,
-    fixed_noise: bool,
     tick: Callable[[], None] | None,
 ) -> list[Work]:
-    """The works after some iterations, blocks of at most `size` of one shape side by side."""
+    """The works after some iterations, blocks of at most `size` of one shape side by side.
+
+    `how`: so many iterations; whether the noise is fixed; whether no more will follow.
+    """
     shapes = _of_one_shape(works, predictor.data)
     blocks = [a[at : at + size] for a in shapes for at in range(0, len(a), size)]
     many, some = len(blocks), [[works[i] for i in block] for block in blocks]
-    found = each(_climb, [predictor] * many, some, [(iterations, fixed_noise)] * many, done=tick)
+    found = each(_climb, [predictor] * many, some, [how] * many, done=tick)
     after = list(works)
     for block, part in zip(blocks, found, strict=True):
         for i, work in zip(block, part, strict=True):
@@ -158,13 +161,13 @@ def _after(
     return after
 
 
-def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool]) -> list[Work]:
+def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool, bool]) -> list[Work]:
     """Refines hypotheses of one shape, side by side."""
-    iterations, fixed_noise = how
+    iterations, fixed_noise, last = how
     works = [replace(work, along=predictor.following()) for work in works]
-    for _ in range(iterations):
+    for left in range(iterations, 0, -1):
         if moving := [work for work in works if not work.still]:
-            _iterate(predictor, moving, fixed_noise)
+            _iterate(predictor, moving, fixed_noise, last=last and left == 1)
     return [replace(work, along=None) for work in works]
 
 
@@ -189,7 +192,9 @@ def _of_one_shape(works: list[Work], data: Data) -> list[list[int]]:
     return [groups[count] for count in sorted(groups)]
 
 
-def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None:
+def _iterate(
+    predictor: Predictor, works: list[Work], fixed_noise: bool, *, last: bool = False
+) -> None:
     data = predictor.data
     B = data.time.shape[1]
     late = [delays_of(work.h, data) for work in works]
@@ -214,12 +219,12 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
             works[0].still = True
         else:  # one of them diverged: each alone
             for work in works:
-                _iterate(predictor, [work], fixed_noise)
+                _iterate(predictor, [work], fixed_noise, last=last)
         return
     white, filtered = kalman.innovations(g, d, r, track=True)
     assert filtered is not None
-    started = smoothed(data, g, np.concatenate(F, axis=1), white[..., 0])
-    if started is not None:
+    jacobian = F[0] if len(F) == 1 else np.concatenate(F, axis=1)
+    if (started := smoothed(data, g, jacobian, white[..., 0])) is not None:
         filtered[0, ..., 0] += started
     rises: dict[int, float] = {}
     for i, (work, there) in enumerate(zip(works, own, strict=True)):
@@ -229,10 +234,10 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
             before = delays.before(work.noise, entry, work.track, residual, g.weight[:, there])
         columns, error = white[:, there, :, : counts[i]], filtered[:, there, :, 0]
         fit = _scored(predictor, work, columns, g.logdet[:, there], error, before)
-        if (rise := _rises(work, fit)) > 0:
-            rises[i] = rise
-        else:
+        if (rise := _rises(work, fit)) == 0:
             work.shorten(data)
+        elif not (last and rise >= LEAST):  # no step follows; nor is it still
+            rises[i] = rise
     if not rises:
         return
     up = [works[i] for i in rises]
@@ -247,7 +252,7 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     for i, work, step in zip(rises, up, steps, strict=True):
         assert work.best is not None
         work.step = proposed(data, work.best, filtered[:, own[i], :, : counts[i]], *step)
-        work.still = work.still or (rises[i] < 1.0 and work.step.promise < NOTHING)
+        work.still = work.still or (rises[i] < LEAST and work.step.promise < NOTHING)
         work.go(data)
 
 

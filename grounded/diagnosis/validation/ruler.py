@@ -24,11 +24,11 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.likelihood.data import Data
-from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out, moved
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
+from grounded.diagnosis.validation.ahead import missed
 from grounded.diagnosis.validation.gain import Errors, Gain
 from grounded.frozen import Array
 from grounded.task import Task
@@ -41,7 +41,6 @@ WHOLE_STEPS = 4000  # of them together, where that leaves LEAST_WHOLE
 LEAST_WHOLE = 3
 FINE = 2e-3  # of a channel's spread: errors below it do not matter
 SLIGHT = 1e-2  # nor below this part of the crude model's, or of the spread where that is less
-FAR = 1e6  # a state beyond it has diverged
 ODD = 10.0  # times the error of the best repeat: a trial that misses more is none
 MOMENTS = 20  # at which repeats are compared
 ALIKE = 0.02  # of a command's spread: how much commands of repeats may differ, rms
@@ -144,15 +143,13 @@ class Ruler:
         return self._measured[id(fit)][1]
 
     def _errors(self, fit: Fitted) -> Errors:
-        data, h = self.data, fit.hypothesis
-        B, found = len(data.valid), self._none()
-        each: list[tuple[Hypothesis, Any]] = [(h, np.arange(B))]
+        data, h, found = self.data, fit.hypothesis, self._none()
+        each, of_run = [h], np.zeros(len(data.valid), int)
         if self.held_out and (h.effects or h.spread > 0):
             shifts, _ = leave_one_out(fit, self.folds)
-            groups = [np.flatnonzero(self.folds == fold) for fold in np.unique(self.folds)]
-            each = [(moved(data, h, s), own) for s, own in zip(shifts, groups, strict=True)]
-        for one, own in each:
-            self._add(found, one, fit.states, own)
+            each = [moved(data, h, shift) for shift in shifts]
+            of_run = np.unique(self.folds, return_inverse=True)[1]
+        self._add(found, each, of_run, fit.states)
         return found
 
     def _none(self) -> Errors:
@@ -162,64 +159,29 @@ class Ruler:
     def _add(
         self,
         found: Errors,
-        h: Hypothesis,
+        each: Sequence[Hypothesis],
+        of_run: Any,
         track: Array,
-        own: Any,
         added: Array | None = None,
         whole: bool = True,
     ) -> None:
-        """The errors of the runs `own`; `added` to every step within a run, (L, B, n)."""
+        """The errors of all runs, each of its hypothesis; `added` to every step within a run."""
         at, run = self.starts
-        mine = np.isin(run, own)
-        if mine.any():
-            at, run = at[mine], run[mine]
-            piece = self.piece0[run] + (at - 1) // self.steps[-1]
-            error = self._along(h, track, at, run, self.steps[-1], added)
-            for k, steps in enumerate(self.steps):
-                square = error[steps] ** 2
-                np.add.at(found.total[k], piece, np.nan_to_num(square))
-                np.add.at(found.count[k], piece, np.isfinite(square))
-        for first in np.intersect1d(self.wholes, own) if whole else ():
-            steps = int(self.data.lengths[self.data.trial_of[first]])
-            square = self._along(h, track, np.zeros(1, int), first[None], steps)[1:, 0] ** 2
-            found.total[-1, self.piece0[first]] += np.nan_to_num(square).sum(axis=0)
-            found.count[-1, self.piece0[first]] += np.isfinite(square).sum(axis=0)
-
-    def _along(
-        self,
-        h: Hypothesis,
-        track: Array,
-        at: Any,
-        run: Any,
-        steps: int,
-        added: Array | None = None,
-    ) -> Array:
-        """Y - prediction 0 to `steps` steps after the moments, (steps + 1, M, n), NaN if unseen."""
-        data, predictor = self.data, self.predictor
-        trial = data.trial_of[run]
-        step = data.step_at[run, 0] - self.step0[trial] + at
-        received, delays = predictor.received(h), delays_of(h, data)
-        oldest = 0 if delays is None else delays.oldest  # what sensors may still show
-        path = [track[np.maximum(at - j, 0), run] for j in range(oldest, -1, -1)]
-        last, advance = data.lengths[trial], predictor.stepper(h)
-        t = np.minimum(step + np.arange(steps)[:, None], last - 1)
-        sent = received[trial, t]
-        z = predictor.marched(h, path[-1], sent) if added is None else None
-        if z is not None and (np.abs(z) < FAR).all():
-            path, sent = [*path, *z[1:]], sent[:0]  # every step is made
-        for j, (u, now) in enumerate(zip(sent, t[: len(sent)] * data.dt, strict=True)):
-            x = advance(path[-1], u, now)
-            if added is not None:
-                inside = (at + j < len(added))[:, None]
-                x = x + np.where(inside, added[np.minimum(at + j, len(added) - 1), run], 0.0)
-            path.append(np.fmax(np.fmin(x, FAR), -FAR))  # what is no number is far too
-        states = np.stack(path)
-        logged = (states + predictor.offset(h, states))[oldest:]
-        ahead = step + np.arange(steps + 1)[:, None]
-        flat = self.state0[trial] + np.minimum(ahead, last)
-        error = data.model.difference(data.filled[flat], logged)
-        seen = np.isfinite(data.states[flat]) & (ahead <= last)[..., None]
-        return np.where(seen, error, np.nan)
+        piece = self.piece0[run] + (at - 1) // self.steps[-1]
+        error = missed(self.predictor, each, of_run[run], track, at, run, self.steps[-1], added)
+        for k, steps in enumerate(self.steps):
+            square = error[steps] ** 2
+            np.add.at(found.total[k], piece, np.nan_to_num(square))
+            np.add.at(found.count[k], piece, np.isfinite(square))
+        lengths = self.data.lengths[self.data.trial_of[self.wholes]]
+        for steps in np.unique(lengths) if whole else ():
+            run = self.wholes[lengths == steps]
+            error = missed(
+                self.predictor, each, of_run[run], track, np.zeros(len(run), int), run, int(steps)
+            )
+            square = error[1:] ** 2
+            found.total[-1, self.piece0[run]] += np.nan_to_num(square).sum(axis=0)
+            found.count[-1, self.piece0[run]] += np.isfinite(square).sum(axis=0)
 
     def doubt(self, fit: Fitted) -> Array:
         """Scatter of the logarithm of each rms error, the jackknife's over runs, (K, n')."""
@@ -236,9 +198,9 @@ class Ruler:
 
     def corrected(self, fit: Fitted, rate: Array) -> tuple[Gain, Errors]:
         """What a fit would gain by a rate (L, B, n) [unit/s] added along its log; its errors."""
-        B, plain, other = len(self.data.valid), self._none(), self._none()
+        plain, other, of_run = self._none(), self._none(), np.zeros(len(self.data.valid), int)
         for found, added in ((plain, None), (other, rate * self.data.dt)):
-            self._add(found, fit.hypothesis, fit.states, np.arange(B), added, whole=False)
+            self._add(found, [fit.hypothesis], of_run, fit.states, added, whole=False)
         return self.compared(plain, other), other
 
     def compared(self, before: Errors, after: Errors) -> Gain:
@@ -314,7 +276,7 @@ class Ruler:
                 moments = np.unique(np.linspace(min(1, last), last, MOMENTS).astype(int))
                 moments = np.zeros(1, int) if k == len(self.steps) else moments[moments >= 0]
                 at, run = np.tile(moments, len(runs)), np.repeat(runs, len(moments))
-                error = self._along(h, fit.states, at, run, steps)
+                error = missed(self.predictor, [h], 0 * at, fit.states, at, run, steps)
                 error = error[1:] if k == len(self.steps) else error[-1:]
                 error = error.reshape(len(error), len(runs), len(moments), -1)
                 there = np.isfinite(error).all(axis=1)
@@ -334,7 +296,8 @@ class Ruler:
         for run in runs:
             at, steps = np.arange(1, int(self.data.valid[run].sum())), self.steps[0]
             at = at[:: max(1, len(at) // MOMENTS)]
-            error = self._along(h, track, at, np.full(len(at), run), steps)[-1]
+            where = np.full(len(at), run)
+            error = missed(self.predictor, [h], 0 * at, track, at, where, steps)[-1]
             squares = error[:, self._watched] ** 2
             count = np.isfinite(squares).sum(axis=0)
             own.append(np.where(count, np.sqrt(np.nansum(squares, axis=0) / count.clip(1)), np.nan))

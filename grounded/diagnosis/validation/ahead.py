@@ -1,0 +1,90 @@
+"""Open-loop predictions from many moments of the log at once, and by how much they miss it.
+
+Each moment may have a hypothesis of its own: those of the folds differ in their numbers alone, so
+all folds step together, and a step costs little more than one fold's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from grounded.diagnosis.likelihood.delays import delays_of
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, by_row
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.frozen import Array
+
+FAR = 1e6  # a state beyond it has diverged
+
+
+def missed(
+    predictor: Predictor,
+    hypotheses: Sequence[Hypothesis],
+    which: Any,
+    track: Array,
+    at: Any,
+    run: Any,
+    steps: int,
+    added: Array | None = None,
+) -> Array:
+    """Y - prediction 0 to `steps` steps after M moments, (steps + 1, M, n), NaN if unseen.
+
+    Args:
+        predictor: the data.
+        hypotheses: of the same effects.
+        which: of them predicts from each moment, (M,) of int.
+        track: the states to begin from, (L + 1, B, n).
+        at: step within the run of each moment, (M,) of int.
+        run: its run, (M,) of int.
+        steps: how far ahead.
+        added: to every step within a run, (L, B, n).
+    """
+    data = predictor.data
+    trial = data.trial_of[run]
+    state0, step0 = (np.cumsum([0, *(data.lengths + more)])[trial] for more in (1, 0))
+    step, last = data.step_at[run, 0] - step0 + at, data.lengths[trial]
+    t = np.minimum(step + np.arange(steps)[:, None], last - 1)
+    each = [(h, np.flatnonzero(which == i)) for i, h in enumerate(hypotheses)]
+    each = [(h, own) for h, own in each if len(own)]
+    sent, begin = np.empty((*t.shape, data.model.m)), dict[int, int]()
+    for h, own in each:
+        sent[:, own] = predictor.received(h)[trial[own], t[:, own]]
+        delays = delays_of(h, data)  # what sensors may still show
+        begin[id(h)] = 0 if delays is None else delays.oldest
+    oldest = max(begin.values())
+    path = [track[np.maximum(at - j, 0), run] for j in range(oldest, -1, -1)]
+    together = by_row([h for h, _ in each], np.searchsorted(np.unique(which), which))
+    advance = predictor.stepper(together)
+    if added is None and (marched := _marched(predictor, each, path[-1], sent)) is not None:
+        path, sent = [*path, *marched[1:]], sent[:0]  # every step is made
+    for j, (u, now) in enumerate(zip(sent, t[: len(sent)] * data.dt, strict=True)):
+        x = advance(path[-1], u, now)
+        if added is not None:
+            inside = (at + j < len(added))[:, None]
+            x = x + np.where(inside, added[np.minimum(at + j, len(added) - 1), run], 0.0)
+        path.append(np.fmax(np.fmin(x, FAR), -FAR))  # what is no number is far too
+    states = np.stack(path)
+    logged = np.empty_like(states[oldest:])
+    for h, own in each:
+        since = states[oldest - begin[id(h)] :, own]
+        logged[:, own] = (since + predictor.offset(h, since))[begin[id(h)] :]
+    ahead = step + np.arange(steps + 1)[:, None]
+    flat = state0 + np.minimum(ahead, last)
+    error = data.model.difference(data.filled[flat], logged)
+    seen = np.isfinite(data.states[flat]) & (ahead <= last)[..., None]
+    return np.where(seen, error, np.nan)
+
+
+def _marched(
+    predictor: Predictor, each: Sequence[tuple[Hypothesis, Any]], x: Array, sent: Array
+) -> Array | None:
+    """States (steps + 1, M, n) of compiled steps alone; None where there is more, or one is far."""
+    found = np.empty((len(sent) + 1, *x.shape))
+    for h, own in each:
+        z = predictor.marched(h, x[own], sent[:, own])
+        if z is None or not (np.abs(z) < FAR).all():
+            return None
+        found[:, own] = z
+    return found
