@@ -3,9 +3,9 @@
 Positions and velocities are held against one another without any physics (`swapped`,
 `other_units`). Commands can't be: the log of a robot whose wheels are exchanged is as good as any,
 it only turns the other way. So the model predicts each trial as it is logged and with the log
-changed, and both times what a plain calibration can do is done (`ahead`): a model that is merely
-crude gains nothing by the change, a mistaken log gains most of what its commands do. The same tells
-two joints that are exchanged with their velocities, which agree with each other.
+changed, and both times what a plain calibration can do is done (`short_runs`): a model that is
+merely crude gains nothing by the change, a mistaken log gains most of what its commands do. The
+same tells two joints that are exchanged with their velocities, which agree with each other.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 
 from grounded.effects import places
 from grounded.frozen import Array
-from grounded.instruments.ahead import Ahead, Fit
 from grounded.instruments.finding import DEGREES
 from grounded.instruments.kinematics import integrals
 from grounded.instruments.other_units import unusable
+from grounded.instruments.short_runs import Ahead, Fit
 from grounded.model import Model
 from grounded.trial import Trial
 
