@@ -12,7 +12,7 @@ from grounded_cli.options import as_json, in_workspace, next_line, open_workspac
 from grounded_cli.terminal import field, number, progress, remark, sentence, show, show_json, table
 
 if TYPE_CHECKING:
-    from grounded_trials.workspace.ingested import Ingested
+    from grounded_trials.workspace.intake.ingested import Ingested
 
 # what a verdict means for the search
 VERDICTS = {

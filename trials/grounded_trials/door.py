@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.exporting import Exported
     from grounded_trials.workspace.fitting import Fitted
     from grounded_trials.workspace.identity import SetAside
-    from grounded_trials.workspace.ingested import Ingested
     from grounded_trials.workspace.inspecting import Inspected
+    from grounded_trials.workspace.intake.ingested import Ingested
     from grounded_trials.workspace.looping import NextRun
     from grounded_trials.workspace.proposing import Proposed, Status
     from grounded_trials.workspace.running import Ran
@@ -141,7 +141,7 @@ class Workspace(Folder):
                 outstanding one.
             data: the log ran no candidate: for fitting and diagnosis only.
         """
-        from grounded_trials.workspace.ingest import ingest_log
+        from grounded_trials.workspace.intake.ingest import ingest_log
 
         return ingest_log(self._afresh(), Path(path), candidate, data=data, ahead=True)
 

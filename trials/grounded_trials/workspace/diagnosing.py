@@ -21,7 +21,7 @@ from grounded.errors import GroundedError, NextCommand, nearest
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.identity import ROWS
-from grounded_trials.workspace.where_to_mend import where_to_mend
+from grounded_trials.workspace.intake.where_to_mend import where_to_mend
 
 if TYPE_CHECKING:
     from grounded.effects import Library

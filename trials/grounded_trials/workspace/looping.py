@@ -12,8 +12,8 @@ from grounded.result import Result
 from grounded.search.candidate import Candidate
 from grounded_trials.workspace.exporting import Exported, export_candidate
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.ingest import ingest_log
-from grounded_trials.workspace.ingested import Ingested
+from grounded_trials.workspace.intake.ingest import ingest_log
+from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.proposing import (
     Proposed,
     Status,

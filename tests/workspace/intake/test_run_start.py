@@ -14,7 +14,7 @@ from facts import holding, holds
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
-from grounded_trials.workspace import foreign, ingest
+from grounded_trials.workspace.intake import foreign, ingest
 from recorded import LOGGED, RATE, record, waiting
 from workspaces import make
 

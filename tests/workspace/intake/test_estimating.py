@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from grounded_trials.logs.signals import Series, SignalSpec
-from grounded_trials.workspace.estimating import EstimateTable, with_estimates
+from grounded_trials.workspace.intake.estimating import EstimateTable, with_estimates
 from workspaces import CONFIG, MODEL, make
 
 TABLE = EstimateTable({"x": 0.002}, {})

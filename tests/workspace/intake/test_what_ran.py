@@ -17,10 +17,10 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
-from grounded_trials.workspace.ingest import ingest_log
+from grounded_trials.workspace.intake.ingest import ingest_log
+from grounded_trials.workspace.intake.who_drove import suspicion
 from grounded_trials.workspace.proposing import propose_in, standing_in
 from grounded_trials.workspace.running import run_candidate
-from grounded_trials.workspace.who_drove import suspicion
 from workspaces import CONFIG, make
 
 NOISY = CONFIG + "[system.noise.measurement]\nx = 0.002\nv = 0.01\n"

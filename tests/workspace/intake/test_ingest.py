@@ -14,7 +14,7 @@ from grounded.errors import GroundedError
 from grounded.trial import Trial
 from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.ingest import ingest_log
+from grounded_trials.workspace.intake.ingest import ingest_log
 from grounded_trials.workspace.proposing import propose_in, standing_in
 from grounded_trials.workspace.running import run_candidate
 from workspaces import CONFIG, make

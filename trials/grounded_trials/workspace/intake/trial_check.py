@@ -17,7 +17,7 @@ from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
 from grounded_trials.wording import count, with_unit
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.who_drove import UNLIKE, follows, latest, second_differences
+from grounded_trials.workspace.intake.who_drove import UNLIKE, follows, latest, second_differences
 
 FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth a warning,
 SURE = 3.0  # if it is so many standard deviations of the sensor's noise off, too

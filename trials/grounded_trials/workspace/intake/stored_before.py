@@ -19,8 +19,8 @@ from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.resample import ABSOLUTE_S
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.foreign import ForeignLog
 from grounded_trials.workspace.identity import StoredTrial, sha256
+from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.proposing import standing_in
 
 EDGE = 2  # last rows of a cut log, which its end may have changed

@@ -14,7 +14,7 @@ from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.config import read_config
 from grounded_trials.workspace.diagnosing import instruments_in
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.ingest import ingest_log
+from grounded_trials.workspace.intake.ingest import ingest_log
 from workspaces import make
 
 LOG = """

@@ -12,7 +12,7 @@ from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.where_to_mend import where_to_mend
+from grounded_trials.workspace.intake.where_to_mend import where_to_mend
 from workspaces import CONFIG, make
 
 NARROW = CONFIG.replace("force = [-5.0, 5.0]", "force = [0.0, 1.17]")

@@ -28,7 +28,7 @@ from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.logs.command_steps import changes_of, phase_of
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
-from grounded_trials.workspace.who_drove import (
+from grounded_trials.workspace.intake.who_drove import (
     FINE,
     LEAST,
     NEARLY,

@@ -11,10 +11,10 @@ import pytest
 
 from grounded.trial import Trial
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.ingest import ingest_log
+from grounded_trials.workspace.intake.ingest import ingest_log
+from grounded_trials.workspace.intake.who_drove import evidence, follows, suspicion
 from grounded_trials.workspace.proposing import propose_in
 from grounded_trials.workspace.running import run_candidate
-from grounded_trials.workspace.who_drove import evidence, follows, suspicion
 from workspaces import CONFIG, make
 
 FULL = CONFIG.replace("[search]", '[search]\nstep = "full"\nrerun_incumbent = false')

@@ -27,13 +27,10 @@ from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL
 from grounded_trials.store.store import DIGITS
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.foreign import ForeignLog, begun, mapping_of, read_foreign
 from grounded_trials.workspace.identity import READ_BY, ROWS, sha256
-from grounded_trials.workspace.ingested import Ingested
-from grounded_trials.workspace.next_step import after_log
-from grounded_trials.workspace.off_target import off_target_of
-from grounded_trials.workspace.proposing import candidate_named, latest_candidates, standing_in
-from grounded_trials.workspace.run_start import (
+from grounded_trials.workspace.intake.foreign import ForeignLog, begun, mapping_of, read_foreign
+from grounded_trials.workspace.intake.ingested import Ingested
+from grounded_trials.workspace.intake.run_start import (
     LOOSE,
     elsewhere,
     loosely,
@@ -41,15 +38,18 @@ from grounded_trials.workspace.run_start import (
     rival_in,
     unit_of,
 )
-from grounded_trials.workspace.stored_before import (
+from grounded_trials.workspace.intake.stored_before import (
     as_stored,
     refuse_as_another,
     repeated,
     same_recording,
     what_repeats,
 )
-from grounded_trials.workspace.trial_check import warnings_about
-from grounded_trials.workspace.who_drove import OTHERS, other_units, suspicion, units_told
+from grounded_trials.workspace.intake.trial_check import warnings_about
+from grounded_trials.workspace.intake.who_drove import OTHERS, other_units, suspicion, units_told
+from grounded_trials.workspace.next_step import after_log
+from grounded_trials.workspace.off_target import off_target_of
+from grounded_trials.workspace.proposing import candidate_named, latest_candidates, standing_in
 
 
 @dataclass(frozen=True, eq=False)

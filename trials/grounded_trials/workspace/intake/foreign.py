@@ -21,15 +21,15 @@ from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
 from grounded_trials.store.store import hash_file
 from grounded_trials.workspace.config import FILE
-from grounded_trials.workspace.estimating import (
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import StoredTrial, sha256
+from grounded_trials.workspace.intake.estimating import (
     EstimateTable,
     read_estimate,
     with_estimates,
 )
-from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import StoredTrial, sha256
-from grounded_trials.workspace.run_start import Recording, recording
-from grounded_trials.workspace.where_to_mend import read_by
+from grounded_trials.workspace.intake.run_start import Recording, recording
+from grounded_trials.workspace.intake.where_to_mend import read_by
 
 
 @dataclass(frozen=True, eq=False)
