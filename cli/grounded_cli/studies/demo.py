@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.proposing import Status
 
 
-STEPS = 6000  # of all trials together: a demo is to end within a minute or two
+STEPS = 1600  # of all trials that are diagnosed: a demo is to end within a minute or two
 
 
 @click.command("demo")
@@ -77,10 +77,16 @@ def command(name: str, folder: str | None, json_: bool) -> None:
 
 
 def _few(workspace: Workspace, status: Status) -> list[str]:
-    """The trials to diagnose: of long ones the model's own policy and the best, [] for all."""
-    tried = [one for one in (*status.standing.history[:1], status.standing.incumbent) if one]
-    long = workspace.task.horizon * status.standing.trials > STEPS
-    return list(dict.fromkeys(one.trials[0].id for one in tried if one.trials)) if long else []
+    """The trials to diagnose: the model's own policy, the best, then the earliest; [] for all.
+
+    The later ones hardly differ from the best, and the demo's user waits.
+    """
+    standing, most = status.standing, max(STEPS // workspace.task.horizon, 2)
+    best = standing.incumbent
+    tried = [trial for one in standing.history for trial in one.trials[:1]]
+    repeats = [*best.trials] if best else []  # they tell how far runs scatter
+    chosen = list(dict.fromkeys(one.id for one in (*tried[:1], *repeats, *tried)))
+    return chosen[:most] if standing.trials > most else []
 
 
 def _tell(document: dict[str, Any], verdict: list[str]) -> None:
