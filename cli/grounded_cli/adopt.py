@@ -64,10 +64,10 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
     for name, value in done.params.items():
         text = with_unit(f"{number(before[name].value)} -> {number(value)}", before[name].unit)
         show(field(name, text, "  "))
-    for name, value in done.left.items():
-        kept, unit = before[name], before[name].unit
-        text = f"{name} stays at {with_unit(number(kept.value), unit)}: these trials do not tell it"
-        remark("note", f"{text}. The effects were fitted beside {with_unit(number(value), unit)}")
+    for one in done.left.values():
+        kept, beside = (with_unit(number(value), one.unit) for value in (one.kept, one.value))
+        text = f"{one.called} stays at {kept}: these trials do not tell it"
+        remark("note", f"{text}. The effects were fitted beside {beside}")
     if done.left:
         remark("note", REMEASURE)
     show(f"\n{next_line(done.then)}")

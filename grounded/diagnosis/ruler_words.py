@@ -15,6 +15,7 @@ NAMED = 3  # channels that a sentence names at most
 MATTERS = 0.05  # of the crude model's error: a rest below it is told as its share
 HALF, MORE = 0.5, 0.2  # of the error that is gone: less a second ahead, so much more by the end
 SHOWS = 0.1  # of the error: a channel that improves by less is not named
+COUNTS = 0.03  # likewise, where nothing else in the same row gains as much
 
 
 def improvement(rows: Sequence[RulerRow]) -> str:
@@ -69,7 +70,7 @@ def _ahead(row: RulerRow) -> str:
 def worsened(rows: Sequence[RulerRow]) -> str:
     """What predictions lose in the channel that loses most, "" where none loses over SHOWS."""
     ratio, row, name = _lost_most(rows)
-    if row is None or not ratio > 1 + SHOWS:
+    if row is None or not (ratio > 1 + SHOWS or outweighed(rows)):
         return ""
     now, then = (_measured(row, name, errors[name]) for errors in (row.with_effects, row.crude))
     text = f"{_ahead(row)} miss {name} by {now} instead of {then}: that is worse"
@@ -79,7 +80,7 @@ def worsened(rows: Sequence[RulerRow]) -> str:
 def outweighed(rows: Sequence[RulerRow]) -> bool:
     """Whether those predictions lose more in what gets worse than they gain in other states."""
     ratio, row, _ = _lost_most(rows)
-    if row is None or not ratio > 1 + SHOWS:
+    if row is None or not ratio > 1 + COUNTS:
         return False
     told = [n for n, e in row.crude.items() if e > 0 and row.tells(n, "crude", "with_effects")]
     ends = [(row.with_effects[n], row.crude[n], row.noise_floor.get(n, 0.0)) for n in told]

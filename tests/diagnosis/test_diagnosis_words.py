@@ -115,7 +115,11 @@ def test_a_slow_plant_is_spoken_of_by_whole_trials():
 
 def test_nothing_is_said_where_nothing_lost_or_only_within_the_noise():
     assert worsened(()) == ""
-    assert worsened((row({"x": 0.2}, {"x": 0.21}),)) == ""
+    assert worsened((row({"x": 0.2}, {"x": 0.205}),)) == ""
+    slight = row({"x": 0.2, "v": 0.5}, {"x": 0.21, "v": 0.5})  # nothing gains as much
+    assert outweighed((slight,)) and worsened((slight,)).endswith("that is worse.")
+    paid = row({"x": 0.2, "v": 0.5}, {"x": 0.21, "v": 0.4})
+    assert not outweighed((paid,)) and worsened((paid,)) == ""
     assert worsened((row({"x": 0.02}, {"x": 0.04}, {"x": 0.05}),)) == ""
     assert worsened((row({"x": 0.02, "v": 0.1}, {"x": math.nan, "v": 0.1}),)) == ""
 

@@ -71,6 +71,26 @@ def test_a_parameter_that_stays_behind_is_told_and_no_gain_is_claimed(cart, tmp_
     assert not adopted["gained"] and "instead of 25 cm" not in words(folder, "status")
 
 
+def test_a_number_of_an_adopted_effect_that_stays_behind_is_told_by_its_effect(cart, tmp_path):
+    """A KeyError, with grounded.toml written: it was looked for among the model's parameters."""
+    adopted = {"name": "quadratic_drag:v", "k": 0.2}
+    name = "quadratic_drag_v_k"
+    folder = written(
+        copied(cart, tmp_path / "w"),
+        diagnosed=MADE | {"adopted": [adopted], "nominal": {"mass": 1.0, name: 0.2}},
+        parameters={name: {"value": 0.5, "std": 0.1, "unit": "1/m"}},
+        identifiable=[{"parameter": name, "verdict": "not identifiable"}],
+    )
+    done = grounded("-C", folder, "adopt", "viscous_friction:v")
+    assert done.code == 0
+    assert holds(
+        " ".join(done.err.split()), "k of quadratic_drag:v stays at 0.2000 1/m", "0.5000 1/m"
+    )
+    assert grounded("-C", folder, "adopt", "--undo").code == 0
+    again = grounded("-C", folder, "adopt", "viscous_friction:v", "--json")
+    assert again.code == 0 and again.json["left"] == {name: 0.5}
+
+
 def test_a_gain_that_nobody_measured_is_not_claimed(cart, tmp_path):
     folder = written(copied(cart, tmp_path / "w"))
     assert grounded("-C", folder, "adopt", "viscous_friction:v", "--effect-only").code == 0

@@ -4,6 +4,7 @@ A cart with feedback and noisy sensors is recorded at 100 Hz; whoever records be
 Sought by the feed-forward alone, and only for what fitted nobody, starts were missed.
 """
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -74,6 +75,32 @@ def test_an_aborted_run_crashed_with_a_lead_in_too(w, tmp_path, until):
     found = w.ingest(record(w, tmp_path / "a.csv", policy, 1.0, until=until))
     assert (found.candidate, found.verdict) == ("c0002", "crashed")
     assert abs(w.trials()[-1].trial.steps - until / policy.dt) <= 1
+
+
+@pytest.mark.parametrize("until", [1.0, 1.5])
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_run_that_was_cut_is_found_behind_a_hold_controller_too(w, tmp_path, until, stopped):
+    """A robot that is held upright before its run moves: somebody took over at 0.4 s, it said."""
+    policy = w.candidate("c0002")[0].policy
+    path = record(w, tmp_path / "a.csv", policy, 1.0, until=until)
+    head, rows = path.read_text().splitlines()[0], np.loadtxt(path, delimiter=",", skiprows=1)
+    t = np.arange(RATE) / RATE
+    rows[:RATE, 1:3] += 0.02 * np.stack([np.sin(30 * t), np.cos(30 * t)], axis=1)
+    rows[:RATE, 3] = -0.5 * rows[:RATE, 1] - 0.3 * rows[:RATE, 2]
+    if stopped:  # by a switch, and the log goes on
+        still = np.repeat(rows[-1:], 2 * RATE, axis=0)
+        still[:, 0] += (1 + np.arange(2 * RATE)) / RATE
+        still[:, 3] = 0.0
+        rows = np.concatenate([rows, still])
+    np.savetxt(path, rows, delimiter=",", header=head, comments="", fmt="%.6f")
+    found = w.ingest(path, candidate="c0002" if stopped else None)
+    (note,) = [one for one in found.notes if "begins" in one]
+    assert found.candidate == "c0002"
+    assert abs(float(re.search(r"begins ([0-9.]+) s", note)[1]) - 1.0) < 1.5 / RATE
+    assert stopped or found.verdict == "crashed"
+    taken = [one for one in found.warnings if "took over" in one]
+    assert bool(taken) == (stopped and until == 1.0)  # later, the policy rests as well
+    assert all("up to 1." in one for one in taken)
 
 
 def test_a_log_that_ends_a_row_early_says_by_how_much_and_what_that_costs(w, tmp_path):

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from grounded.diagnosis.report import Diagnosis, Estimate
+from grounded.diagnosis.report import Diagnosis, Estimate, Made
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.result import Result, percent
 from grounded.search.planner import Planner
@@ -28,6 +28,16 @@ KEPT = "adoptions.json"  # in reports/
 SLIGHT = 1e-3  # of a parameter: no move at all
 
 
+@dataclass(frozen=True)
+class Left:
+    """A number that moved beside the effects and is not adopted with them."""
+
+    called: str  # `m`, or `k of coupling:w<-th`
+    kept: float  # what it stays at
+    value: float  # beside what the effects were fitted
+    unit: str
+
+
 @dataclass(frozen=True, repr=False)
 class Adopted(Result):
     """What the model has now."""
@@ -37,7 +47,7 @@ class Adopted(Result):
     claimed: bool  # the diagnosis claims the new ones; else one was taken by itself
     then: NextCommand = PROPOSE
     beside: tuple[str, ...] = ()  # adopted before from the same diagnosis, fitted in their place
-    left: Mapping[str, float] = field(default_factory=dict)  # beside what the effects were fitted
+    left: Mapping[str, Left] = field(default_factory=dict)  # by name
 
     def summary(self) -> str:
         """The effects that the model has now."""
@@ -51,7 +61,7 @@ class Adopted(Result):
             "params": dict(self.params),
             "claimed": self.claimed,
             "beside": list(self.beside),
-            "left": dict(self.left),
+            "left": {name: one.value for name, one in self.left.items()},
         }
 
 
@@ -117,17 +127,24 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     )
 
 
-def left_behind(found: Diagnosis) -> dict[str, float]:
-    """The values of parameters that moved beside the effects and are not adopted with them.
+def left_behind(found: Diagnosis) -> dict[str, Left]:
+    """The numbers, of parameters and adopted effects, that moved and are not adopted.
 
     The trials do not tell them apart from others; what the diagnosis measured had them all.
     """
-    nominal = {} if found.made is None else found.made.nominal
+    from grounded.effects.wrap import param_name
+
+    made = found.made or Made()
+    called = {
+        param_name(effect, key): f"{key} of {effect}"
+        for effect, values in made.effects.items()
+        for key in values
+    }
     return {
-        name: estimate.value
-        for name, estimate in found.parameters.items()
-        if name not in found.known_parameters and name in nominal
-        if abs(estimate.value - nominal[name]) > SLIGHT * max(abs(nominal[name]), estimate.std)
+        name: Left(called.get(name, name), old, e.value, e.unit)
+        for name, e in found.parameters.items()
+        if name not in found.known_parameters and (old := made.nominal.get(name)) is not None
+        if abs(e.value - old) > SLIGHT * max(abs(old), e.std)
     }
 
 

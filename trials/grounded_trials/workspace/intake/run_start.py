@@ -14,8 +14,9 @@ sent answers to where the robot was then.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +49,7 @@ KNOWN = 0.25  # of a row: the standard deviation from which feedback tells when 
 EXACT = 0.1  # of what a row's lateness does to commands: with less, the states were the policy's
 LOOSE = 0.1  # of a step: a start that is known no better is told
 PACES = (2.0, 0.5)  # of a recording that was played twice as fast, or half
+EXACTLY = 0.02  # of an input's size: the mean difference of a run that is sought by how it begins
 BATCH = 256  # instants compared at once
 
 # the samples of a log, with those of the states that nothing measures: estimated from the others
@@ -108,8 +110,15 @@ class Recording:
         """
         if (policy.state_names, policy.input_names) != self.names or policy.dt != self.dt:
             return None
-        apart, found = self._apart(policy), list[Start]()
-        left = apart.copy()
+        whole = self._starts(policy, self._apart(policy))
+        if any(one.alike for one in whole):
+            return min(whole, key=lambda one: (not one.alike, one.apart))
+        begun = [one for one in self._starts(policy, self._until(policy)) if one.opens_alike]
+        return min(begun or whole, key=lambda one: (not one.alike, one.apart), default=None)
+
+    def _starts(self, policy: Policy, apart: Array) -> list[Start]:
+        """The likeliest places, by how little differs from each instant on."""
+        found, left = list[Start](), apart.copy()
         while len(found) < TRIED and np.isfinite(left).any():
             k = int(np.argmin(left))
             left[max(0, k - self.parts) : k + self.parts + 1] = np.inf
@@ -122,7 +131,7 @@ class Recording:
                 opens = alike or fit.until_s >= LEAST * self.dt
                 between = seconds < on_step
                 found.append(Start(seconds, float(apart[k]), alike, opens, between, loose))
-        return min(found, key=lambda one: (not one.alike, one.apart), default=None)
+        return found
 
     def apart_at(self, policy: Policy, start: float) -> float:
         """The mean difference of the commands from an instant on, as `Start.apart`."""
@@ -175,21 +184,52 @@ class Recording:
 
     def _apart(self, policy: Policy, instants: range | None = None) -> Array:
         """The mean difference of the commands at every instant, infinite where none can be."""
-        states, sent, parts, H = self.whole.states, self.whole.inputs, self.parts, policy.horizon
+        sent, parts, H = self.whole.inputs, self.parts, policy.horizon
         sent = np.clip(sent, policy.low, policy.high)
-        width = policy.high - policy.low
-        size = np.maximum(np.abs(sent).max(axis=0), np.abs(policy.feedforward).max(axis=0))
-        size = size + np.where(np.isfinite(width), 0.1 * width, 1e-12)
         changed = np.any(np.diff(sent, axis=0, prepend=sent[:1]) != 0, axis=1)
         count, quiet = np.cumsum(changed), round(QUIET_S / self.dt * parts)
         apart = np.full(len(sent), np.inf)
         wanted = []
         for k in range(len(sent)) if instants is None else instants:
-            left = (len(sent) - k - parts // 2 - 1) // parts + 1
+            left = self._left(k)
             ran = left >= H - LAST
             begun = count[max(k - 1, 0)] == count[max(k - 1 - quiet, 0)]
             if ran or (begun and left >= max(LEAST, H // SHORT)):
                 wanted.append(k)
+        for ks, off, known in self._off(policy, wanted):
+            apart[ks] = (off * known).sum(axis=1) / known.sum(axis=1)
+        return apart
+
+    def _until(self, policy: Policy) -> Array:
+        """Of every instant from which commands are the policy's for a while, the rest of the run.
+
+        A run that was cut, or stopped, in a log in which something moved before it.
+        """
+        H, apart = policy.horizon, np.full(len(self.whole.inputs), np.inf)
+        least = max(LEAST, H // SHORT)
+        wanted = [k for k in range(len(apart)) if self._left(k) >= least]
+        steps = np.arange(1, H + 1)
+        for ks, off, known in self._off(policy, wanted):
+            mean = np.where(known, np.cumsum(off, axis=1) / steps, np.inf)
+            until = np.where(mean < EXACTLY, steps, 0).max(axis=1)
+            at = mean[np.arange(len(ks)), np.maximum(until - 1, 0)]
+            left = (
+                1 - until / H + 0.1 * at / EXACTLY
+            )  # a step more is no better, for more difference
+            apart[ks] = np.where(until >= least, left, np.inf)
+        return apart
+
+    def _left(self, k: int) -> int:
+        """Steps that the log has from an instant on."""
+        return (len(self.whole.inputs) - k - self.parts // 2 - 1) // self.parts + 1
+
+    def _off(self, policy: Policy, wanted: Sequence[int]) -> Iterator[tuple[Any, Any, Any]]:
+        """Differences of the commands (K, H), of instants (K,), and whether they are known."""
+        states, sent, parts, H = self.whole.states, self.whole.inputs, self.parts, policy.horizon
+        sent = np.clip(sent, policy.low, policy.high)
+        width = policy.high - policy.low
+        size = np.maximum(np.abs(sent).max(axis=0), np.abs(policy.feedforward).max(axis=0))
+        size = size + np.where(np.isfinite(width), 0.1 * width, 1e-12)
         steps = parts * np.arange(H)
         for at in range(0, len(wanted), BATCH):
             ks = np.array(wanted[at : at + BATCH])
@@ -197,9 +237,7 @@ class Recording:
             here = ks[:, None] + steps + parts // 2
             u = sent[np.minimum(here, len(sent) - 1)]
             off = (np.abs(policy.commands(x, policy.past) - u) / size).mean(axis=2)
-            known = here < len(sent)
-            apart[ks] = (off * known).sum(axis=1) / known.sum(axis=1)
-        return apart
+            yield ks, off, here < len(sent)
 
 
 def _close(policy: Policy, trial: Trial) -> bool:

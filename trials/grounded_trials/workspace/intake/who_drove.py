@@ -91,7 +91,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
     noise = _noise_sent(policy, trial.states[:T], free[0])  # between samples there is less
     room = np.maximum(UNLIKE * unrelated, (0.02 * size) ** 2 + 4 * noise[: len(off)])
-    parts = np.array_split(np.arange(len(off)), min(WINDOWS, len(off) // LEAST))
+    parts = np.array_split(np.arange(len(off)), max(1, min(WINDOWS, len(off) // LEAST)))
     bad = [bool((off[k].mean(axis=0) > 2 * room[k].mean(axis=0)).any()) for k in parts]
     drawn_out = np.array([max(1.0, _steps_alike(column) / ROUGH) for column in (sent - asked).T])
     share = off.mean(axis=0) / room.mean(axis=0) * drawn_out
