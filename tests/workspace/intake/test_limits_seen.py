@@ -103,3 +103,19 @@ def test_a_first_plan_that_its_limits_keep_from_the_target_says_so(tmp_path, lim
     told = [one for one in notes if "at its limit" in one]
     assert len(told) == said
     assert all(holds(one, "force", "0.3 N", "x", "[limits]") for one in told)
+
+
+@pytest.mark.parametrize(("most", "said"), [(40.0, True), (0.9, False), (400.0, False)])
+def test_an_angle_far_beyond_safety_that_degrees_would_explain_is_told(tmp_path, most, said):
+    """An encoder in degrees without a rate sensor: nothing else in the log contradicts it."""
+    w = make(tmp_path / "w", "pendulum")
+    config = w.folder / "grounded.toml"
+    config.write_text(config.read_text() + "\n[safety]\ntheta = [-1.0, 1.0]\n")
+    w = Workspace(w.folder)
+    names = w.task.model.state_names, w.task.model.input_names
+    theta = most * np.sin(2 * T)
+    states = np.column_stack([theta, np.full(len(T), np.nan)])
+    trial = Trial(states, np.sin(T[:-1])[:, None], w.task.dt, *names)
+    write_trial(tmp_path / "d.mcap", trial, {"kind": "data"})
+    found = [one for one in w.ingest(tmp_path / "d.mcap", data=True).warnings if "degrees" in one]
+    assert len(found) == said and all("[log.state.theta] scale = 0.01745329" in one for one in found)

@@ -159,7 +159,9 @@ def tidy(name: str, series: Series, *, unwrap: bool) -> Samples:
             name,
             spec,
             f"its {spec.clock} clock jumps back by {-back[k] * 1e-9:.3f} s after sample {k}; it "
-            'was set, or a simulation began again: cut the log there, or use clock = "log"',
+            "was set, ran over, or a simulation began again: cut the log there"
+            + ', or use clock = "log"'
+            * (spec.clock != "log"),
         )
     order = np.argsort(t, kind="stable")
     t, y = t[order], y[order]

@@ -23,6 +23,7 @@ FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth
 SURE = 3.0  # if it is so many standard deviations of the sensor's noise off, too
 LATEST = 3  # steps by which inputs may be logged late, and are told so
 WHITE = 0.6745 * 6**0.5  # the median of its second differences, in its standard deviations
+TURNS, WIDER = 5.0, 2.0  # of [safety]: beyond it in radians, about inside it in degrees
 WIDEN = "no plan will ask for that; widen them if the robot may get it"
 
 
@@ -65,6 +66,7 @@ def warnings_about(
         "sensor on?"
         for one in dead_rates(model, whole, relations)
     ]
+    found += _in_degrees(task, whole)
     sent, scaled = _mistaken(model, whole)
     found += sent
     if not trial.candidate:
@@ -184,6 +186,24 @@ def _inputs(task: Task, trial: Trial) -> list[str]:
         for i, name in enumerate(trial.input_names)
         if excess[i] > 1e-6
     ]
+
+
+def _in_degrees(task: Task, trial: Trial) -> list[str]:
+    """Angles far beyond [safety] that would be inside, were they degrees."""
+    assert task.safety_low is not None and task.safety_high is not None
+    found = []
+    for i, (name, unit) in enumerate(task.model.states.items()):
+        x, low, high = trial.states[:, i], task.safety_low[i], task.safety_high[i]
+        most = float(np.abs(x[np.isfinite(x)]).max(initial=0.0))
+        allowed = max(abs(low), abs(high))
+        inside = np.deg2rad(most) <= WIDER * allowed
+        if unit == "rad" and np.isfinite(allowed) and most > TURNS * allowed and inside:
+            found.append(
+                f"{name} goes to {most:.3g} rad, [safety] is [{low:g}, {high:g}]: in degrees? "
+                f"[log.state.{name}] scale = {np.pi / 180:.8g} would make it "
+                f"{np.deg2rad(most):.3g} rad"
+            )
+    return found
 
 
 def _mistaken(model: Model, trial: Trial) -> tuple[list[str], tuple[str, ...]]:
