@@ -32,6 +32,7 @@ from grounded.diagnosis.error_report import (
     RulerRow,
     UtilityPrediction,
     Where,
+    furthest,
 )
 from grounded.diagnosis.hypotheses.attribution import attribute, grown, so_far
 from grounded.diagnosis.hypotheses.correction import correction
@@ -330,7 +331,7 @@ class _Writer:
         """Each state's part of the gap, with the ruler's errors a second ahead."""
         excess = np.maximum(gain.sum(axis=(0, 1)), 0.0)
         share = excess / max(float(excess.sum()), 1e-12)
-        ahead = [row for row in rows if not row.whole_trial][-1]
+        ahead = furthest(rows) or rows[0]
         found = [
             ChannelShare(
                 name,

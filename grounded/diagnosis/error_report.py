@@ -158,6 +158,8 @@ class RulerRow(Document):
         repeated, and what one step leaves isn't white, so part of it is the model's error.
     runs_away: by column ("crude" ...), the channels whose prediction leaves all that was measured
         far behind, as open-loop ones of an unstable plant do: how far says nothing.
+    drowned: noise alone takes a state beyond all that was measured of it by then: of no channel is
+        anything to be told so far ahead, open loop.
     """
 
     horizon_s: float
@@ -172,10 +174,17 @@ class RulerRow(Document):
     floor_at_most: bool = False
     outset: Mapping[str, float] = field(metadata=BRIEF, default_factory=dict)
     runs_away: Mapping[str, tuple[str, ...]] = field(metadata=BRIEF, default_factory=dict)
+    drowned: bool = field(metadata=BRIEF, default=False)
 
     def tells(self, name: str, *columns: str) -> bool:
         """Whether the errors of a channel in these columns mean something: none runs away."""
         return not any(name in self.runs_away.get(column, ()) for column in columns)
+
+
+def furthest(rows: Sequence[RulerRow]) -> RulerRow | None:
+    """The longest horizon at which noise leaves something to be told, or else the shortest."""
+    ahead = [row for row in rows if not row.whole_trial]
+    return next((row for row in reversed(ahead) if not row.drowned), ahead[0] if ahead else None)
 
 
 def runaway(rows: Sequence[RulerRow]) -> str:

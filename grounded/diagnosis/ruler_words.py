@@ -6,7 +6,14 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.error_report import ABOVE, RulerRow, measured, noise_of, number
+from grounded.diagnosis.error_report import (
+    ABOVE,
+    RulerRow,
+    furthest,
+    measured,
+    noise_of,
+    number,
+)
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Agreement
@@ -43,7 +50,7 @@ def telling(rows: Sequence[RulerRow]) -> RulerRow | None:
 
     A second ahead, what heats up over an hour misses little whatever the model lacks.
     """
-    ahead = next((row for row in reversed(rows) if not row.whole_trial), None)
+    ahead = furthest(rows)
     whole = next((row for row in rows if row.whole_trial), None)
     if ahead and whole and _most(ahead) < HALF and _most(whole) > _most(ahead) + MORE:
         return whole
@@ -94,6 +101,7 @@ def _lost_most(rows: Sequence[RulerRow]) -> tuple[float, RulerRow | None, str]:
     losses = [
         (row.with_effects[name] / max(error, row.noise_floor.get(name, 0.0)), row, name)
         for row in rows
+        if not row.drowned
         for name, error in row.crude.items()
         if error > 0 and math.isfinite(row.with_effects[name]) and row.tells(name, "crude")
     ]
@@ -130,7 +138,7 @@ def most_off(row: RulerRow) -> str:
 
 def open_noise(rows: Sequence[RulerRow]) -> str:
     """The state whose error may be noise or not, for want of repeats; "" where that is known."""
-    row = next((r for r in reversed(rows) if not r.whole_trial and r.floor_at_most), None)
+    row = furthest([row for row in rows if row.floor_at_most])
     return "" if row is None or rest(rows) else most_off(row)
 
 
@@ -143,6 +151,7 @@ def rest(rows: Sequence[RulerRow]) -> str:
             (name, _when(row)),
         )
         for row in rows
+        if not row.drowned
         for name, noise in row.noise_floor.items()
         if noise > 0 and math.isfinite(row.with_effects[name]) and row.tells(name, "with_effects")
     ]

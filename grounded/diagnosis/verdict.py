@@ -11,6 +11,7 @@ from grounded.diagnosis.error_report import (
     Credit,
     Remainder,
     RulerRow,
+    furthest,
     number,
     runaway,
 )
@@ -58,7 +59,7 @@ def verdict(
     left = remainder[0].sentence() if remainder else ""
     left += f"; {len(remainder) - 1} more" if len(remainder) > 1 else ""
     claimed = [row for row in ranking if row.claimed]
-    row = next((r for r in reversed(rows) if not r.whole_trial), None)
+    row = furthest(rows)
     if claims.known.no_cause:
         return _said("unknown", f"No cause is named: {claims.known.sentences[0]}.")
     if not claimed:

@@ -8,7 +8,7 @@ import numpy as np
 
 from facts import holds
 from grounded import Trial
-from grounded.diagnosis.error_report import Credit, Region, Remainder, RulerRow, runaway
+from grounded.diagnosis.error_report import Credit, Region, Remainder, RulerRow, furthest, runaway
 from grounded.diagnosis.report import Agreement, Estimate, Ranked, Unconfirmed
 from grounded.diagnosis.ruler_words import (
     contested,
@@ -48,6 +48,13 @@ def test_what_got_worse_is_said_of_the_channel_that_lost_most():
     assert "0.60 m/s" in worsened((short,))
     assert outweighed((short, whole)) and not outweighed((short,))
     assert said.endswith("that is worse.") and not worsened((short,)).endswith("that is worse.")
+
+
+def test_where_noise_alone_leaves_all_that_was_measured_nothing_is_told_of_a_horizon():
+    short = row({"x": 0.2, "v": 0.5}, {"x": 0.1, "v": 0.5}, horizon_s=0.5)
+    far = row({"x": 2.0, "v": 5.0}, {"x": 1.9, "v": 9.0}, horizon_s=1.0, drowned=True)
+    assert furthest((short, far)) is short and furthest((far,)) is far and furthest(()) is None
+    assert "0.5 s ahead" in improvement((short, far)) and worsened((short, far)) == ""
 
 
 def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt():

@@ -145,10 +145,19 @@ class Measured:
                     floor_from=self.source,
                     floor_at_most=self.at_most,
                     runs_away={key: names for key, names in away.items() if names},
+                    drowned=bool(self.drowned[k]),
                     **found,
                 )
             )
         return tuple(rows)
+
+    @property
+    def drowned(self) -> Any:
+        """Where noise alone takes a state beyond all that was measured of it, (K,), by horizon."""
+        reach = np.array(list(self.reach.values()))
+        lost = np.any((self.floor > reach) & (reach > 0), axis=1)
+        lost[-1] = False  # of whole trials there is no floor but that of repeats
+        return lost
 
     @property
     def reach(self) -> dict[str, float]:
@@ -183,9 +192,10 @@ class Measured:
 
     def remainders(self) -> tuple[Remainder, ...]:
         """What is left above the floor, and what a flexible model finds that would show there."""
-        k, data, ruler = len(self.ruler.steps) - 1, self.data, self.ruler
+        data, ruler = self.data, self.ruler
+        k = int(np.flatnonzero(~self.drowned[:-1]).max(initial=0))
         now, fine = self.rms(self.best), ruler.fine[ruler.shown]
-        short = slice(0, len(ruler.steps))
+        short = slice(0, k + 1)
         doubt = np.minimum(2 * ruler.doubt(self.best), np.log(FAR))
         least = np.maximum(np.log(ABOVE), doubt)
         above = (np.log(now / self.floor) > least) & (now > 2 * fine)

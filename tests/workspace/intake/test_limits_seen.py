@@ -118,4 +118,5 @@ def test_an_angle_far_beyond_safety_that_degrees_would_explain_is_told(tmp_path,
     trial = Trial(states, np.sin(T[:-1])[:, None], w.task.dt, *names)
     write_trial(tmp_path / "d.mcap", trial, {"kind": "data"})
     found = [one for one in w.ingest(tmp_path / "d.mcap", data=True).warnings if "degrees" in one]
-    assert len(found) == said and all("[log.state.theta] scale = 0.01745329" in one for one in found)
+    assert len(found) == said
+    assert all("[log.state.theta] scale = 0.01745329" in one for one in found)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 
-from grounded.diagnosis.error_report import Gap, RulerRow
+from grounded.diagnosis.error_report import Gap, RulerRow, furthest
 from grounded.diagnosis.report import Correction, Diagnosis, Estimate
 from grounded.instruments.finding import Finding
 from grounded_trials.wording import changed, count, figure, percent, ranges, shown, with_unit
@@ -55,7 +55,7 @@ Cells = tuple[str, ...]
 
 def error_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
     """(rows, header): held-out prediction errors a second ahead and over whole trials, in units."""
-    ahead = [row for row in diagnosis.prediction_error if not row.whole_trial][-1:]
+    ahead = [row for row in [furthest(diagnosis.prediction_error)] if row]
     whole = [row for row in diagnosis.prediction_error if row.whole_trial]
     columns = {
         "outset": "model.py",
