@@ -160,7 +160,7 @@ def test_open_loop_predictions_of_an_unstable_plant_run_away():
 
 
 def test_a_horizon_at_which_noise_fills_all_that_was_measured_shows_no_gap():
-    """A robot that balances, with its true model: `a gap remains`, of the way it rolls in 1 s."""
+    """A robot that balances, with its true model: a second ahead it may as well have fallen."""
     true = Model(
         name="balancing",
         states={"x": "m", "v": "m/s", "a": "rad", "w": "rad/s"},
