@@ -315,13 +315,12 @@ def smooth(filtered: Filtered) -> Smoothed:
     assert P is not None
     assert back.whole is not None
     x, after = filtered.x_prior + (P @ back.r[..., None])[..., 0], P - P @ back.whole @ P
-    unseen = ~g.measured.any(axis=(0, 1, 2))
+    unseen = np.asarray(~g.measured.any(axis=(0, 1, 2)))
     if unseen.any():
-        half = np.where(unseen, 0.5 * g.system.Q, 0.0)  # w_t / 2 is half r_t, a priori var(w_t) / 2
+        half, one = np.where(unseen, 0.5 * g.system.Q, 0.0), np.eye(P.shape[-1])
         x -= half * back.r
-        both = half[..., None] * (np.eye(len(unseen)) - back.whole @ P)  # cov(w_t / 2, x_t)
-        own = 0.5 * half[..., None] * np.eye(len(unseen))  # var(w_t / 2)
-        own -= half[..., None] * back.whole * half[..., None, :]
+        both = half[..., None] * (one - back.whole @ P)  # covariance of w_t / 2 and x_t
+        own = half[..., None] * (0.5 * one - back.whole * half[..., None, :])  # of w_t / 2
         after -= both + both.swapaxes(-1, -2) - own
     return Smoothed(x, after)
 
