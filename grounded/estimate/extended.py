@@ -303,12 +303,26 @@ class Smoothed:
 
 
 def smooth(filtered: Filtered) -> Smoothed:
-    """One pass backwards over a filter pass that got through."""
-    back, P = smoother(filtered.gains, filtered.eps, covariances=True), filtered.gains.P
+    """One pass backwards over a filter pass that got through.
+
+    What disturbs a step acts all along it, while the filter adds it at the end. A state that no
+    channel measures is a saw then, seen at its teeth: where the model is off for long, each sample
+    is off by half a disturbance, which grows as a time constant comes near the step. Halfway up
+    the jump, x_t - w_t / 2, a rate fits what integrates it: the trapezoidal rule.
+    """
+    g, P = filtered.gains, filtered.gains.P
+    back = smoother(g, filtered.eps, covariances=True)
     assert P is not None
     assert back.whole is not None
-    x = filtered.x_prior + (P @ back.r[..., None])[..., 0]
-    return Smoothed(x, P - P @ back.whole @ P)
+    x, after = filtered.x_prior + (P @ back.r[..., None])[..., 0], P - P @ back.whole @ P
+    unseen = np.asarray(~g.measured.any(axis=(0, 1, 2)))
+    if unseen.any():
+        half, one = np.where(unseen, 0.5 * g.system.Q, 0.0), np.eye(P.shape[-1])
+        x -= half * back.r
+        both = half[..., None] * (one - back.whole @ P)  # covariance of w_t / 2 and x_t
+        own = half[..., None] * (0.5 * one - back.whole * half[..., None, :])  # of w_t / 2
+        after -= both + both.swapaxes(-1, -2) - own
+    return Smoothed(x, after)
 
 
 def variance_slopes(g: Gains, eps: Array, batch: RecordBatch, noise: NoiseStd) -> Array:

@@ -51,6 +51,9 @@ def smooth_trials(
 ) -> list[Estimated]:
     """The smoother along each trial: what is known afterwards.
 
+    A state that no channel measures is given halfway up what disturbs it at each instant, so that
+    a rate fits what integrates it (`grounded.estimate.extended.smooth`).
+
     Args:
         model: n states, m inputs.
         trials: real trials, or records with clocks of their own.

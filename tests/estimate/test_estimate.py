@@ -1,5 +1,6 @@
 """The filter against a dense Gaussian, the slopes against differences, claims against truth."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -106,6 +107,36 @@ def test_a_linear_model_is_filtered_and_smoothed_exactly():
     filtered = filter_trials(SPRING, trials, SPRING_NOISE)[0]
     assert filtered.loglik == pytest.approx(loglik, abs=1e-6)
     assert np.allclose(filtered.states[-1], smoothed.states[-1])
+
+
+def test_a_state_that_nothing_measures_is_smoothed_halfway_up_its_disturbances():
+    """Exactly, with its covariance: (x_t + f(x_t-1)) / 2 of the dense Gaussian."""
+    _, trials = simulated(SPRING, np.random.default_rng(0), SPRING_NOISE, B=1, T=30)
+    trial, n, seen = trials[0], 2, of_states(SPRING, ["x"])
+    noise = NoiseStd(SPRING_NOISE.process, SPRING_NOISE.measurement[:1], DT)
+    record = record_of(SPRING, trial)
+    record = replace(record, measured=trial.states[:, :1], start_std=SPRING_NOISE.measurement)
+    start = np.array([trial.states[0, 0], 0.0])
+    states = np.vstack([start, trial.states[1:]])
+    at_start = Trial(states, trial.inputs, DT, SPRING.state_names, SPRING.input_names)
+    mean, cov = dense(SPRING, at_start, SPRING_NOISE)
+    H = np.eye(len(mean))[n::n]
+    S = H @ cov @ H.T + SPRING_NOISE.measurement[0] ** 2 * np.eye(30)
+    gain = cov @ H.T @ np.linalg.inv(S)
+    after, spread = mean + gain @ (states[1:, 0] - H @ mean), cov - gain @ H @ cov
+    A = SPRING.system.linearise(states[:1], trial.inputs[:1], SPRING.values, DT)[0][0]
+    half, offset = np.eye(len(mean)), np.zeros(len(mean))
+    for t in range(1, 31):
+        v = n * t + 1
+        half[v, v], half[v, v - 3 : v - 1] = 0.5, 0.5 * A[1]
+        predicted = SPRING.system.step(np.zeros((1, n)), trial.inputs[t - 1 : t], SPRING.values, DT)
+        offset[v] = 0.5 * predicted[0, 1]
+
+    found = smooth_trials(SPRING, [record], noise, measurement=seen)[0]
+    assert np.allclose(found.states.ravel(), half @ after + offset, atol=1e-9)
+    blocks = (half @ spread @ half.T).reshape(31, n, 31, n)
+    expected = blocks[np.arange(31), :, np.arange(31)]
+    assert np.allclose(found.covariance, expected, rtol=1e-5, atol=1e-12)
 
 
 def test_sensitivities_of_the_innovations_match_differences():

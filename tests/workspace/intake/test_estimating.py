@@ -84,6 +84,27 @@ def test_a_log_that_begins_at_speed_is_estimated_alike_in_any_unit(tmp_path, see
     assert v[10 * first] > 400 and np.abs(errors[0][:5]).max() < 0.05
 
 
+@pytest.mark.parametrize("process", [{}, {"v": 0.05}])
+def test_a_speed_is_the_slope_of_its_position_where_the_model_is_off_for_long(tmp_path, process):
+    """It answers in 0.03 s, its gain is too large: the speed was 0.025 m/s too low on average."""
+    quick = MODEL.replace("(a.force - p.drag * s.v) / p.mass", "(a.force - s.v) / 0.03")
+    task = make(tmp_path / "w", model=quick).task
+    t = np.arange(0, 4, 1e-3)
+    force = np.where((t > 0.5) & (t < 3.5), 1.0 + 0.5 * np.sin(2 * np.floor(t / 0.05) * 0.05), 0.0)
+    v = np.zeros(len(t))
+    for k in range(len(t) - 1):
+        v[k + 1] = v[k] + 1e-3 * (0.8 * force[k] - v[k]) / 0.06
+    x = 1e-3 * np.cumsum(v)
+    noise = 0.001 * np.random.default_rng(0).standard_normal(len(t) // 10)
+    log = {
+        "x": series(t[::10], x[::10] + noise),
+        "force": series(t[::10], force[::10], "/csv.force"),
+    }
+    error, _ = off(with_estimates(log, EstimateTable({"x": 0.001}, process), task), t, v)
+    assert abs(np.mean(error)) < 0.003
+    assert np.sqrt(np.mean(error**2)) < (0.03 if process else 0.045)
+
+
 def test_a_process_noise_that_is_given_is_that_of_a_control_step(task):
     """With hardly any, the speed is the model's; with much, it follows the samples."""
     logged, t, v = driven()
