@@ -109,9 +109,14 @@ class About:
         return self._steadied(made) if made.predicted_gain > self.least else made
 
     def _steadied(self, made: Candidate) -> Candidate:
-        """The same run with the incumbent's gains, where the new ones may not hold (`feedback`)."""
+        """The same run with the incumbent's gains, where the new ones may not hold (`feedback`).
+
+        A changed model's own plan keeps its own: the incumbent's were designed in a model that
+        lacked what was found since, a delay say, and that is what made them swing.
+        """
         new, run = made.policy, self.incumbent.candidate.policy
-        if self.alternatives and new.gain is not None and run.gain is not None:
+        own = made.way == "own plan" or new.gain is None or run.gain is None
+        if self.alternatives and not own:
             old = replace(new, gain=run.laid_out(new.state_names, new.angles, new.depths).gain)
             if sum(a.cost(new) - a.cost(old) for a in self.alternatives) > self.least:
                 made = self.make.foretold(made, old, self.real, self.already)
