@@ -241,12 +241,12 @@ class About:
     def _worth(self, made: Candidate) -> float:
         """What an own plan is likely to gain: the larger of what two models say.
 
-        Far from a bad incumbent its bias is no guide, and trials that swung make every model that
-        replays them doubtful. A changed model that foretells the incumbent without its bias is
-        believed, less what it is off by there, unless it is little: its own plan always promises
-        something in it.
+        Trials that swung make every model that replays them doubtful. A changed model that
+        foretells the incumbent without its bias is believed over that doubt, less what it is off
+        by there, where the grounded one promises a gain too (or a drift car flew off), and unless
+        it is little: its own plan always promises something in it.
         """
-        plainly = self._plain_gain(made)
+        plainly = self._plain_gain(made) if made.predicted_gain > self.least else None
         sure = -np.inf if plainly is None else plainly - self._plain_off
         little = sure <= LITTLE * -self.incumbent.utility
         return expected(made) if little else max(expected(made), sure)

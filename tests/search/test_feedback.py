@@ -121,13 +121,16 @@ def test_a_changed_model_that_foretells_the_incumbent_judges_its_own_plan(noisy)
     about, task, best = noisy.about, noisy.task, noisy.now.incumbent
     better = planner_for(task, task.model.with_values({"mass": 1.2}), np.zeros(1))
     about.make = Maker(better, about.make.now, "c0099", model_fingerprint(better.plan))
-    about.plain, about.missed = better.plan.problem(exact=True), 1e9  # the grounded one is no guide
+    about.plain, about.missed = better.plan.problem(exact=True), 1e9  # the grounded one is doubtful
+    about.already = -1e3  # it promises 999, and the plain one:
     about.plainly = predicted(about.plain, best.candidate.policy).utility
     assert about.own_plan(None) is None  # the best one is about as good: it promises little
     bad = 5 * best.utility
     about.incumbent, about.plainly = replace(best, utilities=(bad,)), 0.9 * bad
     assert about.own_plan(None).candidate.way == "own plan"
     about.plainly = 2 * bad  # more would be gained, but it did not foretell this one
+    assert about.own_plan(None) is None
+    about.plainly, about.already = 0.9 * bad, 0.0  # to which the grounded one says: a loss
     assert about.own_plan(None) is None
 
 
