@@ -9,19 +9,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from grounded.compile import Problem
-from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import Result, document
 from grounded.rollout import Rollout, apart
-from grounded.search.candidate import Candidate, Slopes, Tried, Way
+from grounded.search.candidate import LITTLE, Candidate, Slopes, Tried, Way
 from grounded.search.directions import base_columns, direction
+from grounded.search.limit_cycle import limit_cycle
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
 from grounded.search.step_size import KEPT, Step
 from grounded.solve import ddp
 from grounded.solve.measured import measured_gains
-from grounded.task import Task
 from grounded.trial import mean_trial
 
 if TYPE_CHECKING:
@@ -32,7 +31,6 @@ GENTLER = 1e3  # factor on the price of inputs from which gentler gains are desi
 NEAR = 0.2  # of the way that one that lost would go: a step that ends so near is the same one
 REFUTED = 2  # steps by corrected slopes that lost too much: then the model's own are believed
 FORETOLD = 0.2  # of the incumbent's cost: a plain model that is off by more there is no judge
-SWINGS = 6  # of an input about its plan, each as large as the plan's own range: a limit cycle
 
 
 class About:
@@ -109,9 +107,14 @@ class About:
         return self._steadied(made) if made.predicted_gain > self.least else made
 
     def _steadied(self, made: Candidate) -> Candidate:
-        """The same run with the incumbent's gains, where the new ones may not hold (`feedback`)."""
+        """The same run with the incumbent's gains, where the new ones may not hold (`feedback`).
+
+        A changed model's own plan keeps its own: the incumbent's were designed in a model that
+        lacked what was found since, a delay say, and that is what made them swing.
+        """
         new, run = made.policy, self.incumbent.candidate.policy
-        if self.alternatives and new.gain is not None and run.gain is not None:
+        own = made.way == "own plan" or new.gain is None or run.gain is None
+        if self.alternatives and not own:
             old = replace(new, gain=run.laid_out(new.state_names, new.angles, new.depths).gain)
             if sum(a.cost(new) - a.cost(old) for a in self.alternatives) > self.least:
                 made = self.make.foretold(made, old, self.real, self.already)
@@ -199,19 +202,29 @@ class About:
         if self.alternatives:
             cost = sum(a.cost(made.policy) for a in self.alternatives)
             gains.append(self._disturbed - cost)
-        off = abs(self.plainly - self.incumbent.utility)
-        if off < FORETOLD * -self.incumbent.utility:
-            gained = predicted(self.plain, made.policy).utility - self.plainly + off
-            gains += [gained] if gained < 0 else []
+        if (plainly := self._plain_gain(made)) is not None and plainly + self._plain_off < 0:
+            gains.append(plainly + self._plain_off)
         return replace(made, likely_off=made.predicted_gain - min(gains))
+
+    @property
+    def _plain_off(self) -> float:
+        """What the model with no trial in it is off by at the incumbent."""
+        return abs(self.plainly - self.incumbent.utility)
+
+    def _plain_gain(self, made: Candidate) -> float | None:
+        """What that model promises over the incumbent; None where it did not foretell that."""
+        if not self._plain_off < FORETOLD * -self.incumbent.utility:
+            return None
+        return predicted(self.plain, made.policy).utility - self.plainly
 
     def own_plan(self, rival: Proposal | None) -> Proposal | None:
         """A model that was changed since: its own new plan, where more is promised of that.
 
         The plan of a crude model may sit in another valley than that of the better one: going on
         from it ends where it began. Both are judged by the grounded prediction, less what it is
-        likely to be off by so far away, unless the incumbent's trial was wild: a bias measured
-        there says nothing of other runs.
+        likely to be off by so far away; and the own plan by the changed model alone as well, where
+        that foretells the incumbent's trial (`_worth`). It needs no promise where that trial was
+        wild, or its feedback swung to and fro: a bias measured there says nothing of other runs.
         """
         make, base = self.make, self.incumbent.candidate
         tried = losers_of(make.now.history, base.id, make.fingerprint, "own plan")
@@ -220,9 +233,23 @@ class About:
         policy, _ = make.planner.first_policy()
         made = self._told(self.candidate(policy, Step(), "own plan"))
         promise = expected(rival.candidate) if rival and rival.candidate else self.least
-        better = expected(made) > max(promise, self.least) or wild(self.incumbent)
+        swung = wild(self.incumbent) or limit_cycle(self.incumbent, make.planner.task)
+        better = swung or self._worth(made) > max(promise, self.least)
         proposal = make.checked(made) if better else None
         return proposal if proposal is not None and proposal.candidate is not None else None
+
+    def _worth(self, made: Candidate) -> float:
+        """What an own plan is likely to gain: the larger of what two models say.
+
+        Trials that swung make every model that replays them doubtful. A changed model that
+        foretells the incumbent without its bias is believed over that doubt, less what it is off
+        by there, where the grounded one promises a gain too (or a drift car flew off), and unless
+        it is little: its own plan always promises something in it.
+        """
+        plainly = self._plain_gain(made) if made.predicted_gain > self.least else None
+        sure = -np.inf if plainly is None else plainly - self._plain_off
+        little = sure <= LITTLE * -self.incumbent.utility
+        return expected(made) if little else max(expected(made), sure)
 
 
 def expected(made: Candidate) -> float:
@@ -324,28 +351,6 @@ class Maker:
             return Proposal(self.now, made, is_new=True)
         stopped = replace(self.now, phase="stopped", sentence=found[0], ending="not allowed")
         return Proposal(stopped, None, is_new=False, notes=tuple(found))
-
-
-def limit_cycle(tried: Tried, task: Task) -> bool:
-    """Whether feedback swung an input to and fro about its plan, each time by the plan's range."""
-    made = tried.candidate
-    range_ = np.minimum(np.ptp(made.predicted_inputs, axis=0), task.high - task.low)
-    for trial in tried.trials:
-        off = trial.inputs - made.predicted_inputs[: trial.steps]
-        if any(_swings(off[:, i], size) >= SWINGS for i, size in enumerate(range_) if size > 0):
-            return True
-    return False
-
-
-def _swings(values: Array, size: float) -> int:
-    """How often a signal moves by `size` or more, each time against the time before."""
-    found, way, last = 0, 0.0, values[0]
-    for value in values:
-        if (value - last) * way > 0:
-            last = value
-        elif abs(value - last) >= size:
-            found, way, last = found + 1, np.sign(value - last), value
-    return found
 
 
 @dataclass(frozen=True, eq=False, repr=False)

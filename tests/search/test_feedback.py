@@ -116,6 +116,24 @@ def test_an_own_plan_must_promise_more_than_it_is_likely_off_by(noisy):
     assert about.own_plan(None) is None
 
 
+def test_a_changed_model_that_foretells_the_incumbent_judges_its_own_plan(noisy):
+    """From -1.307, which it foretold to be -1.275, its plan was worth -0.17 and never tried."""
+    about, task, best = noisy.about, noisy.task, noisy.now.incumbent
+    better = planner_for(task, task.model.with_values({"mass": 1.2}), np.zeros(1))
+    about.make = Maker(better, about.make.now, "c0099", model_fingerprint(better.plan))
+    about.plain, about.missed = better.plan.problem(exact=True), 1e9  # the grounded one is doubtful
+    about.already = -1e3  # it promises 999, and the plain one:
+    about.plainly = predicted(about.plain, best.candidate.policy).utility
+    assert about.own_plan(None) is None  # the best one is about as good: it promises little
+    bad = 5 * best.utility
+    about.incumbent, about.plainly = replace(best, utilities=(bad,)), 0.9 * bad
+    assert about.own_plan(None).candidate.way == "own plan"
+    about.plainly = 2 * bad  # more would be gained, but it did not foretell this one
+    assert about.own_plan(None) is None
+    about.plainly, about.already = 0.9 * bad, 0.0  # to which the grounded one says: a loss
+    assert about.own_plan(None) is None
+
+
 def test_a_step_that_is_foretold_to_be_a_disaster_is_not_proposed(noisy, monkeypatch):
     """A quadrotor's step promised 0.25, was likely off by 24, and was flown all the same."""
     about = noisy.about

@@ -1,0 +1,33 @@
+"""Whether a trial was a limit cycle: feedback that swings the inputs to and fro about the plan."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.search.candidate import Tried
+from grounded.task import Task
+
+SWINGS = 6  # of an input about its plan, each as large as the plan's own range: a limit cycle
+
+
+def limit_cycle(tried: Tried, task: Task) -> bool:
+    """Whether feedback swung an input to and fro about its plan, each time by the plan's range."""
+    made = tried.candidate
+    range_ = np.minimum(np.ptp(made.predicted_inputs, axis=0), task.high - task.low)
+    for trial in tried.trials:
+        off = trial.inputs - made.predicted_inputs[: trial.steps]
+        if any(_swings(off[:, i], size) >= SWINGS for i, size in enumerate(range_) if size > 0):
+            return True
+    return False
+
+
+def _swings(values: Array, size: float) -> int:
+    """How often a signal moves by `size` or more, each time against the time before."""
+    found, way, last = 0, 0.0, values[0]
+    for value in values:
+        if (value - last) * way > 0:
+            last = value
+        elif abs(value - last) >= size:
+            found, way, last = found + 1, np.sign(value - last), value
+    return found
