@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from grounded.diagnosis.error_report import Credit, RulerRow, measured, number
+from grounded.diagnosis.error_report import Credit, RulerRow, furthest, measured, number
 from grounded.diagnosis.report import Diagnosis
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
 from grounded.result import percent
@@ -175,14 +175,17 @@ def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars
     rows += [(MODELS["with_effects"], error.with_effects)]
     rows += [(models(error)["noise_floor"], error.noise_floor)]
     found = [(look, math.hypot(*(v[n] for n in names))) for look, v in rows if set(names) <= set(v)]
-    bars = tuple(Bar(n, v, measured(v, unit), role) for (role, n), v in found)
+    bars = tuple(Bar(n, v, measured(v, unit), role) for (role, n), v in found if math.isfinite(v))
+    if not bars:  # of a state that was never measured
+        return []
     title = what.removeprefix("the ").capitalize() if len(names) > 1 else what
     return [Bars(f"{title}: error {error.horizon_s:g} s ahead", bars)]
 
 
 def _second_ahead(diagnosis: Diagnosis) -> RulerRow | None:
     errors = diagnosis.prediction_error
-    return next((e for e in errors if math.isclose(e.horizon_s, CREDIT_S, rel_tol=0.1)), None)
+    ahead = (e for e in errors if math.isclose(e.horizon_s, CREDIT_S, rel_tol=0.1))
+    return next((e for e in ahead if not e.drowned), None)
 
 
 def _improved(error: RulerRow) -> list[str]:
@@ -190,7 +193,7 @@ def _improved(error: RulerRow) -> list[str]:
     gain = {
         name: error.crude[name] / max(after, 1e-300)
         for name, after in error.with_effects.items()
-        if error.crude.get(name)
+        if error.crude.get(name) and math.isfinite(error.crude[name])
     }
     return sorted(gain, key=lambda name: -gain[name])
 
@@ -223,9 +226,9 @@ def where_figure(diagnosis: Diagnosis) -> Figure | None:
 
 
 def _ahead(diagnosis: Diagnosis) -> str:
-    """How far ahead errors by channel are measured: the ruler's last row but the whole trial."""
-    rows = [row.horizon_s for row in diagnosis.prediction_error if not row.whole_trial]
-    return f" {rows[-1]:.3g} s ahead, rms" if rows else ", rms"
+    """How far ahead errors by channel are measured."""
+    row = furthest(diagnosis.prediction_error)
+    return f" {row.horizon_s:.3g} s ahead, rms" if row else ", rms"
 
 
 def _shares(shares: Sequence[tuple[str, float, str]], role: str) -> tuple[Bar, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import replace
 from itertools import combinations
 
@@ -331,6 +332,26 @@ def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
     assert worth.bars[1].label == "without delay:u" and worth.bars[1].text == "0.40 m/s"
     (x, v) = accuracy_figure(found).panels
     assert [bar.value for bar in x.bars] == [0.2, 0.1, 0.1, 0.05] and "v" in v.title
+
+
+def test_a_state_that_was_never_measured_and_a_horizon_that_noise_fills_have_no_bars():
+    """An empty chart, `- rad/s`; and bars of equal length where noise alone is all that shows."""
+    lost = math.nan
+    row = RulerRow(
+        1.0,
+        unit_by_channel={"x": "m", "v": "m/s"},
+        crude={"x": 0.3, "v": lost},
+        with_effects={"x": 0.1, "v": lost},
+    )
+    credit = (Credit("delay:u", 0.6, {"x": 0.2, "v": lost}),)
+    found = Diagnosis(Verdict("effect"), prediction_error=(row,), credit=credit)
+    figure = worth_figure(found, [(["v"], "v")])
+    assert figure is not None and [p.title.partition(":")[0] for p in figure.panels] == ["x"]
+    assert [p.title for p in credit_figure(found, 2).panels[1:]] == ["x: error 1 s ahead"]
+    short = replace(row, horizon_s=0.5)
+    drowned = replace(found, prediction_error=(short, replace(row, drowned=True)))
+    assert worth_figure(drowned, [(["x"], "x")]) is None
+    assert len(credit_figure(drowned).panels) == 1
 
 
 def test_a_cause_is_drawn_where_it_shows():
