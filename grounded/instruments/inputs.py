@@ -19,7 +19,8 @@ from grounded.trial import Trial
 
 OFTEN = 0.1  # of the time
 COPY = 0.99  # coherence of two inputs that are one: two motors of one vehicle have 0.96
-FAR, FULL = 20.0, 103.0  # times a limit, and the most that something in percent shows
+FAR = 20.0  # times a limit
+OVER = 1.03  # of full scale: the most that something in percent, or in counts, shows
 ROUNDED = 0.01  # of the largest command: so much beyond a limit is a matter of digits
 
 
@@ -66,7 +67,7 @@ def in_percent(task: Task, inputs: Array, j: int) -> str:
     name, unit = list(task.model.inputs.items())[j]
     most = float(np.nanmax(np.abs(inputs[:, j]), initial=0.0))
     limit = float(max(abs(task.low[j]), abs(task.high[j])))
-    if unit != "1" or not FAR * limit < most <= FULL:
+    if unit != "1" or not FAR * limit < most <= 100 * OVER:
         return ""
     return f"in percent? then [log.input.{name}] scale = 0.01, times what is there"
 

@@ -187,8 +187,8 @@ def _measured(pieces: _Pieces, reach: int, dt: float) -> Lag | None:
     rest, pull = a - s * b, s * slope
     force = max(_scatter(rest * pull, group) for group in pieces.groups)
     std = force / max(_dot(pull, pull), 1e-300)
-    mean = _mean(pieces, a, b, d) * dt
     behind = _filter(pieces, a, _dot(rest, rest), s) if d > 0 else None
+    mean = _mean(pieces, a, b, d) * dt if behind is None else 0.0
     if behind is not None:
         d, b = behind  # the size is that of what went into the filter
         s = _dot(a, b) / max(_dot(b, b), 1e-300)
@@ -198,10 +198,7 @@ def _measured(pieces: _Pieces, reach: int, dt: float) -> Lag | None:
     size_std = max(_scatter(rest * b, group) for group in pieces.groups) / max(_dot(b, b), 1e-300)
     sign, coherence = 1 if s > 0 else -1, min(low / high, 1.0)
     scale_std = size_std / max(s * s, 1e-300)
-    smoothed = mean * (behind is None)
-    return Lag(
-        d * dt, std * dt, behind is not None, sign, low, high, coherence, scale_std, smoothed
-    )
+    return Lag(d * dt, std * dt, behind is not None, sign, low, high, coherence, scale_std, mean)
 
 
 def _dot(a: Array, b: Array) -> float:

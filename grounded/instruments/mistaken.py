@@ -19,6 +19,7 @@ import numpy as np
 from grounded.effects import places
 from grounded.frozen import Array
 from grounded.instruments.finding import DEGREES
+from grounded.instruments.inputs import OVER
 from grounded.instruments.kinematics import integrals
 from grounded.instruments.other_units import unusable
 from grounded.instruments.short_runs import Ahead, Fit
@@ -35,7 +36,7 @@ TRIALS = 4  # that are asked
 MANY = 8  # changes
 MOST = 10  # states of which all mirror images are tried
 WHOLE = {100.0: "percent", 255.0: "counts of 8 bits", 1000.0: "thousandths"}  # full scale
-OPENED, OVER = 0.05, 1.03  # of full scale: what the largest command of a log reaches
+OPENED = 0.05  # of full scale: the least that the largest command of a log reaches (at most OVER)
 ANGULAR, LENGTHS = ("rad", "rad/s"), ("m", "m/s")
 
 

@@ -247,12 +247,14 @@ class _Bench:
             if relation.i not in self.shown or relation.j not in self.shown:
                 continue
             lag = lag_of(self.model, relation, self.trials)
-            if lag is not None and lag.coherence > ALIKE:
-                yield from self.unit(relation, lag)
-                yield from self.late(relation, lag)
+            clear = lag if lag is not None and lag.coherence > ALIKE else None
+            if clear:
+                yield from self.unit(relation, clear)
+                yield from self.late(relation, clear)
             if relation.exact:
                 yield from self.constant(relation)
-                yield from self.smoothed(relation, lag)
+            if relation.exact and clear and clear.mean >= SMOOTH * self.dt:
+                yield self.smoothed(relation, clear)
 
     def unit(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """Sign and unit, which are put right; a scale, which may be either sensor's."""
@@ -313,19 +315,17 @@ class _Bench:
         text, log = f"{d:.3g} s later than {other}", f"delay_s = {d:.3g}"
         return put_right(name, text, "delay", log, delay_s=d, std_s=lag.std)
 
-    def smoothed(self, relation: Integral, lag: Lag | None) -> Iterator[Finding]:
+    def smoothed(self, relation: Integral, lag: Lag) -> Finding:
         """Without a velocity that is a mean over several steps: a difference of its position.
 
         It says no more than the position does, and where something stops it is wrong as long.
         """
-        if lag is None or lag.coherence <= ALIKE or lag.mean < SMOOTH * self.dt:
-            return
         q, w = (self.model.state_names[k] for k in (relation.i, relation.j))
         self.put(relation.j, [np.full_like(x, np.nan) for x in self.column(relation.j)])
         self.shown.remove(relation.j)
         text = f"shows a mean over {lag.mean:.2g} s, as a difference of {q} does; left out here: "
         text += f"{q} says as much"
-        yield Finding(w, text, "smoothed", corrected=True)
+        return Finding(w, text, "smoothed", corrected=True)
 
     def positions(self) -> Iterator[Finding]:
         """Of both positions of a plane that are late together."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -151,7 +152,7 @@ class Measured:
             )
         return tuple(rows)
 
-    @property
+    @cached_property
     def drowned(self) -> Any:
         """Where noise alone takes a state beyond all that was measured of it, (K,), by horizon."""
         reach = np.array(list(self.reach.values()))
@@ -159,7 +160,7 @@ class Measured:
         lost[-1] = False  # of whole trials there is no floor but that of repeats
         return lost
 
-    @property
+    @cached_property
     def reach(self) -> dict[str, float]:
         """From the least to the largest value that was measured of each shown state."""
         reach = np.ptp(self.data.filled, axis=0)

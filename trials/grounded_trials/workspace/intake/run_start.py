@@ -110,10 +110,11 @@ class Recording:
         """
         if (policy.state_names, policy.input_names) != self.names or policy.dt != self.dt:
             return None
-        whole = self._starts(policy, self._apart(policy))
+        apart, until = self._apart(policy)
+        whole = self._starts(policy, apart)
         if any(one.alike for one in whole):
             return min(whole, key=lambda one: (not one.alike, one.apart))
-        begun = [one for one in self._starts(policy, self._until(policy)) if one.opens_alike]
+        begun = [one for one in self._starts(policy, until) if one.opens_alike]
         return min(begun or whole, key=lambda one: (not one.alike, one.apart), default=None)
 
     def _starts(self, policy: Policy, apart: Array) -> list[Start]:
@@ -137,7 +138,7 @@ class Recording:
         """The mean difference of the commands from an instant on, as `Start.apart`."""
         k = round((start - self.first) * self.parts / self.dt)
         inside = 0 <= k < len(self.whole.inputs)
-        return float(self._apart(policy, range(k, k + 1))[k]) if inside else np.inf
+        return float(self._apart(policy, range(k, k + 1))[0][k]) if inside else np.inf
 
     def _on_step(self, policy: Policy, start: float) -> tuple[float, float]:
         """A start moved to where commands change, by less than a step, and the room before it."""
@@ -182,42 +183,34 @@ class Recording:
             return start, loose
         return start - float(np.clip(share, 0.0, 1.0)) * row, loose
 
-    def _apart(self, policy: Policy, instants: range | None = None) -> Array:
-        """The mean difference of the commands at every instant, infinite where none can be."""
+    def _apart(self, policy: Policy, instants: range | None = None) -> tuple[Array, Array]:
+        """Two measures of every instant, infinite where it can't begin a run.
+
+        Returns:
+            The mean difference of the commands, where the log has the run whole, or begins it after
+            a rest. And the part of the run after which commands are the policy's no more: of one
+            that was cut, or stopped, in a log in which something moved before it.
+        """
         sent, parts, H = self.whole.inputs, self.parts, policy.horizon
         sent = np.clip(sent, policy.low, policy.high)
         changed = np.any(np.diff(sent, axis=0, prepend=sent[:1]) != 0, axis=1)
         count, quiet = np.cumsum(changed), round(QUIET_S / self.dt * parts)
-        apart = np.full(len(sent), np.inf)
-        wanted = []
-        for k in range(len(sent)) if instants is None else instants:
-            left = self._left(k)
-            ran = left >= H - LAST
-            begun = count[max(k - 1, 0)] == count[max(k - 1 - quiet, 0)]
-            if ran or (begun and left >= max(LEAST, H // SHORT)):
-                wanted.append(k)
+        apart, until = np.full((2, len(sent)), np.inf)
+        least, steps = max(LEAST, H // SHORT), np.arange(1, H + 1)
+        asked = range(len(sent)) if instants is None else instants
+        wanted = [k for k in asked if self._left(k) >= min(least, H - LAST)]
         for ks, off, known in self._off(policy, wanted):
-            apart[ks] = (off * known).sum(axis=1) / known.sum(axis=1)
-        return apart
-
-    def _until(self, policy: Policy) -> Array:
-        """Of every instant from which commands are the policy's for a while, the rest of the run.
-
-        A run that was cut, or stopped, in a log in which something moved before it.
-        """
-        H, apart = policy.horizon, np.full(len(self.whole.inputs), np.inf)
-        least = max(LEAST, H // SHORT)
-        wanted = [k for k in range(len(apart)) if self._left(k) >= least]
-        steps = np.arange(1, H + 1)
-        for ks, off, known in self._off(policy, wanted):
+            left = known.sum(axis=1)
+            before = np.maximum(ks - 1, 0)
+            begun = count[before] == count[np.maximum(ks - 1 - quiet, 0)]
+            whole = (left >= H - LAST) | (begun & (left >= least))
+            apart[ks[whole]] = ((off * known).sum(axis=1) / left)[whole]
             mean = np.where(known, np.cumsum(off, axis=1) / steps, np.inf)
-            until = np.where(mean < EXACTLY, steps, 0).max(axis=1)
-            at = mean[np.arange(len(ks)), np.maximum(until - 1, 0)]
-            left = (
-                1 - until / H + 0.1 * at / EXACTLY
-            )  # a step more is no better, for more difference
-            apart[ks] = np.where(until >= least, left, np.inf)
-        return apart
+            alike = np.where(mean < EXACTLY, steps, 0).max(axis=1)
+            at = mean[np.arange(len(ks)), np.maximum(alike - 1, 0)]
+            lost = 1 - alike / H + 0.1 * at / EXACTLY  # a step more is no better, for more apart
+            until[ks] = np.where(alike >= least, lost, np.inf)
+        return apart, until
 
     def _left(self, k: int) -> int:
         """Steps that the log has from an instant on."""
