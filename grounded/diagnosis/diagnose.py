@@ -46,7 +46,7 @@ from grounded.diagnosis.ruler_words import contested, open_noise
 from grounded.diagnosis.unconfirmed import another_look, unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import by_trial, compared
 from grounded.diagnosis.validation.claims import Claims
-from grounded.diagnosis.validation.decide import Decision, decide
+from grounded.diagnosis.validation.decide import SLIGHT, Decision, decide
 from grounded.diagnosis.validation.held_out import shrinkage, utility_prediction
 from grounded.diagnosis.validation.limits import (
     Limits,
@@ -59,7 +59,7 @@ from grounded.diagnosis.validation.limits import (
 from grounded.diagnosis.validation.measured import Measured, root_mean_square
 from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.diagnosis.verdict import at_bounds, next_trial, verdict
+from grounded.diagnosis.verdict import MOST_EFFECTS, at_bounds, next_trial, verdict
 from grounded.effects import Library, acting_order, wrapping_order
 from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError
@@ -170,18 +170,23 @@ def diagnose(
     task = subject if isinstance(subject, Task) else None
     here = interruptible(lambda: so_far(search, most))
     with np.errstate(all="ignore"), here, running(engine):
+        written: _Writer | None = None
         while True:
             tick("predict")
             ruler = Ruler(search.predictor, options.origin)
             decision = decide(search, best, ruler, most)
             tick("leftover")
             writer = _Writer(decision, ruler, known, options, most, tick, task, used, exact)
-            found = writer.diagnosis()
-            if options.max_effects or not found.verdict.look_for:
+            if written and not writer.worth_more_than(written):
+                written.most = most  # one more was looked for
+                break
+            written = writer
+            if options.max_effects or not (most < MOST_EFFECTS and writer.unfinished):
                 break
             most += 1
             tick("more effects")
             best = grown(search, best, most)
+        decision, found = written.decision, written.diagnosis()
         groups = [k < first for k in range(data.count)]
         apart = compared(search, decision.fit, groups) if compare else None
         return replace(
@@ -239,6 +244,19 @@ class _Writer:
         self.measured = Measured(decision, ruler, trials, exact)
         self.claims = Claims(decision, self.measured.credit, known, ruler)
         self.left = self.measured.left
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether as many effects as were looked for leave more than noise."""
+        if self.known.no_cause or len(self.claims.names) < self.most:
+            return False
+        return any(one.above for one in self.measured.remainders())
+
+    def worth_more_than(self, other: _Writer) -> bool:
+        """Whether predictions gain by one effect more what is worth a name (`SLIGHT`)."""
+        fit, ruler = self.decision.fit, self.ruler
+        more = ruler.gain(other.decision.fit, fit).mean
+        return more > SLIGHT * ruler.since_outset(fit)
 
     def diagnosis(self) -> Diagnosis:
         data, predictor = self.data, self.predictor

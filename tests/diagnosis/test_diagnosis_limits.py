@@ -10,7 +10,7 @@ from grounded import GroundedError, Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.validation.limits import knowable, still_states
+from grounded.diagnosis.validation.limits import knowable, still_states, switches
 from grounded.effects import Library
 from grounded.models.pendulum import model as pendulum
 
@@ -38,6 +38,16 @@ def test_what_acts_on_a_state_that_never_moved_is_not_offered():
     offered = {e.name for e in knowable(data, Library().candidates(pendulum, data.scales))}
     assert "rate_gain:theta" in offered and "sensor_scale:theta" in offered
     assert not {"viscous_friction:omega", "sensor_delay:omega", "sensor_bias:omega"} & offered
+
+
+def test_how_much_a_switch_is_on_is_not_doubted():
+    """A servo's `torque_enable` of 0 and 1 was claimed to saturate at 0.588."""
+    trials = [replace(t, inputs=(np.asarray(t.inputs) > 0) * 1.0) for t in swings()]
+    data = prepare(pendulum, trials)
+    offered = {e.name for e in knowable(data, Library().candidates(pendulum, data.scales))}
+    assert switches(data) == {"torque"} and "delay:torque" in offered
+    assert not {f"{name}:torque" for name in ("saturation", "input_gain", "backlash")} & offered
+    assert not switches(prepare(pendulum, swings()))
 
 
 def test_a_model_that_is_no_number_at_a_measured_state_says_where():

@@ -27,6 +27,7 @@ from grounded.effects import (
     SensorFamily,
     SensorLagFamily,
 )
+from grounded.effects.actuator import backlash
 from grounded.effects.places import told_by
 from grounded.filter import kalman
 from grounded.frozen import Array
@@ -113,6 +114,17 @@ def constant_inputs(data: Data) -> list[str]:
     ]
 
 
+def switches(data: Data) -> set[str]:
+    """Inputs that were on or off and nothing else: how much one is on can't be off, only when."""
+    found = set()
+    for j, name in enumerate(data.model.input_names):
+        sent = [data.commands[i, :T, j] for i, T in enumerate(data.lengths)]
+        levels = np.unique(np.concatenate(sent))
+        if levels.size == 2 and 0.0 in levels:
+            found.add(name)
+    return found
+
+
 def still_states(data: Data) -> list[str]:
     """States that had one value in every trial: to the last digit, so no sensor of them lives."""
     found = []
@@ -127,7 +139,7 @@ def still_states(data: Data) -> list[str]:
 
 def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
     """The effects that these data could show at all."""
-    still, unmoved = set(constant_inputs(data)), set(still_states(data))
+    still, unmoved, on_off = set(constant_inputs(data)), set(still_states(data)), switches(data)
     dead = {n for i, n in enumerate(data.model.state_names) if not data.seen[..., i].any()}
     memory = {data.model.state_names[i] for i in data.hidden}
     kept = []
@@ -137,6 +149,8 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
         if targets & memory:
             continue
         if isinstance(family, InputFamily | MemoryFamily) and targets & still:
+            continue
+        if targets & on_off and (isinstance(family, InputFamily) or family is backlash):
             continue
         if isinstance(family, RateFamily | LossFamily) and targets & unmoved:
             continue
