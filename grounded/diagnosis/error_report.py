@@ -12,6 +12,7 @@ from grounded.result import Document
 SCALED = ("m", "rad", "s")  # units, and their rates, of which thousandths have a name
 SMALL = 1e-3  # below which they are used
 ABOVE = 1.3  # times the noise floor: what is left is stated
+SURE = 3.0  # standard deviations of the floor: it is compared in each channel, at each horizon
 BRIEF: dict[str, Any] = {"brief": True}  # a field whose key is left out where there is nothing
 
 
@@ -158,6 +159,7 @@ class RulerRow(Document):
         repeated, and what one step leaves isn't white, so part of it is the model's error.
     runs_away: by column ("crude" ...), the channels whose prediction leaves all that was measured
         far behind, as open-loop ones of an unstable plant do: how far says nothing.
+    floor_unsure: standard deviation of the logarithm of the scatter of few or short repeats.
     drowned: noise alone takes a state beyond all that was measured of it by then: of no channel is
         anything to be told so far ahead, open loop.
     """
@@ -172,6 +174,7 @@ class RulerRow(Document):
     noise_floor: Mapping[str, float] = field(default_factory=dict)
     floor_from: str = ""
     floor_at_most: bool = False
+    floor_unsure: float = field(metadata=BRIEF, default=0.0)
     outset: Mapping[str, float] = field(metadata=BRIEF, default_factory=dict)
     runs_away: Mapping[str, tuple[str, ...]] = field(metadata=BRIEF, default_factory=dict)
     drowned: bool = field(metadata=BRIEF, default=False)

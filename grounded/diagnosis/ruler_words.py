@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from grounded.diagnosis.error_report import (
     ABOVE,
+    SURE,
     RulerRow,
     furthest,
     measured,
@@ -154,10 +155,11 @@ def rest(rows: Sequence[RulerRow]) -> str:
         if not row.drowned
         for name, noise in row.noise_floor.items()
         if noise > 0 and math.isfinite(row.with_effects[name]) and row.tells(name, "with_effects")
+        if row.with_effects[name] > noise * max(ABOVE, math.exp(SURE * row.floor_unsure))
     ]
-    times, share, (name, when) = max(found, default=(0.0, 0.0, ("", "")))
-    if not times > ABOVE:
+    if not found:
         return ""
+    times, share, (name, when) = max(found)
     least = "at least " * rows[0].floor_at_most
     text = f"the state {name} is still off by {least}{times:.2g} times the noise {when}"
     if share < MATTERS:

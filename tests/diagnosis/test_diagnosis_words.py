@@ -57,6 +57,12 @@ def test_where_noise_alone_leaves_all_that_was_measured_nothing_is_told_of_a_hor
     assert "0.5 s ahead" in improvement((short, far)) and worsened((short, far)) == ""
 
 
+def test_what_few_repeats_may_have_missed_of_the_noise_is_not_left_over():
+    sure = row({"x": 2.0}, {"x": 0.15}, {"x": 0.1})
+    assert "1.5 times" in rest((sure,))
+    assert not rest((replace(sure, floor_unsure=0.2),))
+
+
 def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt():
     short = row({"x": 0.2, "v": 0.5}, {"x": 0.1, "v": 0.6})
     whole = row({"x": 2.12, "v": 0.5}, {"x": 3.79, "v": 0.3}, whole_trial=True, horizon_s=60.0)

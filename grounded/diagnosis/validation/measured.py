@@ -13,7 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.error_report import ABOVE, Credit, Remainder, RulerRow, RunChange, Split
+from grounded.diagnosis.error_report import (
+    ABOVE,
+    SURE,
+    Credit,
+    Remainder,
+    RulerRow,
+    RunChange,
+    Split,
+)
 from grounded.diagnosis.hypotheses.leftover import Leftover, leftovers, whiteness
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
@@ -48,7 +56,7 @@ class Measured:
         self.whiteness = self.white()
         least = min(self.whiteness.values(), default=0.0)
         self.is_white = not self.left and least * len(self.whiteness) > WHITE
-        self.floor, self.source = self.noise_floor()
+        self.floor, self.source = self.noise_floor()  # and `unsure`: of its logarithm, (K, 1)
         self.at_most = self.source == "short horizon" and not self.is_white
 
     def rms(self, fit: Fitted) -> Array:
@@ -73,20 +81,26 @@ class Measured:
         What one step leaves holds the model's error too: carried on, it is a bound (`at_most`).
         Noise that seems coloured counts as such in channels where no flexible model finds anything.
         """
+        self.unsure = np.zeros((len(self.ruler.steps) + 1, 1))
         if self.exact and not self.is_white:  # what is white is noise, and one trial a copy
             return np.zeros((len(self.ruler.steps) + 1, len(self.units))), "repeats"
         repeats = repeated(self.trials, self.data)
-        found, source = self.ruler.scatter(self.best, repeats), "repeats"
+        scatter, source = self.ruler.scatter(self.best, repeats), "repeats"
         if not all(len({self.trials[i].candidate or i for i in group}) == 1 for group in repeats):
             source = "alike"
-        if found is None:
+        if scatter is not None:
+            found, self.unsure = scatter[0], scatter[1][:, None]
+        else:
             found, source = self.carried(self.best), "short horizon"
             off = [self.data.model.state_names.index(left.channel) for left in self.left]
             if off:
                 found[:, off] = self.carried(plain(self.search, self.best))[:, off]
         reached = [e.rms for _, e in self.ruler.measured]
         reached += [errors.rms for _, errors in self.flexible.values()]
-        return np.fmin(found, np.fmin.reduce(reached))[:, self.ruler.shown], source
+        least = np.fmin.reduce(reached)
+        if scatter is not None and np.isnan(found[-1]).all():
+            least[-1] = np.nan  # repeats are too short to tell the noise of whole trials
+        return np.fmin(found, least)[:, self.ruler.shown], source
 
     def white(self) -> dict[str, float]:
         """The chance that white noise leaves innovations as correlated as these, by channel."""
@@ -145,6 +159,7 @@ class Measured:
                     by if self.ruler.held_out else "no",
                     floor_from=self.source,
                     floor_at_most=self.at_most,
+                    floor_unsure=float(self.unsure[k, 0]),
                     runs_away={key: names for key, names in away.items() if names},
                     drowned=bool(self.drowned[k]),
                     **found,
@@ -197,7 +212,8 @@ class Measured:
         k = int(np.flatnonzero(~self.drowned[:-1]).max(initial=0))
         now, fine = self.rms(self.best), ruler.fine[ruler.shown]
         short = slice(0, k + 1)
-        doubt = np.minimum(2 * ruler.doubt(self.best), np.log(FAR))
+        unsure = np.hypot(2 * ruler.doubt(self.best), SURE * self.unsure)
+        doubt = np.minimum(unsure, np.log(FAR))
         least = np.maximum(np.log(ABOVE), doubt)
         above = (np.log(now / self.floor) > least) & (now > 2 * fine)
         found = []

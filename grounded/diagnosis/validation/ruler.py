@@ -43,6 +43,7 @@ FINE = 2e-3  # of a channel's spread: errors below it do not matter
 SLIGHT = 1e-2  # nor below this part of the crude model's, or of the spread where that is less
 ODD = 10.0  # times the error of the best repeat: a trial that misses more is none
 MOMENTS = 20  # at which repeats are compared
+AS_LONG = 1.25  # times as long as repeats: whole trials that their scatter says something of
 ALIKE = 0.02  # of a command's spread: how much commands of repeats may differ, rms
 
 
@@ -257,13 +258,18 @@ class Ruler:
 
     # -- the floor ----------------------------------------------------------------------------
 
-    def scatter(self, fit: Fitted, repeats: Sequence[Sequence[int]]) -> Array | None:
-        """Rms error that repeats leave around their mean, (K, n); None without repeats."""
+    def scatter(self, fit: Fitted, repeats: Sequence[Sequence[int]]) -> tuple[Array, Array] | None:
+        """Rms error that repeats leave around their mean, (K, n), and how sure it is; None without.
+
+        Sure to that standard deviation of its logarithm, (K,): two repeats of 4 s tell what noise
+        does in a second eight times. Of whole trials they say nothing where those are longer.
+        """
         data, h = self.data, fit.hypothesis
         first = np.flatnonzero(data.step_at[:, 0] == self.step0[data.trial_of])
         of_trial = dict(zip(data.trial_of[first].tolist(), first.tolist(), strict=True))
         total = np.zeros((len(self.steps) + 1, data.model.n))
-        count = np.zeros_like(total)
+        count, often = np.zeros_like(total), np.zeros(len(total))
+        longest = int(data.lengths[data.trial_of[self.wholes]].max())
         for group in repeats:
             runs = np.array([of_trial[i] for i in group if i in of_trial])
             runs = self._alike(h, fit.states, runs)
@@ -272,6 +278,9 @@ class Ruler:
             length = int(data.lengths[data.trial_of[runs]].min())
             own = int(data.valid[runs].sum(axis=1).min())
             for k, steps in enumerate((*self.steps, length)):
+                if k == len(self.steps) and longest > AS_LONG * length:
+                    continue
+                often[k] += (len(runs) - 1) * np.clip(length // steps, 1, MOMENTS)
                 last = min(own - 1, length - steps)
                 moments = np.unique(np.linspace(min(1, last), last, MOMENTS).astype(int))
                 moments = np.zeros(1, int) if k == len(self.steps) else moments[moments >= 0]
@@ -285,7 +294,8 @@ class Ruler:
                 count[k] += there.sum(axis=(0, 1))
         if not (count[:-1][:, self._watched] > 0).all():
             return None
-        return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
+        found = np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
+        return found, 1 / np.sqrt(2 * np.maximum(often, 0.5))
 
     def _alike(self, h: Hypothesis, track: Array, runs: Any) -> Any:
         """The runs that noise alone may tell apart; the rest repeat nothing.
