@@ -35,6 +35,7 @@ STARTS, FEWER = 120, 40  # samples of a trial, and where many changes are asked 
 TRIALS = 4  # that are asked
 MANY = 8  # changes
 MOST = 10  # states of which all mirror images are tried
+PARTS = {"%": (0.01, "parts of 1"), "deg": (1 / DEGREES, "rad"), "deg/s": (1 / DEGREES, "rad/s")}
 WHOLE = {100.0: "percent", 255.0: "counts of 8 bits", 1000.0: "thousandths"}  # full scale
 OPENED = 0.05  # of full scale: the least that the largest command of a log reaches (at most OVER)
 ANGULAR, LENGTHS = ("rad", "rad/s"), ("m", "m/s")
@@ -47,7 +48,7 @@ class Mistake:
     Args:
         states: pairs of states, each in the other's column.
         inputs: two that are, or all that are in another unit.
-        factor: how many times too large these are; 1 for an exchange.
+        factor: how many times too large these are, below 1 too small; 1 for an exchange.
         unit: what that is, in words.
         signs: of exchanged inputs, once they are back.
     """
@@ -143,7 +144,8 @@ def mended_by(model: Model, told: Told) -> str:
         return "Correct the log, or the paths in [log]; or the model, if the log is right"
     tables = " and ".join(f"[log.input.{model.input_names[j]}]" for j in told.mistake.inputs)
     by = f"{1 / told.mistake.factor:.6g}"
-    return f"Multiply the scale in {tables} by {by} (1 where none is given), and [limits] as well"
+    limits = "as well" if told.mistake.factor > 1 else "if they were read from the log"
+    return f"Multiply the scale in {tables} by {by} (1 where none is given), and [limits] {limits}"
 
 
 def described(model: Model, told: Told) -> str:
@@ -155,9 +157,12 @@ def described(model: Model, told: Told) -> str:
     if not told.mistake.swap:
         names = " and ".join(model.input_names[j] for j in told.mistake.inputs)
         one = len(told.mistake.inputs) == 1
+        factor, large = told.mistake.factor, told.mistake.factor > 1
+        times = f"{factor if large else 1 / factor:.4g}"
         return (
-            f"{names} look{'s' * one} {told.mistake.factor:.4g} times too large "
-            f"(in {told.mistake.unit}?): divided by that the model {proof}"
+            f"{names} look{'s' * one} {times} times too {'large' if large else 'small'} "
+            f"(in {told.mistake.unit}?): {'divided by that' if large else f'times {times}'} "
+            f"the model {proof}"
         )
     said = " (or ".join(_pair(model, one) for one in (told.mistake, *told.others))
     said += ")" * len(told.others)
@@ -199,6 +204,10 @@ def _units(model: Model, trials: Sequence[Trial]) -> Iterator[Mistake]:
         same = tuple(j for j, one in enumerate(units) if one == unit)
         if unit in ANGULAR:
             yield Mistake(inputs=same, factor=DEGREES, unit="degrees")
+        elif unit in PARTS:
+            factor, other = PARTS[unit]
+            if max(float(np.abs(t.inputs[:, same]).max(initial=0.0)) for t in trials) < OVER:
+                yield Mistake(inputs=same, factor=factor, unit=other)
         elif unit != "1":
             yield Mistake(inputs=same, factor=1000.0, unit=f"thousandths of {unit}")
             if unit in LENGTHS:
@@ -246,7 +255,8 @@ def _compared(
     before = logged.best(signed[:1], free=False)
     if not change.swap:
         after = mended.best(signed[:1], free=False)
-        return (before, after) if before.score > still + CLEAR and _better(before, after) else None
+        seen = change.factor < 1 or before.score > still + CLEAR  # too small, they do nothing
+        return (before, after) if seen and _better(before, after) else None
     if _better(before, after):
         turned = [*signed, -signed[0]] if change.inputs else signed
         before = logged.best([*turned, np.zeros(model.m)])

@@ -154,6 +154,7 @@ class Standing(Result):
     sentence: str
     ending: Ending = ""
     then: NextCommand | None = None  # what helps now, beside going on
+    doubt: str = ""  # why a diagnosis helps more than the next trial
 
     @property
     def utilities(self) -> list[float]:
@@ -269,8 +270,8 @@ def standing(
         return replace(now, phase="converged", sentence=why, ending=ending)
     sentence = f"improve on {own} with {step}"
     if why := _suspicion(history, incumbent, model):
-        then = NextCommand("diagnose")
-        return replace(now, step=step, way=way, sentence=f"{sentence}; {why}", then=then)
+        then, sentence = NextCommand("diagnose"), f"{sentence}; {why}"
+        return replace(now, step=step, way=way, sentence=sentence, then=then, doubt=why)
     return replace(now, step=step, way=way, sentence=sentence)
 
 

@@ -9,7 +9,7 @@ import grounded as gr
 from facts import holding, holds
 from grounded import Model, Param
 from grounded.errors import GroundedError
-from grounded.instruments.mistaken import Mistake, described, judge_commands, mistaken
+from grounded.instruments.mistaken import Mistake, described, judge_commands, mended_by, mistaken
 from grounded.trial import Trial
 
 
@@ -148,6 +148,24 @@ def test_commands_of_another_unit_are_named_with_their_scale(factor, unit):
     with pytest.raises(GroundedError, match=holding("[log.input.port]", f"{1 / factor:.6g}")) as no:
         judge_commands(CRUDE[1], odd)
     assert no.value.then is not None and no.value.then.arguments == ("t0000", "t0001")
+
+
+def test_parts_of_one_for_a_model_in_percent_are_named():
+    """Nothing was said, and the diagnosis blamed a time constant at its bound and three sensors."""
+
+    def rates(s, a, p):
+        return {"v": p.k * a.throttle - s.v}
+
+    params = {"k": Param(0.05, "m/s^2", 0.03, 0.07)}
+    units = {"states": {"v": "m/s"}, "inputs": {"throttle": "%"}}
+    model = Model(name="m", params=params, derivative=rates, **units)
+    trial = driven(model, gains=40.0)
+    trial = replace(trial, inputs=40 * trial.inputs)
+    assert mistaken(model, [trial], every(model)) is None
+    told = mistaken(model, [replace(trial, inputs=trial.inputs / 100)], every(model))
+    assert told is not None and told.mistake.factor == 0.01
+    assert holds(described(model, told), "100 times too small")
+    assert "by 100 " in mended_by(model, told)
 
 
 def test_commands_that_are_large_in_the_model_too_are_in_no_other_unit():

@@ -15,6 +15,7 @@ from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.effects import Library
 from grounded.errors import GroundedError, NextCommand
+from grounded.search import standing as standing_of_a_search
 from grounded.search.candidate import Candidate
 from grounded_cli.main import COMMANDS, cli
 from grounded_cli.options import ELSEWHERE, placed
@@ -595,3 +596,17 @@ def test_what_trials_differ_in_and_predictions_lose_with_is_not_adopted(cart, tm
     gains = {"unit_by_channel": {"v": "m/s", "x": "m"}, "crude": {"v": 0.3, "x": 4.0}}
     diagnosed(folder, prediction_error=[rows[0] | gains | {"with_effects": {"v": 0.5, "x": 0.1}}])
     assert last(grounded("-C", folder, "status")).startswith("grounded adopt")
+
+
+def test_who_goes_on_after_steps_that_lost_is_told_of_a_diagnosis(tmp_path, monkeypatch):
+    """Five runs of a car brought nothing, and `next` named a sixth."""
+    folder = make(tmp_path / "w", CONFIG).folder
+    Workspace(folder).learn(1)
+    monkeypatch.setattr(standing_of_a_search, "_suspicion", lambda *given: "2 steps were lost")
+    notes = Workspace(folder).propose().proposal.notes
+    assert any(holds(note, "2 steps were lost", "grounded", "diagnose") for note in notes)
+    for file in (folder / "candidates").glob("c0002*"):
+        file.unlink()
+    (folder / "reports").mkdir()
+    diagnosed(folder, made={"trials": ["t0001"]})
+    assert not any("diagnose" in note for note in Workspace(folder).propose().proposal.notes)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
+from grounded_trials.wording import rendered
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.handover import Void, checked_candidate, outside_limits
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
@@ -112,6 +113,12 @@ def propose_in(workspace: Folder) -> Proposed:
                 "nothing was run yet: widen [safety], or draw a target whose run stays inside "
                 "(`target`), and propose again"
             )
+    if doubt := proposal.standing.doubt:
+        from grounded.search.standing import LOST
+
+        last = status_of(workspace, proposal.standing)
+        if last.since is None or last.since.newer >= LOST:
+            notes.append(f"{doubt}: `{rendered(NextCommand('diagnose'), workspace.address)}`")
     proposal = replace(proposal, notes=(*proposal.notes, *notes))
     if candidate is None:
         return Proposed(proposal, None, status_of(workspace, proposal.standing).then)
