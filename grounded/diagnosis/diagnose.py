@@ -57,6 +57,7 @@ from grounded.diagnosis.validation.limits import (
     limits,
 )
 from grounded.diagnosis.validation.measured import Measured, root_mean_square
+from grounded.diagnosis.validation.motions import how_many, without_others
 from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.verdict import at_bounds, next_trial, verdict
@@ -157,7 +158,10 @@ def diagnose(
     with np.errstate(all="ignore"):
         search = HypothesisSearch(data, ())
         null = search.refined([search.fresh(Hypothesis())], FIRST_LOOK)
-        data = replace(data, model=held(uncertain, null[0])) if null else data
+        if null:
+            data = replace(data, model=held(uncertain, null[0]))
+            model = without_others(Predictor(data), null[0].track, options.but, options.library)
+            data = replace(data, model=model)
     offered = options.library.candidates(data.model, data.scales)
     settled = {*options.but, *looked.settled}
     candidates = knowable(data, [e for e in offered if e.name not in settled])
@@ -268,7 +272,19 @@ class _Writer:
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         worse, adopted = contested(rows, agreement, named), self.options.but
         lost = self.unrepeatable()
-        said = verdict(self.claims, ranking, groups, remainder, rows, credit, seen, same, self.most)
+        moved = how_many(predictor)
+        said = verdict(
+            self.claims,
+            ranking,
+            groups,
+            remainder,
+            rows,
+            credit,
+            seen,
+            same,
+            self.most,
+            one_motion=moved == 1 < data.count,
+        )
         further = said.look_for > 0
         return Diagnosis(
             verdict=said,
@@ -319,6 +335,7 @@ class _Writer:
             per_trial=values,
             agreement=agreement,
             trials=data.count,
+            motions=moved,
             steps=data.steps,
             candidates=len(self.search.candidates),
         )

@@ -41,6 +41,7 @@ def verdict(
     seen: Sequence[Unconfirmed] = (),
     same: tuple[tuple[str, ...], ...] = (),
     most: int = 0,
+    one_motion: bool = False,
 ) -> Verdict:
     """One effect, several, none or unknown, and why: what, by how much, what is left.
 
@@ -54,8 +55,10 @@ def verdict(
         seen: what only one trial shows.
         same: of the groups, what is one thing in the model.
         most: effects that were looked for at once; 0: any number.
+        one_motion: that all trials repeat.
     """
-    once = [sentence([one.sentence()]) for one in seen]
+    told = [one for one in seen if not one.repeats] + [one for one in seen if one.repeats][:1]
+    once = [sentence([one.sentence()]) for one in told]
     left = remainder[0].sentence() if remainder else ""
     left += f"; {len(remainder) - 1} more" if len(remainder) > 1 else ""
     claimed = [row for row in ranking if row.claimed]
@@ -88,11 +91,16 @@ def verdict(
         words.append(f"Something is left that no known effect explains: {left}.")
     elif above := rest(rows):
         words.append(sentence([above]))
+    if one_motion and (remainder or seen):
+        words.append(ONE_MOTION)
     words += once
     kind: Kind = "effect" if len(claimed) == 1 else "several"
     effects, off = tuple(r.effect for r in claimed), tuple(_off(claims))
     said = replace(_said(kind, *words), effects=effects, causes=causes, parameters=off)
     return replace(said, look_for=more if more > most else 0)
+
+
+ONE_MOTION = "All trials repeat one motion: numbers that fit it need not hold in another."
 
 
 def _said(kind: Kind, *words: str) -> Verdict:
@@ -178,6 +186,11 @@ def next_trial(
         return " ".join([made, *distinguishing(groups[0], turns=turns)])
     if seen:
         one = seen[0]
+        if one.repeats:
+            return (
+                f"Run a trial that moves differently: those that show {one.effect} repeat one "
+                "motion."
+            )
         why = (unrepeatable or {}).get(one.trial)
         if why is None:
             return f"Repeat trial {one.trial}: hardly another one shows {one.effect}."
