@@ -1,8 +1,9 @@
 """What was seen once: likely effects of too few trials for predictions of others to bear them out.
 
-Or of one motion that the trials repeat (`validation.motions`). They are never causes. Each is told with the trial, the time and the region that show it, where a
-further trial would have to go. What most trials show as likely, and none predicts better by, is a
-fault of the likelihood and is not told; nor is what ties with a cause, which is told as that.
+Or of one motion that the trials repeat (`validation.motions`). They are never causes. Each is told
+with the trial, the time and the region that show it, where a further trial would have to go. What
+most trials show as likely, and none predicts better by, is a fault of the likelihood and is not
+told; nor is what ties with a cause, which is told as that.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ REFIT = 12  # iterations after a cause was taken out
 
 @dataclass(frozen=True, eq=False)
 class Doubtful:
-    """A likely effect that was dropped: predictions gain too little by it, or one motion shows it."""
+    """A likely effect that was dropped: predictions gain too little, or one motion shows it."""
 
     name: str
     nats: float
@@ -263,11 +263,15 @@ def _pruned(
         least = SLIGHT * ruler.since_outset(fit)
         undone = counterparts(search.predictor, fit.hypothesis)
         repeated = {n: repeats(search, fit, without[n], n) for n in _effects(fit)}
-        idle = undone or [n for n, count in repeated.items() if count] or [
-            name
-            for name, less in without.items()
-            if gains[name].channels.max() < least or not _pays(search, ruler, less, fit, white)
-        ]
+        idle = (
+            undone
+            or [n for n, count in repeated.items() if count]
+            or [
+                name
+                for name, less in without.items()
+                if gains[name].channels.max() < least or not _pays(search, ruler, less, fit, white)
+            ]
+        )
         if not idle:
             return fit, without, doubtful
         name = min(idle, key=lambda name: gains[name].mean)

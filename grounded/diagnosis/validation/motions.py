@@ -1,15 +1,16 @@
 """In how many motions an effect that names no mechanism is seen: trials that repeat one are one.
 
-A wave in time, a constant, what one state adds to another's rate, a patch of ground (`Family.loose`)
-fit any shape. Where all trials follow one path, whatever the model lacks is the same function of
+A wave in time, a constant, what one state adds to another's rate, a patch of ground: `Family.loose`
+fits any shape. Where all trials follow one path, whatever the model lacks is the same function of
 time in each of them, and of every state: repeats make it likelier with each trial, and trials that
 are left out are foretold by those that repeat them. None of that tells a cause. So such an effect
 is believed only as far as motions that differ bear it out: of the nats that are lost without it,
 the motion that holds most has no say.
 
 Two trials repeat one motion, for an effect, where what it adds to the rates is nearly the same
-function of time in both, and so is a state of which the rates may depend in another way. Compared are means over tenths of the trial, so that
-a feedback that chatters, or noise, makes no motion another one.
+function of time in both, and so is a state on which the rates may depend in another way. Compared
+are means over tenths of the trial, so that a feedback that chatters, or noise, makes no motion
+another one.
 """
 
 from __future__ import annotations
