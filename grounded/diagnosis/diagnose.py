@@ -179,7 +179,9 @@ def diagnose(
             ruler = Ruler(search.predictor, options.origin)
             decision = decide(search, best, ruler, most)
             tick("leftover")
-            writer = _Writer(decision, ruler, known, options, most, tick, task, used, exact)
+            writer = _Writer(
+                decision, ruler, known, options, most, tick, task, used, exact, uncertain
+            )
             found = writer.diagnosis()
             if options.max_effects or not found.verdict.look_for:
                 break
@@ -190,7 +192,6 @@ def diagnose(
         apart = compared(search, decision.fit, groups) if compare else None
         return replace(
             found,
-            identifiable=tuple(_identified(uncertain, decision.fit, found.parameters)),
             preflight=looked.findings,
             changed=apart.changed if apart else None,
             unchanged=apart.unchanged if apart else (),
@@ -209,7 +210,7 @@ def _identified(
     """Of all uncertain parameters, those that were held too, beside the best hypothesis."""
     if not param_scale(uncertain.data.model).any():
         return []
-    return identifiable(uncertain, best, {name: e.std for name, e in known.items()})
+    return identifiable(uncertain, best, known)
 
 
 def _in_action(h: Hypothesis, claimed: Sequence[str]) -> tuple[str, ...]:
@@ -234,6 +235,7 @@ class _Writer:
         task: Task | None,
         trials: Sequence[Trial],
         exact: bool,
+        uncertain: Predictor,
     ) -> None:
         self.decision, self.ruler, self.known, self.options = decision, ruler, known, options
         self.most, self.tick, self.task, self.trials = most, tick, task, trials
@@ -242,7 +244,7 @@ class _Writer:
         self.shown = list(zip(ruler.shown, ruler.names, strict=True))
         self.measured = Measured(decision, ruler, trials, exact)
         self.claims = Claims(decision, self.measured.credit, known, ruler)
-        self.left = self.measured.left
+        self.left, self.uncertain = self.measured.left, uncertain
 
     def diagnosis(self) -> Diagnosis:
         data, predictor = self.data, self.predictor
@@ -272,7 +274,8 @@ class _Writer:
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         worse, adopted = contested(rows, agreement, named), self.options.but
         lost = self.unrepeatable()
-        moved = how_many(predictor)
+        moved, parameters = how_many(predictor), self.claims.parameters()
+        identified = tuple(_identified(self.uncertain, self.best, parameters))
         said = verdict(
             self.claims,
             ranking,
@@ -284,6 +287,7 @@ class _Writer:
             same,
             self.most,
             one_motion=moved == 1 < data.count,
+            given={one.parameter: tuple(one.given) for one in identified},
         )
         further = said.look_for > 0
         return Diagnosis(
@@ -329,7 +333,8 @@ class _Writer:
             ),
             unknowable=self.known.sentences,
             noise=self.noise(),
-            parameters=self.claims.parameters(),
+            parameters=parameters,
+            identifiable=identified,
             prediction_error=rows,
             credit=credit,
             per_trial=values,

@@ -228,7 +228,7 @@ def _teaching(
 def _misfit(diagnosis: Diagnosis) -> float:
     """How many times more than noise predictions miss: what another motion tells is as far off."""
     left = [one.error / one.floor for one in diagnosis.leftover if one.floor > 0]
-    return max(1.0, diagnosis.where.tempering**-0.5, *left)
+    return float(max(1.0, diagnosis.where.tempering**-0.5, *left))
 
 
 def _information(

@@ -139,13 +139,16 @@ class Unconfirmed(Document):
 class Identifiable(Document):
     """How well the trials tell one uncertain parameter, all others free.
 
-    left: of its prior standard deviation `prior`, 0 to 1.
+    left: of its prior standard deviation `prior`, 0 to 1. given: those that were held at their
+    values though the trials don't tell them, by how many percent it is off for each percent that
+    one of them is (1: only the ratio is known). Its `+-` holds with them as they are.
     """
 
     parameter: str
     verdict: str  # identifiable, weak, not identifiable
     prior: float = math.nan
     left: float = math.nan
+    given: Mapping[str, float] = field(metadata=BRIEF, default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,6 +42,7 @@ def verdict(
     same: tuple[tuple[str, ...], ...] = (),
     most: int = 0,
     one_motion: bool = False,
+    given: Mapping[str, Sequence[str]] | None = None,
 ) -> Verdict:
     """One effect, several, none or unknown, and why: what, by how much, what is left.
 
@@ -56,6 +57,7 @@ def verdict(
         same: of the groups, what is one thing in the model.
         most: effects that were looked for at once; 0: any number.
         one_motion: that all trials repeat.
+        given: by parameter, those held with which alone it is known (`Identifiable.given`).
     """
     told = [one for one in seen if not one.repeats] + [one for one in seen if one.repeats][:1]
     once = [sentence([one.sentence()]) for one in told]
@@ -76,7 +78,7 @@ def verdict(
         else:
             text = f"The model explains the data down to the noise{floor(row)}."
         return _said("none", text, *once)
-    causes = _causes(claims, ranking, credit)
+    causes = _causes(claims, ranking, credit, given or {})
     several = len(causes) > 1
     shares = [f" ({percent(one.share)} of the gain)" * several for one in credit]
     words = [sentence(map(str.__add__, causes, shares)), improvement(rows), worsened(rows)]
@@ -108,7 +110,12 @@ def _said(kind: Kind, *words: str) -> Verdict:
     return Verdict(kind, sentence=" ".join(said), sentences=said)
 
 
-def _causes(claims: Claims, ranking: Sequence[Ranked], credit: Sequence[Credit]) -> tuple[str, ...]:
+def _causes(
+    claims: Claims,
+    ranking: Sequence[Ranked],
+    credit: Sequence[Credit],
+    given: Mapping[str, Sequence[str]],
+) -> tuple[str, ...]:
     """A clause a cause, largest first."""
     effects = {e.name: e for e in claims.best.hypothesis.effects}
     values = {row.effect: row.params for row in ranking}
@@ -118,6 +125,8 @@ def _causes(claims: Claims, ranking: Sequence[Ranked], credit: Sequence[Credit])
             text = meaning(effects[one.of], values[one.of])
         else:
             text = f"the model's own parameters are off: {_moved(claims)}"
+            held = dict.fromkeys(other for n in _off(claims)[:NAMED] for other in given.get(n, ()))
+            text += f", with {' and '.join(held)} as written" * bool(held)
         found.append(text)
     return tuple(found)
 
