@@ -13,16 +13,21 @@ apart by some nats, and have by few; whatever a probe is expected to tell is sca
 Where nothing ties, the probe teaches most about the values that are claimed or calibrated: from
 the information F of the trials so far and J of its run, filtered alike, the expected gain is
 
-    1/2 log det(F + J) / det F        and variances shrink as diag (F + J)^-1 to diag F^-1
+    1/2 log det(F + J) / det F
+
+What it promises is what the diagnosis after it will state: that asks the trials, each left out, and
+does not believe a number that one trial alone tells (`intervals.foretold`). So where one run would
+hardly be believed, the promise is that of two. Where predictions miss by more than the noise, so
+will those of a new motion, and it tells less by that. Nothing measures in the probe's run what
+nothing has measured in the trials.
 
 The probe stays inside the inputs' limits, and both hypotheses' runs inside the task's safety.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -30,9 +35,11 @@ from grounded.diagnosis.hypotheses.explored import TIE
 from grounded.diagnosis.likelihood.data import Data, prepare, shifted
 from grounded.diagnosis.likelihood.fitted import calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.intervals import foretold
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
+from grounded.diagnosis.patterns import BASE, probes
 from grounded.diagnosis.report import Diagnosis, Estimate
 from grounded.effects import Library, Scales, memory_start, scales_of, wrap, wrapping_order
 from grounded.frozen import Array
@@ -42,10 +49,11 @@ from grounded.policy import Policy
 from grounded.task import Task
 from grounded.trial import Trial
 
-SIZES = (0.15, 0.35)  # of the input's range
 NOTHING = 0.1  # nats: less is nothing that a trial could tell
 REPLAYED = 4  # trials whose commands show what they should have told
 ADAPTED = 12  # iterations in which a rival adapts to a run
+TWICE = 0.8  # of what one run leaves of a value's error: if two leave less, two are asked for
+SETTLED = 4  # iterations
 TEACHES = 0.1  # of a value's standard deviation: a probe that takes off less teaches too little
 LITTLE = 1e-6  # of a value's own information, and of its size
 
@@ -55,7 +63,8 @@ class Probe:
     """A runnable policy, the evidence it is expected to bring [nats], and what it does.
 
     `about`: the two effects that it tells apart, or the value that it teaches most of.
-    `little`: that is too little to be worth a trial.
+    `little`: that is too little to be worth a trial. `std`: of that value, in its unit, as a
+    diagnosis will state it after `runs` runs.
     """
 
     policy: Policy
@@ -63,6 +72,8 @@ class Probe:
     about: tuple[str, ...]
     sentence: str
     little: bool = False
+    std: float = np.nan
+    runs: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,81 +179,78 @@ def _teaching(
     std = np.array([s if np.isfinite(s) else 0.0 for s, _ in spreads.values()])
     if not std.any():
         return None
-    F = _information(task, trials, h, noise)
-    if F.shape != (len(std), len(std)) or not np.isfinite(F).all():
+    groups = _information(task, trials, h, noise)
+    if groups.shape[1:] != (len(std), len(std)) or not np.isfinite(groups).all():
         return None
+    F = groups.sum(axis=0)
     own = np.maximum(np.diag(F), 1 / np.maximum(std, LITTLE) ** 2)  # or what is known beforehand
     unit_of = 1 / np.sqrt(own)
-    F = (F + np.diag(own - np.diag(F))) * np.outer(unit_of, unit_of) + LITTLE * np.eye(len(std))
+    groups, prior = groups * np.outer(unit_of, unit_of), np.diag(1 - np.diag(F) / own + LITTLE)
+    F = groups.sum(axis=0) + prior
+    unseen = np.isnan(np.concatenate([trial.states for trial in trials])).all(axis=0)
     for words, candidate in probes(policy, task.model, range(task.model.m)):
         run = _run(task, h, candidate)
         if not _safe(task, run):
             continue
         assert run is not None
-        J = _information(task, [run], h, noise)
-        if J.shape != F.shape or not np.isfinite(J).all():
+        J = _information(task, [run], h, noise, unseen)
+        if J.shape[1:] != F.shape or not np.isfinite(J).all():
             continue
-        after = F + J * np.outer(unit_of, unit_of)
-        gain = 0.5 * float(np.linalg.slogdet(after)[1] - np.linalg.slogdet(F)[1])
+        J = J * np.outer(unit_of, unit_of)
+        gain = 0.5 * float(np.linalg.slogdet(F + J[0])[1] - np.linalg.slogdet(F)[1])
         if best is None or gain > best[0]:
-            left = np.diag(np.linalg.inv(after)) / np.diag(np.linalg.inv(F))
-            best = (gain, candidate, words, np.sqrt(left))
+            best = (gain, candidate, words, J)
     if best is None:
         return None
-    gain, chosen, words, shrunk = best
-    k = int(np.argmin(np.where(std > 0, shrunk, np.inf)))
+    gain, chosen, words, J = best
+    before = foretold(groups, prior)
+    wider = np.median((std / (before * unit_of))[std > 0])  # than where the model is right
+    J = J / max(_misfit(diagnosis) / wider, 1.0) ** 2
+    once, twice = (foretold(np.concatenate([groups, *[J] * n]), prior) / before for n in (1, 2))
+    k = int(np.argmin(np.where(std > 0, twice, np.inf)))
+    again = bool(twice[k] < TWICE * once[k])
+    shrunk = twice[k] if again else once[k]
     name = list(spreads)[k]
     unit = f" {spreads[name][1]}" * (spreads[name][1] != "1")
     now = float(std[k]) * sizes.get(name, 1.0)
-    then = now * float(shrunk[k])
-    sentence = f"{words}: would tell {name} to +- {then:.2g}{unit} (now +- {now:.2g}{unit})"
-    if little := bool(shrunk[k] > 1 - TEACHES):
+    then = now * float(shrunk)
+    little = False
+    tells = f"would tell {name} to +- {then:.2g}{unit} (now +- {now:.2g}{unit})"
+    sentence = f"{words}{', run twice,' if again else ':'} {tells}"
+    if diagnosis.motions == 1 < len(trials) and words != BASE:
+        sentence = f"{words}: would show if {name}, told by one motion so far, holds in another"
+    elif shrunk > 1 - TEACHES:
         sentence = f"no candidate inside the limits teaches much, not even {sentence}"
-    return Probe(chosen, gain, (name,), sentence, little)
+        little = True
+    return Probe(chosen, gain, (name,), sentence, little, then, 1 + again)
 
 
-def _information(task: Task, runs: Sequence[Trial], h: Hypothesis, noise: _Noise) -> Array:
-    """Fisher information (C, C) on a hypothesis' values that runs hold, or would."""
+def _misfit(diagnosis: Diagnosis) -> float:
+    """How many times more than noise predictions miss: what another motion tells is as far off."""
+    left = [one.error / one.floor for one in diagnosis.leftover if one.floor > 0]
+    return float(max(1.0, diagnosis.where.tempering**-0.5, *left))
+
+
+def _information(
+    task: Task, runs: Sequence[Trial], h: Hypothesis, noise: _Noise, unseen: Array | None = None
+) -> Array:
+    """Fisher information on a hypothesis' values that each of the runs holds, or would (S, C, C).
+
+    `unseen`: states (n,) that nothing will measure in predicted runs.
+    """
     data = noise.data(task, runs)
-    start = [(h, noise.model, data.y.copy())]
-    fits = refine(Predictor(data), start, iterations=1, fixed_noise=True)
-    return np.asarray(fits[0].gram.sum(axis=0)) if fits else np.zeros((0, 0))
-
-
-def probes(policy: Policy, model: Model, inputs: Sequence[int]) -> Iterator[tuple[str, Policy]]:
-    """The base policy itself, then with each pattern added to each input."""
-    yield "the base policy once more", policy
-    t = np.arange(policy.horizon, dtype=float) * policy.dt
-    for j in inputs:
-        low, high = policy.low[j], policy.high[j]
-        room = float(high - low) if np.isfinite(high - low) else 2.0
-        limits = f" (limits {low:g} to {high:g})" * bool(np.isfinite(high - low))
-        for size in SIZES:
-            for words, shape in patterns(t):
-                feedforward = policy.feedforward.copy()
-                feedforward[:, j] = np.clip(feedforward[:, j] + size * room * shape, low, high)
-                name = policy.input_names[j]
-                unit = model.inputs[name]
-                of = f"{size * room:.2g} {unit}" if unit != "1" else f"{size * room:.2g}{limits}"
-                made = replace(policy, feedforward=feedforward)
-                yield f"{words} of {of} added to {name}", made
-
-
-def patterns(t: Any) -> list[tuple[str, Array]]:
-    """Shapes of unit size over the times t (H,)."""
-    T = float(t[-1]) + 1e-9
-    phase = t / T
-    stairs = np.round(4 * np.sin(2 * np.pi * phase)) / 4
-    doublets = np.sign(np.sin(2 * np.pi * t / max(T / 5, 0.4)))
-    sweep = np.sin(2 * np.pi * (0.2 * t + 0.5 * (2.0 - 0.2) / T * t**2))
-    return [
-        ("a slow ramp down", -phase),
-        ("a slow ramp up", phase),
-        ("a staircase", stairs),
-        ("doublets", doublets),
-        ("a sweep of frequencies", sweep),
-        ("a pulse to the lower side", -((phase > 0.4) & (phase < 0.7)).astype(float)),
-    ]
+    track, iterations = data.y.copy(), 1
+    if unseen is not None and unseen.any():
+        hidden = [replace(run, states=np.where(unseen, np.nan, run.states)) for run in runs]
+        data = noise.data(task, hidden)
+    elif not data.seen.any(axis=(0, 1)).all():
+        iterations = SETTLED  # a state that nothing measured has no track yet
+    start = [(h, noise.model, track)]
+    fits = refine(Predictor(data), start, iterations=iterations, fixed_noise=True)
+    by = np.zeros((len(runs), *(fits[0].gram.shape[1:] if fits else (0, 0))))
+    if fits:
+        np.add.at(by, data.trial_of, fits[0].gram)
+    return by
 
 
 def _inputs_of(model: Model, names: Sequence[str]) -> list[int]:

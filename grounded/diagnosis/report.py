@@ -105,7 +105,8 @@ class Likeness(Document):
 class Unconfirmed(Document):
     """A likely effect that few trials show, most of all `trial` from `start` to `end` [s].
 
-    seen: how many trials hold most of what it does, of how many; region: where it does.
+    seen: how many trials hold most of what it does, of how many; region: where it does. repeats:
+    they all make one motion, of which nothing tells it from whatever else repeats with that.
     """
 
     effect: str
@@ -117,10 +118,15 @@ class Unconfirmed(Document):
     end: float = field(metadata={"key": "to"}, default=math.nan)
     seen: tuple[int, int] = (1, 1)
     region: Region | None = None
+    repeats: bool = False
 
     def sentence(self) -> str:
         """One clause."""
         few, all_ = self.seen
+        if self.repeats:
+            made = f"{few} of {all_}" if few < all_ else f"all {all_}"
+            rest = f"or whatever else repeats with the one motion of {made} trials"
+            return f"unconfirmed: {self.meaning}, {rest}"
         where = "" if self.region is None else f", mostly where {self.region.when}"
         start, end = number(self.start), number(self.end)
         when = (
@@ -133,13 +139,16 @@ class Unconfirmed(Document):
 class Identifiable(Document):
     """How well the trials tell one uncertain parameter, all others free.
 
-    left: of its prior standard deviation `prior`, 0 to 1.
+    left: of its prior standard deviation `prior`, 0 to 1. given: those that were held at their
+    values though the trials don't tell them, by how many percent it is off for each percent that
+    one of them is (1: only the ratio is known). Its `+-` holds with them as they are.
     """
 
     parameter: str
     verdict: str  # identifiable, weak, not identifiable
     prior: float = math.nan
     left: float = math.nan
+    given: Mapping[str, float] = field(metadata=BRIEF, default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,6 +280,7 @@ class Diagnosis(Document):
     changed: tuple[Changed, ...] | None = field(metadata=BRIEF, default=None)  # of two groups
     unchanged: tuple[Changed, ...] = field(metadata=BRIEF, default=())  # alike in both groups
     trials: int = 0
+    motions: int = field(metadata=BRIEF, default=0)  # that differ, among the trials
     steps: int = 0
     candidates: int = 0
     made: Made | None = field(metadata=BRIEF | {"key": "diagnosed"}, default=None)  # in a workspace

@@ -1,8 +1,9 @@
 """What was seen once: likely effects of too few trials for predictions of others to bear them out.
 
-They are never causes. Each is told with the trial, the time and the region that show it, where a
-further trial would have to go. What most trials show as likely, and none predicts better by, is a
-fault of the likelihood and is not told; nor is what ties with a cause, which is told as that.
+Or of one motion that the trials repeat (`validation.motions`). They are never causes. Each is told
+with the trial, the time and the region that show it, where a further trial would have to go. What
+most trials show as likely, and none predicts better by, is a fault of the likelihood and is not
+told; nor is what ties with a cause, which is told as that.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def unconfirmed(
 
 def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
     data, acts = claims.data, acting(claims.predictor, one.fit, one.name)
-    few = few_trials(data, acts)
+    few = one.repeats or few_trials(data, acts)
     if not few:
         return None
     trial = int(np.bincount(data.trial_of, acts.sum(axis=0), data.count).argmax())
@@ -64,6 +65,7 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
         float(begin + end),
         (few, data.count),
         regions[0] if regions else None,
+        one.repeats > 0,
     )
 
 

@@ -41,6 +41,8 @@ def verdict(
     seen: Sequence[Unconfirmed] = (),
     same: tuple[tuple[str, ...], ...] = (),
     most: int = 0,
+    one_motion: bool = False,
+    given: Mapping[str, Sequence[str]] | None = None,
 ) -> Verdict:
     """One effect, several, none or unknown, and why: what, by how much, what is left.
 
@@ -54,8 +56,11 @@ def verdict(
         seen: what only one trial shows.
         same: of the groups, what is one thing in the model.
         most: effects that were looked for at once; 0: any number.
+        one_motion: that all trials repeat.
+        given: by parameter, those held with which alone it is known (`Identifiable.given`).
     """
-    once = [sentence([one.sentence()]) for one in seen]
+    told = [one for one in seen if not one.repeats] + [one for one in seen if one.repeats][:1]
+    once = [sentence([one.sentence()]) for one in told]
     left = remainder[0].sentence() if remainder else ""
     left += f"; {len(remainder) - 1} more" if len(remainder) > 1 else ""
     claimed = [row for row in ranking if row.claimed]
@@ -73,7 +78,7 @@ def verdict(
         else:
             text = f"The model explains the data down to the noise{floor(row)}."
         return _said("none", text, *once)
-    causes = _causes(claims, ranking, credit)
+    causes = _causes(claims, ranking, credit, given or {})
     several = len(causes) > 1
     shares = [f" ({percent(one.share)} of the gain)" * several for one in credit]
     words = [sentence(map(str.__add__, causes, shares)), improvement(rows), worsened(rows)]
@@ -88,6 +93,8 @@ def verdict(
         words.append(f"Something is left that no known effect explains: {left}.")
     elif above := rest(rows):
         words.append(sentence([above]))
+    if one_motion and (remainder or seen):
+        words.append(ONE_MOTION)
     words += once
     kind: Kind = "effect" if len(claimed) == 1 else "several"
     effects, off = tuple(r.effect for r in claimed), tuple(_off(claims))
@@ -95,12 +102,20 @@ def verdict(
     return replace(said, look_for=more if more > most else 0)
 
 
+ONE_MOTION = "All trials repeat one motion: numbers that fit it need not hold in another."
+
+
 def _said(kind: Kind, *words: str) -> Verdict:
     said = tuple(text for text in words if text)
     return Verdict(kind, sentence=" ".join(said), sentences=said)
 
 
-def _causes(claims: Claims, ranking: Sequence[Ranked], credit: Sequence[Credit]) -> tuple[str, ...]:
+def _causes(
+    claims: Claims,
+    ranking: Sequence[Ranked],
+    credit: Sequence[Credit],
+    given: Mapping[str, Sequence[str]],
+) -> tuple[str, ...]:
     """A clause a cause, largest first."""
     effects = {e.name: e for e in claims.best.hypothesis.effects}
     values = {row.effect: row.params for row in ranking}
@@ -110,6 +125,8 @@ def _causes(claims: Claims, ranking: Sequence[Ranked], credit: Sequence[Credit])
             text = meaning(effects[one.of], values[one.of])
         else:
             text = f"the model's own parameters are off: {_moved(claims)}"
+            held = dict.fromkeys(other for n in _off(claims)[:NAMED] for other in given.get(n, ()))
+            text += f", with {' and '.join(held)} as written" * bool(held)
         found.append(text)
     return tuple(found)
 
@@ -178,6 +195,11 @@ def next_trial(
         return " ".join([made, *distinguishing(groups[0], turns=turns)])
     if seen:
         one = seen[0]
+        if one.repeats:
+            return (
+                f"Run a trial that moves differently: those that show {one.effect} repeat one "
+                "motion."
+            )
         why = (unrepeatable or {}).get(one.trial)
         if why is None:
             return f"Repeat trial {one.trial}: hardly another one shows {one.effect}."

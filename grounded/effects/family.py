@@ -173,6 +173,7 @@ class Family:
         lookalikes: families that the same data may explain.
         vague: nats that a family pays for naming no mechanism, so that a tie goes to one that does.
         turned: of a gain, the sentence where 1 + g is below zero.
+        loose: it names no mechanism, but fits what repeats with a motion, whatever the cause.
     """
 
     name: str
@@ -183,6 +184,7 @@ class Family:
     lookalikes: tuple[str, ...] = ()
     vague: float = 0.0
     turned: str = ""
+    loose: bool = False
 
     def at(self, site: Site) -> Effect:
         """The effect of this family there, with the quantities that it estimates there."""

@@ -244,6 +244,7 @@ slope = RateFamily(
 
 patch = RateFamily(
     name="patch",
+    loose=True,
     equation="s' = model + c exp(-|q - q0|^2 / (2 radius^2))",
     sentence="{target} differs by {c} at one place",
     targets=_patch_targets,

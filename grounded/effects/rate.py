@@ -65,6 +65,7 @@ def _slew_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
 
 offset = RateFamily(
     name="offset",
+    loose=True,
     equation="s' = model + c",
     sentence="{target} drifts by {c}",
     targets=places.states,
@@ -87,6 +88,7 @@ rate_gain = RateFamily(
 
 trend = RateFamily(
     name="trend",
+    loose=True,
     equation="s' = model + k t",
     sentence="{target} drifts more and more, by {k}",
     targets=places.dynamic,
@@ -99,6 +101,7 @@ trend = RateFamily(
 
 coupling = RateFamily(
     name="coupling",
+    loose=True,
     equation="s' = model + k r   (s<-r)",
     sentence="{source} acts on {driven} by {k}",
     targets=places.pairs,
@@ -110,6 +113,7 @@ coupling = RateFamily(
 
 periodic = RateFamily(
     name="periodic",
+    loose=True,
     equation="s' = model + A sin(omega t) + B cos(omega t)",
     sentence="{target} is shaken at {omega}",
     targets=places.dynamic,

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
-from grounded.diagnosis.diagnose import DiagnosisOptions, _Writer, diagnose
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.writer import Writer
 from grounded.effects import Library
 
 DT = 0.02
@@ -63,7 +64,7 @@ def test_more_than_three_effects_are_looked_for_where_three_leave_more_than_nois
 @pytest.mark.slow
 def test_no_effect_is_named_that_predictions_gain_next_to_nothing_by(monkeypatch):
     """A noise-free car's circle: a patch of the ground worth 0.2 % was the sixth cause."""
-    monkeypatch.setattr(_Writer, "unfinished", True)
+    monkeypatch.setattr(Writer, "unfinished", True)
     library = Library(
         tuple(map(Library().family, ("delay", "dead_zone", "input_bias", "coupling")))
     )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from grounded.diagnosis import excitation
-from grounded.diagnosis.excitation import probes
+from grounded.diagnosis.patterns import probes
 from grounded.effects import Library
 from grounded.errors import NextCommand
 from grounded_trials import Workspace
@@ -90,7 +90,7 @@ def test_a_trial_that_teaches_little_is_not_advised(diagnosed, monkeypatch):
     w, found = diagnosed
     (w.folder / "grounded.toml").write_text(NOISY)
     w.forget()
-    found = replace(found, indistinguishable=())
+    found = replace(found, indistinguishable=(), motions=0)
     trials = [w.planner.lift(trial) for trial in w.task_trials()]
     monkeypatch.setattr(excitation, "TEACHES", 0.999)
     identity, sentence = _probe(w, found, trials, Library(), write=False)
@@ -98,6 +98,19 @@ def test_a_trial_that_teaches_little_is_not_advised(diagnosed, monkeypatch):
     assert sentence.startswith(found.next_trial) and "teaches much" in sentence
     identity, sentence = _probe(w, found, trials, Library(), write=True)
     assert identity and "teaches much" in sentence
+
+
+def test_numbers_that_one_motion_told_get_no_promise_in_another(diagnosed):
+    w, found = diagnosed
+    (w.folder / "grounded.toml").write_text(NOISY)
+    w.forget()
+    trials = [w.planner.lift(trial) for trial in w.task_trials()]
+    sentences = []
+    for motions in (1, 2):
+        known = replace(found, indistinguishable=(), motions=motions)
+        sentences.append(_probe(w, known, trials, Library(), write=False)[1])
+    assert "+-" not in sentences[0] and "holds in another" in sentences[0]
+    assert "+-" in sentences[1]
 
 
 def test_people_export_a_probe(diagnosed, tmp_path):

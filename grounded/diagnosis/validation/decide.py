@@ -11,6 +11,7 @@ likeliest of every other structure of noise, are held against the `ruler`:
     a cause without which predictions are as good, within their scatter, is dropped; a further
     effect that is beyond doubt, where white noise is all that is left, only if they gain nothing
     an effect that a parameter's shift undoes is dropped: the parameter alone does both
+    one without a mechanism that a single motion shows is dropped, however often that was repeated
     what is left then must be likelier than none by itself
     what predicts no better than the crude model is not claimed at all
     a likely effect that was dropped is doubtful: seen in too few trials, maybe
@@ -30,6 +31,7 @@ from grounded.diagnosis.hypotheses.plainest import plainer
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
+from grounded.diagnosis.validation.motions import repeats
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.validation.single_steps import borne_out
 from grounded.diagnosis.validation.visits import acting, few_trials
@@ -52,11 +54,12 @@ REFIT = 12  # iterations after a cause was taken out
 
 @dataclass(frozen=True, eq=False)
 class Doubtful:
-    """A likely effect that was dropped because predictions gain too little by it."""
+    """A likely effect that was dropped: predictions gain too little, or one motion shows it."""
 
     name: str
     nats: float
     fit: Fitted  # with it
+    repeats: int = 0  # trials that make the one motion that bears it out; 0: few trials do
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,17 +262,22 @@ def _pruned(
         gains = {name: ruler.gain(less, fit) for name, less in without.items()}
         least = SLIGHT * ruler.since_outset(fit)
         undone = counterparts(search.predictor, fit.hypothesis)
-        idle = undone or [
-            name
-            for name, less in without.items()
-            if gains[name].channels.max() < least or not _pays(search, ruler, less, fit, white)
-        ]
+        repeated = {n: repeats(search, fit, without[n], n) for n in _effects(fit)}
+        idle = (
+            undone
+            or [n for n, count in repeated.items() if count]
+            or [
+                name
+                for name, less in without.items()
+                if gains[name].channels.max() < least or not _pays(search, ruler, less, fit, white)
+            ]
+        )
         if not idle:
             return fit, without, doubtful
         name = min(idle, key=lambda name: gains[name].mean)
         nats = search.score(fit) - search.score(without[name])
         if nats > LIKELY and name in _effects(fit) and name not in undone:
-            doubtful.append(Doubtful(name, nats, fit))
+            doubtful.append(Doubtful(name, nats, fit, repeated[name]))
         fit = without[name]
 
 

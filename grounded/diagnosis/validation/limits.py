@@ -16,7 +16,7 @@ from grounded.diagnosis.likelihood.data import PIECES, Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.linearise import base_columns
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.report import Identifiable
+from grounded.diagnosis.report import Estimate, Identifiable
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -36,6 +36,8 @@ from grounded.trial import Trial
 
 FEW_STEPS = 30
 WEAK, UNKNOWN = 0.2, 0.6  # of its prior standard deviation: what the trials leave of it
+DEPENDS = 2.0  # times its standard deviation: that of a value, all held parameters free
+PART = 0.2  # of that variance, which a parameter makes that it depends on
 QUIETER = 100.0  # times less noise variance: what effects may yet take out of the noise
 
 
@@ -165,20 +167,36 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
 
 
 def identifiable(
-    predictor: Predictor, fit: Fitted, stds: Mapping[str, float] | None = None
+    predictor: Predictor, fit: Fitted, known: Mapping[str, Estimate] | None = None
 ) -> list[Identifiable]:
     """How well the trials tell each uncertain parameter, all others free, under a fit's noise.
 
     The sensitivities of the predictions, whitened, are the information that the data add to the
     priors; what is left of each prior's standard deviation is the verdict, or what a calibrated
     value's own standard deviation is of it, where that is more.
+
+    Args:
+        predictor: of the data, all uncertain parameters free.
+        fit: beside which hypothesis.
+        known: those that were calibrated, the others held at their values.
     """
-    left, stds = _left(_information(predictor, fit)), stds or {}
+    information, known = _information(predictor, fit), known or {}
+    cov = np.linalg.inv(information + np.eye(len(information)))
     model, found = predictor.data.model, []
-    for i, share in zip(calibrated(predictor.data), left, strict=True):
-        name, prior = model.param_names[i], model.params[model.param_names[i]].spread
-        share = max(float(share), min(stds.get(name, 0.0) / prior, 1.0))
-        found.append(Identifiable(name, _verdict(share), prior, share))
+    names = [model.param_names[i] for i in calibrated(predictor.data)]
+    priors = np.array([model.params[name].spread for name in names])
+    held_ = [i for i, name in enumerate(names) if known and name not in known]
+    for i, name in enumerate(names):
+        std = known[name].std if name in known else 0.0
+        share = max(float(np.sqrt(cov[i, i])), min(std / priors[i], 1.0))
+        given = {}
+        if name in known and known[name].value and share > DEPENDS * std / priors[i]:
+            per = cov[i, held_] @ np.linalg.pinv(cov[np.ix_(held_, held_)], hermitian=True)
+            for slope, j in zip(per, held_, strict=True):
+                if slope**2 * cov[j, j] > PART * cov[i, i]:
+                    size = model.params[names[j]].value / known[name].value
+                    given[names[j]] = float(slope * priors[i] / priors[j] * size)
+        found.append(Identifiable(name, _verdict(share), float(priors[i]), share, given))
     return found
 
 

@@ -19,7 +19,7 @@ MOST = 3  # parameters that are named
 
 
 def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple[str, str]]:
-    """(title, text): what was calibrated, how utilities are predicted, what acts alike.
+    """(title, text): what was calibrated or held, how utilities are predicted, what acts alike.
 
     Nothing where no cause could be named: with too little data, what was fitted is not a finding.
 
@@ -32,6 +32,8 @@ def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple
     found = []
     if text := calibrated_sentence(diagnosis, before):
         found.append(("parameters", text))
+    if text := held_sentence(diagnosis):
+        found.append(("held", text))
     if text := utility_sentence(diagnosis):
         found.append(("utility", text))
     for effect in dict.fromkeys(one.effect for one in diagnosis.lookalikes):
@@ -174,6 +176,22 @@ def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> st
     named = ", ".join(text for _, text in sorted(moved)[:MOST])
     others = len(moved) - MOST
     return f"calibrated beside them: {named}{f' (and {others} more)' * (others > 0)}" * bool(moved)
+
+
+def held_sentence(diagnosis: Diagnosis) -> str:
+    """What calibrated parameters depend on that these trials don't tell, and how much."""
+    said, held = [], dict[str, None]()
+    for one in (one for one in diagnosis.identifiable if one.given):
+        e = diagnosis.parameters.get(one.parameter)
+        if e is None:
+            continue
+        held |= dict.fromkeys(one.given)
+        parts = [f"{by:+.2g} % for 1 % more {name}" for name, by in one.given.items()]
+        free = with_unit(f"+- {figure(one.prior * one.left, 2)}", e.unit)
+        said.append(f"{one.parameter} {' and '.join(parts)} ({free} with all free)")
+    if not said:
+        return ""
+    return f"{' and '.join(held)} as written, which these trials don't tell: {', '.join(said)}"
 
 
 def utility_sentence(diagnosis: Diagnosis) -> str:

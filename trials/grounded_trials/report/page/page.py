@@ -233,8 +233,8 @@ def _why(findings: Findings) -> dict[str, Any]:
     before = {} if findings.since.changed else findings.values
     groups = gained_most(diagnosis, findings.task)
     credit = worth_figure(diagnosis, groups) or credit_figure(diagnosis)
-    known = [] if credit else error_lines(diagnosis, before)
-    lines = [(title, text) for title, text in known if title == "parameters"]
+    shown = {"held"} if credit else {"held", "parameters"}
+    lines = [line for line in error_lines(diagnosis, before) if line[0] in shown]
     return {
         "kind": diagnosis.kind,
         "verdict": told(diagnosis, findings.task, findings.since, findings.settled, None),

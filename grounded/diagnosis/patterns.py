@@ -1,0 +1,52 @@
+"""The probes that are tried: a policy with steps, ramps, doublets or a sweep added to an input."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.policy import Policy
+
+BASE = "the base policy once more"
+SIZES = (0.15, 0.35)  # of the input's range
+
+
+def probes(policy: Policy, model: Model, inputs: Sequence[int]) -> Iterator[tuple[str, Policy]]:
+    """The base policy itself, then with each pattern added to each input."""
+    yield BASE, policy
+    t = np.arange(policy.horizon, dtype=float) * policy.dt
+    for j in inputs:
+        low, high = policy.low[j], policy.high[j]
+        room = float(high - low) if np.isfinite(high - low) else 2.0
+        limits = f" (limits {low:g} to {high:g})" * bool(np.isfinite(high - low))
+        for size in SIZES:
+            for words, shape in patterns(t):
+                feedforward = policy.feedforward.copy()
+                feedforward[:, j] = np.clip(feedforward[:, j] + size * room * shape, low, high)
+                name = policy.input_names[j]
+                unit = model.inputs[name]
+                of = f"{size * room:.2g} {unit}" if unit != "1" else f"{size * room:.2g}{limits}"
+                made = replace(policy, feedforward=feedforward)
+                yield f"{words} of {of} added to {name}", made
+
+
+def patterns(t: Any) -> list[tuple[str, Array]]:
+    """Shapes of unit size over the times t (H,)."""
+    T = float(t[-1]) + 1e-9
+    phase = t / T
+    stairs = np.round(4 * np.sin(2 * np.pi * phase)) / 4
+    doublets = np.sign(np.sin(2 * np.pi * t / max(T / 5, 0.4)))
+    sweep = np.sin(2 * np.pi * (0.2 * t + 0.5 * (2.0 - 0.2) / T * t**2))
+    return [
+        ("a slow ramp down", -phase),
+        ("a slow ramp up", phase),
+        ("a staircase", stairs),
+        ("doublets", doublets),
+        ("a sweep of frequencies", sweep),
+        ("a pulse to the lower side", -((phase > 0.4) & (phase < 0.7)).astype(float)),
+    ]

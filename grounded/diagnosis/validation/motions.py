@@ -1,0 +1,140 @@
+"""In how many motions an effect that names no mechanism is seen: trials that repeat one are one.
+
+A wave in time, a constant, what one state adds to another's rate, a patch of ground: `Family.loose`
+fits any shape. Where all trials follow one path, whatever the model lacks is the same function of
+time in each of them, and of every state: repeats make it likelier with each trial, and trials that
+are left out are foretold by those that repeat them. None of that tells a cause. So such an effect
+is believed only as far as motions that differ bear it out: of the nats that are lost without it,
+the motion that holds most has no say.
+
+Two trials repeat one motion, for an effect, where what it adds to the rates is nearly the same
+function of time in both, and so is a state on which the rates may depend in another way. Compared
+are means over tenths of the trial, so that a feedback that chatters, or noise, makes no motion
+another one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from grounded.diagnosis.hypotheses.explored import CLAIM, FittedHypotheses
+from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.effects import Library, param_name
+from grounded.effects.places import dynamic
+from grounded.frozen import Array
+from grounded.model import Model, Param
+
+REPEATS = 0.03  # of a signal's power: trials that differ by less are one motion
+TENTHS = 10  # stretches whose means are compared
+LENGTH = 0.2  # of a trial's steps by which another one may be longer
+
+
+def repeats(search: FittedHypotheses, fit: Fitted, less: Fitted, name: str) -> int:
+    """How many trials repeat the one motion that bears an effect out; 0 where others do, too.
+
+    Args:
+        search: whose evidence counts.
+        fit: with the effect.
+        less: without it, the rest fitted again.
+        name: of the effect.
+    """
+    data, h = search.data, fit.hypothesis
+    if data.count < 2 or not h.effects[h.names.index(name)].family.loose:
+        return 0
+    motion = motions(search.predictor, h.minus(name), h, fit.track)
+    size = np.bincount(motion)
+    lost = 0.5 * (less.rss + less.logdet - fit.rss - fit.logdet)
+    by = np.bincount(motion[data.trial_of], lost, len(size))
+    most = int(by.argmax())
+    alone = search.tempering.factor * (by.sum() - by[most]) < CLAIM
+    return int(size[most]) if alone and size[most] > 1 else 0
+
+
+def without_others(
+    predictor: Predictor, track: Array, adopted: Collection[str], library: Library
+) -> Model:
+    """The model with the numbers of adopted effects as constants that one motion can't tell.
+
+    Those without a mechanism, where all trials make one motion: other trials have told them.
+
+    Args:
+        predictor: of the data.
+        track: of the states (L + 1, B, n).
+        adopted: names of effects whose numbers are parameters.
+        library: that has them.
+    """
+    data, model, held = predictor.data, predictor.data.model, set[str]()
+    for name in adopted if data.count > 1 else ():
+        effect = library.effect(name, model, data.scales)
+        own = {q.name: param_name(name, q.name) for q in effect.quantities}
+        if not effect.family.loose or not all(p in model.params for p in own.values()):
+            continue
+        values = {q: model.params[p].value for q, p in own.items()}
+        h = Hypothesis().plus(effect, values)
+        if not motions(predictor, Hypothesis(), h, track).any():
+            held |= set(own.values())
+    params = {n: Param(p.value, p.unit) if n in held else p for n, p in model.params.items()}
+    return replace(model, params=params) if held else model
+
+
+def how_many(predictor: Predictor) -> int:
+    """In how many motions that differ the trials were made."""
+    return 1 + int(motions(predictor, Hypothesis(), Hypothesis(), predictor.data.y).max())
+
+
+def motions(predictor: Predictor, less: Hypothesis, h: Hypothesis, track: Array) -> Any:
+    """Which motion each trial makes, (S,) of int, for what `h` adds to `less` along a track."""
+    data, x = predictor.data, track[:-1]
+    added = data.model.difference(predictor.next(less, x), predictor.next(h, x))
+    signal, states = _by_trial(data, added), _states(data)
+    power = np.array([float(np.nanmean(one**2)) for one in signal])
+    means = np.concatenate([_tenths(one) for one in states])
+    spread = np.nanvar(means, axis=0)
+    moves = spread > 1e-9 * np.nanmean(means**2, axis=0)
+    led, found = list[int](), np.zeros(data.count, int)
+
+    def same(i: int, j: int) -> bool:
+        steps = min(len(signal[i]), len(signal[j]))
+        if max(len(signal[i]), len(signal[j])) > (1 + LENGTH) * steps:
+            return False
+        acts, moved = (
+            _tenths(some[i][:steps]) - _tenths(some[j][:steps]) for some in (signal, states)
+        )
+        apart = np.nanmean(moved**2, axis=0)[moves] / spread[moves]
+        acts_alike = np.nanmean(acts**2) <= REPEATS * (power[i] + power[j])
+        return bool(acts_alike and len(apart) and apart.min() <= 2 * REPEATS)
+
+    for i in range(data.count):
+        leader = next((k for k, j in enumerate(led) if same(i, j)), len(led))
+        led += [i] * (leader == len(led))
+        found[i] = leader
+    return found
+
+
+def _by_trial(data: Data, values: Array) -> list[Array]:
+    """Values by step (L, B, n), of each trial (T, n); NaN where a run was left out."""
+    flat = np.full((int(data.lengths.sum()), values.shape[-1]), np.nan)
+    there = data.valid > 0
+    flat[data.step_at[there]] = values.swapaxes(0, 1)[there]
+    return np.split(flat, np.cumsum(data.lengths)[:-1])
+
+
+def _states(data: Data) -> list[Array]:
+    """Of each trial (T + 1, n) the states on which a rate may depend, and that some sensor has."""
+    names = data.model.state_names
+    known = [names.index(n) for n in dynamic(data.model) if n in names]
+    seen = [i for i in known if data.seen[..., i].any() and i not in data.hidden]
+    return np.split(data.filled[:, seen], np.cumsum(data.lengths + 1)[:-1])
+
+
+def _tenths(values: Array) -> Array:
+    """Means over stretches of time, (TENTHS, n) of (T, n)."""
+    parts = np.array_split(values, min(TENTHS, len(values)))
+    return np.stack([part.mean(axis=0) for part in parts])

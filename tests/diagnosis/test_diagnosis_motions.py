@@ -1,0 +1,96 @@
+"""Trials that repeat one motion tell no cause from whatever else repeats with it."""
+
+import numpy as np
+import pytest
+
+from grounded import Model, Param, Trial
+from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.validation.motions import motions, without_others
+from grounded.effects import Library
+
+DT, STEPS = 0.05, 120
+WAVE, OMEGA = 0.4, 2.0
+
+
+def carts(speeds, params=None):
+    """A cart that is shaken, sent a sine of each angular frequency [rad/s]; its crude model."""
+    model = Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"u": "m/s^2"},
+        params=params or {"k": Param(1.0, "1", std=0.1)},
+        roles={"position": ("x",), "speed": "v"},
+        derivative=lambda s, a, p: {"x": s.v, "v": p.k * a.u - s.v},
+        name="cart",
+    )
+    rng, found, t = np.random.default_rng(3), [], np.arange(STEPS) * DT
+    for speed in speeds:
+        u, x, states = np.sin(speed * t), np.zeros(2), [np.zeros(2)]
+        for now, value in zip(t, u, strict=True):
+            for part in range(5):
+                shake = WAVE * np.sin(OMEGA * (now + (part + 0.5) * DT / 5))
+                half = x[1] + DT / 10 * (value - x[1] + shake)  # a midpoint
+                x = x + DT / 5 * np.array([half, value - half + shake])
+            states.append(x)
+        y = np.array(states) + np.array([1e-3, 4e-3]) * rng.standard_normal((STEPS + 1, 2))
+        found.append(Trial(y, u[:, None], DT, ("x", "v"), ("u",), start_inputs=np.zeros(1)))
+    return model, found
+
+
+APART = (1.1, 1.7, 2.6, 3.4)
+shake = {"A": WAVE, "B": 0.0, "omega": OMEGA}
+
+
+def looked_at(trials, model, name, values):
+    data = prepare(model, trials, np.zeros(1))
+    h = Hypothesis().plus(Library().effect(name, model, data.scales), values)
+    return motions(Predictor(data), Hypothesis(), h, data.y).tolist()
+
+
+@pytest.mark.slow
+def test_a_wave_is_a_cause_only_where_motions_differ():
+    model, trials = carts(APART)
+    found = diagnose(model, trials)
+    assert found.effects == ("periodic:v",) and found.motions == 4
+    assert not any(one.repeats for one in found.unconfirmed)
+    model, trials = carts([1.7] * 4)
+    found = diagnose(model, trials)
+    assert "periodic:v" not in found.effects and found.motions == 1
+    one = next(one for one in found.unconfirmed if one.repeats)
+    assert one.effect == "periodic:v" and one.seen == (4, 4) and one.evidence > 20
+    assert found.leftover and "moves differently" in found.next_trial
+
+
+def test_trials_make_one_motion_whatever_noise_and_chatter_do():
+    model, trials = carts([1.7] * 3)
+    rattled = trials[1].states.copy()
+    rattled[:, 1] += 0.2 * (-1.0) ** np.arange(STEPS + 1)
+    trials[1] = Trial(rattled, trials[1].inputs, DT, ("x", "v"), ("u",))
+    assert looked_at(trials, model, "periodic:v", shake) == [0, 0, 0]
+    _, other = carts([3.4, 1.7])
+    assert looked_at([*trials, *other], model, "periodic:v", shake) == [0, 0, 0, 1, 0]
+    short = trials[2].until(STEPS // 2)
+    assert looked_at([*trials[:2], short], model, "periodic:v", shake) == [0, 0, 1]
+
+
+def test_what_acts_differently_is_another_motion():
+    """A patch that one trial does not cross, though all states but the place repeat."""
+    model, trials = carts([1.7] * 2)
+    shifted = trials[1].states + np.array([50.0, 0.0])
+    trials[1] = Trial(shifted, trials[1].inputs, DT, ("x", "v"), ("u",))
+    values = {"c": 1.0, "x0": 0.5, "radius": 2.0}
+    assert looked_at(trials, model, "patch:v", values) == [0, 1]
+
+
+@pytest.mark.parametrize(("speeds", "free"), [(APART, True), ([1.7] * 4, False)])
+def test_numbers_of_an_adopted_wave_are_held_where_one_motion_is_repeated(speeds, free):
+    names = ("periodic_v_A", "periodic_v_B", "periodic_v_omega")
+    numbers = dict(zip(names, shake.values(), strict=True))
+    params = {"k": Param(1.0, "1", std=0.1)}
+    params |= {name: Param(value, "1", std=0.1) for name, value in numbers.items()}
+    model, trials = carts(speeds, params)
+    data = prepare(model, trials, np.zeros(1))
+    held = without_others(Predictor(data), data.y, ["periodic:v"], Library())
+    assert [held.params[name].spread > 0 for name in ("k", *names)] == [True] + [free] * 3
