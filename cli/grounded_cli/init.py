@@ -117,11 +117,13 @@ def _tell(begun: Begun) -> None:
     show("")
     for guess in (*begun.states, *begun.inputs):
         mark = "" if guess.sure else "UNSURE "
-        show(field(guess.name, f"{mark}{guess.path or 'nothing in the log fits'}", "  "))
+        none = f"{'no name' if guess.others else 'nothing'} in the log fits"
+        show(field(guess.name, f"{mark}{guess.path or none}", "  "))
         for reason in guess.reasons:
             show(field("", reason, "  "))
         if guess.others and not guess.sure:
-            show(field("", f"or {', '.join(guess.others)}", "  "))
+            or_ = "or" if guess.path else "perhaps"
+            show(field("", f"{or_} {', '.join(guess.others)}", "  "))
     for note in begun.notes:
         remark("note", note)
     look = "; look at what is UNSURE in its [log]" if begun.unsure else ""

@@ -343,6 +343,33 @@ def test_a_joint_by_its_behaviour_where_no_name_fits(swung, tmp_path):
     assert "log's commands" in (tmp_path / "w/grounded.toml").read_text()
 
 
+def test_numbers_without_a_fitting_name_are_found_by_their_unit_or_listed(swung, tmp_path):
+    model = tmp_path / "boom.py"
+    model.write_text(workspaces.MODEL.replace('"m"', '"rad"').replace('"m/s"', '"rad/s"'))
+    log = swung("Ausleger [deg],Strom [A],Ventil [%]", linked=False)
+    found = begin(tmp_path / "w", log, model=model)
+    assert [g.path for g in found.states] == ["/csv.Ausleger", ""]
+    assert found.states[0].scale == pytest.approx(np.pi / 180) and len(found.unsure) == 3
+    bare = begin(tmp_path / "v", swung("Ausleger,Strom,Ventil", linked=False), model=model)
+    every = {"/csv.Ausleger", "/csv.Strom", "/csv.Ventil"}
+    assert all(set(g.others) == every and not g.path for g in (*bare.states, *bare.inputs))
+    text = (tmp_path / "v/grounded.toml").read_text()
+    assert '# path = "/csv.Ausleger"' in text
+    said = grounded("-C", tmp_path / "v", "ingest", "--data", log)
+    assert said.code == 1 and all(path in said.err for path in every)
+
+
+def test_names_with_other_letters_and_times_in_an_unsaid_unit(tmp_path):
+    log, t = tmp_path / "log.csv", 10.0 * np.arange(400)
+    rows = np.column_stack([t, np.sin(t / 300), np.sign(np.cos(t / 300))])
+    head = "Zeit;Winkel;Stellgröße"
+    np.savetxt(log, rows, "%.4f", ";", header=head, comments="", encoding="utf-8")
+    found = begin(tmp_path / "w", log)
+    assert [g.name for g in found.inputs] == ["Stellgröße"]
+    assert any("_ms" in note for note in found.notes)
+    assert Workspace(tmp_path / "w").task.model.input_names == ("Stellgröße",)
+
+
 def test_a_position_is_the_one_whose_derivative_the_named_speed_is(swung, tmp_path):
     model = tmp_path / "cart.py"
     model.write_text(workspaces.MODEL)

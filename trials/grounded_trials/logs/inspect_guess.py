@@ -16,6 +16,7 @@ import numpy as np
 
 from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
 from grounded_trials.logs.stated_units import without_unit
+from grounded_trials.toml_table import key
 
 SURE = 1.5  # how much better than the next topic's best a guess must be
 LEAST = 2.0  # below this score nothing is proposed
@@ -235,11 +236,14 @@ def mapping_toml(
 
 
 def _table(kind: str, guess: Guess, clock: str) -> list[str]:
-    head = f"[log.{kind}.{guess.name}]"
+    head = f"[log.{kind}.{key(guess.name)}]"
     others = f"; or {', '.join(guess.others)}" if guess.others else ""
+    if not guess.path and not guess.others:
+        return [f"# {head}  # nothing in the log fits"]
     if not guess.path:
-        what = "nothing in the log fits" + others
-        return [f"# {head}  # {what}"]
+        rest = f"  # or {', '.join(guess.others[1:])}" * (len(guess.others) > 1)
+        what = "no name in the log fits; if one of these is it, delete the two #"
+        return [f"# {head}  # {what}", f"# path = {_quote(guess.others[0])}{rest}"]
     lines = [head if guess.sure else f"{head}  # unsure{others}"]
     lines.append(f"path = {_quote(guess.path)}")
     if guess.field is not None and guess.field.low is not None:

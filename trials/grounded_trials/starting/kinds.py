@@ -20,7 +20,7 @@ MOST, INPUTS = 6, 4  # states and inputs of a generic model, where nobody says w
 SIDES = re.compile(r"^(left|right|u\d*|u_\w+)$")  # what inputs are called, beside COMMANDED
 COMMANDED = re.compile(
     "cmd|command|desired|setpoint|target|input|throttle|torque|tau|effort|volt|pwm|duty|motor|steer"
-    r"|goal|control|_con|_ref"
+    r"|goal|control|_con|_ref|stellgr|stellwert|sollwert|_soll\b|befehl|consigne|commande|comando"
 )
 
 HEADING = re.compile(r"(^|[/._])(yaw|psi|heading|theta|th|orientation)([/._\d]|$)")
