@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from grounded_trials.logs.inspect_guess import Guess
     from grounded_trials.starting.begin import Begun
 
+FEW = 8  # numbers of a log that are named for one that is missing
+
 
 @click.command("init")
 @click.argument("folder", metavar="DIR", required=False)
@@ -123,7 +125,8 @@ def _tell(begun: Begun) -> None:
             show(field("", reason, "  "))
         if guess.others and not guess.sure:
             or_ = "or" if guess.path else "perhaps"
-            show(field("", f"{or_} {', '.join(guess.others)}", "  "))
+            more = f" or {len(guess.others) - FEW} more" * (len(guess.others) > FEW)
+            show(field("", f"{or_} {', '.join(guess.others[:FEW])}{more}", "  "))
     for note in begun.notes:
         remark("note", note)
     look = "; look at what is UNSURE in its [log]" if begun.unsure else ""

@@ -12,8 +12,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from grounded.errors import GroundedError
-from grounded_trials.logs.inspect_log import inspect_log
 from grounded_trials.formats.text_tables import column_units
+from grounded_trials.logs.inspect_log import inspect_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
 
 N, DT, EPOCH = 300, 0.02, 1_700_000_000_000_000_000

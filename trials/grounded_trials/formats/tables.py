@@ -63,16 +63,18 @@ def _check_size(path: Path) -> None:
 
 
 def _npz_tables(arrays: Mapping[str, Any]) -> dict[str, Columns]:
-    labels = [list(map(column_name, a)) for a in arrays.values() if a.ndim == 1 and a.dtype.kind == "U"]
+    labels = [
+        list(map(column_name, a)) for a in arrays.values() if a.ndim == 1 and a.dtype.kind == "U"
+    ]
     numbers = {k: np.asarray(a, float) for k, a in arrays.items() if a.dtype.kind in "fiub"}
     tables: dict[str, Columns] = {}
     for name, t in numbers.items():
         own = numbers.get(name.removesuffix("_t"), np.zeros(0))
         if not name.endswith("_t") or t.ndim != 1 or len(own) != len(t) or own.ndim > 2:
             continue
-        texts = [label for label in labels if own.ndim == 2 and len(label) == own.shape[1]]
+        names = [label for label in labels if own.ndim == 2 and len(label) == own.shape[1]]
         table = column_name(name.removesuffix("_t"))
-        tables["/" + table] = {"t": t} | _columns(own, texts[0] if texts else [], table)
+        tables["/" + table] = {"t": t} | _columns(own, names[0] if names else [], table)
     used = {name for name in numbers if "/" + column_name(name.removesuffix("_t")) in tables}
     rest = {k: a for k, a in numbers.items() if k not in used and a.ndim in (1, 2)}
     times = [k for k, a in rest.items() if a.ndim == 1 and len(a) > 1 and is_time(k)]

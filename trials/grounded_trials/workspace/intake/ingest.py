@@ -30,6 +30,7 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import READ_BY, ROWS, sha256
 from grounded_trials.workspace.intake.foreign import ForeignLog, begun, mapping_of, read_foreign
 from grounded_trials.workspace.intake.ingested import Ingested
+from grounded_trials.workspace.intake.other_scale import other_units, units_told
 from grounded_trials.workspace.intake.run_start import (
     LOOSE,
     elsewhere,
@@ -46,7 +47,7 @@ from grounded_trials.workspace.intake.stored_before import (
     what_repeats,
 )
 from grounded_trials.workspace.intake.trial_check import warnings_about
-from grounded_trials.workspace.intake.who_drove import OTHERS, other_units, suspicion, units_told
+from grounded_trials.workspace.intake.who_drove import OTHERS, suspicion
 from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of
 from grounded_trials.workspace.proposing import candidate_named, latest_candidates, standing_in

@@ -29,14 +29,13 @@ from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.logs.command_steps import changes_of, phase_of
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
+from grounded_trials.workspace.intake.other_scale import NEARLY, units_tried
 from grounded_trials.workspace.intake.who_drove import (
     FINE,
     LEAST,
-    NEARLY,
     SAME,
     UNLIKE,
     follows,
-    units_tried,
 )
 
 TRIED = 5  # instants at which the commands fit best
