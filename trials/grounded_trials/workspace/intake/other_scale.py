@@ -72,11 +72,19 @@ def other_units(
     return _any_factor(task.model, own.policy, trial, plain, late, LEAVES * _left(plain))
 
 
+def any_factor(task: Task, policy: Policy, trial: Trial) -> tuple[tuple[str, ...], float]:
+    """The columns and the factor with which a trial is a run of a policy; (), 1 for nothing."""
+    trial, late = trial.until(task.horizon), latest(task)
+    if (plain := follows(policy, trial, late)) is None:
+        return (), 1.0
+    return _any_factor(task.model, policy, trial, plain, late, LEAVES * _left(plain))
+
+
 def _any_factor(
     model: Model, policy: Policy, trial: Trial, plain: Following, late: int, most: float
 ) -> tuple[tuple[str, ...], float]:
     """What makes a trial follow a policy best, which leaves less than `most`; (), 1 for nothing."""
-    best, found = most, (tuple[str, ...](), 1.0)
+    best, found = min(most, NEARLY), (tuple[str, ...](), 1.0)
     trial = trial.until(min(trial.finite_steps, policy.horizon))
     least = FAR if plain.alike else ONE
     for names in _scaled_together(model):
