@@ -40,7 +40,7 @@ NAMED = (  # by what a column is multiplied, and what that says of it
     *((factor, "") for factor in THOUSAND),
 )
 NEARLY = 0.1  # of an input's size: what other units must leave of the difference
-EXACT = 0.01  # of an input's size: a unit that leaves less needs no rival
+EXACT, CLOSE = 0.01, 0.05  # of an input's size: leaves a unit, or any factor, that is surely it
 UNITS_LEAVE, LEAVES = 0.5, 0.25  # of the difference at most: units, any factor (many are tried)
 LARGEST = 100.0  # factor, or its inverse
 ONE, FAR = 0.03, 0.2  # factors nearer to 1 say nothing; of commands that are alike as they are
@@ -84,7 +84,7 @@ def _any_factor(
     model: Model, policy: Policy, trial: Trial, plain: Following, late: int, most: float
 ) -> tuple[tuple[str, ...], float]:
     """What makes a trial follow a policy best, which leaves less than `most`; (), 1 for nothing."""
-    best, found = min(most, NEARLY), (tuple[str, ...](), 1.0)
+    best, found = min(most, CLOSE), (tuple[str, ...](), 1.0)
     trial = trial.until(min(trial.finite_steps, policy.horizon))
     least = FAR if plain.alike else ONE
     for names in _scaled_together(model):
