@@ -277,6 +277,36 @@ def test_a_robot_whose_wheels_have_a_command_each_gets_its_equations(wheels, tmp
     assert moved["v"] > 0 > moved["omega"] and {"gain", "track", "tau"} == set(model.params)
 
 
+@pytest.mark.parametrize(
+    ("names", "kind"),
+    [
+        ("x,v,pitch,pitch_rate,voltage [V]", "balance"),
+        ("wheel_position,speed,tilt,tilt_rate,pwm", "balance"),
+        ("x,v,pitch,roll,thrust", "drone"),
+        ("x,v,pitch,pitch_rate,battery", "generic"),  # no command
+    ],
+)
+def test_a_robot_that_balances_gets_its_equations(tmp_path, names, kind):
+    """It was "generic": numbers that follow the voltage with a lag."""
+    t, log = 0.01 * np.arange(600), tmp_path / "log.csv"
+    pitch, x = 0.1 * np.sin(2 * t), 0.5 * np.sin(0.7 * t)
+    rows = np.column_stack([t, x, np.gradient(x, t), pitch, np.gradient(pitch, t), np.cos(3 * t)])
+    np.savetxt(log, rows, "%.5f", ",", header=f"t,{names}", comments="")
+    found = begin(tmp_path / "w", log)
+    assert found.kind == kind
+    if kind != "balance":
+        return
+    command = names.split(",")[-1].split()[0]
+    paths = [f"/csv.{name.split()[0]}" for name in names.split(",")]
+    assert [g.path for g in (*found.states, *found.inputs)] == paths
+    model = Workspace(tmp_path / "w").base_model
+    assert dict(model.inputs) == {command: "V" if "V" in names else "1"}
+    leant = np.array([[0.0, 0.0, 0.05, 0.0], [0.0, 0.0, 0.0, 0.0]])
+    moved = model.system.step(leant, np.array([[0.0], [5.0]]), model.values, 0.01)
+    assert moved[0, 3] > 0.005  # it falls to where it leans
+    assert moved[1, 1] > 0 > moved[1, 3]  # driven forwards, it leans back
+
+
 @pytest.mark.parametrize("names", ["left_encoder,right_encoder", "port,right"])
 def test_what_is_measured_on_both_sides_drives_nothing(wheels, tmp_path, names):
     assert begin(tmp_path / "w", wheels(names)).kind == "generic"
