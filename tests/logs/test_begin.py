@@ -477,6 +477,34 @@ def test_a_path_keeps_to_its_speeds_and_starts_from_rest(tmp_path):
         assert np.abs(error).max() < 0.2
 
 
+def test_a_robot_with_one_axis_has_a_line_and_a_step_from_its_start(tmp_path):
+    """A boom was told to have a role 'position' of two states; a step began at 0."""
+    cart = workspaces.MODEL.replace(', "speed": "v"', "").replace('"position": ("x",)', "")
+    config = workspaces.CONFIG.replace('"target.csv"\n', '"target.csv"\nstart = { x = 0.5 }\n', 1)
+    made = workspaces.make(tmp_path / "w", model=cart, config=config)
+    done = grounded("-C", made.folder, "target", "line", "--to", "x=-1", "--speed", "0.5", "--json")
+    assert done.json["columns"] == {"x": [-1.0, 0.5], "v": [-0.5, 0.0]}
+    names, rows = read_target(made.folder / "target.csv")
+    x, v = rows[:, names.index("x")], rows[:, names.index("v")]
+    assert x[0] == 0.5 and v[0] == v[-1] == 0 and len(rows) == done.json["horizon"] + 1
+    np.testing.assert_allclose(np.diff(x) / 0.05, (v[1:] + v[:-1]) / 2, atol=0.02)
+    further = grounded("-C", made.folder, "target", "line", "--size", "2", "--json").json
+    assert further["columns"]["x"] == [0.5, 2.5]
+    step = grounded("-C", made.folder, "target", "step", "--to", "x=1", "--json").json
+    assert step["columns"] == {"x": [0.5, 1.0]}
+    for shape, to, said in (("circle", (), "--to STATE"), ("line", ("--to", "x=0.5"), "x = 0.5")):
+        refused = grounded("-C", made.folder, "target", shape, *to)
+        assert refused.code == 1 and said in refused.err
+    free = "def f(s, a, p):\n    return {'b': a.u, 'c': s.b * a.u}\n"
+    (made.folder / "model.py").write_text(
+        f"from grounded import Model\n{free}\n"
+        "model = Model(states={'b': '1', 'c': '1'}, inputs={'u': '1'}, params={}, derivative=f)\n"
+    )
+    (made.folder / "grounded.toml").write_text(config.replace("x = ", "b = ").replace("force", "u"))
+    refused = grounded("-C", made.folder, "target", "line")
+    assert refused.code == 1 and "--to b=1.0" in refused.err
+
+
 def test_the_target_of_a_workspace_is_drawn_and_the_old_one_kept(tmp_path):
     grounded("init", tmp_path / "w", "--example", "pendulum")
     old = (tmp_path / "w/target.csv").read_text()

@@ -194,7 +194,7 @@ BALANCE = Skeleton(
         '"pitch_rate": (mass * fall - coupled * push) / det',
     ),
     ("pitch",),
-    {"rail": "x", "upright": ("pitch",), "position": ("x",), "speed": "v"},
+    {"rail": "x", "upright": ("pitch",), "speed": "v"},
     before=(
         "torque = p.kt * (a.voltage - p.ke * (s.v / p.r - s.pitch_rate))  # of both motors",
         "mass, inertia = p.body + p.wheels, p.I + p.body * p.l**2  # l: axle to its centre",
