@@ -205,7 +205,7 @@ def _is_cut(lines: Sequence[str]) -> bool:
 
 def _stamps(texts: Sequence[tuple[int, str, str]], name: str, path: Path) -> Any:
     """Times [ns] of texts: since 1970 with a date, UTC where no zone is said, else of the day."""
-    found, days = [], timedelta()
+    found, days = list[datetime](), timedelta()
     for line, text, date in texts:
         moment = _moment(f"{date.strip()} {text.strip()}".strip()) or _moment(text)
         if moment is None:

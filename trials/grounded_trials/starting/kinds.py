@@ -178,7 +178,8 @@ def _driven_by(command: str, volts: bool) -> Skeleton:
     before = [line.replace("a.voltage", f"a.{command}") for line in BALANCE.before]
     if volts:
         return replace(BALANCE, inputs={command: "V"}, before=before)
-    params = BALANCE.params | {"kt": '0.5, "N m", 0.0001, 50.0', "ke": '0.03, "s/rad", 0.0, 5.0'}
+    unitless = {"kt": '0.5, "N m", 0.0001, 50.0', "ke": '0.03, "s/rad", 0.0, 5.0'}
+    params = {**BALANCE.params, **unitless}
     return replace(BALANCE, inputs={command: "1"}, before=before, params=params)
 
 

@@ -124,8 +124,8 @@ def has_plane(model: Model) -> bool:
 
 def _axis(model: Model) -> str:
     """The one state that a line without an end moves."""
-    named = model.roles.get("position", ()) or (model.roles.get("rail", ""),)
-    moved = [name for name in named if name] or list(velocities(model))
+    named = model.roles.get("position") or model.roles.get("rail") or tuple(velocities(model))
+    moved = (named,) if isinstance(named, str) else named
     if len(moved) == 1:
         return moved[0]
     raise GroundedError(

@@ -23,7 +23,7 @@ from grounded_trials.logs.signals import Series
 from grounded_trials.store.store import hash_file
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import StoredTrial, sha256
+from grounded_trials.workspace.identity import ESTIMATED_WITH, StoredTrial, sha256
 from grounded_trials.workspace.intake.estimating import (
     EstimateTable,
     read_estimate,
@@ -116,9 +116,10 @@ class ForeignLog:
 
     def complete(self, series: Mapping[str, Series]) -> Mapping[str, Series]:
         """Signals as this log holds them, and those of the states that nothing measures."""
-        return (
-            with_estimates(series, self.estimate, self.workspace.task) if self.estimate else series
-        )
+        if not self.estimate:
+            return series
+        names = self.workspace.base_model.state_names
+        return with_estimates(series, self.estimate, self.workspace.planner.plan, names)
 
     @cached_property
     def whole(self) -> Mapping[str, Series]:
@@ -179,6 +180,7 @@ def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignL
     source |= read_by(mapping)
     if guessed := [name for name in model.state_names if name not in states]:
         source["estimated"] = ",".join(guessed)
+        source[ESTIMATED_WITH] = ",".join(str(effect["name"]) for effect in config.model.effects)
     series = mapped_signals(files, mapping, states, model.input_names)
     return ForeignLog(workspace, path, mapping, estimate, series, source)
 

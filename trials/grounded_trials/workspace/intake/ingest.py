@@ -38,6 +38,7 @@ from grounded_trials.workspace.intake.run_start import (
 )
 from grounded_trials.workspace.intake.stored_before import (
     as_stored,
+    estimated_otherwise,
     refuse_as_another,
     repeated,
     same_recording,
@@ -78,6 +79,8 @@ def ingest_log(
         read = read_log_file(workspace, path, candidate, data)
     read = _copied(workspace, path, read, "" if data else candidate)
     read = _recognised(workspace, path, read, candidate)
+    if read.log and (other := estimated_otherwise(workspace, read.log)):
+        read = replace(read, notes=(*read.notes, *other))
     if read.log and read.log.stored:
         read = replace(read, data=as_stored(workspace, read.log, read.trial, read.data))
     before = "" if read.copy else repeated(workspace, path, read.trial, read.data)
