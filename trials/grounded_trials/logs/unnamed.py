@@ -6,7 +6,8 @@ Where one number alone is left in the unit of one state or input alone, it is pr
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from grounded_trials.logs.inspect_evidence import as_stated
@@ -14,14 +15,12 @@ from grounded_trials.logs.inspect_guess import Guess
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.stated_units import Stated, factor_between
 
+PARTS = re.compile("covariance|layout")  # of messages: no robot's numbers
 MOST = 20  # numbers of the log to choose from
 
 
 def from_the_rest(
-    guesses: Sequence[Guess],
-    units: Mapping[str, str],
-    log: LogReport,
-    free: Iterable[str],
+    guesses: Sequence[Guess], units: Mapping[str, str], log: LogReport
 ) -> tuple[Guess, ...]:
     """The guesses, where those without a path get what the rest of the log may be to them.
 
@@ -29,10 +28,10 @@ def from_the_rest(
         guesses: of states and inputs.
         units: of the model, by their names.
         log: that was looked through.
-        free: message paths of numbers that move.
     """
     stated, taken = Stated.by(log.files), {guess.path for guess in guesses}
-    left = [path for path in free if path not in taken]
+    moving = [f.path for t in log.topics for f in t.fields if f.low != f.high]
+    left = [p for p in moving if p not in taken and not PARTS.search(p)]
     lost = [guess for guess in guesses if not guess.path and not guess.others]
     fits = {g.name: [p for p in left if _goes_with(stated.unit(p), units[g.name])] for g in lost}
     alone = {

@@ -175,8 +175,7 @@ def _begin(
         )
         notes = (*notes, *_left_out(report, found))
     units = {**found.states, **found.inputs}
-    free = [one.path for one in reversed(moving(report).values())]
-    both = from_the_rest((*states, *inputs), units, report, free)
+    both = from_the_rest((*states, *inputs), units, report)
     states, inputs = both[: found.n], both[found.n :]
     if ask is not None:
         said = Stated.by(files)
