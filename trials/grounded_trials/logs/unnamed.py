@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from grounded_trials.logs.inspect_evidence import as_stated
+from grounded_trials.logs.inspect_evidence import as_stated, unit_of
 from grounded_trials.logs.inspect_guess import Guess
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.stated_units import Stated, factor_between
@@ -46,7 +46,8 @@ def from_the_rest(
             one = _by_unit(guess, alone[name], log)
             found.append(as_stated(stated, units[name], one))
         elif name in fits:
-            unsaid = [path for path in left if not stated.unit(path)]
+            may = ("", units[name])  # by ROS's conventions
+            unsaid = [path for path in left if not stated.unit(path) and unit_of(path) in may]
             rest = tuple(p for p in fits[name] or unsaid if p not in alone.values())
             found.append(replace(guess, others=rest[:MOST]))
         else:

@@ -87,10 +87,11 @@ def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> 
 
 def estimated_otherwise(workspace: Folder, log: ForeignLog) -> tuple[str, ...]:
     """What to do about trials whose speeds another model estimated; said until the next trial."""
-    now, trials = log.source.get(ESTIMATED_WITH), workspace.trials()
-    known = [one for one in trials if one.meta.get("estimated")]
+    if (now := log.source.get(ESTIMATED_WITH)) is None:
+        return ()
+    known = [one for one in workspace.whole_trials() if one.meta.get("estimated")]
     other = [one for one in known if one.meta.get(ESTIMATED_WITH, "") != now]
-    if now is None or not other or known[-1] is not other[-1]:
+    if not other or known[-1] is not other[-1]:
         return ()
     names, before = (
         ", ".join(one.stored.id for one in other),
