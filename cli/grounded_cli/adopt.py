@@ -23,6 +23,11 @@ BESIDE = (
     "of these, not beside them. Take it out of [model] effects in grounded.toml, or diagnose again"
 )
 
+BIASED = (
+    "the robot is steered by what the sensor of {state} reads, {by}: where [task] start or the "
+    "target was not measured by it, they are off by that. Add it there, or take it out of what is "
+    "read, [log.state.{state}] offset = {off:.3g}, and in the robot's program"
+)
 REMEASURE = "nothing has measured the model as it is now yet: `grounded diagnose` does"
 
 
@@ -55,6 +60,13 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
         return
     for name in dict.fromkeys(effects):
         sentence(f"{name} is part of the model now ({workspace.config.file})")
+    units = workspace.base_model.states
+    for effect in done.effects:
+        family, _, state = str(effect["name"]).partition(":")
+        if family == "sensor_bias" and effect["name"] in effects:
+            high = with_unit(f"{abs(effect['b']):.3g}", units[state])
+            low = "low" if effect["b"] < 0 else "high"
+            remark("note", BIASED.format(state=state, by=f"{high} too {low}", off=-effect["b"]))
     if not done.claimed:
         remark("note", f"{effects[0]} {UNCLAIMED}")
     if done.beside:

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from grounded_trials.logs.inspect_guess import Guess
     from grounded_trials.starting.begin import Begun
 
+FEW = 8  # numbers of a log that are named for one that is missing
+
 
 @click.command("init")
 @click.argument("folder", metavar="DIR", required=False)
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 @click.option("--blank", is_flag=True, help="No log yet: a workspace of --model, to fill in.")
 @click.option(
     "--kind",
-    help="Of the model skeleton: car, rover, differential, drone, arm, pendulum, generic.",
+    help="Of the model skeleton: car, rover, differential, balance, drone, arm, pendulum, generic.",
 )
 @click.option("--inputs", metavar="A,B,...", help="Columns that are inputs (kind generic).")
 @click.option(
@@ -117,11 +119,14 @@ def _tell(begun: Begun) -> None:
     show("")
     for guess in (*begun.states, *begun.inputs):
         mark = "" if guess.sure else "UNSURE "
-        show(field(guess.name, f"{mark}{guess.path or 'nothing in the log fits'}", "  "))
+        none = f"{'no name' if guess.others else 'nothing'} in the log fits"
+        show(field(guess.name, f"{mark}{guess.path or none}", "  "))
         for reason in guess.reasons:
             show(field("", reason, "  "))
         if guess.others and not guess.sure:
-            show(field("", f"or {', '.join(guess.others)}", "  "))
+            or_ = "or" if guess.path else "perhaps"
+            more = f" or {len(guess.others) - FEW} more" * (len(guess.others) > FEW)
+            show(field("", f"{or_} {', '.join(guess.others[:FEW])}{more}", "  "))
     for note in begun.notes:
         remark("note", note)
     look = "; look at what is UNSURE in its [log]" if begun.unsure else ""

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @click.option("--accel", type=float, default=1.0, help="Along the path, at most [m/s^2] (1).")
 @click.option("--lateral", type=float, default=4.0, help="Across it, at most [m/s^2] (4).")
 @click.option("--laps", type=float, default=1.0, help="Of a circle or figure-8 (1).")
-@click.option("--to", multiple=True, metavar="STATE=VALUE", help="Where a step goes.")
+@click.option("--to", multiple=True, metavar="STATE=VALUE", help="Where a line or step ends.")
 @click.option("--seconds", type=float, default=5.0, help="Of a step or swing-up (5).")
 @in_workspace
 @as_json
@@ -41,18 +41,33 @@ def command(
     """Write target.csv: a line, circle, figure-8, step or swing-up, or a recorded run.
 
     FILE is a log, read through [log], or a CSV with columns `t` and states. Paths start from rest
-    and keep to the speeds and accelerations given. The target there was is kept as target.csv.bak,
-    and [task] horizon follows; so do the weights in [reward] state, unless you chose them.
-    Earlier trials stay, for fit and diagnose; the search begins anew.
+    and keep to the speeds and accelerations given. A line with --to, and that of a robot with one
+    axis, goes from [task] start to rest, in the states' own units; a step begins at [task] start.
+
+    The target there was is kept as target.csv.bak, and [task] horizon follows; so do the weights in
+    [reward] state, unless you chose them. Earlier trials stay, for fit and diagnose; the search
+    begins anew.
     """
-    from grounded_trials.starting.shapes import PATHS, Drive, path_target, step_target, swing_up
+    from grounded_trials.starting.shapes import (
+        PATHS,
+        Drive,
+        has_plane,
+        line_target,
+        path_target,
+        step_target,
+        swing_up,
+    )
 
     workspace = open_workspace()
     model, dt = workspace.base_model, workspace.config.task.dt
-    if shape in PATHS:
-        columns = path_target(shape, Drive(size, speed, accel, lateral, laps), model, dt)
+    start, ends = workspace.config.task.start, _values(to)
+    drive = Drive(size, speed, accel, lateral, laps)
+    if shape == "line" and (ends or not has_plane(model)):
+        columns = line_target(ends, start, drive, model, dt)
+    elif shape in PATHS:
+        columns = path_target(shape, drive, model, dt)
     elif shape == "step":
-        columns = step_target(_values(to), model, dt, seconds)
+        columns = step_target(ends, model, dt, seconds, start)
     elif shape == "swing-up":
         columns = swing_up(model, dt, seconds)
     else:

@@ -1,6 +1,7 @@
 """START HERE: the instruments, from their own signals alone, before any physics is judged.
 
 odd_trial     a whole trial in other units than the rest
+slow_clock    one pace of the stamps behind several rates that are off
 other_units   a position in mm beside a velocity in m/s
 swapped       two columns of a trial in each other's place
 mismatch      a position that doesn't move as velocities and angles say
@@ -61,6 +62,7 @@ from grounded.instruments.odd_trial import (
 from grounded.instruments.other_units import judge_units
 from grounded.instruments.rows import kinematic_rows, tied
 from grounded.instruments.single import Signal, judge_signal
+from grounded.instruments.slow_clock import told_by_the_clock
 from grounded.instruments.swapped import judge_columns
 from grounded.model import Model
 from grounded.task import Task
@@ -138,6 +140,7 @@ def preflight(
             *judge_inputs(subject, bench.trials),
         ]
     in_step, refuted = frozenset(bench.in_step), frozenset(bench.refuted)
+    found = told_by_the_clock(model, trials, found, refuted)
     return Preflight(tuple(found), tuple(bench.trials), in_step, refuted)
 
 

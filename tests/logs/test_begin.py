@@ -277,6 +277,36 @@ def test_a_robot_whose_wheels_have_a_command_each_gets_its_equations(wheels, tmp
     assert moved["v"] > 0 > moved["omega"] and {"gain", "track", "tau"} == set(model.params)
 
 
+@pytest.mark.parametrize(
+    ("names", "kind"),
+    [
+        ("x,v,pitch,pitch_rate,voltage [V]", "balance"),
+        ("wheel_position,speed,tilt,tilt_rate,pwm", "balance"),
+        ("x,v,pitch,roll,thrust", "drone"),
+        ("x,v,pitch,pitch_rate,battery", "generic"),  # no command
+    ],
+)
+def test_a_robot_that_balances_gets_its_equations(tmp_path, names, kind):
+    """It was "generic": numbers that follow the voltage with a lag."""
+    t, log = 0.01 * np.arange(600), tmp_path / "log.csv"
+    pitch, x = 0.1 * np.sin(2 * t), 0.5 * np.sin(0.7 * t)
+    rows = np.column_stack([t, x, np.gradient(x, t), pitch, np.gradient(pitch, t), np.cos(3 * t)])
+    np.savetxt(log, rows, "%.5f", ",", header=f"t,{names}", comments="")
+    found = begin(tmp_path / "w", log)
+    assert found.kind == kind
+    if kind != "balance":
+        return
+    command = names.split(",")[-1].split()[0]
+    paths = [f"/csv.{name.split()[0]}" for name in names.split(",")]
+    assert [g.path for g in (*found.states, *found.inputs)] == paths
+    model = Workspace(tmp_path / "w").base_model
+    assert dict(model.inputs) == {command: "V" if "V" in names else "1"}
+    leant = np.array([[0.0, 0.0, 0.05, 0.0], [0.0, 0.0, 0.0, 0.0]])
+    moved = model.system.step(leant, np.array([[0.0], [5.0]]), model.values, 0.01)
+    assert moved[0, 3] > 0.005  # it falls to where it leans
+    assert moved[1, 1] > 0 > moved[1, 3]  # driven forwards, it leans back
+
+
 @pytest.mark.parametrize("names", ["left_encoder,right_encoder", "port,right"])
 def test_what_is_measured_on_both_sides_drives_nothing(wheels, tmp_path, names):
     assert begin(tmp_path / "w", wheels(names)).kind == "generic"
@@ -341,6 +371,33 @@ def test_a_joint_by_its_behaviour_where_no_name_fits(swung, tmp_path):
     done = grounded("-C", tmp_path / "w", found.then.verb, *found.then.arguments)
     assert found.then.verb == "ingest" and done.code == 0
     assert "log's commands" in (tmp_path / "w/grounded.toml").read_text()
+
+
+def test_numbers_without_a_fitting_name_are_found_by_their_unit_or_listed(swung, tmp_path):
+    model = tmp_path / "boom.py"
+    model.write_text(workspaces.MODEL.replace('"m"', '"rad"').replace('"m/s"', '"rad/s"'))
+    log = swung("Ausleger [deg],Strom [A],Ventil [%]", linked=False)
+    found = begin(tmp_path / "w", log, model=model)
+    assert [g.path for g in found.states] == ["/csv.Ausleger", ""]
+    assert found.states[0].scale == pytest.approx(np.pi / 180) and len(found.unsure) == 3
+    bare = begin(tmp_path / "v", swung("Ausleger,Strom,Ventil", linked=False), model=model)
+    every = {"/csv.Ausleger", "/csv.Strom", "/csv.Ventil"}
+    assert all(set(g.others) == every and not g.path for g in (*bare.states, *bare.inputs))
+    text = (tmp_path / "v/grounded.toml").read_text()
+    assert '# path = "/csv.Ausleger"' in text
+    said = grounded("-C", tmp_path / "v", "ingest", "--data", log)
+    assert said.code == 1 and all(path in said.err for path in every)
+
+
+def test_names_with_other_letters_and_times_in_an_unsaid_unit(tmp_path):
+    log, t = tmp_path / "log.csv", 10.0 * np.arange(400)
+    rows = np.column_stack([t, np.sin(t / 300), np.sign(np.cos(t / 300))])
+    head = "Zeit;Winkel;Stellgröße"
+    np.savetxt(log, rows, "%.4f", ";", header=head, comments="", encoding="utf-8")
+    found = begin(tmp_path / "w", log)
+    assert [g.name for g in found.inputs] == ["Stellgröße"]
+    assert any("_ms" in note for note in found.notes)
+    assert Workspace(tmp_path / "w").task.model.input_names == ("Stellgröße",)
 
 
 def test_a_position_is_the_one_whose_derivative_the_named_speed_is(swung, tmp_path):
@@ -418,6 +475,34 @@ def test_a_path_keeps_to_its_speeds_and_starts_from_rest(tmp_path):
         turned = np.arctan2(np.diff(columns["y"]), np.diff(columns["x"]))
         error = np.angle(np.exp(1j * (turned - columns["psi"][:-1])))[step > 0.1]
         assert np.abs(error).max() < 0.2
+
+
+def test_a_robot_with_one_axis_has_a_line_and_a_step_from_its_start(tmp_path):
+    """A boom was told to have a role 'position' of two states; a step began at 0."""
+    cart = workspaces.MODEL.replace(', "speed": "v"', "").replace('"position": ("x",)', "")
+    config = workspaces.CONFIG.replace('"target.csv"\n', '"target.csv"\nstart = { x = 0.5 }\n', 1)
+    made = workspaces.make(tmp_path / "w", model=cart, config=config)
+    done = grounded("-C", made.folder, "target", "line", "--to", "x=-1", "--speed", "0.5", "--json")
+    assert done.json["columns"] == {"x": [-1.0, 0.5], "v": [-0.5, 0.0]}
+    names, rows = read_target(made.folder / "target.csv")
+    x, v = rows[:, names.index("x")], rows[:, names.index("v")]
+    assert x[0] == 0.5 and v[0] == v[-1] == 0 and len(rows) == done.json["horizon"] + 1
+    np.testing.assert_allclose(np.diff(x) / 0.05, (v[1:] + v[:-1]) / 2, atol=0.02)
+    further = grounded("-C", made.folder, "target", "line", "--size", "2", "--json").json
+    assert further["columns"]["x"] == [0.5, 2.5]
+    step = grounded("-C", made.folder, "target", "step", "--to", "x=1", "--json").json
+    assert step["columns"] == {"x": [0.5, 1.0]}
+    for shape, to, said in (("circle", (), "--to STATE"), ("line", ("--to", "x=0.5"), "x = 0.5")):
+        refused = grounded("-C", made.folder, "target", shape, *to)
+        assert refused.code == 1 and said in refused.err
+    free = "def f(s, a, p):\n    return {'b': a.u, 'c': s.b * a.u}\n"
+    (made.folder / "model.py").write_text(
+        f"from grounded import Model\n{free}\n"
+        "model = Model(states={'b': '1', 'c': '1'}, inputs={'u': '1'}, params={}, derivative=f)\n"
+    )
+    (made.folder / "grounded.toml").write_text(config.replace("x = ", "b = ").replace("force", "u"))
+    refused = grounded("-C", made.folder, "target", "line")
+    assert refused.code == 1 and "--to b=1.0" in refused.err
 
 
 def test_the_target_of_a_workspace_is_drawn_and_the_old_one_kept(tmp_path):

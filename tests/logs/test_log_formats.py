@@ -12,6 +12,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from grounded.errors import GroundedError
+from grounded_trials.formats.text_tables import column_units
 from grounded_trials.logs.inspect_log import inspect_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
 
@@ -160,6 +161,43 @@ def test_decimal_commas_between_semicolons(tmp_path):
     assert np.diff(found["x"].t).tolist() == [10_000_000]
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Zeit_s;x\n0,5;1\n0,75;2\n",
+        "Zeit [ms];x\n500;1\n750;2\n",
+        "temps;x\n0.5;1\n0.75;2\n",
+        "tempo,t,x\n9,0.5,1\n3,0.75,2\n",
+        "Trace V2\nPLC: B-1; cycle 10 ms\n\ntime_ms;x\n500;1\n750;2\n",
+        "Device;B-1;\nCycle;10;ms\n\nZeit;x;\nms;deg;\n500;1;\n750;2;\n",
+        "time,x\n2026-11-21 10:05:00.500,1\n2026-11-21T10:05:00.75Z,2\n",
+        "time;x\n21.11.2026 23:59:59,75;1\n22.11.2026 00:00:00;2\n",
+        "Uhrzeit;x\n23:59:59,75;1\n0:00:00,000;2\n",
+        "Date;Time;x\n21.11.2026;23:59:59.75;1\n22.11.2026;00:00:00;2\n",
+        "Datum;x\n21.11.2026 08:06:26.5;1\n21.11.2026 08:06:26.75;2\n",
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "cp1252"])
+def test_tables_as_a_plc_or_another_language_writes_them(tmp_path, text, encoding):
+    path = tmp_path / "log.csv"
+    path.write_text(text.replace("x", "größe"), encoding=encoding)
+    found = read_signals(path, {"x": SignalSpec('/csv."größe"')})["x"]
+    assert found.values.tolist() == [1, 2] and np.diff(found.t).tolist() == [250_000_000]
+
+
+def test_the_date_of_a_text_is_kept(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("time,x\n2026-11-21 10:05:00.000123+01:00,1\n")
+    found = read_signals(path, {"x": SignalSpec("/csv.x")})["x"]
+    assert found.t[0] == 1_795_251_900_000_123_000  # `date -ud '2026-11-21 09:05' +%s`
+
+
+def test_units_below_the_names_are_the_columns(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t;Winkel;u (V)\ns;[Grad];x\n0;1;2\n1;1;2\n")
+    assert column_units(path) == {"/csv.Winkel": "Grad", "/csv.u": "V"} | {"/csv.t": "s"}
+
+
 def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path):
     """A logger that was stopped; `Time [ms]` was read as seconds."""
     path = tmp_path / "log.csv"
@@ -178,7 +216,9 @@ def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path
         ("t,b\n0,4\n1\n", ("line 3", "1", "2")),
         ("t,b\n0,4\n1\n2,4", ("line 3", "1", "2")),
         ("t,b\n1e30,4\n", ("'t'", "calendar", "_ms")),
-        ("time,b\n2026-11-21 10:05:00,4\n", ("'time'", "1 of 1", "Text", "seconds", "_ms")),
+        ("run_time,b\n0,4\n1,4\n2,4\n", ("'run_time' rises", "'t'", "_ms")),
+        ("time,b\nyesterday,4\n", ("line 2", "'time'", "'yesterday'", "2026-11-21 10:05:00")),
+        ("time,b\n0,4\n,4\n", ("'time'", "1 of 2")),
         ("", ("log.csv",)),
     ],
 )

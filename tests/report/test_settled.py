@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -171,3 +172,13 @@ def test_a_gain_needs_the_values_that_were_diagnosed(adopted):
     findings = gather(Folder(adopted))
     assert findings.settled is not None and not findings.settled.closed
     assert replace(findings.settled, left="").lines == [findings.settled.lines[0]]
+
+
+@pytest.mark.parametrize("value", [0.05, -0.05])
+def test_a_sensor_s_bias_is_said_to_move_start_and_target(cart, tmp_path, value):
+    text = json.dumps(DIAGNOSIS).replace("viscous_friction:v", "sensor_bias:v")
+    document = json.loads(text.replace('"k": {"value": 0.3', f'"b": {{"value": {value}'))
+    folder = written(copied(cart, tmp_path / "w"), **document)
+    done = grounded("-C", folder, "adopt", "sensor_bias:v")
+    reads = f"0.05 m/s too {'high' if value > 0 else 'low'}"
+    assert done.code == 0 and holds(done.err, "start", "target", reads, f"offset = {-value}")

@@ -5,7 +5,9 @@ Every complaint names the file, the key with its table, what was found, and what
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -158,3 +160,8 @@ def read_toml(path: Path) -> Table:
         return Table(tomllib.loads(text), path)
     except (ValueError, RecursionError) as error:
         raise GroundedError(f"{path.name} is not valid TOML: {error}") from None
+
+
+def key(name: str) -> str:
+    """A name as a key of a TOML file: quoted where it has other letters than ASCII's."""
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name, ensure_ascii=False)

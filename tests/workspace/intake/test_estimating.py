@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
+from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
+from grounded_trials.workspace.adopted import planner_of
+from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.intake.estimating import EstimateTable, with_estimates
 from workspaces import CONFIG, MODEL, make
 
@@ -121,3 +124,62 @@ def test_nothing_is_estimated_where_everything_is_measured(task):
     logged["v"] = series(t[::10], v[::10], "/csv.v")
     table = EstimateTable({"x": 0.002, "v": 0.01}, {})
     assert with_estimates(logged, table, task) == logged
+
+
+@pytest.mark.parametrize(
+    ("effect", "lag", "friction"),
+    [
+        ({"name": "first_order_lag:force", "tau": 0.15}, 0.15, 0.0),  # has a memory state
+        ({"name": "coulomb_friction:v", "c": 0.8}, 0.0, 0.8),
+    ],
+)
+def test_adopted_effects_make_estimates_better(task, effect, lag, friction):
+    logged, t, v = disturbed(lag, friction)
+    crude, _ = off(with_estimates(logged, TABLE, task), t, v)
+    plan = planner_of(task, [effect]).plan
+    found = with_estimates(logged, TABLE, plan, task.model.state_names)
+    better, _ = off(found, t, v)
+    assert set(found) == {"x", "v", "force"}
+    assert np.sqrt(np.mean(better**2)) < 0.5 * np.sqrt(np.mean(crude**2))
+
+
+def disturbed(lag, friction, until=6.0, fine=1e-3):
+    """The crude model's cart with a lag or a friction."""
+    t = np.arange(0, until, fine)
+    held = np.floor(t / 0.05) * 0.05
+    force = np.where(t < 1, 0.0, 3 * np.sin(2 * held) + 1.5 * np.sign(np.sin(5 * held)))
+    x = v = u = 0.0
+    path = []
+    for k in force:
+        path.append((x, v))
+        u += fine / max(lag, fine) * (k - u)
+        x, v = x + fine * v, v + fine * (u - 0.2 * v - friction * np.tanh(v / 0.02))
+    x, v = np.transpose(path)
+    noisy = x[::10] + 0.002 * np.random.default_rng(0).standard_normal(len(x[::10]))
+    return {"x": series(t[::10], noisy), "force": series(t[::10], force[::10], "/u")}, t, v
+
+
+def test_trials_that_another_model_estimated_stay_and_are_told(tmp_path):
+    lines = [f'[log.{k}.{n}]\npath = "/csv.{n}"' for k, n in (("state", "x"), ("input", "force"))]
+    config = CONFIG + "\n".join([*lines, "[estimate]", "measured = { x = 0.002 }"])
+    folder = make(tmp_path / "w", config=config).folder
+    for k in range(3):
+        logged, _, _ = disturbed(0.0, 0.8, until=4.0 + k)
+        t = logged["x"].t * 1e-9 + 100 * k
+        table = np.column_stack([t, logged["x"].values, logged["force"].values])
+        np.savetxt(tmp_path / f"{k}.csv", table, "%.5f", ",", header="t,x,force", comments="")
+    first = Workspace(folder).ingest(tmp_path / "0.csv", data=True)
+    before = Workspace(folder).trials()[0].measured.states
+    set_in_model(folder / "grounded.toml", effects=[{"name": "coulomb_friction:v", "c": 0.8}])
+    w = Workspace(folder)
+    again = w.ingest(tmp_path / "0.csv", data=True)
+    assert again.known and again.trial == first.trial
+    np.testing.assert_array_equal(w.trials()[0].measured.states, before)
+    told = w.ingest(tmp_path / "1.csv", data=True)
+    for one in (again, told):
+        assert any("coulomb_friction:v" in note and "t0001" in note for note in one.notes)
+    third = w.ingest(tmp_path / "2.csv", data=True)
+    assert not any("t0001" in note for note in third.notes)
+    w.discard("t0001")
+    anew = w.ingest(tmp_path / "0.csv", data=True)
+    assert not anew.known and anew.trial != first.trial

@@ -15,7 +15,7 @@ from facts import holding, holds
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
-from grounded_trials.workspace.intake import foreign, ingest
+from grounded_trials.workspace.intake import foreign, reading
 from recorded import LOGGED, RATE, record, waiting
 from workspaces import make
 
@@ -189,7 +189,7 @@ def test_a_log_that_was_stored_before_is_no_run_of_the_candidate_that_waits_now(
     renamed = w.ingest(copy, candidate="c0002")
     assert renamed.known and renamed.trial == first.trial and len(w.trials()) == 2
     with monkeypatch.context() as nothing:  # the search has ended
-        nothing.setattr(ingest, "_outstanding", lambda *_: pytest.fail("asked for"))
+        nothing.setattr(reading, "_outstanding", lambda *_: pytest.fail("asked for"))
         assert w.ingest(copy).trial == first.trial
 
 

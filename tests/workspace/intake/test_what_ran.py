@@ -366,3 +366,22 @@ def test_a_copy_is_discarded_without_its_original(waiting):
     assert list(w.discard(original.id).discarded) == [original.id, copy.id]
     assert list(w.restore(original.id).discarded) == [copy.id]
     assert w.restore(copy.id).discarded == {}
+
+
+def test_a_run_of_another_workspace_s_candidate_is_told(tmp_path):
+    """Two copies of a task with other weights: their first candidates send nearly the same."""
+    here, there = (
+        Workspace(make(tmp_path / name, config=CONFIG.replace("x = 10.0", weight)).folder)
+        for name, weight in (("here", "x = 10.0"), ("there", "x = 300.0"))
+    )
+    for w in (here, there):
+        w.propose()
+    log = there.run()
+    trial = read_trial(log.trial_file)[0]
+    stored = here.ingest(log.trial_file, data=True)
+    assert any("another workspace" in note for note in stored.notes)
+    write_trial(tmp_path / "bare.mcap", trial, {"kind": "trial"})
+    told = here.ingest(tmp_path / "bare.mcap")
+    assert any("another workspace" in warning for warning in told.warnings)
+    assert not there.ingest(tmp_path / "bare.mcap").warnings
+    assert not there.ingest(log.trial_file, data=True).notes

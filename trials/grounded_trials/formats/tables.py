@@ -1,4 +1,4 @@
-"""Tables of numbers as the same records: `.csv`, `.npz`, and PX4's `.ulg`.
+"""Tables of numbers as the records of a log: `.npz`, PX4's `.ulg`; `text_tables` has `.csv`.
 
 A table is a topic whose messages hold a stamp and one double a column, so that everything that
 reads a bag reads a table: `/csv.speed`, `/run03.q[1]`, `/vehicle_attitude.q[0]`. Every table needs
@@ -8,12 +8,10 @@ digits and underscores; a unit in brackets or after the last comma is left out.
 
 from __future__ import annotations
 
-import csv
 import io
 import re
-import warnings
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -29,82 +27,14 @@ VALUES = 200_000_000  # numbers in one file
 ROWS = 50_000  # of a batch
 STAMPS = ("t", "time", "timestamp", "stamp", "times", "timestamps")
 TIMES = (*STAMPS, "seconds", "secs", "clock", "clk", "elapsed")
+ABROAD = (  # the same in other languages, where no column has an English name
+    *("zeit", "zeitstempel", "uhrzeit", "temps", "horodatage", "heure", "tiempo", "hora"),
+    *("tempo", "ora", "tijd", "tid", "czas", "aika", "время", "时间", "時間", "时间戳"),
+)
 UNITS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 LATEST = 4e18  # [ns], the year 2096
 
 Columns = Mapping[str, Floats]
-
-
-def csv_records(path: Path) -> Iterator[Record]:
-    """The records of a text table: a row of names, then rows of numbers.
-
-    Raises:
-        GroundedError: without names or times, or where a row doesn't fit.
-    """
-    with path.open(encoding="utf-8-sig", errors="replace", newline="") as stream:
-        head = stream.readline(65536)
-        mark = next((m for m in "\t;," if m in head), ",")
-        names = [_name(cell) for cell in next(csv.reader([head], delimiter=mark), [])]
-        if not head.strip() or not any(names) or _are_numbers(head, mark):
-            raise GroundedError(
-                f"{path} begins with {head[:40].strip()!r}: its first row must name the columns, "
-                "one of them 't' (time in seconds)"
-            )
-        _time_of(names, path)
-        try:
-            with warnings.catch_warnings():  # a table without rows is found below
-                warnings.simplefilter("ignore")
-                values = np.loadtxt(stream, delimiter=mark, ndmin=2, usecols=range(len(names)))
-        except ValueError:
-            stream.seek(0)
-            stream.readline()
-            values = _with_holes(stream, mark, len(names), path)
-    if not values.size:
-        raise GroundedError(f"{path} has no rows below its first line")
-    columns = {name: values[:, i] for i, name in enumerate(names) if name}
-    yield from table_records({"/csv": columns}, "csv", path)
-
-
-def column_units(path: Path) -> dict[str, str]:
-    """The units that a text table's first row states, `x [m]` or `x (m)`, by message path."""
-    if path.suffix.lower() not in (".csv", ".tsv", ".txt"):
-        return {}
-    with path.open(encoding="utf-8-sig", errors="replace", newline="") as stream:
-        head = stream.readline(65536)
-    mark = next((m for m in "\t;," if m in head), ",")
-    cells = next(csv.reader([head], delimiter=mark), [])
-    said = {_name(cell): re.search(r"[\[(]\s*([^\d\s][^\])]*?)\s*[\])]", cell) for cell in cells}
-    return {f"/csv.{name}": unit[1] for name, unit in said.items() if unit and '"' not in unit[1]}
-
-
-def _with_holes(stream: Any, mark: str, width: int, path: Path) -> Floats:
-    """Rows with texts or empty cells, which are no number; without a last one that was cut off."""
-    rows: list[list[float]] = []
-    lines = list(stream)
-    for number, row in enumerate(csv.reader(lines, delimiter=mark), start=2):
-        if not any(cell.strip() for cell in row):
-            continue
-        if len(row) != width:
-            if number > len(lines) and len(row) < width and not lines[-1].endswith("\n"):
-                break  # whoever wrote it was stopped there
-            raise GroundedError(
-                f"{path}, line {number}: it has {len(row)} cells, its first line names {width}"
-            )
-        if mark != ",":  # half of Europe writes 0,5
-            row = [cell.replace(",", ".", 1) if "." not in cell else cell for cell in row]
-        rows.append([_number(cell) for cell in row])
-    return np.array(rows, dtype=float).reshape(-1, width)
-
-
-def _number(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        return float({"true": 1, "false": 0}.get(cell.strip().lower(), "nan"))
-
-
-def _are_numbers(head: str, mark: str) -> bool:
-    return all(not np.isnan(_number(cell)) for cell in head.split(mark) if cell.strip())
 
 
 def npz_records(path: Path) -> Iterator[Record]:
@@ -133,25 +63,27 @@ def _check_size(path: Path) -> None:
 
 
 def _npz_tables(arrays: Mapping[str, Any]) -> dict[str, Columns]:
-    labels = [list(map(_name, a)) for a in arrays.values() if a.ndim == 1 and a.dtype.kind == "U"]
+    labels = [
+        list(map(column_name, a)) for a in arrays.values() if a.ndim == 1 and a.dtype.kind == "U"
+    ]
     numbers = {k: np.asarray(a, float) for k, a in arrays.items() if a.dtype.kind in "fiub"}
     tables: dict[str, Columns] = {}
     for name, t in numbers.items():
         own = numbers.get(name.removesuffix("_t"), np.zeros(0))
         if not name.endswith("_t") or t.ndim != 1 or len(own) != len(t) or own.ndim > 2:
             continue
-        texts = [label for label in labels if own.ndim == 2 and len(label) == own.shape[1]]
-        table = _name(name.removesuffix("_t"))
-        tables["/" + table] = {"t": t} | _columns(own, texts[0] if texts else [], table)
-    used = {name for name in numbers if "/" + _name(name.removesuffix("_t")) in tables}
+        names = [label for label in labels if own.ndim == 2 and len(label) == own.shape[1]]
+        table = column_name(name.removesuffix("_t"))
+        tables["/" + table] = {"t": t} | _columns(own, names[0] if names else [], table)
+    used = {name for name in numbers if "/" + column_name(name.removesuffix("_t")) in tables}
     rest = {k: a for k, a in numbers.items() if k not in used and a.ndim in (1, 2)}
-    times = [k for k, a in rest.items() if a.ndim == 1 and len(a) > 1 and _is_time(k)]
+    times = [k for k, a in rest.items() if a.ndim == 1 and len(a) > 1 and is_time(k)]
     for k in times[:1]:
-        flat: dict[str, Floats] = {_name(k): rest.pop(k)}
+        flat: dict[str, Floats] = {column_name(k): rest.pop(k)}
         length = len(next(iter(flat.values())))
         for name, a in rest.items():
             if len(a) == length:
-                flat |= _columns(a, [], _name(name))
+                flat |= _columns(a, [], column_name(name))
         tables["/npz"] = flat
     return tables
 
@@ -160,7 +92,7 @@ def _columns(array: Floats, names: list[str], table: str) -> dict[str, Floats]:
     if array.ndim == 1:
         return {table: array}
     names = names or [f"{table}_{i}" for i in range(array.shape[1])]
-    return {name: array[:, i] for i, name in enumerate(names) if not _is_time(name)}
+    return {name: array[:, i] for i, name in enumerate(names) if not is_time(name)}
 
 
 def ulog_records(path: Path) -> Iterator[Record]:
@@ -249,6 +181,9 @@ def _rows(channel: int, stamps: Any, columns: list[Floats]) -> Messages:
 
 def _times(columns: Columns, path: Path) -> tuple[str, Any]:
     """The column of times, and its values [ns]."""
+    for name, values in columns.items():
+        if values.dtype.kind == "i":  # [ns], from texts
+            return name, values
     name = _time_of(list(columns), path)
     unit = next((u for u in ("ns", "us", "ms") if name.lower().endswith("_" + u)), "")
     values = columns[name]
@@ -258,10 +193,8 @@ def _times(columns: Columns, path: Path) -> tuple[str, Any]:
         unit = "ns" if top > 1e17 else "us" if top > 1e14 else "ms" if top > 1e11 else "s"
     if lost := len(values) - len(finite):
         raise GroundedError(
-            f"{path}: '{name}' is no number in {lost} of {len(values)} rows. Times are read as "
-            "numbers: seconds, or in the unit that the column's name ends with, _ms, _us or _ns. "
-            "Text such as 2026-11-21 10:05:00.250 is not read: write the seconds since the first "
-            "row in its place"
+            f"{path}: '{name}' is no number in {lost} of {len(values)} rows: delete those rows, "
+            "or name the column of times 't' if this is not it"
         )
     if top * UNITS[unit] > LATEST:
         raise GroundedError(
@@ -271,24 +204,30 @@ def _times(columns: Columns, path: Path) -> tuple[str, Any]:
     return name, np.rint(values * UNITS[unit]).astype(np.int64)
 
 
-def _time_of(names: list[str], path: Path) -> str:
-    for name in names:
-        if _is_time(name):
-            return name
+def _time_of(names: Sequence[str], path: Path) -> str:
+    if name := time_among(names):
+        return name
     raise GroundedError(
         f"{path} has no column of times among {', '.join(names[:8])}: name one 't' (seconds), or "
         "'t_ms', 't_us' or 't_ns' in their units ('time', 'stamp', 'clock', 'elapsed' will do too)"
     )
 
 
-def _is_time(name: str) -> bool:
-    stem = re.sub(r"_?(s|ns|us|ms|sec)$", "", name.lower()) or name.lower()
-    return name.lower() in TIMES or stem in TIMES
+def time_among(names: Sequence[str]) -> str:
+    """The first name of times, in English before other languages; "" for none."""
+    ranked = (n for words in (TIMES, ABROAD) for n in names if is_time(n, words))
+    return next(ranked, "")
 
 
-def _name(cell: str) -> str:
+def is_time(name: str, words: Sequence[str] = (*TIMES, *ABROAD)) -> bool:
+    """Whether a column's name says time, perhaps with its unit at the end."""
+    stem = re.sub(r"_?(in_)?(s|ns|us|ms|sec)$", "", name.lower()) or name.lower()
+    return name.lower() in words or stem in words
+
+
+def column_name(cell: str) -> str:
     """A column's name as a message path can say it."""
     bare = re.sub(r"[\[(].*?[\])]", "", cell.strip()) if not re.search(r"\[\d+\]", cell) else cell
     name = re.sub(r"[^\w\[\]]+", "_", bare.strip()).strip("_")
     unit = re.search(r"[\[(]\s*(ms|us|ns)\s*[\])]$", cell.strip())
-    return f"{name}_{unit[1]}" if unit and _is_time(name) else name
+    return f"{name}_{unit[1]}" if unit and is_time(name) else name

@@ -16,7 +16,9 @@ import numpy as np
 
 from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
 from grounded_trials.logs.stated_units import without_unit
+from grounded_trials.toml_table import key
 
+FEW = 8  # others that [log] names
 SURE = 1.5  # how much better than the next topic's best a guess must be
 LEAST = 2.0  # below this score nothing is proposed
 DRIFT = 2e-4  # of a signal's range: the least deviation that is proposed for it
@@ -31,7 +33,8 @@ _MEANINGS: dict[str, tuple[str, ...]] = {
     "yaw": _YAW,
     "heading": _YAW,
     "theta": ("@rpy.pitch", "@rpy.yaw", "theta", "angle", "pitch"),
-    "pitch": ("@rpy.pitch", "pitch", "theta"),
+    "pitch": ("@rpy.pitch", "pitch", "theta", "tilt", "lean"),
+    "pitch_rate": ("angular.y", "angular_velocity.y", "pitch_rate", "pitch_velocity"),
     "phi": ("@rpy.roll", "roll", "phi"),
     "roll": ("@rpy.roll", "roll", "phi"),
     "v": ("linear.x", "speed", "velocity", "vel", "v"),
@@ -235,11 +238,14 @@ def mapping_toml(
 
 
 def _table(kind: str, guess: Guess, clock: str) -> list[str]:
-    head = f"[log.{kind}.{guess.name}]"
-    others = f"; or {', '.join(guess.others)}" if guess.others else ""
+    head = f"[log.{kind}.{key(guess.name)}]"
+    others = f"; or {', '.join(guess.others[:FEW])}" if guess.others else ""
+    if not guess.path and not guess.others:
+        return [f"# {head}  # nothing in the log fits"]
     if not guess.path:
-        what = "nothing in the log fits" + others
-        return [f"# {head}  # {what}"]
+        rest = f"  # or {', '.join(guess.others[1:FEW])}" * (len(guess.others) > 1)
+        what = "no name in the log fits; if one of these is it, delete the two #"
+        return [f"# {head}  # {what}", f"# path = {_quote(guess.others[0])}{rest}"]
     lines = [head if guess.sure else f"{head}  # unsure{others}"]
     lines.append(f"path = {_quote(guess.path)}")
     if guess.field is not None and guess.field.low is not None:

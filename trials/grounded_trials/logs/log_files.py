@@ -135,7 +135,7 @@ def _by_format(path: Path, head: bytes, stream: BinaryIO) -> Iterator[Record]:
     if head.startswith(MAGIC[:5]) or path.name.endswith(".mcap") or not head:
         yield from map(_plain, read_records(stream, str(path)))
         return
-    from grounded_trials.formats import bags, tables
+    from grounded_trials.formats import bags, tables, text_tables
 
     begins = {
         bags.SQLITE: bags.sqlite_records,
@@ -149,7 +149,7 @@ def _by_format(path: Path, head: bytes, stream: BinaryIO) -> Iterator[Record]:
             f"{path} is no log: it begins with {head[:8]!r}; MCAP, ROS 2 .db3, ROS 1 .bag, .csv, "
             ".npz and PX4 .ulg can be read"
         )
-    yield from map(_plain, (reader or tables.csv_records)(path))
+    yield from map(_plain, (reader or text_tables.csv_records)(path))
 
 
 def _plain(record: Record) -> Record:

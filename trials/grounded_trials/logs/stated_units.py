@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from grounded_trials.formats.tables import column_units
+from grounded_trials.formats.text_tables import column_units
 
 _OF = {  # a multiple of another unit, itself a product
     "mm": ("m", 1e-3),
@@ -24,8 +24,10 @@ _OF = {  # a multiple of another unit, itself a product
     "degree": ("rad", math.pi / 180),
     "degrees": ("rad", math.pi / 180),
     "°": ("rad", math.pi / 180),
+    "Grad": ("rad", math.pi / 180),
     "mrad": ("rad", 1e-3),
     "rpm": ("rad/s", 2 * math.pi / 60),
+    "U": ("rad", 2 * math.pi),
     "dps": ("rad/s", math.pi / 180),
     "us": ("s", 1e-6),
     "ms": ("s", 1e-3),

@@ -7,7 +7,6 @@ marked.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,7 +19,7 @@ from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Result
-from grounded_trials.formats.tables import column_units
+from grounded_trials.formats.text_tables import column_units
 from grounded_trials.logs.inspect_evidence import as_stated, weigh
 from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated, mapping_toml
 from grounded_trials.logs.inspect_log import LogReport, inspect_log
@@ -29,17 +28,18 @@ from grounded_trials.logs.joint_names import joint_names
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.stated_units import Stated
+from grounded_trials.logs.unnamed import from_the_rest
 from grounded_trials.starting.examples import fresh_folder
+from grounded_trials.starting.first_toml import write_first
 from grounded_trials.starting.interval import interval_of
 from grounded_trials.starting.kinds import KINDS, Joints, called_input, kind_in, moving, skeleton
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.model_file import load_module, model_in
-from grounded_trials.workspace.task_file import equal_weights, write_target
 
 WRITTEN = (FILE, "model.py", "target.csv")
-MOST_ASKED = 20  # numbers of the log to choose from where nothing fits
+SLOWEST = 0.5  # [Hz] rows of a robot's log: slower ones have times in another unit
 HORIZON = 200  # steps of a target that is a recorded run, at most
 Ask = Callable[[Guess], str]
 
@@ -174,14 +174,16 @@ def _begin(
             tuple(_only_named(g, of) for g in s) for s, of in ((states, "state"), (inputs, "input"))
         )
         notes = (*notes, *_left_out(report, found))
+    units = {**found.states, **found.inputs}
+    both = from_the_rest((*states, *inputs), units, report)
+    states, inputs = both[: found.n], both[found.n :]
     if ask is not None:
-        taken = {g.path for g in (*states, *inputs)}
-        free = tuple(one.path for one in moving(report).values() if one.path not in taken)
-        said, units = Stated.by(files), {**found.states, **found.inputs}
+        said = Stated.by(files)
         states, inputs = (
-            tuple(_asked(g, ask, free, partial(as_stated, said, units[g.name])) for g in some)
+            tuple(_asked(g, ask, partial(as_stated, said, units[g.name])) for g in some)
             for some in (states, inputs)
         )
+    notes = (*notes, *_in_seconds(report))
     step, whose, note = (dt, "", "") if dt else interval_of(report, inputs, states)
     ranges = {g.name: _range(report, g) for g in (*states, *inputs)}
     if chosen != "drone":  # what is sent after a run must be allowed: rest
@@ -192,7 +194,7 @@ def _begin(
 
     def write(columns: Mapping[str, Array], rows: int) -> None:
         name = Path(log).name
-        _write(folder, found, (step, whose), columns, rows, ranges, table, why, name)
+        write_first(folder, found, (step, whose), columns, rows, ranges, table, why, name)
 
     write({found.state_names[0]: np.zeros(2)}, 1)
     target, horizon, more = _recorded(folder, files, found, states, step, write)
@@ -274,15 +276,24 @@ def _left_out(report: LogReport, model: Model) -> tuple[str, ...]:
     left = [name for name in moving(report) if name not in {**model.states, **model.inputs}]
     found = [f"left out of model.py: {', '.join(reversed(left))}"] * bool(left)
     if not set(model.inputs) & set(moving(report)):
-        found.append("no number looks like a command: --inputs A,B says which are")
+        last = next(iter(moving(report)), "A")
+        found.append(f"no number looks like a command: --inputs says which are, --inputs {last}")
     return tuple(found)
 
 
-def _asked(guess: Guess, ask: Ask, free: tuple[str, ...], stated: Callable[..., Guess]) -> Guess:
+def _in_seconds(report: LogReport) -> tuple[str, ...]:
+    """What to do where a table's times are in another unit than seconds, and do not say so."""
+    slow = [t for t in report.topics if t.topic == "/csv" and 0 < t.rate_hz < SLOWEST]
+    return tuple(
+        f"read in seconds, the rows come every {1 / t.rate_hz:.3g} s: are the times in ms or us? "
+        "Then end that column's name with _ms or _us, and make the workspace anew"
+        for t in slow
+    )
+
+
+def _asked(guess: Guess, ask: Ask, stated: Callable[..., Guess]) -> Guess:
     if guess.sure:
         return guess
-    if not guess.path and not guess.others:
-        guess = replace(guess, others=free[:MOST_ASKED])
     path = ask(guess)
     if path == guess.path:
         return replace(guess, sure=bool(path))
@@ -323,63 +334,3 @@ def _recorded(
     horizon = len(found.states) - 1
     write(columns, horizon)
     return f"the run in the log, its first {horizon * dt:g} s", horizon, found.warnings
-
-
-def _write(
-    folder: Path,
-    model: Model,
-    grid: tuple[float, str],
-    columns: Mapping[str, Array],
-    horizon: int,
-    ranges: Mapping[str, tuple[float, float] | None],
-    table: str,
-    why: str,
-    log: str,
-) -> None:
-    dt, whose = grid
-    write_target(folder / "target.csv", dt, dict(columns))
-    weights = equal_weights(columns, model.states)
-    limits = [
-        f"{name} = [{found[0]:.6g}, {found[1]:.6g}]"
-        for name in model.input_names
-        if (found := ranges[name]) is not None and found[0] < found[1]
-    ]
-    lines = [
-        f"# made from a log by `grounded init --from` ({why})",
-        "",
-        "[model]",
-        'file = "model.py"             # the crude model, plain NumPy',
-        "",
-        "[task]",
-        f"dt = {dt:g}                     # [s] control interval{whose}",
-        f"horizon = {horizon}                 # steps",
-        'target = "target.csv"         # `grounded target` draws another; no column: free',
-        "start = { }",
-        "feedback = true               # false: open loop",
-        "latency = { }                 # [s] transport delay of inputs: `fit --latency` finds it",
-        "",
-        "[reward]                      # quadratic weights: 1 / (range in the target)^2; `target`",
-        "                              # sets them anew until you change one; of a column that",
-        "                              # stays at 0: the largest of its unit, else 1",
-        f"state = {_inline(weights)}",
-        "# terminal, of the last step alone: where the run is to END at rest on its target",
-        "# (docking, parking) and overshoots, 10 to 100 times state, the speeds' too",
-        f"# terminal = {_inline({name: 10 * weight for name, weight in weights.items()})}",
-        f"input_change = {_inline(dict.fromkeys(model.input_names, 0.01))}",
-        "",
-        "[limits]                      # SEEN in the log, and 0: put in what your robot may get",
-        *limits,
-        *[f"seen_in = {json.dumps(log, ensure_ascii=False)}  # delete this line once you did"]
-        * bool(limits),
-        "",
-        "[search]",
-        "max_trials = 40",
-        "",
-        table.rstrip(),
-        "",
-    ]
-    write_atomically(folder / FILE, "\n".join(lines).encode())
-
-
-def _inline(values: Mapping[str, float]) -> str:
-    return "{ " + ", ".join(f"{name} = {value:.4g}" for name, value in values.items()) + " }"

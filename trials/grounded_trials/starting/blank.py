@@ -61,8 +61,9 @@ def send(u):
 def main(candidate, trial):
     runner = load(candidate, states=tuple(STATES), inputs=tuple(INPUTS))
     dt, steps = runner.policy.dt, len(runner.policy.feedforward)
+    ran = dict(candidate=Path(candidate).stem, policy=Path(candidate).read_bytes())
     about = dict(dt=dt, states=STATES, inputs=INPUTS, meta={{"kind": "trial"}})
-    with TrialWriter(trial, candidate=Path(candidate).stem, **about) as log:
+    with TrialWriter(trial, **about, **ran) as log:
         start = time.monotonic()
         for step in range(steps + 1):
             time.sleep(max(0.0, start + step * dt - time.monotonic()))

@@ -15,6 +15,7 @@ import numpy as np
 from grounded.errors import GroundedError, nearest
 from grounded.task import Task
 from grounded_trials.store.store import write_atomically
+from grounded_trials.toml_table import key
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.task_file import target_text
 
@@ -212,7 +213,7 @@ def toml_of(task: Task, name: str, system: str = SIMULATED) -> str:
         "input_change": dict(zip(inputs, reward.input_change, strict=True)),
     }
     limits = [
-        f"{i} = [{_number(low)}, {_number(high)}]"
+        f"{key(i)} = [{_number(low)}, {_number(high)}]"
         for i, low, high in zip(inputs, task.low, task.high, strict=True)
         if np.isfinite(low) and np.isfinite(high)
     ]
@@ -258,5 +259,5 @@ def _number(value: float) -> str:
 
 
 def _table(values: Mapping[str, float]) -> str:
-    inside = ", ".join(f"{name} = {_number(value)}" for name, value in values.items())
+    inside = ", ".join(f"{key(name)} = {_number(value)}" for name, value in values.items())
     return f"{{ {inside} }}" if inside else "{ }"

@@ -1,4 +1,4 @@
-"""A model skeleton for each kind of robot, and which kind a log was recorded on.
+"""Which kind of robot a log was recorded on, and the skeleton of its model, named after the log.
 
 A skeleton is a model.py that runs as it is: the simplest equations of its kind, with parameters
 whose bounds say how little is known of them. It is meant to be changed.
@@ -8,10 +8,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 from grounded.errors import GroundedError, nearest
 from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
+from grounded_trials.starting.skeletons import (
+    BALANCE,
+    CAR,
+    DIFFERENTIAL,
+    DRONE,
+    PENDULUM,
+    ROVER,
+    Skeleton,
+    arm,
+)
 
 Joints = Mapping[str, tuple[str, ...]]  # of each topic, see `joint_names`
 Units = Mapping[str, str]  # of a number by its path
@@ -20,203 +30,18 @@ MOST, INPUTS = 6, 4  # states and inputs of a generic model, where nobody says w
 SIDES = re.compile(r"^(left|right|u\d*|u_\w+)$")  # what inputs are called, beside COMMANDED
 COMMANDED = re.compile(
     "cmd|command|desired|setpoint|target|input|throttle|torque|tau|effort|volt|pwm|duty|motor|steer"
-    r"|goal|control|_con|_ref"
+    r"|goal|control|_con|_ref|stellgr|stellwert|sollwert|_soll\b|befehl|consigne|commande|comando"
 )
 
 HEADING = re.compile(r"(^|[/._])(yaw|psi|heading|theta|th|orientation)([/._\d]|$)")
 SENSED = re.compile(
     "encoder|tick|position|current|effort|bumper|cliff|range|sonar|feedback|measured"
 )
+PITCHES, ROLLS_ON = {"pitch", "tilt", "lean"}, {"x", "v", "position", "speed", "velocity", "wheel"}
+FLIES = {"roll", "yaw", "z", "thrust", "altitude", "elevator", "rudder", "steering", "psi"}
 FLYING = re.compile(
     r"(^|[/_])(cf\d*|crazyflie|quad(rotor|copter)?|drone|uav|mavros|copter)([/_]|$)"
 )
-
-
-@dataclass(frozen=True)
-class Skeleton:
-    """A model as text: names with units, parameters, lines of equations."""
-
-    kind: str
-    text: str  # what it is, one line
-    states: Mapping[str, str]
-    inputs: Mapping[str, str]
-    params: Mapping[str, str]  # name -> the arguments of Param
-    lines: Sequence[str]  # name: expression, of ds/dt
-    angles: tuple[str, ...] = ()
-    roles: Mapping[str, object] = field(default_factory=dict)
-
-    def source(self) -> str:
-        """The text of model.py."""
-        params = [f'        "{name}": Param({given}),' for name, given in self.params.items()]
-        return "\n".join(
-            [
-                f'"""{self.text}.',
-                "",
-                "A skeleton by `grounded init --from`: make it yours.",
-                '"""',
-                "",
-                "import numpy as np",
-                "",
-                "from grounded import Model, Param",
-                "",
-                "",
-                "def dynamics(s, a, p):",
-                '    """ds/dt."""',
-                "    return {",
-                *(f"        {line}," for line in self.lines),
-                "    }",
-                "",
-                "",
-                "# Param(value, unit) is a constant; with bounds, `fit` may move it between them.",
-                "model = Model(",
-                f'    name="{self.kind}",',
-                f"    states={_dict(self.states)},",
-                f"    inputs={_dict(self.inputs)},",
-                "    params={",
-                *params,
-                "    },",
-                f"    angles={self.angles!r},",
-                f"    roles={dict(self.roles)!r},",
-                "    derivative=dynamics,",
-                ")",
-                "",
-            ]
-        ).replace("import numpy as np\n\n", "import numpy as np\n\n" if self._numpy() else "")
-
-    def _numpy(self) -> bool:
-        return any("np." in line for line in self.lines)
-
-
-def _dict(units: Mapping[str, str]) -> str:
-    inside = [f'"{name}": "{unit}"' for name, unit in units.items()]
-    if len(inside) < 5:
-        return "{" + ", ".join(inside) + "}"
-    return "{\n" + "".join(f"        {one},\n" for one in inside) + "    }"
-
-
-PLANE = {"position": ("x", "y"), "heading": "psi", "speed": "v"}
-CAR = Skeleton(
-    "car",
-    "A kinematic car: rear axle at (x, y), speed v, steering without lag",
-    {"v": "m/s", "x": "m", "y": "m", "psi": "rad"},
-    {"steering": "rad", "speed": "m/s"},
-    {
-        "L": '0.3, "m", 0.1, 3.0',
-        "tau": '0.3, "s", 0.02, 3.0',
-        "gain": '1.0, "1", 0.2, 5.0',
-        "trim": '0.0, "rad", -0.2, 0.2',
-    },
-    (
-        '"v": (p.gain * a.speed - s.v) / p.tau',
-        '"x": s.v * np.cos(s.psi)',
-        '"y": s.v * np.sin(s.psi)',
-        '"psi": s.v * np.tan(a.steering + p.trim) / p.L',
-    ),
-    ("psi",),
-    PLANE,
-)
-ROVER = Skeleton(
-    "rover",
-    "A robot on two driven wheels: speed and turn rate follow their commands with a lag",
-    {"v": "m/s", "omega": "rad/s", "x": "m", "y": "m", "psi": "rad"},
-    {"speed": "m/s", "turn": "rad/s"},
-    {"tau_v": '0.2, "s", 0.01, 2.0', "tau_w": '0.2, "s", 0.01, 2.0', "gain": '1.0, "1", 0.3, 2.0'},
-    (
-        '"v": (p.gain * a.speed - s.v) / p.tau_v',
-        '"omega": (a.turn - s.omega) / p.tau_w',
-        '"x": s.v * np.cos(s.psi)',
-        '"y": s.v * np.sin(s.psi)',
-        '"psi": s.omega',
-    ),
-    ("psi",),
-    PLANE | {"heading_rate": "omega"},
-)
-DIFFERENTIAL = Skeleton(
-    "differential",
-    "A robot on two driven wheels, each with its own command, whose speed it follows with a lag",
-    ROVER.states,
-    {"left": "1", "right": "1"},
-    {
-        "gain": '1.0, "m/s", 0.02, 20.0',
-        "track": '0.3, "m", 0.05, 2.0',
-        "tau": '0.2, "s", 0.01, 2.0',
-    },
-    (
-        '"v": (p.gain * (a.right + a.left) / 2 - s.v) / p.tau',
-        '"omega": (p.gain * (a.right - a.left) / p.track - s.omega) / p.tau',
-        *ROVER.lines[2:],
-    ),
-    ROVER.angles,
-    ROVER.roles,
-)
-DRONE = Skeleton(
-    "drone",
-    "A hovering drone: attitude follows its commands with a lag, thrust lifts along its axis",
-    {
-        **dict.fromkeys("xyz", "m"),
-        **{f"v{axis}": "m/s" for axis in "xyz"},
-        **{"roll": "rad", "pitch": "rad"},
-    },
-    {"roll_command": "rad", "pitch_command": "rad", "thrust": "1"},
-    {
-        "g": '9.81, "m/s^2"',
-        "hover": '0.5, "1", 0.1, 1.0',
-        "tau": '0.15, "s", 0.02, 1.0',
-        "drag": '0.2, "1/s", 0.0, 2.0',
-    },
-    (
-        '"x": s.vx',
-        '"y": s.vy',
-        '"z": s.vz',
-        '"vx": p.g * a.thrust / p.hover * np.sin(s.pitch) - p.drag * s.vx',
-        '"vy": -p.g * a.thrust / p.hover * np.sin(s.roll) - p.drag * s.vy',
-        '"vz": p.g * (a.thrust / p.hover * np.cos(s.roll) * np.cos(s.pitch) - 1) - p.drag * s.vz',
-        '"roll": (a.roll_command - s.roll) / p.tau',
-        '"pitch": (a.pitch_command - s.pitch) / p.tau',
-    ),
-    (),
-    {"position": ("x", "y", "z")},
-)
-PENDULUM = Skeleton(
-    "pendulum",
-    "One joint under gravity, theta = 0 hanging down",
-    {"theta": "rad", "omega": "rad/s"},
-    {"torque": "N m"},
-    {
-        "inertia": '0.1, "kg m^2", 0.0001, 10.0',
-        "damping": '0.01, "N m s", 0.0, 5.0',
-        "weight": '0.5, "N m", 0.0, 50.0',
-    },
-    (
-        '"theta": s.omega',
-        '"omega": (a.torque - p.damping * s.omega - p.weight * np.sin(s.theta)) / p.inertia',
-    ),
-    roles={"hanging": "theta"},
-)
-
-
-def arm(joints: Sequence[str]) -> Skeleton:
-    """An arm whose joints don't feel each other, named after them."""
-    short = [re.sub(r"_?joint_?", "", joint) or joint for joint in joints]
-    distinct = len(set(short)) == len(joints)
-    bare = [re.sub(r"\W+", "_", joint).strip("_") for joint in (short if distinct else joints)]
-    names = [name if name.isidentifier() else f"joint{i}" for i, name in enumerate(bare, start=1)]
-    return Skeleton(
-        "arm",
-        f"An arm of {len(names)} joints that don't feel each other: write its inertia matrix",
-        {f"{n}_position": "rad" for n in names} | {f"{n}_velocity": "rad/s" for n in names},
-        {f"{n}_effort": "N m" for n in names},
-        {f"inertia_{n}": '0.1, "kg m^2", 0.0001, 10.0' for n in names}
-        | {f"b_{n}": '0.1, "N m s", 0.0, 10.0' for n in names},
-        [
-            *(f'"{n}_position": s.{n}_velocity' for n in names),
-            *(
-                f'"{n}_velocity": (a.{n}_effort - p.b_{n} * s.{n}_velocity) / p.inertia_{n}'
-                for n in names
-            ),
-        ],
-        roles={"level": tuple(f"{n}_position" for n in names)},
-    )
 
 
 def moving(log: LogReport) -> dict[str, FieldReport]:
@@ -285,7 +110,7 @@ def _word(path: str) -> str:
     return name if name.isidentifier() else f"s_{name}"
 
 
-KINDS = ("car", "rover", "differential", "drone", "arm", "pendulum", "generic")
+KINDS = ("car", "rover", "differential", "balance", "drone", "arm", "pendulum", "generic")
 
 
 def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
@@ -311,6 +136,8 @@ def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
     words = {_word(one.path).lower() for topic in log.topics for one in topic.fields}
     if both := _both_sides(log):
         return "differential", f"{' and '.join(both)} drive it, and it has a heading"
+    if command := _balancing(log):
+        return "balance", f"it pitches, rolls on and has one command, {command}"
     if words & {"theta", "angle", "q", "q_rad", "position"} and words & {"torque", "tau", "u"}:
         return "pendulum", "an angle and a torque"
     if flat := next((t.topic for t in log.topics if _in_the_plane(t)), None):
@@ -329,6 +156,31 @@ def _both_sides(log: LogReport) -> tuple[str, ...]:
         if pair and not any(SENSED.search(found[n].path.lower()) for n in (name, pair)):
             return name, pair
     return ()
+
+
+def _balancing(log: LogReport) -> str:
+    """The command of a robot that balances on two wheels; "" where it is another."""
+    found = moving(log)
+    words = {word for name in found for word in (name.lower(), *name.lower().split("_"))}
+    if not words & PITCHES or not words & ROLLS_ON or words & FLIES:
+        return ""
+    sent = [name for name, one in found.items() if called_input(name, one.path)]
+    return sent[0] if len(sent) == 1 else ""
+
+
+def _in_volts(name: str, path: str, units: Units) -> bool:
+    """Whether a command is said to be in volts, or called so."""
+    return units.get(path, "V" if "volt" in name.lower() else "1").endswith("V")
+
+
+def _driven_by(command: str, volts: bool) -> Skeleton:
+    """The balancing robot with its command's own name, in volts or without a unit."""
+    before = [line.replace("a.voltage", f"a.{command}") for line in BALANCE.before]
+    if volts:
+        return replace(BALANCE, inputs={command: "V"}, before=before)
+    unitless = {"kt": '0.5, "N m", 0.0001, 50.0', "ke": '0.03, "s/rad", 0.0, 5.0'}
+    params = {**BALANCE.params, **unitless}
+    return replace(BALANCE, inputs={command: "1"}, before=before, params=params)
 
 
 def _in_the_plane(topic: TopicReport) -> bool:
@@ -365,5 +217,7 @@ def skeleton(
             for line in DIFFERENTIAL.lines
         ]
         return replace(DIFFERENTIAL, inputs=dict.fromkeys(both, "1"), lines=lines)
-    fixed = {one.kind: one for one in (CAR, ROVER, DIFFERENTIAL, DRONE, PENDULUM)}
+    if kind == "balance" and (command := _balancing(log)):
+        return _driven_by(command, _in_volts(command, moving(log)[command].path, units or {}))
+    fixed = {one.kind: one for one in (CAR, ROVER, DIFFERENTIAL, BALANCE, DRONE, PENDULUM)}
     return fixed[kind] if kind in fixed else generic(log, inputs, units)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded_trials.logs.inspect_log import inspect_log
+from grounded_trials.logs.inspect_pairs import velocities
 from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
 from grounded_trials.workspace.folder import Folder
@@ -54,11 +56,10 @@ def path_target(shape: str, drive: Drive, model: Model, dt: float) -> dict[str, 
     if len(position) < 2:
         raise GroundedError(
             f"model '{model.name}' has no role 'position' of two states, which a {shape} needs: "
-            'add roles={"position": ("x", "y"), "heading": "psi", "speed": "v"} to model.py'
+            'add roles={"position": ("x", "y"), "heading": "psi", "speed": "v"} to model.py. '
+            "`target line --to STATE=VALUE` and `target step --to STATE=VALUE` need no role"
         )
-    for name, value in vars(drive).items():
-        if not 0 < value < np.inf:
-            raise GroundedError(f"--{name} must be positive, found {value:g}")
+    _check(drive)
     along, x, y, heading = _path(shape, drive)
     curvature = np.abs(np.gradient(heading, along))
     limit = np.minimum(drive.speed, np.sqrt(drive.lateral / np.maximum(curvature, 1e-9)))
@@ -73,6 +74,68 @@ def path_target(shape: str, drive: Drive, model: Model, dt: float) -> dict[str, 
         if isinstance(played, str) and played in model.states:
             columns[played] = np.interp(t, when, values)
     return columns
+
+
+def _check(drive: Drive) -> None:
+    for name, value in vars(drive).items():
+        if not 0 < value < np.inf:
+            raise GroundedError(f"--{name} must be positive, found {value:g}")
+
+
+def line_target(
+    to: Mapping[str, float], start: Mapping[str, float], drive: Drive, model: Model, dt: float
+) -> dict[str, Array]:
+    """Columns of a straight line in the states, from rest to rest, with their rates.
+
+    Args:
+        to: where it ends, by state; none: `drive.size` further, on the model's one axis.
+        start: where states start that do not start at 0.
+        drive: speed and acceleration of the state that goes farthest, in its unit.
+        model: whose states they are.
+        dt: control interval [s].
+
+    Raises:
+        GroundedError: for a name that is no state, a line of no length, or where several axes may
+            be meant.
+    """
+    _check(drive)
+    to = to or {(name := _axis(model)): start.get(name, 0.0) + drive.size}
+    _check_states(to, model)
+    way = {name: value - start.get(name, 0.0) for name, value in to.items()}
+    length = max(map(abs, way.values()))
+    if not 0 < length < np.inf:
+        raise GroundedError(f"the line ends where it starts, at {_told(to)}: --to says where else")
+    along = np.linspace(0, length, FINE)
+    limit = np.full(FINE, drive.speed)
+    limit[-1] = 0.0
+    speed = _reachable(along, limit, drive.accel)
+    when = np.concatenate([[0.0], np.cumsum(2 * np.diff(along) / (speed[1:] + speed[:-1]))])
+    t = dt * np.arange(np.ceil(when[-1] / dt - 1e-6) + 1)
+    share, rate = np.interp(t, when, along) / length, np.interp(t, when, speed) / length
+    columns = {name: start.get(name, 0.0) + share * far for name, far in way.items()}
+    rates = velocities(model)
+    return columns | {rates[q]: rate * far for q, far in way.items() if rates.get(q, q) not in way}
+
+
+def has_plane(model: Model) -> bool:
+    """Whether paths can be drawn in the model's plane."""
+    return len(model.roles.get("position", ())) > 1
+
+
+def _axis(model: Model) -> str:
+    """The one state that a line without an end moves."""
+    named = model.roles.get("position") or model.roles.get("rail") or tuple(velocities(model))
+    moved = (named,) if isinstance(named, str) else named
+    if len(moved) == 1:
+        return moved[0]
+    raise GroundedError(
+        f"model '{model.name}' has {'several axes' if moved else 'no axis'} that a line may be "
+        f"along: name one, such as --to {next(iter(moved or model.states))}=1.0"
+    )
+
+
+def _told(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} = {value:g}" for name, value in values.items())
 
 
 def _path(shape: str, drive: Drive) -> tuple[Array, Array, Array, Array]:
@@ -103,9 +166,13 @@ def _reachable(along: Array, limit: Array, accel: float) -> Array:
 
 
 def step_target(
-    to: Mapping[str, float], model: Model, dt: float, seconds: float
+    to: Mapping[str, float],
+    model: Model,
+    dt: float,
+    seconds: float,
+    start: Mapping[str, float] = MappingProxyType({}),
 ) -> dict[str, Array]:
-    """Columns that ask for given values from the second row on.
+    """Columns that ask for given values from the second row on; the first is the start, else 0.
 
     Raises:
         GroundedError: for a name that is no state.
@@ -113,10 +180,15 @@ def step_target(
     rows = round(seconds / dt) + 1
     if not to or rows < 2:
         raise GroundedError("name a state and its value, such as --to x=1.0, and some --seconds")
+    _check_states(to, model)
+    first = np.arange(rows) < 1
+    return {name: np.where(first, start.get(name, 0.0), value) for name, value in to.items()}
+
+
+def _check_states(to: Mapping[str, float], model: Model) -> None:
     for name in to:
         if name not in model.states:
             raise GroundedError(f"'{name}' is not a state: {nearest(name, model.states)}")
-    return {name: np.where(np.arange(rows) < 1, 0.0, value) for name, value in to.items()}
 
 
 def swing_up(model: Model, dt: float, seconds: float) -> dict[str, Array]:

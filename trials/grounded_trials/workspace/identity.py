@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.folder import Folder
 
 ROWS = "rows_s"  # of a log's metadata: the time between a table's rows that repeat a command
+ESTIMATED_WITH = "estimated_with"  # likewise: adopted effects of the model that found its speeds
 READ_BY = "read_by"  # likewise: the keys of [log] that changed its signals
 # a candidate's metadata, in the order of the file
 _FIELDS: Mapping[str, Callable[[str], Any]] = {

@@ -79,6 +79,7 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     """
     from grounded_trials.logs.inspect_evidence import weigh
     from grounded_trials.logs.inspect_guess import guess_mapping, is_simulated, mapping_toml
+    from grounded_trials.logs.unnamed import from_the_rest
 
     report = inspect_log(log)
     if report.meta.get("format") or report.damage:
@@ -91,5 +92,7 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
         return Inspected(str(log), report, "", why)
     states, inputs = guess_mapping(report, model.state_names, model.input_names)
     states, inputs = weigh(report, model, states, inputs)
+    both = from_the_rest((*states, *inputs), {**model.states, **model.inputs}, report)
+    states, inputs = both[: model.n], both[model.n :]
     table = mapping_toml(states, inputs, simulated=is_simulated(report))
     return Inspected(str(log), report, table, ran_nothing=not workspace.candidate_ids())

@@ -4,7 +4,8 @@
     measured = { x = 0.002, y = 0.002, psi = 0.005 }   # standard deviation of each measured state
     process = { v = 0.05 }                             # optional, a control step; else estimated
 
-The measured states are filtered forth and back through the crude model, on a clock about as fine as
+The measured states are filtered forth and back through the model that plans, the crude one with all
+effects that were adopted, on a clock about as fine as
 they were sampled. Its process noise is estimated from the same log by maximum likelihood, where
 commands change: what the model gets wrong shows in motion, not while the robot waits. All of a log
 is smoothed before a run is sought in it or cut out of it, since what comes before the start of a
@@ -65,20 +66,24 @@ def read_estimate(table: Table, model: Model) -> EstimateTable:
 
 
 def with_estimates(
-    series: Mapping[str, Series], table: EstimateTable, task: Task
+    series: Mapping[str, Series],
+    table: EstimateTable,
+    task: Task,
+    asked: Sequence[str] | None = None,
 ) -> dict[str, Series]:
     """A log's signals, and beside them those of the states that nothing measures.
 
     Args:
         series: the samples of every measured state and every input, in any order.
         table: which are measured, and how well.
-        task: with the crude model, its latency and the control step.
+        task: with the model, its latency and the control step.
+        asked: states to estimate; None: all of the model's. Memories of effects are no signals.
 
     Raises:
         GroundedError: for samples that can't be used, or where the smoother fails.
     """
     model = task.model
-    guessed = [name for name in model.state_names if name not in table.measured]
+    guessed = [name for name in asked or model.state_names if name not in table.measured]
     if not guessed:
         return dict(series)
     samples = [tidy(n, series[n], unwrap=n in model.angles) for n in table.measured]
@@ -187,7 +192,7 @@ def _smoothed(
     states = np.concatenate(kept)
     if not np.isfinite(states).all():
         raise GroundedError(
-            f"the smoother finds no finite states for this log ({smooth[0].status}): the crude "
+            f"the smoother finds no finite states for this log ({smooth[0].status}): the "
             "model is too far off to tell what was not measured; check its units and the [log] "
             "mapping"
         )

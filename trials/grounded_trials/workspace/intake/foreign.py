@@ -15,6 +15,7 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.model import Model
 from grounded.trial import Trial
+from grounded_trials.logs.inspect_log import inspect_log
 from grounded_trials.logs.log_files import log_files, log_records
 from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signals
 from grounded_trials.logs.resample import Gridded, Span, to_grid
@@ -22,7 +23,7 @@ from grounded_trials.logs.signals import Series
 from grounded_trials.store.store import hash_file
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import StoredTrial, sha256
+from grounded_trials.workspace.identity import ESTIMATED_WITH, StoredTrial, sha256
 from grounded_trials.workspace.intake.estimating import (
     EstimateTable,
     read_estimate,
@@ -30,6 +31,8 @@ from grounded_trials.workspace.intake.estimating import (
 )
 from grounded_trials.workspace.intake.run_start import Recording, recording
 from grounded_trials.workspace.intake.where_to_mend import read_by
+
+FEW = 12  # numbers of a log that a message can name
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +116,10 @@ class ForeignLog:
 
     def complete(self, series: Mapping[str, Series]) -> Mapping[str, Series]:
         """Signals as this log holds them, and those of the states that nothing measures."""
-        return (
-            with_estimates(series, self.estimate, self.workspace.task) if self.estimate else series
-        )
+        if not self.estimate:
+            return series
+        names = self.workspace.base_model.state_names
+        return with_estimates(series, self.estimate, self.workspace.planner.plan, names)
 
     @cached_property
     def whole(self) -> Mapping[str, Series]:
@@ -171,19 +175,24 @@ def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignL
     missing = [s for s in states if s not in mapping.states]
     missing += [i for i in model.input_names if i not in mapping.inputs]
     if missing:
-        raise _unmapped(model, mapping, missing[0], estimated=estimate is not None)
+        raise _unmapped(model, mapping, missing[0], path, estimated=estimate is not None)
     source = {"source": path.name, "source_sha256": _hashed(files)}
     source |= read_by(mapping)
     if guessed := [name for name in model.state_names if name not in states]:
         source["estimated"] = ",".join(guessed)
+        source[ESTIMATED_WITH] = ",".join(str(effect["name"]) for effect in config.model.effects)
     series = mapped_signals(files, mapping, states, model.input_names)
     return ForeignLog(workspace, path, mapping, estimate, series, source)
 
 
-def _unmapped(model: Model, mapping: LogMapping, name: str, *, estimated: bool) -> GroundedError:
+def _unmapped(
+    model: Model, mapping: LogMapping, name: str, path: Path, *, estimated: bool
+) -> GroundedError:
     """What to do about a state or an input that [log] does not map."""
     if name in model.input_names:
-        return GroundedError(f"[log] maps no '{name}': every input has to be logged, map it")
+        return GroundedError(
+            f"[log] maps no '{name}': every input has to be logged, map it{_numbers(path)}"
+        )
     if estimated:
         return GroundedError(
             f"[log] maps no '{name}', which [estimate] says is measured: map it, or take it out "
@@ -191,12 +200,20 @@ def _unmapped(model: Model, mapping: LogMapping, name: str, *, estimated: bool) 
         )
     known = [f"{one} = 0.01" for one in model.state_names if one in mapping.states]
     if not known:
-        return GroundedError(f"[log] maps no '{name}', nor any other state: map what is measured")
+        return GroundedError(
+            f"[log] maps no '{name}', nor any other state: map what is measured{_numbers(path)}"
+        )
     return GroundedError(
         f"[log] maps no '{name}': map it. Where no sensor measures it, a smoother finds it from "
         "the others: add to grounded.toml, each with its own noise (standard deviation, in the "
         f"state's unit),\n[estimate]\nmeasured = {{ {', '.join(known)} }}"
     )
+
+
+def _numbers(path: Path) -> str:
+    """The numbers that a log has, where they are few."""
+    found = [f.path for t in inspect_log(path).topics for f in t.fields if f.low != f.high]
+    return f". {path.name} has {', '.join(found)}" if 0 < len(found) <= FEW else ""
 
 
 def _hashed(files: Sequence[Path]) -> str:

@@ -8,28 +8,26 @@ finds the first.
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.search.candidate import Candidate, Tried
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of
-from grounded_trials.logs.samples import SignalReport
-from grounded_trials.logs.stated_units import same_unit
-from grounded_trials.plain_file import read_file
-from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL
+from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.store.store import DIGITS
-from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import READ_BY, ROWS, sha256
-from grounded_trials.workspace.intake.foreign import ForeignLog, begun, mapping_of, read_foreign
+from grounded_trials.workspace.identity import sha256
+from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.intake.ingested import Ingested
+from grounded_trials.workspace.intake.other_scale import other_units, units_told
+from grounded_trials.workspace.intake.reading import Read, cut_log, read_log_file, read_own_trial
 from grounded_trials.workspace.intake.run_start import (
     LOOSE,
     elsewhere,
@@ -40,29 +38,19 @@ from grounded_trials.workspace.intake.run_start import (
 )
 from grounded_trials.workspace.intake.stored_before import (
     as_stored,
+    estimated_otherwise,
     refuse_as_another,
     repeated,
     same_recording,
     what_repeats,
 )
 from grounded_trials.workspace.intake.trial_check import warnings_about
-from grounded_trials.workspace.intake.who_drove import OTHERS, other_units, suspicion, units_told
+from grounded_trials.workspace.intake.who_drove import OTHERS, Following, suspicion
 from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of
 from grounded_trials.workspace.proposing import candidate_named, latest_candidates, standing_in
 
-
-@dataclass(frozen=True, eq=False)
-class _Read:
-    trial: Trial
-    data: bytes
-    warnings: tuple[str, ...] = ()
-    signals: tuple[SignalReport, ...] = ()
-    notes: tuple[str, ...] = ()
-    copy: bool = False  # of a stored trial, or a part of one
-    bare: bool = False  # it ran a candidate, and carries no copy of it
-    log: ForeignLog | None = None
-    last_s: float = math.nan  # its last sample of every state, since the start; of a foreign log
+EXACT = 0.1  # of how finely commands are known: a log of what the program saw and sent
 
 
 def ingest_log(
@@ -86,11 +74,13 @@ def ingest_log(
     if candidate is not None and data:
         raise GroundedError("--data is for a log that ran no candidate; drop it or --candidate")
     if kind == TRIAL:
-        read = _own(workspace, path, candidate, data)
+        read = read_own_trial(workspace, path, candidate, data)
     else:
-        read = _foreign(workspace, path, candidate, data)
+        read = read_log_file(workspace, path, candidate, data)
     read = _copied(workspace, path, read, "" if data else candidate)
     read = _recognised(workspace, path, read, candidate)
+    if read.log and (other := estimated_otherwise(workspace, read.log)):
+        read = replace(read, notes=(*read.notes, *other))
     if read.log and read.log.stored:
         read = replace(read, data=as_stored(workspace, read.log, read.trial, read.data))
     before = "" if read.copy else repeated(workspace, path, read.trial, read.data)
@@ -129,7 +119,7 @@ def ingest_log(
     )
 
 
-def _copied(workspace: Folder, path: Path, read: _Read, wanted: str | None) -> _Read:
+def _copied(workspace: Folder, path: Path, read: Read, wanted: str | None) -> Read:
     """The stored trial in place of a file that is a copy of it, or a part."""
     known = sha256(read.data)[:DIGITS] in workspace.store.digests()
     if known or (read.log and read.log.stored):
@@ -138,10 +128,10 @@ def _copied(workspace: Folder, path: Path, read: _Read, wanted: str | None) -> _
         return read
     refuse_as_another(path, (one,), wanted)
     note = f"its rows are those of {one.stored.id}: it is the same recording, or a part of it"
-    return _Read(one.trial, workspace.store.read(one.stored), notes=(note,), copy=True)
+    return Read(one.trial, workspace.store.read(one.stored), notes=(note,), copy=True)
 
 
-def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | None) -> _Read:
+def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None) -> Read:
     """Refuses a log whose commands are not its candidate's; with a warning if one was named.
 
     A foreign log without a [log.span] may begin before the run: it is taken from where that fits.
@@ -162,7 +152,7 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
     units, by = other_units(workspace.task, whole, own, seen.ran)
     units = () if other else units
     if not why and not units:
-        return read
+        return replace(read, warnings=(*read.warnings, *_like(read, ran, seen.ran)))
     slow = pace_of(log, workspace.task, own.policy) if log else None
     if slow:  # drawn out, it may pass for one in another unit
         units = ()
@@ -201,6 +191,17 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
     )
 
 
+def _like(read: Read, ran: str, found: Following | None) -> tuple[str, ...]:
+    """That a trial of ours may be of another workspace: its commands are not quite its policy's."""
+    if not read.bare or found is None or np.nanmax(np.abs(found.off) / found.fine) < EXACT:
+        return ()
+    return (
+        f"its commands are like those of {ran}, but not the same, and it carries no copy of what "
+        f"it ran: if that was the {ran} of another workspace, `discard` it. TrialWriter(..., "
+        "policy=Path(candidate).read_bytes()) makes sure",
+    )
+
+
 class _Look:
     """Where a candidate's run begins in a log, and whether it is its run.
 
@@ -214,7 +215,7 @@ class _Look:
 
     def __init__(
         self,
-        read: _Read,
+        read: Read,
         log: ForeignLog | None,
         own: Candidate,
         candidates: list[Candidate],
@@ -233,7 +234,7 @@ class _Look:
             if found and elsewhere(self.log, found, own.policy, seen.why):
                 begins = found.seconds + (_sooner(apart, read.log) if apart else 0)
                 note = f"the log begins {begins:.3f} s before {ran} does: it is taken from there"
-                self.read = replace(_cut(read.log, ran, begins), notes=(note,))
+                self.read = replace(cut_log(read.log, ran, begins), notes=(note,))
                 cut = apart.cut(ran, found.seconds)[0] if apart else self.read.trial
                 self.whole = interpolate_gaps(cut).trial
                 seen = judged(self.whole)
@@ -261,139 +262,3 @@ def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:
         return "probe" if trial.candidate else ""
     ran = [one.id for one in tried.trials[:repeats]]
     return "run again" if tried.accepted and trial.id not in ran else tried.verdict()
-
-
-def _own(workspace: Folder, path: Path, candidate: str | None, data: bool) -> _Read:
-    """A trial of ours: every name, the time grid and the task must be this workspace's."""
-    content = read_file(path, FILE_LIMIT)
-    trial, meta, policy = read_trial(content, str(path))
-    model, dt = workspace.base_model, workspace.config.task.dt
-    for what, found, own in (
-        ("states", trial.state_names, model.state_names),
-        ("inputs", trial.input_names, model.input_names),
-    ):
-        if found != own:
-            raise GroundedError(
-                f"{path} has the {what} {', '.join(found)}; this workspace's model has "
-                f"{', '.join(own)}: it is a trial of another robot"
-            )
-    if other := list(_other_units(workspace, meta)):
-        raise GroundedError(
-            f"{path}: {'; '.join(other)}. A trial is stored as it is: write its signals in the "
-            "model's units and name those, or ingest them as a CSV with a scale in [log]"
-        )
-    if abs(trial.dt - dt) > 1e-9:
-        raise GroundedError(
-            f"{path} was recorded every {trial.dt:g} s, this workspace's [task] dt is {dt:g} s: "
-            "it belongs to another task"
-        )
-    if data:
-        if not trial.candidate:
-            return _Read(trial, content)
-        kept = ("system", "source", "source_sha256", "estimated", READ_BY)
-        about = {k: v for k, v in meta.items() if k in kept}
-        about |= {"kind": "data", "ran": trial.candidate}
-        trial = replace(trial, candidate="")
-        return _Read(trial, _encode(workspace, trial, about))
-    if candidate is not None and trial.candidate not in ("", candidate):
-        raise GroundedError(f"{path} says that it ran {trial.candidate}, not {candidate}")
-    if trial.candidate:
-        _check_candidate(workspace, path, trial.candidate, meta.get("task", ""), policy)
-        return _Read(trial, content, bare=policy is None)
-    trial = replace(trial, candidate=candidate or _outstanding(workspace, path))
-    _check_candidate(workspace, path, trial.candidate)
-    return _Read(trial, _encode(workspace, trial, _about(workspace, trial.candidate)))
-
-
-def _other_units(workspace: Folder, meta: dict[str, str]) -> Iterator[str]:
-    """The signals of a trial whose units are stated, and not the model's: `N m` is `N·m`, too."""
-    model = workspace.base_model
-    for kind, own in (("states", model.states), ("inputs", model.inputs)):
-        for name, unit in json.loads(meta[kind]).items():
-            if unit and "1" not in (unit.strip(), own[name]) and not same_unit(unit, own[name]):
-                yield f"{name} is in {unit}, the model has {own[name]}"
-
-
-def _check_candidate(
-    workspace: Folder, path: Path, candidate: str, task: str = "", policy: bytes | None = None
-) -> None:
-    """The candidate must be one of this workspace and task, the policy the one in its file."""
-    if candidate not in workspace.candidate_ids():
-        raise GroundedError(
-            f"{path} ran {candidate}, which this workspace never proposed; take it in with --data "
-            "to use it for fitting and diagnosis"
-        )
-    own = workspace.task.hash
-    _, meta = workspace.candidate(candidate)
-    if meta.get("task") != own or task not in ("", own):
-        raise GroundedError(
-            f"{path} ran {candidate} for another task (other target, reward, limits, start or "
-            "horizon); its utility can't be compared. Take it in with --data to use it for fitting "
-            "and diagnosis"
-        )
-    if policy is not None and policy != workspace.candidate_bytes(candidate):
-        raise GroundedError(
-            f"{path} carries a policy that is not the {candidate} of this workspace: it comes from "
-            "another one, or the candidate was made again since. Take it in with --data"
-        )
-
-
-def _foreign(workspace: Folder, path: Path, candidate: str | None, data: bool) -> _Read:
-    """Somebody else's log, through [log]."""
-    log = read_foreign(workspace, path, mapping_of(workspace, path))
-    ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
-    refuse_as_another(path, log.stored, "" if data else candidate)
-    chosen = "" if data else ran or _outstanding(workspace, path)
-    if chosen:
-        _check_candidate(workspace, path, chosen)
-    return _cut(log, chosen)
-
-
-def _cut(log: ForeignLog, candidate: str, start: float | None = None) -> _Read:
-    trial, found = log.cut(candidate, start)
-    about = _about(log.workspace, candidate) | log.source
-    about |= {ROWS: f"{found.row_s:.6g}"} if found.row_s and not candidate else {}
-    encoded = _encode(log.workspace, trial, about, found.start_ns)
-    return _Read(
-        trial,
-        encoded,
-        (*log.unlike_units, *found.warnings),
-        found.reports,
-        notes=() if candidate else tuple(begun(found, trial.dt)),
-        log=log,
-        last_s=(found.last_ns - found.start_ns) * 1e-9,
-    )
-
-
-def _outstanding(workspace: Folder, path: Path) -> str:
-    now = standing_in(workspace)
-    waiting = now.outstanding
-    if waiting is None:
-        best = now.incumbent.candidate.id if now.incumbent else ""
-        raise GroundedError(
-            f"{path} doesn't say which candidate it ran, and none is waiting for a trial: name it "
-            "with --candidate ID, or use --data for a log that ran none",
-            NextCommand("ingest", (str(path), "--candidate", best)) if best else None,
-        )
-    return waiting.id
-
-
-def _about(workspace: Folder, candidate: str) -> dict[str, str]:
-    """The metadata of a trial that is written here."""
-    if not candidate:
-        return {"kind": "data"}
-    _, meta = workspace.candidate(candidate)
-    return {"kind": "trial", "task": workspace.task.hash} | {
-        key: meta[key] for key in ("iteration", "alpha")
-    }
-
-
-def _encode(workspace: Folder, trial: Trial, about: dict[str, str], start_ns: int = 0) -> bytes:
-    return trial_bytes(
-        trial,
-        about,
-        workspace.candidate_bytes(trial.candidate) if trial.candidate else None,
-        state_units=dict(workspace.base_model.states),
-        input_units=dict(workspace.base_model.inputs),
-        start_ns=start_ns,
-    )

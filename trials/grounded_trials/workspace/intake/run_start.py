@@ -29,17 +29,17 @@ from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.logs.command_steps import changes_of, phase_of
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
+from grounded_trials.workspace.intake.other_scale import NEARLY, any_factor, units_tried
 from grounded_trials.workspace.intake.who_drove import (
     FINE,
     LEAST,
-    NEARLY,
     SAME,
     UNLIKE,
     follows,
-    units_tried,
 )
 
 TRIED = 5  # instants at which the commands fit best
+HELD = 3.5  # steps: what changes no sooner may begin a run
 FINEST = 8  # parts of a step, between which the start is sought
 QUIET_S = 1.0  # without a change of commands, before a run that the log does not have whole
 SHORT = 4  # at least 1 / SHORT of a run tells that it was one
@@ -101,6 +101,12 @@ class Recording:
             return None
         run = Trial(cut.states, cut.inputs, self.dt, *self.names, start_inputs=cut.start_inputs)
         return interpolate_gaps(run).trial if cut.late_s == 0 else None
+
+    @property
+    def openings(self) -> list[float]:
+        """Instants from which commands change after they were held for some steps [s]."""
+        held = np.diff(self.changes, prepend=-np.inf)
+        return [float(at) for at in self.changes[held > HELD * self.dt]]
 
     def start_of(self, policy: Policy) -> Start | None:
         """Where a policy's run begins: the best of all instants; None for a log too short to tell.
@@ -328,6 +334,11 @@ def unit_of(log: Recording, task: Task, policy: Policy) -> tuple[tuple[str, ...]
         fit = run and follows(policy, run.until(policy.horizon), 0)
         if fit and fit.error < NEARLY:
             return names, by
+    for begins in log.openings[:TRIED]:
+        if trial := log.trial_from(begins):
+            names, by = any_factor(task, policy, trial)
+            if names:
+                return names, by
     return (), 1.0
 
 

@@ -19,7 +19,7 @@ from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.resample import ABSOLUTE_S
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import StoredTrial, sha256
+from grounded_trials.workspace.identity import ESTIMATED_WITH, StoredTrial, sha256
 from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.proposing import standing_in
 
@@ -64,10 +64,15 @@ def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> 
     Raises:
         GroundedError: if it was stored with other numbers, read in another way.
     """
-    digest = sha256(data)
+    digest, now = sha256(data), log.source.get(ESTIMATED_WITH, "")
     for one in log.stored:
         same = one.trial.candidate == trial.candidate
-        pairs = ((one.measured.states, trial.states), (one.measured.inputs, trial.inputs))
+        guessed = one.meta.get("estimated", "") if one.meta.get(ESTIMATED_WITH, "") != now else ""
+        kept = [name not in guessed.split(",") for name in trial.state_names]
+        pairs = (
+            (one.measured.states[:, kept], trial.states[:, kept]),
+            (one.measured.inputs, trial.inputs),
+        )
         if digest.startswith(one.stored.digest):
             return data
         if same and all(np.array_equal(a, b, equal_nan=True) for a, b in pairs):
@@ -78,6 +83,26 @@ def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> 
     if not names:
         return data  # another part of a long recording
     raise _read_otherwise(log.path, names)
+
+
+def estimated_otherwise(workspace: Folder, log: ForeignLog) -> tuple[str, ...]:
+    """What to do about trials whose speeds another model estimated; said until the next trial."""
+    if (now := log.source.get(ESTIMATED_WITH)) is None:
+        return ()
+    known = [one for one in workspace.whole_trials() if one.meta.get("estimated")]
+    other = [one for one in known if one.meta.get(ESTIMATED_WITH, "") != now]
+    if not other or known[-1] is not other[-1]:
+        return ()
+    names, before = (
+        ", ".join(one.stored.id for one in other),
+        other[-1].meta.get(ESTIMATED_WITH, ""),
+    )
+    with_, was = (", ".join(s.split(",")) or "no effect" for s in (now, before))
+    return (
+        f"{' and '.join(log.source['estimated'].split(','))} is estimated with {with_} in the "
+        f"model, in {names} with {was}: to have them alike, `discard` those and ingest their logs "
+        "again",
+    )
 
 
 def _read_otherwise(path: Path, names: tuple[str, ...]) -> GroundedError:

@@ -7,19 +7,17 @@ another candidate, is something else.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from grounded.frozen import Array
-from grounded.model import Model
 from grounded.policy import Policy, z_difference
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import with_unit
-from grounded_trials.workspace.config import FILE
 
 LEAST = 10  # steps: less says nothing of who drove
 UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
@@ -30,9 +28,6 @@ ROUGH = 4.0  # steps over which noise keeps its sign: what strays for longer, so
 FINE = 1e-4  # of an input's size: how finely commands are logged at best
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # steps: states of the log older than those acted on
 AGES = 1.0  # steps by which that varies in a run: packets are lost, clocks drift and jitter
-THOUSAND, PERCENT = (1e-3, 1e3), (1e-2, 1e2)
-ANGULAR = (("rad", "rad/s"), ("rad",), ("rad/s",))  # groups of units that may be in degrees
-NEARLY = 0.1  # of an input's size: what other units must leave of the difference
 OTHERS = 20  # candidates to compare with, the latest
 
 
@@ -181,59 +176,6 @@ def suspicion(task: Task, trial: Trial, own: Candidate, others: Sequence[Candida
         f"{differs} (rms); {looks}"
     )
     return Suspicion(found, why, name)
-
-
-def other_units(
-    task: Task, trial: Trial, own: Candidate, plain: Following | None
-) -> tuple[tuple[str, ...], float]:
-    """The signals with which a log is a run of its candidate once they are multiplied, and by what.
-
-    Degrees for radians or the other way round, thousandths or thousands; (), 1 where nothing helps,
-    or nothing needs to: a log so noisy that any commands could follow from it is nobody's.
-    `plain`: how its commands follow as they are.
-    """
-    if plain is None or (plain.alike and plain.error < NEARLY):
-        return (), 1.0
-    trial, late = trial.until(task.horizon), latest(task)
-    for names, factor in units_tried(task.model):
-        by = [
-            np.array([factor if name in names else 1.0 for name in every])
-            for every in (trial.state_names, trial.input_names)
-        ]
-        turned = replace(trial, states=trial.states * by[0], inputs=trial.inputs * by[1])
-        found = follows(own.policy, turned, late)
-        fits = found is not None and found.alike and found.error < NEARLY
-        if found and fits and (not plain.alike or evidence(plain, found) > DECISIVE):
-            return tuple(names), float(factor)
-    return (), 1.0
-
-
-def units_tried(model: Model) -> Iterator[tuple[Sequence[str], float]]:
-    """Signals that may be in another unit together, or of the other sign, and what mends it."""
-    angular = [[n for n, u in model.states.items() if u in units] for units in ANGULAR]
-    angular += [[n] for n, u in (*model.states.items(), *model.inputs.items()) if u in ANGULAR[0]]
-    single = [[name] for name in (*model.state_names, *model.input_names)]
-    pure = [name for name, unit in model.inputs.items() if unit == "1"]
-    yield from ((names, f) for f in (np.pi / 180, 180 / np.pi) for names in angular if names)
-    yield from ((pure, f) for f in PERCENT if pure)
-    yield from ((names, f) for f in (*THOUSAND, -1.0) for names in single)
-
-
-def units_told(names: Sequence[str], by: float, mapped: bool) -> str:
-    """What is wrong with the units of a log, and what mends it; `mapped`: by a [log] table."""
-    which = " and ".join(names)
-    if by < 0:
-        mend = f"multiply its scale by -1 in {FILE}'s [log] (1 where none is given)"
-        alone = "append it times -1 and run it again, or take it in with --data"
-        return f"with {which} of the other sign: {mend if mapped else alone}"
-    size = f"{max(by, 1 / by):.4g} times too {'large' if by < 1 else 'small'}"
-    unit = (" (in degrees)", " (radians for degrees)")
-    unit = (" (in percent)", " (not in percent)") if by in PERCENT else unit
-    told = "" if by in THOUSAND else unit[by > 1]
-    mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (1 where none is given)"
-    if not mapped:
-        mend = f"append {which} times {by:.6g} and run it again, or take it in with --data"
-    return f"with {which} {size}{told}: {mend}"
 
 
 def latest(task: Task) -> int:

@@ -1,0 +1,230 @@
+"""The skeletons of the kinds of robot: the simplest equations of each, as texts of a model.py."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """A model as text: names with units, parameters, lines of equations."""
+
+    kind: str
+    text: str  # what it is, one line
+    states: Mapping[str, str]
+    inputs: Mapping[str, str]
+    params: Mapping[str, str]  # name -> the arguments of Param
+    lines: Sequence[str]  # name: expression, of ds/dt
+    angles: tuple[str, ...] = ()
+    roles: Mapping[str, object] = field(default_factory=dict)
+    before: Sequence[str] = ()  # lines above the equations
+
+    def source(self) -> str:
+        """The text of model.py."""
+        params = [f'        "{name}": Param({given}),' for name, given in self.params.items()]
+        return "\n".join(
+            [
+                f'"""{self.text}.',
+                "",
+                "A skeleton by `grounded init --from`: make it yours.",
+                '"""',
+                "",
+                "import numpy as np",
+                "",
+                "from grounded import Model, Param",
+                "",
+                "",
+                "def dynamics(s, a, p):",
+                '    """ds/dt."""',
+                *(f"    {line}" for line in self.before),
+                "    return {",
+                *(f"        {line}," for line in self.lines),
+                "    }",
+                "",
+                "",
+                "# Param(value, unit) is a constant; with bounds, `fit` may move it between them.",
+                "model = Model(",
+                f'    name="{self.kind}",',
+                f"    states={_dict(self.states)},",
+                f"    inputs={_dict(self.inputs)},",
+                "    params={",
+                *params,
+                "    },",
+                f"    angles={self.angles!r},",
+                f"    roles={dict(self.roles)!r},",
+                "    derivative=dynamics,",
+                ")",
+                "",
+            ]
+        ).replace("import numpy as np\n\n", "import numpy as np\n\n" if self._numpy() else "")
+
+    def _numpy(self) -> bool:
+        return any("np." in line for line in (*self.lines, *self.before))
+
+
+def _dict(units: Mapping[str, str]) -> str:
+    inside = [f'"{name}": "{unit}"' for name, unit in units.items()]
+    if len(inside) < 5:
+        return "{" + ", ".join(inside) + "}"
+    return "{\n" + "".join(f"        {one},\n" for one in inside) + "    }"
+
+
+PLANE = {"position": ("x", "y"), "heading": "psi", "speed": "v"}
+CAR = Skeleton(
+    "car",
+    "A kinematic car: rear axle at (x, y), speed v, steering without lag",
+    {"v": "m/s", "x": "m", "y": "m", "psi": "rad"},
+    {"steering": "rad", "speed": "m/s"},
+    {
+        "L": '0.3, "m", 0.1, 3.0',
+        "tau": '0.3, "s", 0.02, 3.0',
+        "gain": '1.0, "1", 0.2, 5.0',
+        "trim": '0.0, "rad", -0.2, 0.2',
+    },
+    (
+        '"v": (p.gain * a.speed - s.v) / p.tau',
+        '"x": s.v * np.cos(s.psi)',
+        '"y": s.v * np.sin(s.psi)',
+        '"psi": s.v * np.tan(a.steering + p.trim) / p.L',
+    ),
+    ("psi",),
+    PLANE,
+)
+ROVER = Skeleton(
+    "rover",
+    "A robot on two driven wheels: speed and turn rate follow their commands with a lag",
+    {"v": "m/s", "omega": "rad/s", "x": "m", "y": "m", "psi": "rad"},
+    {"speed": "m/s", "turn": "rad/s"},
+    {"tau_v": '0.2, "s", 0.01, 2.0', "tau_w": '0.2, "s", 0.01, 2.0', "gain": '1.0, "1", 0.3, 2.0'},
+    (
+        '"v": (p.gain * a.speed - s.v) / p.tau_v',
+        '"omega": (a.turn - s.omega) / p.tau_w',
+        '"x": s.v * np.cos(s.psi)',
+        '"y": s.v * np.sin(s.psi)',
+        '"psi": s.omega',
+    ),
+    ("psi",),
+    PLANE | {"heading_rate": "omega"},
+)
+DIFFERENTIAL = Skeleton(
+    "differential",
+    "A robot on two driven wheels, each with its own command, whose speed it follows with a lag",
+    ROVER.states,
+    {"left": "1", "right": "1"},
+    {
+        "gain": '1.0, "m/s", 0.02, 20.0',
+        "track": '0.3, "m", 0.05, 2.0',
+        "tau": '0.2, "s", 0.01, 2.0',
+    },
+    (
+        '"v": (p.gain * (a.right + a.left) / 2 - s.v) / p.tau',
+        '"omega": (p.gain * (a.right - a.left) / p.track - s.omega) / p.tau',
+        *ROVER.lines[2:],
+    ),
+    ROVER.angles,
+    ROVER.roles,
+)
+DRONE = Skeleton(
+    "drone",
+    "A hovering drone: attitude follows its commands with a lag, thrust lifts along its axis",
+    {
+        **dict.fromkeys("xyz", "m"),
+        **{f"v{axis}": "m/s" for axis in "xyz"},
+        **{"roll": "rad", "pitch": "rad"},
+    },
+    {"roll_command": "rad", "pitch_command": "rad", "thrust": "1"},
+    {
+        "g": '9.81, "m/s^2"',
+        "hover": '0.5, "1", 0.1, 1.0',
+        "tau": '0.15, "s", 0.02, 1.0',
+        "drag": '0.2, "1/s", 0.0, 2.0',
+    },
+    (
+        '"x": s.vx',
+        '"y": s.vy',
+        '"z": s.vz',
+        '"vx": p.g * a.thrust / p.hover * np.sin(s.pitch) - p.drag * s.vx',
+        '"vy": -p.g * a.thrust / p.hover * np.sin(s.roll) - p.drag * s.vy',
+        '"vz": p.g * (a.thrust / p.hover * np.cos(s.roll) * np.cos(s.pitch) - 1) - p.drag * s.vz',
+        '"roll": (a.roll_command - s.roll) / p.tau',
+        '"pitch": (a.pitch_command - s.pitch) / p.tau',
+    ),
+    (),
+    {"position": ("x", "y", "z")},
+)
+PENDULUM = Skeleton(
+    "pendulum",
+    "One joint under gravity, theta = 0 hanging down",
+    {"theta": "rad", "omega": "rad/s"},
+    {"torque": "N m"},
+    {
+        "inertia": '0.1, "kg m^2", 0.0001, 10.0',
+        "damping": '0.01, "N m s", 0.0, 5.0',
+        "weight": '0.5, "N m", 0.0, 50.0',
+    },
+    (
+        '"theta": s.omega',
+        '"omega": (a.torque - p.damping * s.omega - p.weight * np.sin(s.theta)) / p.inertia',
+    ),
+    roles={"hanging": "theta"},
+)
+
+
+BALANCE = Skeleton(
+    "balance",
+    "A robot that balances on two wheels: pitch = 0 upright, forwards > 0; weigh its parts",
+    {"x": "m", "v": "m/s", "pitch": "rad", "pitch_rate": "rad/s"},
+    {"voltage": "V"},
+    {
+        "body": '1.0, "kg"',  # weigh it: motion tells ratios of masses and torques alone
+        "wheels": '0.15, "kg"',  # half as much again as they weigh, since they turn, too
+        "l": '0.1, "m", 0.01, 1.0',
+        "I": '0.005, "kg m^2", 0.00001, 5.0',
+        "r": '0.035, "m"',
+        "kt": '0.05, "N m/V", 0.0001, 5.0',
+        "ke": '0.3, "V s/rad", 0.0, 5.0',
+        "g": '9.81, "m/s^2"',
+    },
+    (
+        '"x": s.v',
+        '"v": (inertia * push - coupled * fall) / det',
+        '"pitch": s.pitch_rate',
+        '"pitch_rate": (mass * fall - coupled * push) / det',
+    ),
+    ("pitch",),
+    {"rail": "x", "upright": ("pitch",), "speed": "v"},
+    before=(
+        "torque = p.kt * (a.voltage - p.ke * (s.v / p.r - s.pitch_rate))  # of both motors",
+        "mass, inertia = p.body + p.wheels, p.I + p.body * p.l**2  # l: axle to its centre",
+        "coupled = p.body * p.l * np.cos(s.pitch)",
+        "push = torque / p.r + p.body * p.l * np.sin(s.pitch) * s.pitch_rate**2",
+        "fall = p.body * p.g * p.l * np.sin(s.pitch) - torque  # I: of the body, about its centre",
+        "det = mass * inertia - coupled**2",
+    ),
+)
+
+
+def arm(joints: Sequence[str]) -> Skeleton:
+    """An arm whose joints don't feel each other, named after them."""
+    short = [re.sub(r"_?joint_?", "", joint) or joint for joint in joints]
+    distinct = len(set(short)) == len(joints)
+    bare = [re.sub(r"\W+", "_", joint).strip("_") for joint in (short if distinct else joints)]
+    names = [name if name.isidentifier() else f"joint{i}" for i, name in enumerate(bare, start=1)]
+    return Skeleton(
+        "arm",
+        f"An arm of {len(names)} joints that don't feel each other: write its inertia matrix",
+        {f"{n}_position": "rad" for n in names} | {f"{n}_velocity": "rad/s" for n in names},
+        {f"{n}_effort": "N m" for n in names},
+        {f"inertia_{n}": '0.1, "kg m^2", 0.0001, 10.0' for n in names}
+        | {f"b_{n}": '0.1, "N m s", 0.0, 10.0' for n in names},
+        [
+            *(f'"{n}_position": s.{n}_velocity' for n in names),
+            *(
+                f'"{n}_velocity": (a.{n}_effort - p.b_{n} * s.{n}_velocity) / p.inertia_{n}'
+                for n in names
+            ),
+        ],
+        roles={"level": tuple(f"{n}_position" for n in names)},
+    )

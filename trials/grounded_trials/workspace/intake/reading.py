@@ -1,0 +1,195 @@
+"""A file as it is read, a trial of ours or a log, before anybody asks what it ran.
+
+A trial of ours must be of this workspace's model, time grid and task, and where it carries the
+policy that it ran, of this workspace's candidate to the last bit.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from grounded.errors import GroundedError, NextCommand
+from grounded.trial import Trial
+from grounded_trials.logs.samples import SignalReport
+from grounded_trials.logs.stated_units import same_unit
+from grounded_trials.plain_file import read_file
+from grounded_trials.store.own_files import FILE_LIMIT
+from grounded_trials.store.trial_file import read_trial, trial_bytes
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import ESTIMATED_WITH, READ_BY, ROWS
+from grounded_trials.workspace.intake.foreign import ForeignLog, begun, mapping_of, read_foreign
+from grounded_trials.workspace.intake.stored_before import refuse_as_another
+from grounded_trials.workspace.proposing import standing_in
+
+
+@dataclass(frozen=True, eq=False)
+class Read:
+    """A trial that may be stored, and what is to be said of it."""
+
+    trial: Trial
+    data: bytes
+    warnings: tuple[str, ...] = ()
+    signals: tuple[SignalReport, ...] = ()
+    notes: tuple[str, ...] = ()
+    copy: bool = False  # of a stored trial, or a part of one
+    bare: bool = False  # it ran a candidate, and carries no copy of it
+    log: ForeignLog | None = None
+    last_s: float = math.nan  # its last sample of every state, since the start; of a foreign log
+
+
+def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: bool) -> Read:
+    """A trial of ours: every name, the time grid and the task must be this workspace's.
+
+    Raises:
+        GroundedError: if they are not, or its candidate is none of this workspace's.
+    """
+    content = read_file(path, FILE_LIMIT)
+    trial, meta, policy = read_trial(content, str(path))
+    model, dt = workspace.base_model, workspace.config.task.dt
+    for what, found, own in (
+        ("states", trial.state_names, model.state_names),
+        ("inputs", trial.input_names, model.input_names),
+    ):
+        if found != own:
+            raise GroundedError(
+                f"{path} has the {what} {', '.join(found)}; this workspace's model has "
+                f"{', '.join(own)}: it is a trial of another robot"
+            )
+    if other := list(_other_units(workspace, meta)):
+        raise GroundedError(
+            f"{path}: {'; '.join(other)}. A trial is stored as it is: write its signals in the "
+            "model's units and name those, or ingest them as a CSV with a scale in [log]"
+        )
+    if abs(trial.dt - dt) > 1e-9:
+        raise GroundedError(
+            f"{path} was recorded every {trial.dt:g} s, this workspace's [task] dt is {dt:g} s: "
+            "it belongs to another task"
+        )
+    if data:
+        if not trial.candidate:
+            return Read(trial, content)
+        kept = ("system", "source", "source_sha256", "estimated", ESTIMATED_WITH, READ_BY)
+        about = {k: v for k, v in meta.items() if k in kept}
+        about |= {"kind": "data", "ran": trial.candidate}
+        notes = _elsewhere(workspace, trial.candidate, policy)
+        trial = replace(trial, candidate="")
+        return Read(trial, _encode(workspace, trial, about), notes=notes)
+    if candidate is not None and trial.candidate not in ("", candidate):
+        raise GroundedError(f"{path} says that it ran {trial.candidate}, not {candidate}")
+    if trial.candidate:
+        _check_candidate(workspace, path, trial.candidate, meta.get("task", ""), policy)
+        return Read(trial, content, bare=policy is None)
+    trial = replace(trial, candidate=candidate or _outstanding(workspace, path))
+    _check_candidate(workspace, path, trial.candidate)
+    return Read(trial, _encode(workspace, trial, _about(workspace, trial.candidate)))
+
+
+def _other_units(workspace: Folder, meta: dict[str, str]) -> Iterator[str]:
+    """The signals of a trial whose units are stated, and not the model's: `N m` is `N·m`, too."""
+    model = workspace.base_model
+    for kind, own in (("states", model.states), ("inputs", model.inputs)):
+        for name, unit in json.loads(meta[kind]).items():
+            if unit and "1" not in (unit.strip(), own[name]) and not same_unit(unit, own[name]):
+                yield f"{name} is in {unit}, the model has {own[name]}"
+
+
+def _elsewhere(workspace: Folder, candidate: str, policy: bytes | None) -> tuple[str, ...]:
+    """That the policy which a trial carries is none of this workspace's."""
+    known = candidate in workspace.candidate_ids()
+    if policy is None or (known and policy == workspace.candidate_bytes(candidate)):
+        return ()
+    return (f"the {candidate} that it ran is of another workspace, or was made again since",)
+
+
+def _check_candidate(
+    workspace: Folder, path: Path, candidate: str, task: str = "", policy: bytes | None = None
+) -> None:
+    """The candidate must be one of this workspace and task, the policy the one in its file."""
+    if candidate not in workspace.candidate_ids():
+        raise GroundedError(
+            f"{path} ran {candidate}, which this workspace never proposed; take it in with --data "
+            "to use it for fitting and diagnosis"
+        )
+    own = workspace.task.hash
+    _, meta = workspace.candidate(candidate)
+    if meta.get("task") != own or task not in ("", own):
+        raise GroundedError(
+            f"{path} ran {candidate} for another task (other target, reward, limits, start or "
+            "horizon); its utility can't be compared. Take it in with --data to use it for fitting "
+            "and diagnosis"
+        )
+    if policy is not None and policy != workspace.candidate_bytes(candidate):
+        raise GroundedError(
+            f"{path} carries a policy that is not the {candidate} of this workspace: it comes from "
+            "another one, or the candidate was made again since. Take it in with --data"
+        )
+
+
+def read_log_file(workspace: Folder, path: Path, candidate: str | None, data: bool) -> Read:
+    """Somebody else's log, through [log].
+
+    Raises:
+        GroundedError: if it can't be mapped or sampled, or no candidate waits for it.
+    """
+    log = read_foreign(workspace, path, mapping_of(workspace, path))
+    ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
+    refuse_as_another(path, log.stored, "" if data else candidate)
+    chosen = "" if data else ran or _outstanding(workspace, path)
+    if chosen:
+        _check_candidate(workspace, path, chosen)
+    return cut_log(log, chosen)
+
+
+def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read:
+    """The trial in a log, from `start` on [s]; None: as [log.span] says, or its first command."""
+    trial, found = log.cut(candidate, start)
+    about = _about(log.workspace, candidate) | log.source
+    about |= {ROWS: f"{found.row_s:.6g}"} if found.row_s and not candidate else {}
+    encoded = _encode(log.workspace, trial, about, found.start_ns)
+    return Read(
+        trial,
+        encoded,
+        (*log.unlike_units, *found.warnings),
+        found.reports,
+        notes=() if candidate else tuple(begun(found, trial.dt)),
+        log=log,
+        last_s=(found.last_ns - found.start_ns) * 1e-9,
+    )
+
+
+def _outstanding(workspace: Folder, path: Path) -> str:
+    now = standing_in(workspace)
+    waiting = now.outstanding
+    if waiting is None:
+        best = now.incumbent.candidate.id if now.incumbent else ""
+        raise GroundedError(
+            f"{path} doesn't say which candidate it ran, and none is waiting for a trial: name it "
+            "with --candidate ID, or use --data for a log that ran none",
+            NextCommand("ingest", (str(path), "--candidate", best)) if best else None,
+        )
+    return waiting.id
+
+
+def _about(workspace: Folder, candidate: str) -> dict[str, str]:
+    """The metadata of a trial that is written here."""
+    if not candidate:
+        return {"kind": "data"}
+    _, meta = workspace.candidate(candidate)
+    return {"kind": "trial", "task": workspace.task.hash} | {
+        key: meta[key] for key in ("iteration", "alpha")
+    }
+
+
+def _encode(workspace: Folder, trial: Trial, about: dict[str, str], start_ns: int = 0) -> bytes:
+    return trial_bytes(
+        trial,
+        about,
+        workspace.candidate_bytes(trial.candidate) if trial.candidate else None,
+        state_units=dict(workspace.base_model.states),
+        input_units=dict(workspace.base_model.inputs),
+        start_ns=start_ns,
+    )
