@@ -33,6 +33,7 @@ from grounded.model import Model
 from grounded.trial import Trial
 
 FINE = 6  # integration steps a control step
+NUDGE = 1e-2  # of an input's unit: the difference by which its own part of a rate is known
 
 # What is outside the library acts on received inputs: f(u (m,), state of its own, t, dt) -> u
 Actuator = Callable[[Array, dict[str, Any], float, float], Array]
@@ -166,9 +167,10 @@ class _Run:
         for effect, values in self.truth.effects:
             if isinstance(effect.family, LossFamily):
                 tau, w = coupled(effect.site)
-                lost = effect.family.torque(s[w], own[w], a[tau], values)
-                left = [a[n] - lost if n == tau else a[n] for n in model.input_names]
-                a = Named("input", model.input_names, left)
+                more = model.derivative(s, _with(a, tau, a[tau] + NUDGE), self.p)
+                gain = (more[w] - own[w]) / NUDGE
+                lost = effect.family.torque(s[w], own[w], gain, a[tau], values)
+                a = _with(a, tau, a[tau] - lost)
                 own = dict(model.derivative(s, a, self.p))
         total = {n: float(own[n]) for n in self.names}
         for effect, values in self.truth.effects:
@@ -251,3 +253,8 @@ class _Run:
         for x in self.past[1:]:
             found = found + part * (x[i] - found)
         return float(found)
+
+
+def _with(inputs: Named, name: str, value: Any) -> Named:
+    """Inputs with another value of one."""
+    return Named("input", tuple(inputs), [value if n == name else inputs[n] for n in inputs])
