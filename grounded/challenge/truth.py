@@ -98,10 +98,12 @@ class _Run:
         latency = truth.latency or (0.0,) * model.m
         self.late = [divmod(seconds / self.fine, 1.0) for seconds in latency]
         self.settle()
-        self.gust, self.last, self.past = np.zeros(model.n), self.held, [self.x.copy()]
+        self.gust, self.last = np.zeros(model.n), self.held
         pairs = ((n, partner(model, n)) for n in self.names)
         self.plant = None if truth.mechanism is None else truth.mechanism.plant(self.fine)
         self.tied = [(self.names.index(n), self.names.index(k)) for n, k in pairs if k is not None]
+        self.tie(0.0)
+        self.past = [self.x.copy()]
 
     def trial(self, controller: Callable[[int, Array], Array], steps: int) -> Trial:
         model = self.truth.model
