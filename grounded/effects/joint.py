@@ -207,7 +207,7 @@ def _inertia(w: Any, free: Any, gain: Any, u: Any, c: Any, dt: Any) -> Any:
 
 
 def _carried(moved: Any, gain: Any, u: Any) -> Any:
-    """What a gear carries, the mean of what drives and what resists; u and the rest make `moved`."""
+    """What a gear carries, the mean of what drives and what resists: `moved` is by all of it."""
     return np.abs(u - 0.5 * moved / gain)
 
 
