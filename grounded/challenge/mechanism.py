@@ -18,7 +18,7 @@ import numpy as np
 from grounded.errors import needs
 from grounded.frozen import Array
 
-STEP = 1e-3  # [s] of the simulator, at most
+STEP = 1e-4  # [s] of the simulator, at most: it shows the motion a part of a step early
 
 CART = """
 <mujoco model="cart-pole">

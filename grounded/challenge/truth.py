@@ -33,6 +33,7 @@ from grounded.model import Model
 from grounded.trial import Trial
 
 FINE = 6  # integration steps a control step
+NUDGE = 1e-2  # of an input's unit: the difference by which its own part of a rate is known
 
 # What is outside the library acts on received inputs: f(u (m,), state of its own, t, dt) -> u
 Actuator = Callable[[Array, dict[str, Any], float, float], Array]
@@ -97,10 +98,12 @@ class _Run:
         latency = truth.latency or (0.0,) * model.m
         self.late = [divmod(seconds / self.fine, 1.0) for seconds in latency]
         self.settle()
-        self.gust, self.last, self.past = np.zeros(model.n), self.held, [self.x.copy()]
+        self.gust, self.last = np.zeros(model.n), self.held
         pairs = ((n, partner(model, n)) for n in self.names)
         self.plant = None if truth.mechanism is None else truth.mechanism.plant(self.fine)
         self.tied = [(self.names.index(n), self.names.index(k)) for n, k in pairs if k is not None]
+        self.tie(0.0)
+        self.past = [self.x.copy()]
 
     def trial(self, controller: Callable[[int, Array], Array], steps: int) -> Trial:
         model = self.truth.model
@@ -166,9 +169,10 @@ class _Run:
         for effect, values in self.truth.effects:
             if isinstance(effect.family, LossFamily):
                 tau, w = coupled(effect.site)
-                lost = effect.family.torque(s[w], own[w], a[tau], values)
-                left = [a[n] - lost if n == tau else a[n] for n in model.input_names]
-                a = Named("input", model.input_names, left)
+                more = model.derivative(s, _with(a, tau, a[tau] + NUDGE), self.p)
+                gain = (more[w] - own[w]) / NUDGE
+                lost = effect.family.torque(s[w], own[w], gain, a[tau], values)
+                a = _with(a, tau, a[tau] - lost)
                 own = dict(model.derivative(s, a, self.p))
         total = {n: float(own[n]) for n in self.names}
         for effect, values in self.truth.effects:
@@ -251,3 +255,8 @@ class _Run:
         for x in self.past[1:]:
             found = found + part * (x[i] - found)
         return float(found)
+
+
+def _with(inputs: Named, name: str, value: Any) -> Named:
+    """Inputs with another value of one."""
+    return Named("input", tuple(inputs), [value if n == name else inputs[n] for n in inputs])

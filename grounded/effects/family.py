@@ -221,12 +221,12 @@ class LossFamily(Family):
     """What the motion w takes off the input u that drives it, at a target `u<-w` (`joint`).
 
     loss(w, free, gain, u, c, dt): its mean over a step that begins at the speed w and would end at
-    `free`; a unit of u adds `gain` to that. torque(w, rate, u, c): the same at one moment, where
-    the speed's own rate is `rate`.
+    `free`; a unit of u adds `gain` to that. torque(w, rate, gain, u, c): the same at one moment,
+    where the speed's own rate is `rate` and a unit of u adds `gain` to it.
     """
 
     loss: Callable[[Any, Any, Any, Any, Any, Any], Any] = lambda w, free, gain, u, c, dt: 0.0
-    torque: Callable[[Any, Any, Any, Any], Any] = lambda w, rate, u, c: 0.0
+    torque: Callable[[Any, Any, Any, Any, Any], Any] = lambda w, rate, gain, u, c: 0.0
 
 
 @dataclass(frozen=True)

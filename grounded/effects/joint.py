@@ -206,8 +206,13 @@ def _inertia(w: Any, free: Any, gain: Any, u: Any, c: Any, dt: Any) -> Any:
     return wanted * (free - w) / np.maximum(1 + gain * wanted, 0.1)
 
 
+def _carried(moved: Any, gain: Any, u: Any) -> Any:
+    """What a gear carries, the mean of what drives and what resists: `moved` is by all of it."""
+    return np.abs(u - 0.5 * moved / gain)
+
+
 def _load(w: Any, free: Any, gain: Any, u: Any, c: Any, dt: Any) -> Any:
-    carried = np.abs(u - 0.5 * (free - w) / gain)  # the mean of what drives and what resists
+    carried = _carried(free - w, gain, u)
     return dry(w, free, gain, c["c"] + c["k"] * carried, c["b"], c["width"])
 
 
@@ -253,7 +258,7 @@ joint_friction = LossFamily(
     quantities=_friction,
     lookalikes=("coulomb_friction", "viscous_friction", "dead_zone", "stiction", "parameter"),
     loss=lambda w, free, gain, u, c, dt: dry(w, free, gain, c["c"], c["b"], c["width"]),
-    torque=lambda w, rate, u, c: c["c"] * np.tanh(w / c["width"]) + c["b"] * w,
+    torque=lambda w, rate, gain, u, c: c["c"] * np.tanh(w / c["width"]) + c["b"] * w,
 )
 
 load_friction = LossFamily(
@@ -265,8 +270,8 @@ load_friction = LossFamily(
     quantities=_loaded,
     lookalikes=("joint_friction", "coulomb_friction", "viscous_friction", "input_gain"),
     loss=_load,
-    torque=lambda w, rate, u, c: (
-        (c["c"] + c["k"] * np.abs(u)) * np.tanh(w / c["width"]) + c["b"] * w
+    torque=lambda w, rate, gain, u, c: (
+        (c["c"] + c["k"] * _carried(rate, gain, u)) * np.tanh(w / c["width"]) + c["b"] * w
     ),
 )
 
@@ -278,7 +283,7 @@ added_inertia = LossFamily(
     quantities=lambda site: (Quantity("J", _per_acceleration(site)),),
     lookalikes=("input_gain", "rate_gain", "parameter"),
     loss=_inertia,
-    torque=lambda w, rate, u, c: c["J"] * rate,
+    torque=lambda w, rate, gain, u, c: c["J"] * rate,
 )
 
 FAMILIES = (joint_friction, load_friction, added_inertia)

@@ -265,11 +265,8 @@ def _joint_step(model: Model, effects: tuple[Effect, ...]) -> Step:
         result = dict(final)
         for n, k in tied.items():  # a carried heading rate is the heading's rate, effects and all
             first, last = instant(start, a, p, dt), instant(final, a, p, dt)
-            if not rates:
-                result[k] = s[k] + last[n] - first[n]
-                continue
-            before = _added(rates, start, a, first, now, p, dt).get(n, 0.0)
-            later = _added(rates, final, a, last, then, p, dt).get(n, 0.0)
+            before = _added(effects, start, a, first, now, p, dt).get(n, 0.0)
+            later = _added(effects, final, a, last, then, p, dt).get(n, 0.0)
             result[k] = s[k] + (last[n] - first[n]) + later - before
         return {**result, **then}
 

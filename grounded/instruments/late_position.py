@@ -4,7 +4,8 @@ What is late by d is off by -d S', the change of its velocity S. Other things ar
 or across it as well: a slipping wheel by k S' along it, an unmodelled side slip by k S' across it,
 a point that is tracked l ahead of the modelled one by l omega across it. So a delay is what is left
 beside a tracked point; and of a body whose sideways velocity nothing measures, along and across
-both have to show it.
+both have to show it. One position that is late alone looks half as late along and across, too: so
+each by itself has to show the same delay, or which of them it is stays for the physics to say.
 """
 
 from __future__ import annotations
@@ -55,12 +56,22 @@ def late_positions(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -
     lag = lag_between([(said[:, k], moved[:, k]) for k in (0, 1) for moved, said in ways], dt)
     if lag is None or lag.sign < 0 or lag.coherence < LIKE:
         return None
-    if lag.delay < max(SURE * lag.std, LEAST_STEPS * dt):
+    if lag.delay < max(SURE * lag.std, LEAST_STEPS * dt) or _apart(ways, lag, dt):
         return None
     for left, std in _left(ways, lag.delay / dt, dt, apart=len(plane.speed) < 2):
         if std > UNSURE * lag.delay or abs(left) > max(AGREE * std, CLOSE * lag.delay):
             return None
     return Late((both[0].i, both[1].i), lag)
+
+
+def _apart(ways: Sequence[Way], both: Lag, dt: float) -> bool:
+    """Whether the two positions, each by itself, are surely not late by the same."""
+    each = [lag_between([(said[:, k], moved[:, k]) for moved, said in ways], dt) for k in (0, 1)]
+    one, other = each
+    if one is None or other is None:
+        return False
+    sure = AGREE * float(np.hypot(one.std, other.std))
+    return abs(one.delay - other.delay) > max(sure, CLOSE * both.delay)
 
 
 def _left(

@@ -12,7 +12,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import sensitivities, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.effects import Library
+from grounded.effects import Library, wrap
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +35,7 @@ def effect(data, name):
         ("rate_gain:v", {"g": 0.3}),
         ("slope:v", {"a": 0.2, "b": -0.3}),
         ("slew_limit:delta", {"r": 0.5}),
+        ("grip_limit:psi", {"a": 1.0}),
     ],
 )
 def test_the_jacobian_is_that_of_the_hypothesis(cars, name, values):
@@ -54,6 +55,29 @@ def test_the_jacobian_is_that_of_the_hypothesis(cars, name, values):
         error = np.abs(F[..., j] - slope)
         # kinks (braking, a limit that is just reached) lie on few of the steps
         assert np.quantile(error.max(axis=-1), 0.9) < 0.02 * max(1.0, np.abs(slope).max())
+
+
+def test_a_carried_heading_rate_is_limited_with_the_heading(cars):
+    """A gyro shows what the tyres let the heading do; adopted, the model says the same."""
+    _, data = cars
+    predictor, grip = Predictor(data), effect(data, "grip_limit:psi")
+    h, names = Hypothesis().plus(grip, {"a": 1.0}), data.model.state_names
+    speed, rate = names.index("v"), names.index("psi_rate")
+    x, u = data.y[:-1].copy(), predictor.inputs(h)
+
+    def limited(at):
+        own = predictor.instant(Hypothesis(), at, u)[..., names.index("psi")]
+        most = 1.0 / np.maximum(np.abs(at[..., speed]), 1e-3)
+        return np.clip(own, -most, most), np.abs(own) > 1.2 * most
+
+    x[..., rate] = limited(x)[0]
+    after = predictor.advance(h, x, u, data.time)
+    expected, sliding = limited(after)
+    assert sliding.mean() > 0.05
+    np.testing.assert_allclose(after[..., rate], expected, atol=1e-9)
+    model = wrap(grip, {"a": 1.0}, data.dt)
+    adopted = model.system.step(*predictor.flat(x, u), model.values, data.dt).reshape(x.shape)
+    np.testing.assert_allclose(adopted, after, atol=1e-4)
 
 
 def test_without_the_effects_slope_it_would_be_another(cars):

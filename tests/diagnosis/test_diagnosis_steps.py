@@ -1,5 +1,6 @@
 """Single steps of trials that were left out: what they bear out where white noise is left."""
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.validation import decide
+from grounded.diagnosis.validation.averaged import averaged
 from grounded.diagnosis.validation.gain import Gain
 from grounded.diagnosis.validation.ruler import folds
 from grounded.diagnosis.validation.single_steps import borne_out, left_out
@@ -144,3 +146,84 @@ def test_what_ties_with_a_parameter_is_named_as_that(search):
     assert decide._own_numbers(search, gain, better) is gain
     rubs = fit_of(search, FRICTION)
     assert decide._own_numbers(search, rubs, Coarse(0.0)) is rubs
+
+
+@pytest.fixture(scope="module")
+def calibrated(search):
+    """Friction and a gain that is the parameter k; friction alone with k free, as likely."""
+    gain = next(e for e in search.candidates if e.name == "input_gain:u")
+    rubs = fit_of(search, FRICTION)
+    both = rubs.hypothesis.plus(gain, {"g": 0.05})
+    free = replace(rubs.hypothesis, shift=np.zeros(1), spread=0.1)
+    search.refined([(both, rubs.noise, rubs.track)], 25)
+    search.refined([(free, rubs.noise, rubs.track)], 25)
+    key = next(k for k in search.fits if k[1] == 0.1 and k[2] == (FRICTION,))
+    fit = fit_of(search, FRICTION, "input_gain:u")
+    near = replace(fit, evidence=search.fits[key].evidence)
+    off = search.score(search.fits[key]) - search.score(near)  # prices differ
+    return replace(near, evidence=near.evidence + off / search.tempering.factor), search.fits[key]
+
+
+def more_likely(search, fit, nats):
+    return replace(fit, evidence=fit.evidence + nats / search.tempering.factor)
+
+
+def test_calibration_takes_the_place_of_a_further_effect_unless_that_is_beyond_doubt(
+    search, calibrated
+):
+    fit, free = calibrated
+    near, sure = (more_likely(search, fit, nats) for nats in (6.0, 10.0))
+    assert decide._calibrated_instead(search, near, Coarse(0.0)) is free
+    assert decide._calibrated_instead(search, sure, Coarse(0.0)) is sure
+    assert decide._calibrated_instead(search, near, Coarse(3.0, largest=0.1)) is near
+    alone = fit_of(search, FRICTION)
+    assert decide._calibrated_instead(search, alone, Coarse(0.0)) is alone
+
+
+def test_of_causes_that_can_each_be_spared_evidence_says_which(search, calibrated):
+    fit, free = calibrated
+    without = {"calibration": more_likely(search, fit, 20.0), FRICTION: free}
+    both = [FRICTION, "calibration"]
+    found = decide._least_needed(search, Coarse(0.0), without, FRICTION, both)
+    assert found == "calibration"  # without it the rest is 20 nats likelier
+    assert decide._least_needed(search, Coarse(3.0, 0.1), without, FRICTION, both) == FRICTION
+    tied = {"calibration": more_likely(search, fit, 2.0), FRICTION: free}
+    assert decide._least_needed(search, Coarse(0.0), tied, FRICTION, both) == FRICTION
+
+
+def test_a_parameter_that_is_hardly_off_needs_predictions_not_single_steps(search, monkeypatch):
+    bare, own = fit_of(search), fit_of(search, "parameter:k")
+    monkeypatch.setattr(decide, "borne_out", lambda *_: True)
+    sure = more_likely(search, own, 50.0)
+
+    def off_by(share):  # of the 0.3 by which k is uncertain
+        h = sure.hypothesis.with_theta(np.array([0.3 * share]))
+        return replace(sure, hypothesis=h)
+
+    assert decide._pays(search, Coarse(0.01), bare, off_by(0.2), True)
+    assert not decide._pays(search, Coarse(0.01), bare, off_by(0.05), True)
+    assert decide._pays(search, Coarse(3.0, 0.1), bare, off_by(0.05), True)
+
+
+def test_intervals_are_those_of_all_likely_fits_of_the_same_effects(search, calibrated):
+    _, free = calibrated
+    exact = fit_of(search, FRICTION)
+    apart = float(free.hypothesis.theta[0] - exact.hypothesis.theta[0])
+    sizes = {id(exact): (0.01, 0.03), id(free): (0.02, 0.05)}
+
+    def of(fit):
+        return tuple(np.array([a]) for a in sizes.get(id(fit), (0.0, 0.0)))
+
+    def found(nats, ruler):
+        both = {("", 0.0, (FRICTION,)): exact, ("", 0.1, (FRICTION,)): free}
+        monkeyed = copy(search)
+        monkeyed.fits = both
+        monkeyed.score = lambda fit: nats if fit is free else 0.0
+        return [float(a[0]) for a in averaged(monkeyed, exact, ruler, of)]
+
+    std, half = found(0.0, Coarse(0.0))  # as likely: half and half
+    assert std == pytest.approx(np.sqrt((0.01**2 + 0.02**2 + apart**2) / 2))
+    assert half == pytest.approx(np.sqrt((0.03**2 + 0.05**2 + (1.96 * apart) ** 2) / 2))
+    assert found(30.0, Coarse(0.0))[0] == pytest.approx(np.hypot(0.02, apart), rel=1e-6)
+    assert found(-20.0, Coarse(0.0)) == [0.01, 0.03]
+    assert found(30.0, Coarse(3.0, 0.1)) == [0.01, 0.03]  # refuted by predictions

@@ -14,7 +14,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import sensitivities_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, wrap
-from grounded.effects.joint import dry, has_viscous, pairs_of
+from grounded.effects.joint import FAMILIES, dry, has_viscous, pairs_of
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
@@ -116,6 +116,18 @@ def test_dry_friction_over_a_step_is_that_of_many_small_ones(w, free):
     assert end == pytest.approx(x, abs=gain * c / 2 + 1.5 * width)
     if w * x > 0 or w == 0:  # it does not turn round
         assert end == pytest.approx(x, abs=5e-3 + 1.5 * width)
+
+
+@pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
+@pytest.mark.parametrize(("w", "rate", "u"), [(1.0, -3.0, 2.0), (1.0, 5.0, -1.0), (-2.0, 4.0, 0.0)])
+def test_a_loss_at_one_moment_is_that_of_a_short_step(family, w, rate, u):
+    """The challenge's truth has the one, the diagnosis the other."""
+    values, gain, dt = {"c": 0.3, "b": 0.1, "width": 0.02, "k": 0.2, "J": 0.05}, 2.0, 1e-7
+    mean = family.loss(w, w + dt * rate, dt * gain, u, values, dt)
+    moment = family.torque(w, rate, gain, u, values)
+    if family.name == "added_inertia":  # the step is solved for the rate that it leaves
+        moment /= 1 + gain * values["J"]
+    assert mean == pytest.approx(moment, rel=1e-4) and abs(mean) > 0.1
 
 
 @pytest.mark.slow

@@ -253,10 +253,10 @@ def test_a_heading_off_by_a_constant_is_no_exchange_and_no_sign(model, angle):
     assert (found.signal, found.kind, found.corrected) == ("psi", "offset", False)
 
 
-def positions_late(by: float):
+def positions_late(by: float, which: tuple[int, ...] = (0, 1)):
     def fault(x: Array) -> Array:
         at, y = np.arange(len(x)) - by / DT, np.array(x)
-        for i in (0, 1):
+        for i in which:
             y[:, i] = np.interp(at, np.arange(len(x)), x[:, i])
         return y[int(np.ceil(by / DT)) :]
 
@@ -272,6 +272,16 @@ def test_positions_that_are_late_are_told_by_velocities_and_heading(by):
     found = preflight(BOAT, logged(BOAT, positions_late(by)))
     assert delayed(found.findings) == pytest.approx({"x": by, "y": by}, abs=0.01)
     assert not delayed(preflight(BOAT, found.trials).findings)
+
+
+@pytest.mark.parametrize("alone", [0, 1])
+def test_one_position_that_is_late_alone_does_not_make_both_late(alone, monkeypatch):
+    """Half of its delay is left along and across; noise may hide that, each by itself tells."""
+    monkeypatch.setattr("grounded.instruments.late_position._left", lambda *_, **__: [(0.0, 0.0)])
+    assert delayed(preflight(BOAT, logged(BOAT, positions_late(0.15))).findings)
+    found = preflight(BOAT, logged(BOAT, positions_late(0.15, (alone,))))
+    assert not delayed(found.findings)
+    assert "sensor_delay:" + "xy"[alone] not in found.settled
 
 
 def test_what_nothing_measures_sideways_makes_no_position_late():

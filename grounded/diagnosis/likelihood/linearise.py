@@ -239,7 +239,7 @@ def with_effects(
     """The Jacobian of a hypothesis' step from x (L, B, n); F (L, B, n, n) of the model alone."""
     one, data = np.eye(x.shape[-1]), predictor.data
     F = passed(predictor, h, x, u, F, one)
-    if not rates_of(h):
+    if not rates_of(h) and not (limits_of(h) and predictor.tied()):
         return F
     after = predictor.advance(h, x, u, data.time) if after is None else after
     half, mean = 0.5 * data.dt, (F - one) / data.dt
@@ -291,18 +291,27 @@ def passed(
 
 
 def rate_slopes(
-    predictor: Predictor, h: Hypothesis, x: Array, u: Array, t: Array, of_own: Array | None
+    predictor: Predictor,
+    h: Hypothesis,
+    x: Array,
+    u: Array,
+    t: Array,
+    of_own: Array | None,
+    *,
+    now: bool = False,
 ) -> Array:
     """Slope of the added rates (L, B, n, n) [1/s] at x (L, B, n).
 
     of_own: slope of the model's own rates, (L, B, n, n) or broadcastable; None: they stay.
+    now: of this very moment, limits too, not the mean over the step.
     """
-    rates, data = rates_of(h), predictor.data
+    rates, data = [*rates_of(h), *(limits_of(h) if now else [])], predictor.data
     n, half, names = x.shape[-1], 0.5 * data.dt, data.model.state_names
     if not rates:
         return np.zeros((*x.shape, n))
-    needs = any(e.family.needs_own for e, _ in rates)
-    own = (predictor.moved(h, x, u) - x) / data.dt if needs else x
+    own = x
+    if any(e.family.needs_own for e, _ in rates):
+        own = predictor.instant(h, x, u) if now else (predictor.moved(h, x, u) - x) / data.dt
     base = predictor.added_rate(rates, x, u, t, predictor.named(own))
     found = np.empty((*x.shape, n))
     for j, name in enumerate(names):
@@ -325,9 +334,10 @@ def heading_slope(
     f_x, _ = predictor.slopes(x, u, predictor.params(h), short)
     one, name = np.eye(x.shape[-1]), data.model.state_names[heading]
     slope = (f_x[..., heading, :] - one[heading]) / short
-    if any(name in e.site.targets or f"{name}<-" in e.name for e, _ in rates_of(h)):
+    acting = [*rates_of(h), *limits_of(h)]
+    if any(name in e.site.targets or f"{name}<-" in e.name for e, _ in acting):
         own = (f_x - one) / short
-        slope += rate_slopes(predictor, h, x, u, t, own)[..., heading, :]
+        slope += rate_slopes(predictor, h, x, u, t, own, now=True)[..., heading, :]
     slope[..., [heading, rate]] = 0.0
     return np.asarray(slope)
 

@@ -161,8 +161,8 @@ class Predictor(SentOnce):
 
     def advance(self, h: Hypothesis, x: Array, u: Array, t: Array) -> Array:
         """One step of a hypothesis from x (..., n) with received inputs u (..., m) at times t."""
-        dt, rates = self.data.dt, rates_of(h)
-        if not rates and not limits_of(h):
+        dt, rates, limits = self.data.dt, rates_of(h), limits_of(h)
+        if not rates and not limits:
             return self.moved(h, x, u)
         needs_own = any(e.family.needs_own for e, _ in rates)
         own = self.named((self.moved(h, x, u) - x) / dt) if needs_own else {}
@@ -175,8 +175,9 @@ class Predictor(SentOnce):
             found = []
             for s, when in ((x, t), (result, t + dt)):
                 rate = self.instant(h, s, u)
-                own = self.named(rate) if needs_own else {}
-                found.append(rate[..., i] + self.added_rate(rates, s, u, when, own)[..., i])
+                own = self.named(rate) if needs_own or limits else {}
+                added = self.added_rate([*rates, *limits], s, u, when, own)
+                found.append(rate[..., i] + added[..., i])
             result[..., j] = x[..., j] + found[1] - found[0]
         return result
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import islice
 from typing import Any
 
@@ -31,6 +32,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
 from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.report import Estimate, Likeness, Ranked
+from grounded.diagnosis.validation.averaged import averaged
 from grounded.diagnosis.validation.decide import BETTER, SLIGHT, Decision, ordered
 from grounded.diagnosis.validation.held_out import gaps_of, held_out_errors
 from grounded.diagnosis.validation.limits import Limits
@@ -239,7 +241,7 @@ class Claims:
 
     def estimates(self, fit: Fitted) -> list[dict[str, Estimate]]:
         """Values with intervals, effect by effect."""
-        stds, halves = standard_deviations(self.predictor, fit, folds(self.data))
+        stds, halves = self._sure if fit is self.best else self._alone(fit)
         found, at = [], 0
         for effect, values in zip(fit.hypothesis.effects, fit.hypothesis.values, strict=True):
             some = {}
@@ -251,6 +253,14 @@ class Claims:
                 at += 1
             found.append(some)
         return found
+
+    @cached_property
+    def _sure(self) -> tuple[Array, Array]:
+        """How sure the claim's values are, by all that is likely of the same effects."""
+        return averaged(self.search, self.best, self.ruler, self._alone)
+
+    def _alone(self, fit: Fitted) -> tuple[Array, Array]:
+        return standard_deviations(self.predictor, fit, folds(self.data))
 
     def groups(self) -> tuple[tuple[str, ...], ...]:
         """For each claimed effect, what could stand in its place within a few nats.

@@ -49,6 +49,7 @@ OVERRULES = (3.0, 0.1)  # and for a claim that is likely under another noise onl
 SLIGHT = 0.02  # of what all causes gain, adopted ones too: less in each channel is not named
 AMOUNTS = 0.1  # of what the likeliest gains: what a rival has to gain beyond it
 LIKELY = 10.0  # nats from which a dropped effect is mentioned
+HARDLY = 0.1  # of its own prior: a parameter that is off by less is as it was given
 REFIT = 12  # iterations after a cause was taken out
 
 
@@ -119,7 +120,7 @@ def _plainest(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool) 
 
 
 def _own_numbers(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
-    """The fit with a parameter in the place of each effect that ties with its shift.
+    """The fit with a parameter in the place of each effect that ties with its shift, or with all.
 
     A number that its owner calls uncertain is off sooner than the equations lack something.
     """
@@ -139,7 +140,29 @@ def _own_numbers(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
         ties = other is not fit and score(fit) - score(other) < TIE
         if ties and not ruler.gain(other, fit).beyond(*BETTER):
             return _own_numbers(search, other, ruler)
-    return fit
+    return _calibrated_instead(search, fit, ruler)
+
+
+def _calibrated_instead(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
+    """The fit with the model's parameters calibrated in the place of a further effect.
+
+    Where all of them are off by a little no single shift is as good as an effect of two numbers,
+    but together they are. So beside another cause an effect has to be likelier beyond doubt.
+    """
+    h, score, names = fit.hypothesis, search.score, _effects(fit)
+    rests = [tuple(sorted({*h.names} - {name})) for name in names if len(names) > 1]
+    if h.spread > 0 or not rests:
+        return fit
+
+    def likeliest() -> Fitted:
+        free = [f for (_, w, some), f in search.fits.items() if w and some in rests]
+        return max(free, key=score, default=fit)
+
+    if score(fit) - score(likeliest()) < 2 * SURE:
+        search.finished([likeliest()], TO_THE_TOP)
+    other = likeliest()
+    as_good = other is not fit and score(fit) - score(other) < SURE
+    return fit if not as_good or ruler.gain(other, fit).beyond(*BETTER) else other
 
 
 def _likelier(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted | None:
@@ -187,12 +210,22 @@ def _pays(
     further = effects > max(1, len(before.hypothesis.effects))
     if gain.pays(*(ALONE if sure and effects < 2 else PAYS)):
         return True
-    if not (sure and white and new and gain.largest > LEAST):
+    if not (sure and white and new and gain.largest > LEAST) or _as_given(after, new):
         return False
     if further and gain.mean > 0 and _in_several(search, after, new):
         return True
     near = gain.mean > 0 and gain.pieces.sum() > 0
     return bool(near) and borne_out(search, before, after)
+
+
+def _as_given(fit: Fitted, names: set[str]) -> bool:
+    """Whether all of these are parameters that are hardly off by what they are uncertain."""
+    pairs = [(e, v) for e, v in fit.hypothesis.pairs if e.name in names]
+    return all(
+        isinstance(e.family, ParamFamily)
+        and abs(v["d"]) < HARDLY * e.site.model.params[e.site.target].spread
+        for e, v in pairs
+    )
 
 
 def _in_several(search: HypothesisSearch, fit: Fitted, names: set[str]) -> bool:
@@ -274,11 +307,25 @@ def _pruned(
         )
         if not idle:
             return fit, without, doubtful
-        name = min(idle, key=lambda name: gains[name].mean)
+        name = _least_needed(search, ruler, without, min(idle, key=lambda n: gains[n].mean), idle)
         nats = search.score(fit) - search.score(without[name])
         if nats > LIKELY and name in _effects(fit) and name not in undone:
             doubtful.append(Doubtful(name, nats, fit, repeated[name]))
         fit = without[name]
+
+
+def _least_needed(
+    search: HypothesisSearch, ruler: Ruler, without: dict[str, Fitted], name: str, idle: list[str]
+) -> str:
+    """Of causes that can each be spared, the one without which the rest is likeliest.
+
+    Each does the others' work: unless predictions tell what is left, evidence does.
+    """
+    for other in idle:
+        likelier = search.score(without[other]) - search.score(without[name]) > TIE
+        if likelier and not ruler.gain(without[other], without[name]).beyond(*BETTER):
+            name = other
+    return name
 
 
 def _effects(fit: Fitted) -> list[str]:

@@ -1,0 +1,74 @@
+"""How sure a claim's values are where other fits of the same effects are likely, too.
+
+Parameters that are held as they were given may be off all the same: where evidence hardly tells, or
+calibration was dropped because predictions don't need it, the claim's own interval is that of exact
+parameters. So it is averaged over the noise structures and over parameters held and moving, by
+their evidence (Hoeting, Madigan, Raftery & Volinsky, Bayesian model averaging, 1999):
+
+    var = sum_f p_f (var_f + (value_f - value)^2)
+
+about the claim's own value. A fit that predicts trials left out clearly worse has no part in it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from grounded.diagnosis.hypotheses.explored import FittedHypotheses
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.validation.decide import BETTER
+from grounded.diagnosis.validation.ruler import Ruler
+from grounded.frozen import Array
+
+SLIGHT = 0.01  # of the claim's evidence: less has no part
+NORMAL = 1.96  # standard deviations to each side that hold 95 %
+MOST = 50.0  # nats by which another fit counts as likelier
+
+Sure = tuple[Array, Array]
+
+
+def averaged(
+    search: FittedHypotheses, fit: Fitted, ruler: Ruler, of: Callable[[Fitted], Sure]
+) -> Sure:
+    """Standard deviations and half-widths of the 95 % intervals of a claim's values, (C,) each.
+
+    Args:
+        search: with all fits of the same effects.
+        fit: the claim.
+        ruler: that may rule out some of them.
+        of: the same of one fit by itself.
+    """
+    std, half = (np.array(a) for a in of(fit))
+    own, size = _values(fit.hypothesis), len(fit.hypothesis.theta)
+    var, wide, whole = std[:size] ** 2, half[:size] ** 2, 1.0
+    for other, weight in _rivals(search, fit, ruler):
+        theirs = _values(other.hypothesis)
+        rows = [theirs[key] for key in own]
+        apart = other.hypothesis.theta[rows] - fit.hypothesis.theta
+        s, h = (a[rows] for a in of(other))
+        var, wide = var + weight * (s**2 + apart**2), wide + weight * (h**2 + (NORMAL * apart) ** 2)
+        whole += weight
+    std[:size] = np.maximum(std[:size], np.sqrt(var / whole))
+    half[:size] = np.maximum(half[:size], np.sqrt(wide / whole))
+    return std, half
+
+
+def _rivals(search: FittedHypotheses, fit: Fitted, ruler: Ruler) -> list[tuple[Fitted, float]]:
+    """Other fits of the same free values, and how likely each is beside the claim."""
+    names, own, found = sorted(fit.hypothesis.names), _values(fit.hypothesis), []
+    for (_, _, some), other in search.fits.items():
+        nats = search.score(other) - search.score(fit)
+        likely = other is not fit and list(some) == names and nats > math.log(SLIGHT)
+        if likely and set(_values(other.hypothesis)) == set(own):
+            worse = ruler.held_out and ruler.gain(other, fit).beyond(*BETTER)
+            found += [] if worse else [(other, math.exp(min(nats, MOST)))]
+    return found
+
+
+def _values(h: Hypothesis) -> dict[tuple[str, str], int]:
+    """Rows of the free values by effect and name."""
+    return {key: i for i, key in enumerate((e.name, q.name) for e in h.effects for q in e.free)}
