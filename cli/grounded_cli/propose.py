@@ -95,7 +95,7 @@ def _so_far(candidate: Candidate, best: Tried) -> str:
     if abs(rest) > told and math.isfinite(best.standard_error):
         within = abs(rest) <= LUCKY * best.standard_error
         known = "within the scatter of its runs" if within else "more than its runs scatter"
-        why.append(f"{number(rest)} is {known}")
+        why.append(f"{number(rest)} of {'it' if why else 'that'} is {known}")
     return "; ".join([text, *why])
 
 

@@ -195,7 +195,8 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
     """What the first trial missed by, and the best one does: in the units of the states."""
     rows = [(one.text, one.what) for one in improvements_in(findings)]
     first, best = findings.first, findings.best
-    if first is not None and best is not None and best is not first:
+    same = first is None or best is None or figure(first.utility) == figure(best.utility)
+    if first is not None and best is not None and not same:
         gain = ""
         if -math.inf < first.utility < 0 and best.utility <= 0:
             gain = f": {100 * (1 - best.utility / first.utility):.1f} % of the first cost is gone"
