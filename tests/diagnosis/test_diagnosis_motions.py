@@ -1,14 +1,16 @@
 """Trials that repeat one motion tell no cause from whatever else repeats with it."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
-from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.data import PIECES, prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.validation.motions import motions, without_others
+from grounded.diagnosis.validation.motions import motions, repeats, without_others
 from grounded.effects import Library
 
 DT, STEPS = 0.05, 120
@@ -73,6 +75,16 @@ def test_trials_make_one_motion_whatever_noise_and_chatter_do():
     assert looked_at([*trials, *other], model, "periodic:v", shake) == [0, 0, 0, 1, 0]
     short = trials[2].until(STEPS // 2)
     assert looked_at([*trials[:2], short], model, "periodic:v", shake) == [0, 0, 1]
+
+
+def test_a_log_of_many_motions_needs_no_other_one():
+    """EMPS was driven to and fro for 24 s, twice: a stretch of its axis was no cause any more."""
+    model, trials = carts([1.7] * 2)
+    data = prepare(model, trials, np.zeros(1))
+    h = Hypothesis().plus(Library().effect("periodic:v", model, data.scales), shake)
+    runs = SimpleNamespace(count=2, trial_of=np.repeat([0, 1], PIECES))
+    found = repeats(SimpleNamespace(data=runs), SimpleNamespace(hypothesis=h), None, "periodic:v")
+    assert found == 0
 
 
 def test_what_acts_differently_is_another_motion():

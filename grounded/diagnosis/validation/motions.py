@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import CLAIM, FittedHypotheses
-from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.data import PIECES, Data
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -48,6 +48,8 @@ def repeats(search: FittedHypotheses, fit: Fitted, less: Fitted, name: str) -> i
     data, h = search.data, fit.hypothesis
     if data.count < 2 or not h.effects[h.names.index(name)].family.loose:
         return 0
+    if np.bincount(data.trial_of).max() >= PIECES:
+        return 0  # a log so long makes many motions, and would do without the others
     motion = motions(search.predictor, h.minus(name), h, fit.track)
     size = np.bincount(motion)
     lost = 0.5 * (less.rss + less.logdet - fit.rss - fit.logdet)
