@@ -1,12 +1,14 @@
 """A parameter that is known only together with one that is held says so."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.report import Estimate, Identifiable
 from grounded.effects import Library
 from grounded_trials.report.diagnosis_words import error_lines, held_sentence
 
@@ -64,3 +66,13 @@ def test_table_and_document_say_it(found):
     )
     free = replace(found, identifiable=tuple(replace(i, given={}) for i in found.identifiable))
     assert "held" not in dict(error_lines(free, {}))
+
+
+def test_a_line_names_no_twenty_parameters():
+    """An aircraft's page had a paragraph of them, all known together with one inertia."""
+    names = [f"C{k}" for k in range(20)]
+    parts = [Identifiable(n, "weak", 1.0, 0.01, {"J": 0.9 + k / 1e3}) for k, n in enumerate(names)]
+    known = {n: Estimate(1.0, 0.1, "1/rad") for n in names}
+    said = held_sentence(SimpleNamespace(identifiable=parts, parameters=known))
+    assert "20 values" in said and "+0.9 to +0.92 % for 1 % more J" in said and "C3" not in said
+    assert "C0" in held_sentence(SimpleNamespace(identifiable=parts[:2], parameters=known))

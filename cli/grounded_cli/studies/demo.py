@@ -77,15 +77,16 @@ def command(name: str, folder: str | None, json_: bool) -> None:
 
 
 def _few(workspace: Workspace, status: Status) -> list[str]:
-    """The trials to diagnose: the model's own policy, the best, then the earliest; [] for all.
+    """The trials to diagnose: first, last and best, then the earliest; [] for all.
 
     The later ones hardly differ from the best, and the demo's user waits.
     """
     standing, most = status.standing, max(STEPS // workspace.task.horizon, 2)
     best = standing.incumbent
     tried = [trial for one in standing.history for trial in one.trials[:1]]
+    last = sorted((t for one in standing.history for t in one.trials), key=lambda t: t.id)[-1:]
     repeats = [*best.trials] if best else []  # they tell how far runs scatter
-    chosen = list(dict.fromkeys(one.id for one in (*tried[:1], *repeats, *tried)))
+    chosen = list(dict.fromkeys(one.id for one in (*tried[:1], *last, *repeats, *tried)))
     return chosen[:most] if standing.trials > most else []
 
 

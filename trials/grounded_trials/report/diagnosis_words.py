@@ -180,18 +180,23 @@ def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> st
 
 def held_sentence(diagnosis: Diagnosis) -> str:
     """What calibrated parameters depend on that these trials don't tell, and how much."""
-    said, held = [], dict[str, None]()
+    said, held = [], dict[str, list[float]]()
     for one in (one for one in diagnosis.identifiable if one.given):
         e = diagnosis.parameters.get(one.parameter)
         if e is None:
             continue
-        held |= dict.fromkeys(one.given)
+        for name, by in one.given.items():
+            held.setdefault(name, []).append(by)
         parts = [f"{by:+.2g} % for 1 % more {name}" for name, by in one.given.items()]
         free = with_unit(f"+- {figure(one.prior * one.left, 2)}", e.unit)
         said.append(f"{one.parameter} {' and '.join(parts)} ({free} with all free)")
-    if not said:
-        return ""
-    return f"{' and '.join(held)} as written, which these trials don't tell: {', '.join(said)}"
+    if len(said) > MOST:
+        said = [
+            f"{len(some)} values {min(some):+.2g} to {max(some):+.2g} % for 1 % more {name}"
+            for name, some in held.items()
+        ]
+    told = f"{' and '.join(held)} as written, which these trials don't tell: {', '.join(said)}"
+    return told * bool(said)
 
 
 def utility_sentence(diagnosis: Diagnosis) -> str:
