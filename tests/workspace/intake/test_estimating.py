@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from facts import holds
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.workspace.adopted import planner_of
@@ -183,3 +184,42 @@ def test_trials_that_another_model_estimated_stay_and_are_told(tmp_path):
     w.discard("t0001")
     anew = w.ingest(tmp_path / "0.csv", data=True)
     assert not anew.known and anew.trial != first.trial
+
+
+def test_a_late_sensor_that_was_adopted_leaves_estimates_as_they_are(tmp_path):
+    """The speed of a position that is told 40 ms late is as late; it was 20 times worse."""
+    lines = [f'[log.{k}.{n}]\npath = "/csv.{n}"' for k, n in (("state", "x"), ("input", "force"))]
+    config = CONFIG + "\n".join([*lines, "[estimate]", "measured = { x = 0.002 }"])
+    logged, *_ = disturbed(0.0, 0.8)
+    late = np.interp(logged["x"].t * 1e-9 - 0.04, logged["x"].t * 1e-9, logged["x"].values)
+    table = np.column_stack([logged["x"].t * 1e-9, late, logged["force"].values])
+    np.savetxt(tmp_path / "late.csv", table, "%.5f", ",", header="t,x,force", comments="")
+    friction = {"name": "coulomb_friction:v", "c": 0.8}
+    speeds = []
+    for name, effects in (
+        ("a", [friction]),
+        ("b", [friction, {"name": "sensor_delay:x", "d": 0.04}]),
+    ):
+        folder = make(tmp_path / name, config=config).folder
+        set_in_model(folder / "grounded.toml", effects=effects)
+        w = Workspace(folder)
+        w.ingest(tmp_path / "late.csv", data=True)
+        stored = w.trials()[0]
+        assert stored.meta["estimated_with"] == "coulomb_friction:v"
+        speeds.append(stored.measured.states[:, 1])
+    np.testing.assert_array_equal(*speeds)
+    assert np.sqrt(np.mean(speeds[0] ** 2)) > 0.1
+
+
+def test_a_mapped_state_that_estimate_leaves_out_is_told(tmp_path):
+    """Its signal was not read, and nothing said so."""
+    names = (("state", "x"), ("state", "v"), ("input", "force"))
+    lines = [f'[log.{k}.{n}]\npath = "/csv.{n}"' for k, n in names]
+    config = CONFIG + "\n".join([*lines, "[estimate]", "measured = { x = 0.002 }"])
+    logged, _, v = disturbed(0.0, 0.0)
+    table = [logged["x"].t * 1e-9, logged["x"].values, v[::10], logged["force"].values]
+    head = {"header": "t,x,v,force", "comments": ""}
+    np.savetxt(tmp_path / "all.csv", np.column_stack(table), "%.5f", ",", **head)
+    w = Workspace(make(tmp_path / "w", config=config).folder)
+    warned = w.ingest(tmp_path / "all.csv", data=True).warnings
+    assert any(holds(one, "[log.state.v]", "measured") for one in warned)

@@ -267,11 +267,14 @@ def _estimate(states: Sequence[Guess]) -> list[str]:
     known = [guess for guess in states if guess.path and guess.field is not None]
     if not missing or not known:
         return []
-    deviations = ", ".join(f"{guess.name} = {_deviation(guess):.1g}" for guess in known)
+    deviations = ", ".join(
+        f"{guess.name} = {abs(guess.scale) * _deviation(guess):.1g}" for guess in known
+    )
     return [
         "",
         f"[estimate]  # the smoother finds {', '.join(missing)}",
-        f"measured = {{ {deviations} }}  # standard deviations; check them",
+        f"measured = {{ {deviations} }}  # standard deviations, in the model's units; check them",
+        f"# add {' or '.join(missing)} where you find it in the log after all",
     ]
 
 

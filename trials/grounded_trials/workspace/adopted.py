@@ -13,7 +13,15 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from grounded.effects.family import Effect, Family, Scales, Site, joining_order
+from grounded.effects.family import (
+    Effect,
+    Family,
+    Scales,
+    SensorDelayFamily,
+    SensorLagFamily,
+    Site,
+    joining_order,
+)
 from grounded.effects.registry import Library
 from grounded.errors import GroundedError
 from grounded.search.planner import Planner, planner_with
@@ -70,6 +78,18 @@ def planner_of(task: Task, effects: Sequence[Mapping[str, Any]]) -> Planner:
     library = installed_effects() if effects else None
     given = [(str(e["name"]), {k: v for k, v in e.items() if k != "name"}) for e in effects]
     return planner_with(task, given, library, _checked)
+
+
+def but_late_sensors(effects: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Effects but delays and lags of sensors: those of the model that estimates states.
+
+    What a log has of a late state is its late value; states that nothing measures are estimated as
+    late as what they are estimated from, or they contradict each other.
+    """
+    library = installed_effects() if effects else Library()
+    family = {str(e["name"]): library.family(str(e["name"]).partition(":")[0]) for e in effects}
+    late = SensorDelayFamily | SensorLagFamily
+    return [e for e in effects if not isinstance(family[str(e["name"])], late)]
 
 
 def _checked(effect: Effect, values: Mapping[str, Any]) -> Mapping[str, float]:

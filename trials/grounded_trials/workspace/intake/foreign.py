@@ -14,6 +14,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.model import Model
+from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.logs.inspect_log import inspect_log
 from grounded_trials.logs.log_files import log_files, log_records
@@ -21,6 +22,7 @@ from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signa
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
 from grounded_trials.store.store import hash_file
+from grounded_trials.workspace.adopted import but_late_sensors, planner_of
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, StoredTrial, sha256
@@ -119,7 +121,28 @@ class ForeignLog:
         if not self.estimate:
             return series
         names = self.workspace.base_model.state_names
-        return with_estimates(series, self.estimate, self.workspace.planner.plan, names)
+        return with_estimates(series, self.estimate, self._estimating, names)
+
+    @cached_property
+    def _estimating(self) -> Task:
+        """The task with the model that estimates states."""
+        effects = self.workspace.config.model.effects
+        kept = but_late_sensors(effects)
+        if len(kept) == len(effects):
+            return self.workspace.planner.plan
+        return planner_of(self.workspace.task, kept).plan
+
+    @property
+    def unread(self) -> tuple[str, ...]:
+        """States that [log] maps and [estimate] calls not measured: nobody reads their signals."""
+        if not self.estimate:
+            return ()
+        return tuple(
+            f"{name} is in [log], but not in [estimate] measured, so its signal is not read: add "
+            f"{name} = its scatter at standstill there, or take [log.state.{name}] out"
+            for name in self.workspace.base_model.state_names
+            if name in self.mapping.states and name not in self.estimate.measured
+        )
 
     @cached_property
     def whole(self) -> Mapping[str, Series]:
@@ -180,7 +203,8 @@ def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignL
     source |= read_by(mapping)
     if guessed := [name for name in model.state_names if name not in states]:
         source["estimated"] = ",".join(guessed)
-        source[ESTIMATED_WITH] = ",".join(str(effect["name"]) for effect in config.model.effects)
+        kept = but_late_sensors(config.model.effects)
+        source[ESTIMATED_WITH] = ",".join(str(effect["name"]) for effect in kept)
     series = mapped_signals(files, mapping, states, model.input_names)
     return ForeignLog(workspace, path, mapping, estimate, series, source)
 

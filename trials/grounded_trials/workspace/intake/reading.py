@@ -153,7 +153,7 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
     return Read(
         trial,
         encoded,
-        (*log.unlike_units, *found.warnings),
+        (*log.unlike_units, *log.unread, *found.warnings),
         found.reports,
         notes=() if candidate else tuple(begun(found, trial.dt)),
         log=log,
