@@ -116,7 +116,7 @@ def _what(candidate: Candidate, standing: Standing, task: Task) -> str:
         step = Step(candidate.damping, candidate.alpha)
         by = ", by slopes that the trials corrected" * bool(candidate.slopes)
         return f"iteration {candidate.iteration}: {step} from {candidate.base}{by}, {seconds}"
-    crashes = candidate.caution
+    crashes = round(candidate.caution)  # of a first policy
     gently = f", designed more gently after {count(crashes, 'crash', 'crashes')}" * bool(crashes)
     return f"the model's own policy{gently}, {seconds}"
 

@@ -47,7 +47,7 @@ class Candidate(Result):
     predicted_utility: float
     damping: float = 1.0  # lambda of `step_size`
     predicted_gain: float = float("nan")  # over the mean trial of its base
-    caution: int = 0  # how often the first policy, or its gains, were designed more gently
+    caution: float = 0  # how often the first policy, or its gains, were designed more gently
     way: Way = ""  # how it was made
     slopes: Slopes = ""  # of the model that it was planned in
     base_as_run: float = float("nan")  # what the model gives its base from where its trials began

@@ -8,6 +8,7 @@ from grounded.frozen import Array
 from grounded.search.candidate import Tried
 from grounded.task import Task
 
+NEAR, OFTEN = 0.01, 0.3  # of its range; of the steps
 SWINGS = 6  # of an input about its plan, each as large as the plan's own range: a limit cycle
 
 
@@ -18,6 +19,17 @@ def limit_cycle(tried: Tried, task: Task) -> bool:
     for trial in tried.trials:
         off = trial.inputs - made.predicted_inputs[: trial.steps]
         if any(_swings(off[:, i], size) >= SWINGS for i, size in enumerate(range_) if size > 0):
+            return True
+    return False
+
+
+def between_limits(tried: Tried, task: Task) -> bool:
+    """Whether feedback held an input at one limit or the other for much of a trial."""
+    near = NEAR * (task.high - task.low)
+    for trial in tried.trials:
+        at_low, at_high = trial.inputs <= task.low + near, trial.inputs >= task.high - near
+        both = at_low.any(axis=0) & at_high.any(axis=0)
+        if np.any(both & ((at_low | at_high).mean(axis=0) > OFTEN)):
             return True
     return False
 

@@ -14,7 +14,7 @@ from grounded.result import Result, document
 from grounded.rollout import Rollout, apart
 from grounded.search.candidate import LITTLE, Candidate, Slopes, Tried, Way
 from grounded.search.directions import base_columns, direction
-from grounded.search.limit_cycle import limit_cycle
+from grounded.search.limit_cycle import between_limits, limit_cycle
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from grounded.search.feedback import Alternative
 
 GENTLER = 1e3  # factor on the price of inputs from which gentler gains are designed
+HALF, FINE = 0.5, 12  # of the mean gain is left where no limit is met; parts of a caution
 NEAR = 0.2  # of the way that one that lost would go: a step that ends so near is the same one
 REFUTED = 2  # steps by corrected slopes that lost too much: then the model's own are believed
 FORETOLD = 0.2  # of the incumbent's cost: a plain model that is off by more there is no judge
@@ -273,7 +274,7 @@ class Maker:
         step: Step,
         already: float = float("nan"),
         way: Way = "",
-        caution: int | None = None,
+        caution: float | None = None,
     ) -> Candidate:
         """A candidate; its gains are designed as gently as its incumbent's, or by `caution`."""
         base, policy = self.now.incumbent, self.planner.narrowed(policy)
@@ -316,7 +317,9 @@ class Maker:
         """The incumbent's plan with gentler gains, where its loop was unstable on the robot.
 
         High gains and a delay that the model lacks make a limit cycle, which no step along a
-        direction leaves: the grounded model replays it, and has no delay to blame.
+        direction leaves: the grounded model replays it, and has no delay to blame. An input that
+        swings from limit to limit asks for far less gain. Else it may be noise that high gains
+        carry, and half of them are still needed.
         """
         own = incumbent.candidate
         lost = losers_of(self.now.history, own.id, self.fingerprint, "gentler gains")
@@ -325,9 +328,15 @@ class Maker:
         if not limit_cycle(incumbent, self.planner.task):
             return None
         problem, real = self.planner.plan.problem(exact=True), incumbent.utility
-        return self.candidate(own.policy, problem, Step(), real, "gentler gains", own.caution + 1)
+        caution = own.caution + 1.0
+        if not between_limits(incumbent, self.planner.task):
+            less = own.caution + np.arange(1, FINE) / FINE
+            most = HALF * _gain(own.policy)
+            few = (c for c in less if _gain(self._gently(own.policy, problem, c)) < most)
+            caution = float(next(few, caution))
+        return self.candidate(own.policy, problem, Step(), real, "gentler gains", caution)
 
-    def _gently(self, policy: Policy, problem: Problem, caution: int) -> Policy:
+    def _gently(self, policy: Policy, problem: Problem, caution: float) -> Policy:
         """The same run with the gains of a regulator whose inputs cost GENTLER ** caution more."""
         if policy.gain is None:
             return policy
@@ -382,3 +391,8 @@ class Proposal(Result):
         )
         best = now.incumbent and now.incumbent.utility
         return known | document(best_utility=best, new=self.is_new) if made else known
+
+
+def _gain(policy: Policy) -> float:
+    """The mean size of the feedback's gains."""
+    return 0.0 if policy.gain is None else float(np.abs(policy.gain).mean())

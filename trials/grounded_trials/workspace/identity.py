@@ -42,7 +42,7 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "predicted_utility": float,
     "predicted_gain": float,
     "damping": float,
-    "caution": int,
+    "caution": float,
     "way": str,
     "slopes": str,
     "base_as_run": float,
