@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +24,15 @@ from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.store.store import DIGITS
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
+from grounded_trials.workspace.intake.acted_on import sender_of
 from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.intake.other_scale import other_units, units_told
 from grounded_trials.workspace.intake.reading import Read, cut_log, read_log_file, read_own_trial
 from grounded_trials.workspace.intake.run_start import (
     LOOSE,
+    Recording,
+    Start,
     elsewhere,
     loosely,
     pace_of,
@@ -230,7 +233,8 @@ class _Look:
             seen = alone  # it may be of another workspace: that it looks like one of these is luck
         self.log = log.recording if log else None
         if log and read.log and self.log:
-            self.found = found = self.log.start_of(own.policy)
+            start_of = cache(partial(_start_of, self.log))
+            self.found = found = start_of(own)
             if found and elsewhere(self.log, found, own.policy, seen.why):
                 begins = found.seconds + (_sooner(apart, read.log) if apart else 0)
                 note = f"the log begins {begins:.3f} s before {ran} does: it is taken from there"
@@ -238,7 +242,12 @@ class _Look:
                 cut = apart.cut(ran, found.seconds)[0] if apart else self.read.trial
                 self.whole = interpolate_gaps(cut).trial
                 seen = judged(self.whole)
-            if (rival := rival_in(self.log, found, ran, candidates)) is not None:
+            sender = sender_of(self.log, own, candidates, start_of)
+            if sender.sure:
+                seen = replace(seen, why="", other="")
+            elif sender.other:
+                seen = replace(seen, why=sender.why, other=sender.other)
+            elif (rival := rival_in(self.log, own, candidates, start_of)) is not None:
                 there = judged(rival)  # as it lies where that one fits best
                 told = there if there.other else seen if seen.why else replace(seen, why=there.why)
                 seen = replace(told, ran=seen.ran)
@@ -249,6 +258,11 @@ class _Look:
         """Whether it is another's run, and how far the commands are from the candidate's."""
         ran = self.suspicion.ran
         return bool(self.suspicion.why), math.inf if ran is None else ran.error
+
+
+def _start_of(log: Recording, candidate: Candidate) -> Start | None:
+    """Where a candidate's run seems to begin in a log."""
+    return log.start_of(candidate.policy)
 
 
 def _sooner(log: ForeignLog, stored: ForeignLog) -> float:
