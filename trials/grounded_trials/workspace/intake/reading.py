@@ -155,7 +155,7 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
         encoded,
         (*log.unlike_units, *found.warnings),
         found.reports,
-        notes=() if candidate else tuple(begun(found, trial.dt)),
+        notes=() if candidate else tuple(begun(found, trial.dt, trial.input_names)),
         log=log,
         last_s=(found.last_ns - found.start_ns) * 1e-9,
     )
