@@ -27,6 +27,7 @@ from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.intake.acted_on import sender_of
 from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.intake.ingested import Ingested
+from grounded_trials.workspace.intake.odd_run import odd_run
 from grounded_trials.workspace.intake.other_scale import other_units, units_told
 from grounded_trials.workspace.intake.reading import Read, cut_log, read_log_file, read_own_trial
 from grounded_trials.workspace.intake.run_start import (
@@ -116,7 +117,7 @@ def ingest_log(
         warnings=warnings,
         signals=read.signals,
         verdict=verdict,
-        notes=read.notes,
+        notes=(*read.notes, *(odd_run(workspace, now, added.id) if now else ())),
         off_target=off_target_of(workspace.task, judged),
         then=after_log(workspace, verdict, now),
     )
