@@ -22,7 +22,6 @@ from grounded.search.candidate import Candidate
 from grounded_trials.formats.messages import Ints
 from grounded_trials.logs.samples import Samples, tidy
 from grounded_trials.workspace.intake.who_drove import (
-    DECISIVE,
     FINE,
     LEAST,
     WINDOWS,
@@ -39,7 +38,8 @@ PARTS = 8  # ages tried in the time between samples
 ROUNDS = 2  # in which each topic's age is sought, the others' held
 EXACT = 1e-3  # of an input's size: so near is half of what was sent to the candidate that ran
 LUCK = float(np.log(2) / 2)  # [nats] a step: half the squares, which lower gains may leave as well
-FEW, STRAYS = 4, 1e-2  # steps of a part that tell, and what half of them may be off by in each
+FEW, FEWEST = 4, 0.2  # steps of a part that tell, and the share of them that is exact in each
+CLEARLY = 6.0  # [nats] beyond luck, by which another one is nearer
 ONE = 3e-3  # of an input's size: candidates that differ by less are one to whoever drives
 
 
@@ -65,7 +65,7 @@ class ActedOn:
     def throughout(self) -> bool:
         """Whether they are so, and at no time somebody else's."""
         parts = (one[np.isfinite(one)] for one in np.array_split(self.off, WINDOWS))
-        return self.exact and all(len(one) < FEW or np.median(one) < STRAYS for one in parts)
+        return self.exact and all(len(one) < FEW or np.mean(one < EXACT) > FEWEST for one in parts)
 
     @property
     def left(self) -> float:
@@ -228,7 +228,7 @@ def sender_of(
     mine = acted_on(log, own.policy, begins)
     if mine is None or mine.exact:
         return Sender(mine)
-    best, name, theirs = DECISIVE, "", mine
+    best, name, theirs = CLEARLY, "", mine
     for one in reversed(candidates):
         at = begins
         if (found is None or not found.alike) and (there := start_of(one)) and there.opens_alike:
