@@ -26,6 +26,7 @@ FULL = CONFIG.replace("[search]", '[search]\nstep = "full"\nrerun_incumbent = fa
     '[log]\nclock = "publish"\n[log.state.x]\npath = "/place.x"\n[log.state.v]\n'
     'path = "/wheel.v"\n[log.input.force]\npath = "/sent.force"\n'
 )
+NOISY = CONFIG + "[system.noise.measurement]\nx = 0.002\nv = 0.01\n"
 SEEDS = range(50)
 
 
@@ -210,7 +211,7 @@ def test_candidates_that_send_the_same_are_one(ladder, tmp_path):
     w, by_alpha = ladder
     policy = by_alpha[1].policy
     twin = replace(by_alpha[1], id="c0099", policy=replace(policy, gain=1.0002 * policy.gain))
-    log, policy, start = at_start(w, drive(tmp_path / "a.mcap", w, twin, 1), by_alpha[1])
+    log, _, _ = at_start(w, drive(tmp_path / "a.mcap", w, twin, 1), by_alpha[1])
     seen = sender_of(log, by_alpha[1], [twin, *by_alpha.values()], lambda c: log.start_of(c.policy))
     assert seen.other == ""
 
@@ -225,3 +226,18 @@ def at_start(w, path, made):
     """A log, a candidate's policy, and where its run begins."""
     log = read_foreign(w, path, mapping_of(w, path)).recording
     return log, made.policy, log.start_of(made.policy).seconds
+
+
+def test_a_run_that_the_others_contradict_says_what_it_did(ladder, tmp_path):
+    """One that was taken in though warned dethroned the best without a word."""
+    w = make(tmp_path / "w", config=NOISY)
+    first = propose_in(w).candidate.id
+    for _ in range(3):
+        done = ingest_log(w, run_candidate(w, first).trial_file, first)
+        assert not [note for note in done.notes if "discard" in note]
+    runs = [one.trial for one in w.trials()]
+    strange = replace(runs[0], states=runs[0].states + np.linspace(0, 0.5, 41)[:, None])
+    write_trial(tmp_path / "a.mcap", strange, {"kind": "trial", "task": w.task.hash})
+    done = ingest_log(w, tmp_path / "a.mcap", first)
+    (note,) = done.notes
+    assert first in note and f"discard {done.trial}" in note

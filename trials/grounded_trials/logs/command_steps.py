@@ -99,9 +99,7 @@ def rows_apart(inputs: Sequence[Samples], states: Sequence[Samples]) -> float:
     return max((held_rows(s.t, s.y) for s in shared), default=0.0)
 
 
-def first_step(
-    inputs: Sequence[Samples], start: int, dt: float, unknown: bool
-) -> tuple[int, str]:
+def first_step(inputs: Sequence[Samples], start: int, dt: float, unknown: bool) -> tuple[int, str]:
     """From a start to where data begin [ns], and a warning, "" for none.
 
     Args:

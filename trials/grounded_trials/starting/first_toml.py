@@ -45,9 +45,7 @@ def write_first(
     dt, whose = grid
     write_target(folder / "target.csv", dt, dict(columns))
     weights = equal_weights(columns, model.states)
-    changes = {
-        name: change_weight(ranges[name], model.inputs[name]) for name in model.input_names
-    }
+    changes = {name: change_weight(ranges[name], model.inputs[name]) for name in model.input_names}
     limits = [
         f"{key(name)} = [{found[0]:.6g}, {found[1]:.6g}]"
         for name in model.input_names

@@ -25,6 +25,7 @@ from grounded_trials.workspace.intake.who_drove import (
     FINE,
     LEAST,
     WINDOWS,
+    Following,
     follows,
     steps_alike,
 )
@@ -40,6 +41,7 @@ EXACT = 1e-3  # of an input's size: so near is half of what was sent to the cand
 LUCK = float(np.log(2) / 2)  # [nats] a step: half the squares, which lower gains may leave as well
 FEW, FEWEST = 4, 0.2  # steps of a part that tell, and the share of them that is exact in each
 CLEARLY = 6.0  # [nats] beyond luck, by which another one is nearer
+LATEST = 3  # steps by which commands may be logged late
 ONE = 3e-3  # of an input's size: candidates that differ by less are one to whoever drives
 
 
@@ -229,23 +231,28 @@ def sender_of(
     if mine is None or mine.exact:
         return Sender(mine)
     best, name, theirs = CLEARLY, "", mine
+    ran = _following(log, own.policy, begins)
+    late = ran is not None and ran.alike and ran.late != 0  # logged late, they are at other steps
     for one in reversed(candidates):
         at = begins
-        if (found is None or not found.alike) and (there := start_of(one)) and there.opens_alike:
-            at = there.seconds
+        if (found is None or not found.alike) and (begun := start_of(one)) and begun.opens_alike:
+            at = begun.seconds
         fit = None if one.id == own.id else acted_on(log, one.policy, at)
         if fit is None or _one(mine, fit):
             continue
-        if (for_it := nats(mine, fit)) > best and (fit.exact or _alike(log, one.policy, at)):
+        if (for_it := nats(mine, fit)) <= best:
+            continue
+        if fit.exact or (not late and (there := _following(log, one.policy, at)) and there.alike):
             best, name, theirs = for_it, one.id, fit
         if name and theirs.left < FINE:
             break
     if not name:
         return Sender(mine)
+    are = "are" if theirs.exact else "seem to be"
     why = (
-        f"on the samples that the robot had, half of its commands are within {theirs.percent} of "
-        f"what {name} sends, and only within {mine.percent} of what {own.id} sends: they are those "
-        f"of {name}"
+        f"on the samples that it had, half of its commands are within {theirs.percent} of what "
+        f"{name} sends, and within {mine.percent} of what {own.id} sends: they {are} those of "
+        f"{name}. Was the robot given {own.id}?"
     )
     return Sender(mine, name, why)
 
@@ -257,8 +264,7 @@ def _one(mine: ActedOn, fit: ActedOn) -> bool:
     return float(np.sqrt((apart**2).mean())) < ONE
 
 
-def _alike(log: Recording, policy: Policy, start: float) -> bool:
-    """Whether commands may be a policy's at all: of nobody's, one candidate is the nearest too."""
+def _following(log: Recording, policy: Policy, start: float) -> Following | None:
+    """How the commands compare with a policy's: of nobody's, one candidate is the nearest too."""
     trial = log.trial_from(start)
-    fit = follows(policy, trial.until(policy.horizon)) if trial else None
-    return fit is not None and fit.alike
+    return follows(policy, trial.until(policy.horizon), LATEST) if trial else None

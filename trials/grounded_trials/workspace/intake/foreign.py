@@ -243,7 +243,9 @@ def begun(found: Gridded, dt: float, inputs: Sequence[str]) -> Iterator[str]:
         )
     elif found.moved_s > 0:
         yield f"{at}, where a step of the commands begins"
-    slow = [one for one in found.reports if one.name in inputs and 0 < one.rate_hz * dt < 1 / SLOWER]
+    slow = [
+        one for one in found.reports if one.name in inputs and 0 < one.rate_hz * dt < 1 / SLOWER
+    ]
     if slow:
         every = 1 / max(one.rate_hz for one in slow)
         yield (

@@ -186,12 +186,18 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             f"diagnosis, or with --candidate {ran} all the same",
             NextCommand("ingest", (str(path), "--data")),
         )
-    what = f"; with --candidate {other} for what it seems to have run" * bool(other)
+    said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
+    if other:
+        raise GroundedError(
+            f"{said} Take it in with --candidate {other}, with --candidate {ran} all the same, or "
+            "with --data for fitting and diagnosis only",
+            NextCommand("ingest", (str(path), "--candidate", other)),
+        )
     begins = "; [log.span] start = SECONDS says where the run begins" * (read.log is not None)
     raise GroundedError(
-        f"{path} did not run {ran}: {why}. Take it in with --data for fitting and diagnosis{what}, "
-        f"or with --candidate {ran} all the same{begins}",
-        NextCommand("ingest", (str(path), *(("--candidate", other) if other else ("--data",)))),
+        f"{said} Take it in with --data for fitting and diagnosis, or with --candidate {ran} all "
+        f"the same{begins}",
+        NextCommand("ingest", (str(path), "--data")),
     )
 
 
