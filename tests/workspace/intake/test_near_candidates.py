@@ -236,7 +236,8 @@ def test_a_run_that_the_others_contradict_says_what_it_did(ladder, tmp_path):
         done = ingest_log(w, run_candidate(w, first).trial_file, first)
         assert not [note for note in done.notes if "discard" in note]
     runs = [one.trial for one in w.trials()]
-    strange = replace(runs[0], states=runs[0].states + np.linspace(0, 0.5, 41)[:, None])
+    states = runs[0].states + np.linspace(0, 0.5, 41)[:, None]
+    strange = replace(runs[0], states=states, inputs=runs[0].inputs[::-1])
     write_trial(tmp_path / "a.mcap", strange, {"kind": "trial", "task": w.task.hash})
     done = ingest_log(w, tmp_path / "a.mcap", first)
     (note,) = done.notes

@@ -167,7 +167,8 @@ class _Samples:
         if held and not self.guessed[i]:
             return one.y[last]
         t = one.t - one.t[0]
-        return np.interp((at - one.t[0]).ravel(), t, one.y).reshape(at.shape)
+        between: Array = np.interp((at - one.t[0]).ravel(), t, one.y).reshape(at.shape)
+        return between
 
 
 def _sent_at(sent: Sequence[Samples], begin: int, dt: float, steps: int) -> Ints:
@@ -191,7 +192,7 @@ def nats(own: ActedOn, other: ActedOn) -> float:
     lost packets do. A ratio that luck, or lower gains, give as well counts for nothing.
     """
     T = min(len(own.off), len(other.off))
-    both = own.told[:T] & other.told[:T]
+    both = np.isfinite(own.off[:T] + other.off[:T])
     a, b = (np.log(np.hypot(one.off[:T][both], FINE)) for one in (own, other))
     gained = a - b - LUCK
     return float(gained.sum()) / steps_alike(gained) if both.sum() >= LEAST else 0.0

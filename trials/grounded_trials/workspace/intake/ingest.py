@@ -117,7 +117,7 @@ def ingest_log(
         warnings=warnings,
         signals=read.signals,
         verdict=verdict,
-        notes=(*read.notes, *(odd_run(workspace, now, added.id) if now else ())),
+        notes=(*read.notes, *(odd_run(workspace, now, added.id) if now and read.doubted else ())),
         off_target=off_target_of(workspace.task, judged),
         then=after_log(workspace, verdict, now),
     )
@@ -174,7 +174,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
                 f"no start of {ran} was found in it: it is taken from {log.first:.3f} s on, its "
                 "first command; [log.span] start = SECONDS names another"
             )
-        return replace(read, warnings=(*read.warnings, *doubts))
+        return replace(read, warnings=(*read.warnings, *doubts), doubted=True)
     if units:
         raise GroundedError(f"{path} ran {ran}, {units_told(units, by, read.log is not None)}")
     if pace:

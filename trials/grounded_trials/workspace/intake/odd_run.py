@@ -48,7 +48,7 @@ def odd_run(workspace: Folder, now: Standing, identity: str) -> tuple[str, ...]:
     return (
         f"{name}'s utility goes from {before.utility:.4g} to {after.utility:.4g}"
         f"{f', and {best} is the best now' * dethroned}: this run's, {run:.4g}, is far from those "
-        f"of its other {n}, which scatter by {before.deviation:.2g}. If it was none of {name}: `{undo}`",
+        f"of its other {n}, which scatter by {before.deviation:.2g}. To take it back: `{undo}`",
     )
 
 

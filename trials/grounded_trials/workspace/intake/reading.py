@@ -37,6 +37,7 @@ class Read:
     notes: tuple[str, ...] = ()
     copy: bool = False  # of a stored trial, or a part of one
     bare: bool = False  # it ran a candidate, and carries no copy of it
+    doubted: bool = False  # taken in as a candidate's run, though its commands say otherwise
     log: ForeignLog | None = None
     last_s: float = math.nan  # its last sample of every state, since the start; of a foreign log
 
