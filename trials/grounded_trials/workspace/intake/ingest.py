@@ -143,7 +143,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     ran = read.trial.candidate
     if not ran or sha256(read.data)[:DIGITS] in workspace.store.digests():
         return read
-    (own, _), candidates = workspace.candidate(ran), latest_candidates(workspace, OTHERS)
+    (own, _), candidates = workspace.candidate(ran), _may_have_run(workspace)
     logs = [read.log]
     if read.log and (late := read.log.as_seen):  # its program may have acted on these
         logs.append(late)
@@ -199,6 +199,16 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         f"the same{begins}",
         NextCommand("ingest", (str(path), "--data")),
     )
+
+
+def _may_have_run(workspace: Folder) -> list[Candidate]:
+    """The latest candidates, and before them the best, which is on the robot though it is older."""
+    latest = latest_candidates(workspace, OTHERS)
+    if len(workspace.candidate_ids()) <= OTHERS:
+        return latest
+    best = standing_in(workspace).incumbent
+    known = best is None or best.candidate.id in [one.id for one in latest]
+    return latest if known or best is None else [best.candidate, *latest]
 
 
 def _like(read: Read, ran: str, found: Following | None) -> tuple[str, ...]:
