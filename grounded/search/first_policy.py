@@ -99,10 +99,12 @@ def cautious(task: Task, caution: int) -> Task:
     """The task with inputs that cost CAUTION times more for each crash of a first policy."""
     if not caution:
         return task
+    width = task.high - task.low
+    least = np.minimum(1e-3, np.where(np.isfinite(width), 4e-3 / width**2, 1e-3))  # in any unit
     reward = replace(
         task.reward,
         input=task.reward.input * CAUTION**caution,
-        input_change=np.maximum(task.reward.input_change, 1e-3) * CAUTION**caution,
+        input_change=np.maximum(task.reward.input_change, least) * CAUTION**caution,
     )
     return replace(task, reward=reward)
 

@@ -1,11 +1,14 @@
 """A log that says mm beside a model in metres was taken in as metres, a thousand times too far."""
 
+import tomllib
+
 import numpy as np
 import pytest
 
 from cli import grounded
 from facts import holds
 from grounded_trials.logs.stated_units import (
+    bare_command,
     factor_between,
     same_unit,
     unit_in_name,
@@ -86,12 +89,77 @@ def test_units_in_a_table_s_first_row_become_scales(tmp_path):
         ("/csv.vel_N", "N", "/csv.vel_N"),
         ("/csv._mm", "", "/csv._mm"),
         ("/csv.summ", "", "/csv.summ"),
+        ("/mcu.steering_pct", "%", "/mcu.steering"),
+        ("/mcu.steering_percent", "%", "/mcu.steering"),
         ("/imu.orientation.@rpy.yaw", "", "/imu.orientation.@rpy.yaw"),
     ],
 )
 def test_the_end_of_a_name_says_a_unit(path, unit, bare):
     assert unit_in_name(path) == unit
     assert without_unit(path) == bare
+
+
+@pytest.mark.parametrize(
+    ("path", "unit", "bare"),
+    [
+        ("/mcu.steering_deg_cmd", "deg", "/mcu.steering"),
+        ("/mcu.steering_cmd_deg", "deg", "/mcu.steering"),
+        ("/mcu.speed_setpoint", "", "/mcu.speed"),
+        ("/mcu._cmd", "", "/mcu._cmd"),
+        ("/mcu.ref", "", "/mcu.ref"),
+    ],
+)
+def test_a_command_s_role_stands_before_its_unit_or_after(path, unit, bare):
+    assert (unit_in_name(path), bare_command(path)) == (unit, bare)
+
+
+@pytest.mark.parametrize(
+    ("named", "inputs", "scales"),
+    [
+        ("steering_pct,throttle_pct", ("steering", "throttle"), (0.01, 0.01)),
+        ("steering_percent,throttle_percent", ("steering", "throttle"), (0.01, 0.01)),
+        ("steer_cmd,throttle_cmd", ("steering", "throttle"), (1, 1)),
+        ("steering_deg,throttle_ref", ("steering", "throttle"), (np.pi / 180, 1)),
+        ("steering_pct,speed_cmd", ("steering", "speed"), (0.01, 1)),
+        ("steering_cmd_rad,speed_setpoint_mps", ("steering", "speed"), (1, 1)),
+    ],
+)
+def test_a_car_s_commands_are_found_whatever_unit_or_role_their_names_end_with(
+    tmp_path, named, inputs, scales
+):
+    """`steering_pct` named a steering, and then nothing in the log fitted the steering."""
+    t = np.arange(0, 8, 0.02)
+    held = 0.05 * np.floor(t / 0.05 + 1e-9)
+    v, psi = 1 + 0.3 * np.sin(t), 0.5 * np.sin(0.7 * t)
+    x, y = 0.02 * np.cumsum(v * np.cos(psi)), 0.02 * np.cumsum(v * np.sin(psi))
+    sent = np.column_stack([np.cos(0.7 * held), 1 + 0.3 * np.sin(held)]) / scales
+    table = np.column_stack([t, x, y, psi, v, sent])
+    head = f"t,x,y,psi,v,{named}"
+    np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header=head, comments="")
+    made = grounded("init", tmp_path / "w", "--from", tmp_path / "log.csv", "--yes", "--json")
+    found = {one["name"]: one for one in made.json["signals"]}
+    assert made.json["kind"] == "car" and made.json["dt"] == 0.05
+    for name, path, scale in zip(inputs, named.split(","), scales, strict=True):
+        assert found[name]["path"] == f"/csv.{path}"
+        assert found[name]["scale"] == pytest.approx(scale)
+
+
+@pytest.mark.parametrize("unit, size", [("%", 100.0), ("1", 1.0)])
+def test_the_weight_of_changes_is_that_of_their_range(tmp_path, unit, size):
+    """At 0.01 a change by 1 % cost as much as 0.1 m: a car was planned to stop before its line."""
+    t = np.arange(0, 8, 0.02)
+    table = np.column_stack([t, np.sin(t), np.cos(t), size * np.sin(np.floor(3 * t))])
+    np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="t,x,v,force", comments="")
+    model = f"""from grounded import Model
+model = Model(states={{"x": "m", "v": "m/s"}}, inputs={{"force": "{unit}"}}, params={{}},
+    derivative=lambda s, a, p: {{"x": s.v, "v": a.force}})
+"""
+    (tmp_path / "m.py").write_text(model)
+    for name, how in {"a": ("--from", tmp_path / "log.csv", "--yes"), "b": ("--blank",)}.items():
+        made = grounded("init", tmp_path / name, *how, "--model", tmp_path / "m.py")
+        assert made.code == 0, made.err
+        weights = tomllib.loads((tmp_path / name / "grounded.toml").read_text())["reward"]
+        assert weights["input_change"]["force"] == pytest.approx(0.01 / size**2, rel=0.01)
 
 
 BEAM = """from grounded import Model, Param

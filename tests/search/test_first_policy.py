@@ -10,7 +10,7 @@ from grounded.experiments.figure8 import flight_task
 from grounded.experiments.pendulum import pendulum_task
 from grounded.models import aircraft, car, pendulum
 from grounded.search.first_guess import filled_target, first_guess
-from grounded.search.first_policy import first_policy
+from grounded.search.first_policy import cautious, first_policy
 from grounded.solve import ddp
 from small_tasks import cart_task, rover_task
 
@@ -75,3 +75,15 @@ def test_a_target_that_no_input_reaches_still_gives_a_guess():
     task = cart_task(low=np.array([-0.01]), high=np.array([0.01]))
     guess = first_guess(task)
     assert np.isfinite(guess.cost) and np.abs(guess.inputs).max() <= 0.01 + 1e-12
+
+
+def test_caution_does_not_hang_on_the_unit_of_an_input():
+    """After a crash, the least weight on changes was a thousandth per square percent."""
+    task = car_task(NAMES[0], car.model)
+    plain = replace(task.reward, input_change=np.zeros(task.model.m))
+    task = replace(task, reward=plain)
+    fine = cautious(replace(task, low=-np.ones(2), high=np.ones(2)), 1).reward.input_change
+    wide = cautious(replace(task, low=-100 * np.ones(2), high=100 * np.ones(2)), 1)
+    free = cautious(replace(task, low=np.full(2, -np.inf), high=np.full(2, np.inf)), 1)
+    np.testing.assert_allclose(wide.reward.input_change, fine / 1e4)
+    np.testing.assert_allclose(free.reward.input_change, fine)

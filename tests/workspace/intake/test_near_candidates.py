@@ -9,15 +9,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from grounded.errors import GroundedError
 from grounded.trial import Trial
+from grounded_trials.formats.mcap_writer import LogWriter, encode_doubles
 from grounded_trials.store.trial_file import write_trial
+from grounded_trials.workspace.intake.acted_on import acted_on, sender_of
+from grounded_trials.workspace.intake.foreign import mapping_of, read_foreign
 from grounded_trials.workspace.intake.ingest import ingest_log
 from grounded_trials.workspace.intake.who_drove import evidence, follows, suspicion
 from grounded_trials.workspace.proposing import propose_in
 from grounded_trials.workspace.running import run_candidate
+from recorded import follow
 from workspaces import CONFIG, make
 
-FULL = CONFIG.replace("[search]", '[search]\nstep = "full"\nrerun_incumbent = false')
+FULL = CONFIG.replace("[search]", '[search]\nstep = "full"\nrerun_incumbent = false') + (
+    '[log]\nclock = "publish"\n[log.state.x]\npath = "/place.x"\n[log.state.v]\n'
+    'path = "/wheel.v"\n[log.input.force]\npath = "/sent.force"\n'
+)
+NOISY = CONFIG + "[system.noise.measurement]\nx = 0.002\nv = 0.01\n"
 SEEDS = range(50)
 
 
@@ -109,3 +118,127 @@ def test_evidence_is_nats_that_grow_with_the_run_and_are_none_for_the_same_polic
     half = [follows(by_alpha[alpha].policy, trial.until(20)) for alpha in (1 / 4, 1)]
     assert evidence(own, other) > evidence(*half) > 0
     assert evidence(other, other) <= 0 and evidence(other, own) < 0
+
+
+def drive(path, w, made, seed, *, felt=(1.0, 0.0), jitter=0.0):
+    """The cart driven by a candidate that acts on samples which are 12 and 4 ms old when they come.
+
+    Args:
+        path: of the log, a topic for each sensor and one for the commands.
+        w: whose model the cart is.
+        made: the candidate; 0.3 s before its run the cart stands still, and nothing is sent.
+        seed: of its sensors' noise.
+        felt: what the program makes of what it got: share of the newest, [s] that it predicts.
+        jitter: of the way to the program [s].
+    """
+    model, policy = w.task.model, made.policy
+    rng, every, begin = np.random.default_rng(seed), round(policy.dt * 1000), 300
+    z, force, got, known = np.array(w.task.start, float), 0.0, [], {}
+    past, acted = policy.past.copy(), None
+    next_x, next_v = rng.integers(0, 20, 2)
+    with path.open("wb") as stream:
+        log = LogWriter(stream)
+        topics = [log.channel(f"/{t}", t, [n]) for t, n in TOPICS]
+
+        def say(topic, k, value):
+            (line,) = encode_doubles(np.array([[value]]))
+            log.message(topics[topic], 10**18 + k * 10**6, line)
+
+        for k in range(begin + every * policy.horizon + 300):
+            if k == next_x:
+                next_x += 20 + rng.integers(-1, 2)
+                x = z[0] + rng.normal(0, 0.01)
+                got.append((k + 12 + 1000 * jitter * rng.random(), 0, x))
+                say(0, k, x)
+            if k == next_v:
+                next_v += 20 + rng.integers(-1, 2)
+                v = z[1] + rng.normal(0, 0.05)
+                got.append((k + 4, 1, v))
+                say(1, k, v)
+            for one in [one for one in got if one[0] <= k]:
+                known[one[1]] = one[2]
+                got.remove(one)
+            step, part = divmod(k - begin, every)
+            if 0 <= step < policy.horizon and part == 0:
+                now = np.array([known[0] + felt[1] * known[1], known[1]])
+                acted = now if acted is None else acted + felt[0] * (now - acted)
+                force = float(follow(policy, step, acted, past)[0])
+                say(2, k, force)
+            force = force if step < policy.horizon else 0.0
+            if k >= begin and k % 5 == 0:
+                z = model.system.step(z[None], np.array([[force]]), model.values, 0.005)[0]
+        log.finish()
+    return path
+
+
+TOPICS = (("place", "x"), ("wheel", "v"), ("sent", "force"))
+WAYS = {"held": {}, "late": {"jitter": 0.012}, "ahead": {"felt": (1.0, 0.02)}}
+
+
+@pytest.mark.parametrize("way", ["held", "late"])
+@pytest.mark.parametrize("ran, said", [(1, 1 / 4), (1 / 4, 1 / 2), (1 / 8, 1 / 4)])
+def test_the_robot_ran_an_old_candidate_on_samples_of_its_own(ladder, tmp_path, ran, said, way):
+    """An old file was driven at a track: 9 of 10 runs were booked as the new candidate's."""
+    w, by_alpha = ladder
+    log = drive(tmp_path / "a.mcap", w, by_alpha[ran], 1, **WAYS[way])
+    seen = sender_of_log(w, log, by_alpha[said])
+    assert seen.other == by_alpha[ran].id and by_alpha[said].id in seen.why
+    assert seen.own.left > 2 * acted_on(*at_start(w, log, by_alpha[ran])).left
+
+
+@pytest.mark.parametrize("way", [*WAYS, "filtered"])
+def test_who_ran_its_candidate_on_samples_of_its_own_is_believed(ladder, tmp_path, way):
+    w, by_alpha = ladder
+    how = WAYS.get(way, {"felt": (0.6, 0.0)})
+    for seed, alpha in enumerate(by_alpha):
+        log = drive(tmp_path / f"{seed}.mcap", w, by_alpha[alpha], seed, **how)
+        seen = sender_of_log(w, log, by_alpha[alpha])
+        assert seen.other == seen.why == "" and seen.sure == (way in ("held", "late"))
+
+
+def test_ingest_names_the_candidate_that_ran_and_both_ways_on(ladder, tmp_path):
+    w, by_alpha = ladder
+    waits = propose_in(w).candidate
+    log = drive(tmp_path / "a.mcap", w, by_alpha[1], 1)
+    with pytest.raises(GroundedError, match=by_alpha[1].id) as refused:
+        ingest_log(w, log)
+    text = str(refused.value)
+    assert f"--candidate {by_alpha[1].id}" in text and f"--candidate {waits.id}" in text
+    assert refused.value.then.arguments[-1] == by_alpha[1].id
+
+
+def test_candidates_that_send_the_same_are_one(ladder, tmp_path):
+    w, by_alpha = ladder
+    policy = by_alpha[1].policy
+    twin = replace(by_alpha[1], id="c0099", policy=replace(policy, gain=1.0002 * policy.gain))
+    log, _, _ = at_start(w, drive(tmp_path / "a.mcap", w, twin, 1), by_alpha[1])
+    seen = sender_of(log, by_alpha[1], [twin, *by_alpha.values()], lambda c: log.start_of(c.policy))
+    assert seen.other == ""
+
+
+def sender_of_log(w, path, said):
+    """Who sent a log's commands, of all candidates of the workspace."""
+    log, _, _ = at_start(w, path, said)
+    return sender_of(log, said, w.read().candidates, lambda one: log.start_of(one.policy))
+
+
+def at_start(w, path, made):
+    """A log, a candidate's policy, and where its run begins."""
+    log = read_foreign(w, path, mapping_of(w, path)).recording
+    return log, made.policy, log.start_of(made.policy).seconds
+
+
+def test_a_run_that_the_others_contradict_says_what_it_did(ladder, tmp_path):
+    """One that was taken in though warned dethroned the best without a word."""
+    w = make(tmp_path / "w", config=NOISY)
+    first = propose_in(w).candidate.id
+    for _ in range(3):
+        done = ingest_log(w, run_candidate(w, first).trial_file, first)
+        assert not [note for note in done.notes if "discard" in note]
+    runs = [one.trial for one in w.trials()]
+    states = runs[0].states + np.linspace(0, 0.5, 41)[:, None]
+    strange = replace(runs[0], states=states, inputs=runs[0].inputs[::-1])
+    write_trial(tmp_path / "a.mcap", strange, {"kind": "trial", "task": w.task.hash})
+    done = ingest_log(w, tmp_path / "a.mcap", first)
+    (note,) = done.notes
+    assert first in note and f"discard {done.trial}" in note

@@ -383,7 +383,7 @@ def test_data_that_begin_in_motion_begin_where_it_is_known_what_was_sent(w, tmp_
     """Held at rest before the first row, a delay made of the first step a limit that nobody has."""
     rows = recorded_in_motion(tmp_path / "a.csv")
     found = w.ingest(tmp_path / "a.csv", data=True)
-    assert any("in motion" in note for note in found.notes)
+    assert any("before its first command" in note for note in found.notes)
     (kept,) = (t for t in w.trials() if t.stored.id == found.trial)
     first = round((0.17 + 0.25) / 0.01)  # nothing has changed for 0.25 s
     np.testing.assert_allclose(kept.trial.states[0], rows[first, 1:3], atol=1e-3)

@@ -3,7 +3,8 @@
 Where commands change within the steps of the grid, all of them would lie up to half a step early or
 late: data begin with the next change. A recording that begins in motion does not say what was
 commanded before it; with a delay in the model its first steps would be judged by commands that
-nobody knows. There data begin where the commands have been steady for a while.
+nobody knows. There data begin where the commands have been steady for a while. A robot that stands
+still until its first command was sent nothing, or what holds it there.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ MOVED = 0.05  # of a step; a start that is nearer to a change is left where it i
 HELD = 0.5  # of a table's rows repeat the one before: it was not made where commands change
 STEADY_S, STEADY_STEPS = 0.25, 4  # without a change, both: what was commanded before is known
 LOOK_S, LOOK = 3.0, 0.2  # how far into a log, and into what share of it, such a moment is sought
+STILL_S = 0.2  # of a standstill say that it is one
+STILL, NOISE = 2e-3, 4.0  # of a state's range, and times its noise: what stands still is within
 
 
 def phase_of(changes: Floats, dt: float, late: Floats | None = None) -> tuple[float, float] | None:
@@ -96,14 +99,14 @@ def rows_apart(inputs: Sequence[Samples], states: Sequence[Samples]) -> float:
     return max((held_rows(s.t, s.y) for s in shared), default=0.0)
 
 
-def first_step(inputs: Sequence[Samples], start: int, dt: float, rest: Floats) -> tuple[int, str]:
+def first_step(inputs: Sequence[Samples], start: int, dt: float, unknown: bool) -> tuple[int, str]:
     """From a start to where data begin [ns], and a warning, "" for none.
 
     Args:
         inputs: the commands.
         start: where every signal is known [ns].
         dt: the step [s].
-        rest: (m,) what the inputs hold before a run.
+        unknown: whether nobody knows what was sent before, see `in_motion`.
     """
     at, late = (
         np.concatenate(x) for x in zip(*(changes_of(s.t, s.y) for s in inputs), strict=True)
@@ -122,7 +125,7 @@ def first_step(inputs: Sequence[Samples], start: int, dt: float, rest: Floats) -
                 f"commands change every {apart:.3g} s, not in steps of {dt:g} s: each is up to "
                 f"{dt / 2:.3g} s early or late, and so is a delay that is found"
             )
-    if in_motion(inputs, start, rest):
+    if unknown:
         moved = _steady(inputs, found, start, moved, dt)
     return moved, warning
 
@@ -131,6 +134,27 @@ def in_motion(inputs: Sequence[Samples], start: int, rest: Floats) -> bool:
     """Whether a table's rows begin with commands that are not those of rest."""
     rows = any(held_rows(s.t, s.y) > 0 for s in inputs)
     return rows and any(s.before(start) != u for s, u in zip(inputs, rest, strict=True))
+
+
+def stands_still(states: Sequence[Samples], rates: Sequence[str], until: int) -> bool:
+    """Whether a robot was recorded before its first command, and did not move.
+
+    Args:
+        states: those that are measured; no state may drift, nor a rate be anything but zero.
+        rates: names of the states that are velocities.
+        until: the first command [ns].
+    """
+    for one in states:
+        y = one.y[one.t < until]
+        if len(y) < 2 * FEW or (until - one.t[0]) * 1e-9 < STILL_S:
+            return False
+        change, half = np.diff(y), len(y) // 2
+        noise = float(np.sqrt((change**2).mean() / 2)) + STILL * float(np.ptp(one.y))
+        drift = abs(float(y[half:].mean() - y[:half].mean()))
+        off = abs(float(y.mean())) if one.name in rates else 0.0
+        if max(drift, off) > NOISE * noise or np.ptp(y) > 2 * NOISE * noise:
+            return False
+    return bool(states)
 
 
 def _steady(inputs: Sequence[Samples], changes: Ints, start: int, moved: int, dt: float) -> int:

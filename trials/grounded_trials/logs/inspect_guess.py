@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
-from grounded_trials.logs.stated_units import without_unit
+from grounded_trials.logs.stated_units import bare_command, without_unit
 from grounded_trials.toml_table import key
 
 FEW = 8  # others that [log] names
@@ -147,7 +147,8 @@ def _score(
 ) -> float:
     path = field.path.lower()
     inside = field.path[len(topic.topic) :].lower().strip('".')
-    bare = without_unit(field.path)[len(topic.topic) :].lower().strip('".')
+    plain = bare_command if is_input else without_unit
+    bare = plain(field.path)[len(topic.topic) :].lower().strip('".')
     best = max(_fit(called, one, topic.topic.lower()) for one in {inside, bare})
     if best <= 0:
         return 0.0

@@ -20,7 +20,12 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded_trials.formats.messages import Floats
-from grounded_trials.logs.command_steps import first_step, in_motion, rows_apart
+from grounded_trials.logs.command_steps import (
+    first_step,
+    in_motion,
+    rows_apart,
+    stands_still,
+)
 from grounded_trials.logs.samples import (
     Samples,
     SignalReport,
@@ -97,6 +102,7 @@ def to_grid(
     angles: Sequence[str] = (),
     steps: int | None = None,
     rest: Floats | None = None,
+    rates: Sequence[str] = (),
 ) -> Gridded:
     """Samples signals every dt.
 
@@ -109,6 +115,7 @@ def to_grid(
         angles: names that are unwrapped whether their spec says so or not.
         steps: at most this many steps.
         rest: (m,) what inputs hold before a run: to begin where `command_steps` says; None: not.
+        rates: names of states that are velocities.
 
     Raises:
         GroundedError: for a gap beyond max_age_s, a clock that jumps, signals on clocks that do
@@ -126,7 +133,10 @@ def to_grid(
     origin = min(int(s.t[0]) for s in samples.values())
     start, late = _start(span, series, samples, inputs, known, origin)
     sent = [samples[name] for name in inputs]
-    moved, uneven = (0, "") if rest is None else first_step(sent, start, dt, rest)
+    tracked = [samples[name] for name in states if how[name] == "linear"]
+    still = rest is not None and stands_still(tracked, rates, start)
+    unknown = rest is not None and not still and in_motion(sent, start, rest)
+    moved, uneven = (0, "") if rest is None else first_step(sent, start, dt, unknown)
     start += moved
     stop = min(until, _end(span, series, start, origin, until))
     count = _steps(start, stop, dt, steps, origin)
@@ -138,10 +148,11 @@ def to_grid(
         value = samples[name].linear if how[name] == "linear" else samples[name].hold
         columns.append(value(at, dt, start))
         reports.append(report_of(samples[name], series[name], columns[-1], at, start))
-    tracked = [samples[name] for name in states if how[name] == "linear"]
     stairs = [staircase(s, start, int(grid[-1]), dt) for s in tracked]
     held = np.array([s.before(start - round(dt * 0.5e9)) for s in sent])
-    if rest is not None and in_motion(sent, start, rest):
+    if still and rest is not None:
+        held = np.where(np.isfinite(held), held, rest)
+    elif rest is not None and in_motion(sent, start, rest):
         held = np.where(np.isfinite(held), held, [s.y[0] for s in sent])
     return Gridded(
         states=np.column_stack(columns[: len(states)]),

@@ -49,10 +49,16 @@ _ENDINGS = {  # of a name, and the unit that they write
     **dict.fromkeys(("m_s", "mps", "m_per_s"), "m/s"),
     **dict.fromkeys(("km_h", "kmh", "kph"), "km/h"),
     **{"mm_s": "mm/s", "cm_s": "cm/s", "m_s2": "m/s^2", "deg_s2": "deg/s^2", "RPM": "rpm"},
+    **dict.fromkeys(("pct", "percent", "perc"), "%"),
+    **dict.fromkeys(("degree", "degrees"), "deg"),
+    **dict.fromkeys(("radian", "radians"), "rad"),
     **{unit: unit for unit in ("mm", "cm", "m", "km", "deg", "mrad", "rad", "rpm", "us", "ms")},
     **{unit: unit for unit in ("mV", "mA", "Nm", "mNm", "mN", "kN")},
     **{unit: unit for unit in ("s", "V", "A", "N")},
 }
+_ROLES = re.compile(  # what a command is to its robot: its unit may stand before that, or after
+    r"_(?:cmd|command|commanded|ref|reference|target|setpoint|sp|desired|des|goal|request|req)$"
+)
 _SHORT = ("s", "V", "A", "N")  # may be part of a name as well: `vel_N`
 _NUMBER = re.compile(r"(?:\.(?:data|value))?(?:\[-?\d+\])*\"?$")  # what follows a number's name
 
@@ -84,13 +90,25 @@ class Stated:
 
 def unit_in_name(path: str) -> str:
     """The unit that the last name of a message path ends with, `/csv.x_mm`; "" for none."""
-    return _ENDINGS.get(_parts(path)[1], "")
+    return _ENDINGS.get(_parts(path)[1] or _parts(without_role(path))[1], "")
 
 
 def without_unit(path: str) -> str:
     """A message path without the unit that its last name ends with, where that is surely one."""
     bare, ending = _parts(path)
     return bare if ending and ending not in _SHORT else path
+
+
+def without_role(path: str) -> str:
+    """A message path without what says that a number is a command, `steering_pct_cmd`."""
+    whole = _NUMBER.sub("", path)
+    bare = _ROLES.sub("", whole)
+    return path if bare == whole or bare.endswith((".", "/")) else bare
+
+
+def bare_command(path: str) -> str:
+    """A message path without its unit and what says that it is a command, in either order."""
+    return without_role(without_unit(without_role(path)))
 
 
 def _parts(path: str) -> tuple[str, str]:

@@ -20,6 +20,7 @@ from grounded.model import Model
 from grounded.task import Task
 from grounded.utility import Reward
 from grounded_trials.starting.examples import fresh_folder, toml_of
+from grounded_trials.starting.first_toml import change_weight
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.first_plan import holding_input
@@ -129,11 +130,12 @@ def _task(model: Model, dt: float) -> Task:
     """Hold every state at zero for a hundred steps, from the inputs that hold it there."""
     n, m = model.n, model.m
     free = np.full(m, np.inf)
+    changes = np.array([change_weight(None, unit) for unit in model.inputs.values()])
     task = Task(
         model=model,
         dt=dt,
         target=np.zeros((HORIZON + 1, n)),
-        reward=Reward(np.ones(n), np.zeros(n), np.zeros(m), np.full(m, 0.01)),
+        reward=Reward(np.ones(n), np.zeros(n), np.zeros(m), changes),
         start=np.zeros(n),
         past=np.zeros(m),
         low=-free,

@@ -13,6 +13,10 @@ from grounded_trials.toml_table import key
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.task_file import equal_weights, write_target
 
+UNKNOWN = {"%": (-100.0, 100.0)}  # what an input may be, by its unit, where nothing says it
+CHANGE = 0.01  # the weight on the changes of an input from -1 to 1
+CHANGES = 4 * CHANGE
+
 
 def write_first(
     folder: Path,
@@ -41,6 +45,7 @@ def write_first(
     dt, whose = grid
     write_target(folder / "target.csv", dt, dict(columns))
     weights = equal_weights(columns, model.states)
+    changes = {name: change_weight(ranges[name], model.inputs[name]) for name in model.input_names}
     limits = [
         f"{key(name)} = [{found[0]:.6g}, {found[1]:.6g}]"
         for name in model.input_names
@@ -67,7 +72,8 @@ def write_first(
         "# terminal, of the last step alone: where the run is to END at rest on its target",
         "# (docking, parking) and overshoots, 10 to 100 times state, the speeds' too",
         f"# terminal = {_inline({name: 10 * weight for name, weight in weights.items()})}",
-        f"input_change = {_inline(dict.fromkeys(model.input_names, 0.01))}",
+        "# of (a_t - a_{t-1})^2: 0.04 / (range of [limits])^2, 0.01 of an input from -1 to 1",
+        f"input_change = {_inline(changes)}",
         "",
         "[limits]                      # SEEN in the log, and 0: put in what your robot may get",
         *limits,
@@ -81,6 +87,17 @@ def write_first(
         "",
     ]
     write_atomically(folder / FILE, "\n".join(lines).encode())
+
+
+def change_weight(limits: tuple[float, float] | None, unit: str) -> float:
+    """The first weight on an input's changes: a part of its whole range costs as much in any unit.
+
+    Args:
+        limits: lowest and highest value; None where nothing says them: -1 to 1, or -100 to 100 %.
+        unit: of the input.
+    """
+    low, high = limits or UNKNOWN.get(unit, (-1.0, 1.0))
+    return CHANGES / (high - low) ** 2 if high > low else CHANGE
 
 
 def _inline(values: Mapping[str, float]) -> str:

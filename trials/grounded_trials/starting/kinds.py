@@ -12,6 +12,7 @@ from dataclasses import replace
 
 from grounded.errors import GroundedError, nearest
 from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
+from grounded_trials.logs.stated_units import factor_between, unit_in_name
 from grounded_trials.starting.skeletons import (
     BALANCE,
     CAR,
@@ -196,6 +197,20 @@ def _says(topic: TopicReport, words: Sequence[str]) -> bool:
     return any(word in everything for word in words)
 
 
+def _car(log: LogReport) -> Skeleton:
+    """The car with a speed or a throttle as its command, its steering an angle, or a part of 1."""
+    throttle = any(_says(topic, ("throttle",)) for topic in log.topics)
+    numbers = [one.path for topic in log.topics for one in topic.fields]
+    said = {unit_in_name(path) for path in numbers if "steer" in _word(path).lower()} - {""}
+    angle = any(factor_between(unit, "rad") is not None for unit in said)
+    part = any(factor_between(unit, "1") is not None for unit in said)
+    unit = "rad" if angle or not (throttle or part) else "1"
+    if not throttle:
+        return replace(CAR, inputs={**CAR.inputs, "steering": unit})
+    lines = [line.replace("a.speed", "a.throttle") for line in CAR.lines]
+    return replace(CAR, inputs={"steering": unit, "throttle": "1"}, lines=lines)
+
+
 def skeleton(
     kind: str,
     log: LogReport,
@@ -207,9 +222,8 @@ def skeleton(
     if kind == "arm":
         return arm(next(iter(joints.values())) if joints else ("joint1", "joint2"))
     ackermann = any("Ackermann" in topic.type for topic in log.topics)
-    if kind == "car" and not ackermann and any(_says(t, ("throttle",)) for t in log.topics):
-        lines = [line.replace("a.speed", "a.throttle") for line in CAR.lines]
-        return replace(CAR, inputs={"steering": "1", "throttle": "1"}, lines=lines)
+    if kind == "car" and not ackermann:
+        return _car(log)
     if kind == "differential" and (both := _both_sides(log)):
         named = dict(zip(DIFFERENTIAL.inputs, both, strict=True))
         lines = [

@@ -34,6 +34,7 @@ from grounded_trials.workspace.intake.estimating import (
 from grounded_trials.workspace.intake.run_start import Recording, recording
 from grounded_trials.workspace.intake.where_to_mend import read_by
 
+SLOWER = 1.5  # times dt: commands that come so seldom were sent on another grid
 FEW = 12  # numbers of a log that a message can name
 
 
@@ -69,6 +70,7 @@ class ForeignLog:
             angles=model.angles,
             steps=task.horizon if candidate else None,
             rest=None if candidate else rest,
+            rates=() if candidate else _rates(model),
         )
         logged = tuple(one for one in found.reports if one.name in self.series)
         found = replace(found, reports=logged)
@@ -246,13 +248,34 @@ def _hashed(files: Sequence[Path]) -> str:
     return hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode())
 
 
-def begun(found: Gridded, dt: float) -> Iterator[str]:
-    """Where data were begun, and how well the time of their commands is known."""
+def _rates(model: Model) -> tuple[str, ...]:
+    """The states that are velocities: zero where a robot stands still."""
+    from grounded.instruments.kinematics import integrals
+
+    said = (model.roles.get("speed"), model.roles.get("heading_rate"))
+    found = {model.state_names[one.j] for one in integrals(model)} | {*said}
+    return tuple(name for name in model.state_names if name in found)
+
+
+def begun(found: Gridded, dt: float, inputs: Sequence[str]) -> Iterator[str]:
+    """Where data were begun, how well the time of their commands is known, and if dt is theirs."""
     at = f"it is taken from {(found.start_ns - found.origin_ns) * 1e-9:.3f} s on"
     if found.moved_s > dt:
-        yield f"{at}: before that it begins in motion, and does not say what was sent earlier"
+        yield (
+            f"{at}: the log does not say what was sent before its first command, nor was the robot "
+            "seen at rest"
+        )
     elif found.moved_s > 0:
         yield f"{at}, where a step of the commands begins"
+    slow = [
+        one for one in found.reports if one.name in inputs and 0 < one.rate_hz * dt < 1 / SLOWER
+    ]
+    if slow:
+        every = 1 / max(one.rate_hz for one in slow)
+        yield (
+            f"the commands of {' and '.join(one.name for one in slow)} come every {every:.3g} s, "
+            f"[task] dt is {dt:g} s: is dt = {every:.3g} meant?"
+        )
     if found.row_s > dt / 20:
         yield (
             f"its rows come every {found.row_s:.3g} s, so a command was sent up to that much "

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +24,16 @@ from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.store.store import DIGITS
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
+from grounded_trials.workspace.intake.acted_on import sender_of
 from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.intake.ingested import Ingested
+from grounded_trials.workspace.intake.odd_run import odd_run
 from grounded_trials.workspace.intake.other_scale import other_units, units_told
 from grounded_trials.workspace.intake.reading import Read, cut_log, read_log_file, read_own_trial
 from grounded_trials.workspace.intake.run_start import (
     LOOSE,
+    Recording,
+    Start,
     elsewhere,
     loosely,
     pace_of,
@@ -113,7 +117,7 @@ def ingest_log(
         warnings=warnings,
         signals=read.signals,
         verdict=verdict,
-        notes=read.notes,
+        notes=(*read.notes, *(odd_run(workspace, now, added.id) if now and read.doubted else ())),
         off_target=off_target_of(workspace.task, judged),
         then=after_log(workspace, verdict, now),
     )
@@ -139,7 +143,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     ran = read.trial.candidate
     if not ran or sha256(read.data)[:DIGITS] in workspace.store.digests():
         return read
-    (own, _), candidates = workspace.candidate(ran), latest_candidates(workspace, OTHERS)
+    (own, _), candidates = workspace.candidate(ran), _may_have_run(workspace)
     logs = [read.log]
     if read.log and (late := read.log.as_seen):  # its program may have acted on these
         logs.append(late)
@@ -170,7 +174,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
                 f"no start of {ran} was found in it: it is taken from {log.first:.3f} s on, its "
                 "first command; [log.span] start = SECONDS names another"
             )
-        return replace(read, warnings=(*read.warnings, *doubts))
+        return replace(read, warnings=(*read.warnings, *doubts), doubted=True)
     if units:
         raise GroundedError(f"{path} ran {ran}, {units_told(units, by, read.log is not None)}")
     if pace:
@@ -182,13 +186,29 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             f"diagnosis, or with --candidate {ran} all the same",
             NextCommand("ingest", (str(path), "--data")),
         )
-    what = f"; with --candidate {other} for what it seems to have run" * bool(other)
+    said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
+    if other:
+        raise GroundedError(
+            f"{said} Take it in with --candidate {other}, with --candidate {ran} all the same, or "
+            "with --data for fitting and diagnosis only",
+            NextCommand("ingest", (str(path), "--candidate", other)),
+        )
     begins = "; [log.span] start = SECONDS says where the run begins" * (read.log is not None)
     raise GroundedError(
-        f"{path} did not run {ran}: {why}. Take it in with --data for fitting and diagnosis{what}, "
-        f"or with --candidate {ran} all the same{begins}",
-        NextCommand("ingest", (str(path), *(("--candidate", other) if other else ("--data",)))),
+        f"{said} Take it in with --data for fitting and diagnosis, or with --candidate {ran} all "
+        f"the same{begins}",
+        NextCommand("ingest", (str(path), "--data")),
     )
+
+
+def _may_have_run(workspace: Folder) -> list[Candidate]:
+    """The latest candidates, and before them the best, which is on the robot though it is older."""
+    latest = latest_candidates(workspace, OTHERS)
+    if len(workspace.candidate_ids()) <= OTHERS:
+        return latest
+    best = standing_in(workspace).incumbent
+    known = best is None or best.candidate.id in [one.id for one in latest]
+    return latest if known or best is None else [best.candidate, *latest]
 
 
 def _like(read: Read, ran: str, found: Following | None) -> tuple[str, ...]:
@@ -230,7 +250,8 @@ class _Look:
             seen = alone  # it may be of another workspace: that it looks like one of these is luck
         self.log = log.recording if log else None
         if log and read.log and self.log:
-            self.found = found = self.log.start_of(own.policy)
+            start_of = cache(partial(_start_of, self.log))
+            self.found = found = start_of(own)
             if found and elsewhere(self.log, found, own.policy, seen.why):
                 begins = found.seconds + (_sooner(apart, read.log) if apart else 0)
                 note = f"the log begins {begins:.3f} s before {ran} does: it is taken from there"
@@ -238,7 +259,12 @@ class _Look:
                 cut = apart.cut(ran, found.seconds)[0] if apart else self.read.trial
                 self.whole = interpolate_gaps(cut).trial
                 seen = judged(self.whole)
-            if (rival := rival_in(self.log, found, ran, candidates)) is not None:
+            sender = sender_of(self.log, own, candidates, start_of)
+            if sender.sure:
+                seen = replace(seen, why="", other="")
+            elif sender.other:
+                seen = replace(seen, why=sender.why, other=sender.other)
+            elif (rival := rival_in(self.log, own, candidates, start_of)) is not None:
                 there = judged(rival)  # as it lies where that one fits best
                 told = there if there.other else seen if seen.why else replace(seen, why=there.why)
                 seen = replace(told, ran=seen.ran)
@@ -249,6 +275,11 @@ class _Look:
         """Whether it is another's run, and how far the commands are from the candidate's."""
         ran = self.suspicion.ran
         return bool(self.suspicion.why), math.inf if ran is None else ran.error
+
+
+def _start_of(log: Recording, candidate: Candidate) -> Start | None:
+    """Where a candidate's run seems to begin in a log."""
+    return log.start_of(candidate.policy)
 
 
 def _sooner(log: ForeignLog, stored: ForeignLog) -> float:

@@ -37,6 +37,7 @@ class Read:
     notes: tuple[str, ...] = ()
     copy: bool = False  # of a stored trial, or a part of one
     bare: bool = False  # it ran a candidate, and carries no copy of it
+    doubted: bool = False  # taken in as a candidate's run, though its commands say otherwise
     log: ForeignLog | None = None
     last_s: float = math.nan  # its last sample of every state, since the start; of a foreign log
 
@@ -155,7 +156,7 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
         encoded,
         (*log.unlike_units, *log.unread, *found.warnings),
         found.reports,
-        notes=() if candidate else tuple(begun(found, trial.dt)),
+        notes=() if candidate else tuple(begun(found, trial.dt, trial.input_names)),
         log=log,
         last_s=(found.last_ns - found.start_ns) * 1e-9,
     )

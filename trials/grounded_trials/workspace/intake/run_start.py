@@ -377,12 +377,16 @@ def loosely(seconds: float, ran: str) -> str:
 
 
 def rival_in(
-    log: Recording, found: Start | None, own: str, candidates: Sequence[Candidate]
+    log: Recording,
+    own: Candidate,
+    candidates: Sequence[Candidate],
+    start_of: Callable[[Candidate], Start | None],
 ) -> Trial | None:
     """The log from where another candidate fits it much better than the own one anywhere."""
+    found = start_of(own)
     best, bound = None, SAME * found.apart if found and found.alike else np.inf
     for one in candidates:
-        start = log.start_of(one.policy) if one.id != own else None
+        start = start_of(one) if one.id != own.id else None
         if start is not None and start.alike and start.apart < bound:
             best, bound = log.trial_from(start.seconds), start.apart
     return best

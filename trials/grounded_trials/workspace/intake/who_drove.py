@@ -88,7 +88,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     room = np.maximum(UNLIKE * unrelated, (0.02 * size) ** 2 + 4 * noise[: len(off)])
     parts = np.array_split(np.arange(len(off)), max(1, min(WINDOWS, len(off) // LEAST)))
     bad = [bool((off[k].mean(axis=0) > 2 * room[k].mean(axis=0)).any()) for k in parts]
-    drawn_out = np.array([max(1.0, _steps_alike(column) / ROUGH) for column in (sent - asked).T])
+    drawn_out = np.array([max(1.0, steps_alike(column) / ROUGH) for column in (sent - asked).T])
     share = off.mean(axis=0) / room.mean(axis=0) * drawn_out
     first = parts[bad.index(True)] if any(bad) else parts[0][:1]
     left = first[int(np.argmax((off[first] > 2 * room[first]).any(axis=1)))]
@@ -120,11 +120,11 @@ def evidence(own: Following, other: Following) -> float:
     a, b = own.off[known], other.off[known]
     noise = (b**2).mean(axis=0) + own.fine**2
     return float(((a**2 / 2 - b**2) / (2 * noise)).sum()) / max(
-        _steps_alike(column) for column in b.T
+        steps_alike(column) for column in b.T
     )
 
 
-def _steps_alike(noise: Array) -> float:
+def steps_alike(noise: Array) -> float:
     """How many successive samples say as much as one: the autocorrelation, summed to its zero."""
     noise = noise - noise.mean()
     power = np.correlate(noise, noise, "full")[len(noise) - 1 :]

@@ -1,0 +1,58 @@
+"""A run that its candidate's others contradict: what averaging it did to the candidate, in a note.
+
+The mean of a candidate's runs is what the search compares. One that does not belong there, taken in
+with `--candidate` although a warning told against it, may dethrone the best.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from grounded.errors import NextCommand
+from grounded_trials.wording import rendered
+from grounded_trials.workspace.folder import Folder
+
+if TYPE_CHECKING:
+    from grounded.search.candidate import Tried
+    from grounded.search.standing import Standing
+
+FAR = 5.0  # deviations of a single run: its candidate's others hardly ever scatter so far
+
+
+def odd_run(workspace: Folder, now: Standing, identity: str) -> tuple[str, ...]:
+    """What a run did to its candidate's utility, where its other runs say that it is none of them.
+
+    Args:
+        workspace: whose trials are averaged.
+        now: with the run.
+        identity: the run's, t0011.
+    """
+    from grounded.search.standing import standing
+
+    after = _of(now, identity)
+    if after is None or len(after.utilities) < 3 or now.incumbent is None:
+        return ()
+    others = [trial for trial in workspace.task_trials() if trial.id != identity]
+    candidates = workspace.read().candidates
+    model = workspace.planner.fingerprint
+    was = standing(workspace.task, candidates, others, workspace.config.search, model)
+    before = next((t for t in was.history if t.candidate.id == after.candidate.id), None)
+    if before is None or len(before.utilities) < 2 or not before.deviation > 0:
+        return ()
+    n, run = len(before.utilities), after.utilities[[t.id for t in after.trials].index(identity)]
+    if not abs(run - before.utility) > FAR * before.deviation * (1 + 1 / n) ** 0.5:
+        return ()
+    name, best = before.candidate.id, now.incumbent.candidate.id
+    dethroned = was.incumbent is not None and was.incumbent.candidate.id == name != best
+    undo = rendered(NextCommand("discard", (identity,)), workspace.address)
+    return (
+        f"{name}'s utility goes from {before.utility:.4g} to {after.utility:.4g}"
+        f"{f', and {best} is the best now' * dethroned}: this run's, {run:.4g}, is far from those "
+        f"of its other {n}, which scatter by {before.deviation:.2g}. To take it back: `{undo}`",
+    )
+
+
+def _of(now: Standing, identity: str) -> Tried | None:
+    """The candidate that a run is averaged into."""
+    runs = ((tried, [trial.id for trial in tried.trials]) for tried in now.history)
+    return next((tried for tried, ids in runs if identity in ids), None)
