@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 MOST = 3  # target states whose range is told
 LAST = 3  # predictions whose misses are told
 LUCKY = 2.0  # standard errors
+ASTRAY = 10.0  # times what a run cost: a model that gives it so much does not replay it
 UNLIKE = 0.2  # of a promised gain: how much luckier a trial is than the model says, to be told
 
 
@@ -85,6 +86,8 @@ def _so_far(candidate: Candidate, best: Tried) -> str:
     same, told = candidate.expected_of_base, UNLIKE * abs(candidate.predicted_gain)
     if candidate.base != best.candidate.id or not abs(same - best.utility) > told:
         return text
+    if same < ASTRAY * best.utility:
+        return f"{text}, which the same model does not replay: it gives {number(same)}"
     text = f"{text}, to which the same model gives {number(same)}"
     if not math.isfinite(candidate.base_as_run):
         return text
@@ -208,7 +211,7 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     if best is None or candidate.id in tried or not math.isfinite(missed[-1]):
         return text
     gain = candidate.predicted_gain
-    if candidate.base != best.candidate.id:
+    if candidate.base != best.candidate.id or gain > -best.utility:  # no utility is above 0
         gain = candidate.predicted_utility - best.utility
     if not gain > 0:
         return text

@@ -21,6 +21,8 @@ import numpy as np
 from grounded.effects import places
 from grounded.effects.family import Quantity, RateFamily, Site, Values, per, width
 
+HALTS = 2.0  # times the fastest motion, a control step: what opposes it by more is no friction
+
 
 def _least(site: Site, power: int) -> float:
     """How far below zero: less friction than modelled, as far as the model damps the motion.
@@ -36,24 +38,29 @@ def _least(site: Site, power: int) -> float:
     return -max(damping, 0.0) * site.scales.peak(name) ** (1 - power)
 
 
+def _opposing(site: Site, name: str, unit: str, power: int) -> Quantity:
+    """Of a friction that grows with this power of the speed; one that halts all motion is none.
+
+    A dead or exchanged sensor of the speed asked for 1e136 1/s.
+    """
+    peak = max(site.scales.peak(site.target), 1e-12)
+    most = HALTS / site.scales.dt * peak ** (1 - power)
+    return Quantity(name, unit, low=_least(site, power), high=10 * most, absurd=most)
+
+
 def _viscous(site: Site) -> tuple[Quantity, ...]:
-    return (Quantity("k", "1/s", low=_least(site, 1)),)
+    return (_opposing(site, "k", "1/s", 1),)
 
 
 def _coulomb(site: Site) -> tuple[Quantity, ...]:
-    return (
-        Quantity("c", per(site.unit(site.target)), low=_least(site, 0)),
-        width(site, site.target),
-    )
+    dry = _opposing(site, "c", per(site.unit(site.target)), 0)
+    return (dry, width(site, site.target))
 
 
 def _quadratic(site: Site) -> tuple[Quantity, ...]:
     unit = site.unit(site.target)
-    return (
-        Quantity(
-            "k", {"m/s": "1/m", "rad/s": "1/rad"}.get(unit, f"1/({unit} s)"), low=_least(site, 2)
-        ),
-    )
+    squared = {"m/s": "1/m", "rad/s": "1/rad"}.get(unit, f"1/({unit} s)")
+    return (_opposing(site, "k", squared, 2),)
 
 
 def _stiction(site: Site) -> tuple[Quantity, ...]:

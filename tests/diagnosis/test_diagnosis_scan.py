@@ -50,12 +50,15 @@ def test_a_delay_of_a_hundredth_of_a_step_is_a_matter_of_time_stamps():
         ("input_fade:torque", {"k": -0.1}, {"k": -4.94}),
         ("sensor_scale:theta", {"k": 0.5}, {"k": 1.81}),
         ("input_gain:torque", {"g": 1.0}, {"g": 5.0}),
+        ("viscous_friction:omega", {"k": 5.0}, {"k": 1.04e136}),
+        ("coulomb_friction:omega", {"c": 5.0}, {"c": 81.0}),
     ],
 )
 def test_absurd_sizes_are_not_claimed(name, sound, absurd):
     """Logs in degrees: the command got 494 % stronger every second, a log was 181 % too large."""
     t = np.arange(60) * 0.05
-    trial = Trial(np.zeros((61, 2)), np.sin(t)[:, None], 0.05, ("theta", "omega"), ("torque",))
+    states = 2 * np.sin(0.05 * np.arange(61))[:, None] * [1.0, 1.0]
+    trial = Trial(states, np.sin(t)[:, None], 0.05, ("theta", "omega"), ("torque",))
     data = prepare(pendulum, [trial, trial])
     search = HypothesisSearch(data, Library().candidates(pendulum, data.scales))
     effect = Library().effect(name, pendulum, data.scales)

@@ -217,5 +217,8 @@ def test_of_what_the_model_gives_otherwise_only_known_reasons_are_told(as_run, e
     text = _so_far(made, best)
     assert "-8.000" in text and "luck" not in text
     assert all(part in text for part in parts) and not any(word in text for word in never)
+    made.expected_of_base = -766.0
+    assert "does not replay" in _so_far(made, best) and "scatter" not in _so_far(made, best)
+    made.expected_of_base = -8.0
     near = SimpleNamespace(candidate=best.candidate, utility=-8.1, standard_error=error)
     assert "same model" not in _so_far(made, near)
