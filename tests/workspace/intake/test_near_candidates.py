@@ -207,6 +207,17 @@ def test_ingest_names_the_candidate_that_ran_and_both_ways_on(ladder, tmp_path):
     assert refused.value.then.arguments[-1] == by_alpha[1].id
 
 
+def test_a_log_that_is_stored_is_not_asked_again_who_drove(ladder, tmp_path):
+    """What was made of a trial since sends what that trial sent: its log "did not run" its own."""
+    w, by_alpha = ladder
+    log = drive(tmp_path / "a.mcap", w, by_alpha[1], 1)
+    waits = propose_in(w).candidate
+    first = ingest_log(w, log, waits.id)  # all the same
+    assert first.warnings and first.candidate == waits.id
+    again = ingest_log(w, log)
+    assert again.known and again.trial == first.trial
+
+
 def test_candidates_that_send_the_same_are_one(ladder, tmp_path):
     w, by_alpha = ladder
     policy = by_alpha[1].policy

@@ -152,6 +152,8 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     read, log, found, whole, seen = look.read, look.log, look.found, look.whole, look.suspicion
     if found and found.alike and found.loose_s > LOOSE * workspace.task.dt:
         read = replace(read, warnings=(*read.warnings, loosely(found.loose_s, ran)))
+    if read.log and any(one.trial.candidate == ran for one in read.log.stored):
+        return read  # it was believed when it came; what was made of it since is like it
     why, other = seen.why, seen.other
     units, by = other_units(workspace.task, whole, own, seen.ran)
     units = () if other else units
