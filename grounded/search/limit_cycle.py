@@ -25,7 +25,8 @@ def limit_cycle(tried: Tried, task: Task) -> bool:
 
 def between_limits(tried: Tried, task: Task) -> bool:
     """Whether feedback held an input at one limit or the other for much of a trial."""
-    near = NEAR * (task.high - task.low)
+    range_ = task.high - task.low
+    near = np.where(np.isfinite(range_), NEAR * range_, 0.0)
     for trial in tried.trials:
         at_low, at_high = trial.inputs <= task.low + near, trial.inputs >= task.high - near
         both = at_low.any(axis=0) & at_high.any(axis=0)
