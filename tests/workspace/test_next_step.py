@@ -467,9 +467,12 @@ def test_trust_sets_the_promised_gain_against_the_last_misses(tmp_path):
     assert "stop here" not in said[1]  # which promises all of the cost
     made, best = ran[2].candidate, ran[1]
     assert made.base == best.candidate.id and "model" not in _so_far(made, best)
-    lucky = replace(made, predicted_gain=made.predicted_gain + 5)  # a trial better than its policy
-    assert holds(_so_far(lucky, best), f"{lucky.predicted_utility - lucky.predicted_gain:.4g}")
-    assert f"{lucky.predicted_gain:.4g}" in _came_true(lucky, ran[:2], ran_standing(folder, best))
+    poor = replace(made, predicted_gain=made.predicted_gain - 2)  # a trial worse than its policy
+    assert holds(_so_far(poor, best), f"{poor.predicted_utility - poor.predicted_gain:.4g}")
+    now = ran_standing(folder, best)
+    assert f"{poor.predicted_gain:.4g}" in _came_true(poor, ran[:2], now)
+    beyond = replace(made, predicted_gain=1 - best.utility)  # no utility is above 0
+    assert f"a gain of {gain:.4g}" in _came_true(beyond, ran[:2], now)
 
 
 def ran_standing(folder, best):
