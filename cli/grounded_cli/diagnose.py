@@ -121,6 +121,7 @@ def _tell(found: Diagnosis, before: dict[str, float]) -> None:
         correction_line,
         error_lines,
         error_table,
+        in_vain,
     )
 
     show(_verdict(found))
@@ -136,6 +137,8 @@ def _tell(found: Diagnosis, before: dict[str, float]) -> None:
     _places(found)
     for title, text in error_lines(found, before):
         show(field(title, text))
+    for text in in_vain(found):
+        show(field("dropped", text))
     if found.correction is not None:
         show(field("correction", correction_line(found.correction)))
     for title, text in agreement_lines(found):

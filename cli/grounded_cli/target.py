@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 @click.option("--accel", type=float, default=1.0, help="Along the path, at most [m/s^2] (1).")
 @click.option("--lateral", type=float, default=4.0, help="Across it, at most [m/s^2] (4).")
 @click.option("--laps", type=float, default=1.0, help="Of a circle or figure-8 (1).")
+@click.option("--hold", type=float, default=0.0, help="At rest at a path's end [s] (0).")
 @click.option("--to", multiple=True, metavar="STATE=VALUE", help="Where a line or step ends.")
 @click.option("--seconds", type=float, default=5.0, help="Of a step or swing-up (5).")
 @in_workspace
@@ -34,6 +35,7 @@ def command(
     accel: float,
     lateral: float,
     laps: float,
+    hold: float,
     to: tuple[str, ...],
     seconds: float,
     json_: bool,
@@ -43,6 +45,7 @@ def command(
     FILE is a log, read through [log], or a CSV with columns `t` and states. Paths start from rest
     and keep to the speeds and accelerations given. A line with --to, and that of a robot with one
     axis, goes from [task] start to rest, in the states' own units; a step begins at [task] start.
+    With --hold a path ends at rest and stays there.
 
     The target there was is kept as target.csv.bak, and [task] horizon follows; so do the weights in
     [reward] state, unless you chose them. Earlier trials stay, for fit and diagnose; the search
@@ -61,7 +64,7 @@ def command(
     workspace = open_workspace()
     model, dt = workspace.base_model, workspace.config.task.dt
     start, ends = workspace.config.task.start, _values(to)
-    drive = Drive(size, speed, accel, lateral, laps)
+    drive = Drive(size, speed, accel, lateral, laps, hold)
     if shape == "line" and (ends or not has_plane(model)):
         columns = line_target(ends, start, drive, model, dt)
     elif shape in PATHS:

@@ -85,6 +85,7 @@ class Ranked(Document):
     gap_after: float = math.nan
     shrinkage: float = math.nan  # the share of the gap that it closes
     claimed: bool = False
+    no_better: bool = False  # likely by evidence, but held-out trials are predicted no better
 
     @property
     def values(self) -> dict[str, float]:

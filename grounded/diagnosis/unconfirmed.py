@@ -2,20 +2,21 @@
 
 Or of one motion that the trials repeat (`validation.motions`). They are never causes. Each is told
 with the trial, the time and the region that show it, where a further trial would have to go. What
-most trials show as likely, and none predicts better by, is a fault of the likelihood and is not
-told; nor is what ties with a cause, which is told as that.
+most trials show as likely, and none predicts better by, is a fault of the likelihood: it is marked
+in the table, so that nobody asks why its nats make no cause; what ties with a cause is told as tied.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.report import Unconfirmed
+from grounded.diagnosis.report import Ranked, Unconfirmed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Doubtful
 from grounded.diagnosis.validation.prediction_error import by_region
@@ -67,6 +68,11 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
         regions[0] if regions else None,
         one.repeats > 0,
     )
+
+
+def marked(ranking: Sequence[Ranked], likely: Collection[str]) -> tuple[Ranked, ...]:
+    """The ranking, with a mark on what is likely and yet predicts held-out trials no better."""
+    return tuple(replace(r, no_better=r.effect in likely and not r.claimed) for r in ranking)
 
 
 def unrepeatable(task: Task, trials: Sequence[Trial]) -> dict[str, str]:

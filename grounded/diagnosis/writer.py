@@ -23,7 +23,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Diagnosis, Estimate, Identifiable, NoiseLevels
 from grounded.diagnosis.ruler_words import contested, open_noise
-from grounded.diagnosis.unconfirmed import another_look, unconfirmed, unrepeatable
+from grounded.diagnosis.unconfirmed import another_look, marked, unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import by_trial
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import SLIGHT, Decision
@@ -105,6 +105,8 @@ class Writer:
         look = another_look(self.task, self.trials, off, when) if off else ""
         named = [row.effect for row in ranking if row.claimed]
         seen = unconfirmed(self.claims, self.decision.doubtful, groups)
+        told = {one.effect for one in seen}.union(*groups)
+        ranking = marked(ranking, {one.name for one in self.decision.doubtful} - told)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         worse = contested(rows, agreement, named)
         lost = self.unrepeatable()

@@ -1,7 +1,9 @@
-"""A velocity whose sensor shows nothing: one value throughout, while its position moves otherwise.
+"""A velocity whose sensor shows nothing: one value, or noise, while its position moves otherwise.
 
-The wrong column, a gyro that was not switched on: taken for a measurement, it makes the robot turn
-without turning, and any effect that holds it still explains it.
+The wrong column, a gyro that was not switched on or that of another axis: taken for a measurement,
+it makes the robot turn without turning, and any effect that holds it still explains it. Noise is
+what is far smaller than the rate of the position and has none of its shape, however late: a wrong
+unit or sign keeps the shape.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from grounded.frozen import Array, wrapped
 from grounded.instruments.kinematics import Integral, integrals, pieces
 from grounded.instruments.other_units import unusable
 from grounded.model import Model
@@ -18,23 +21,34 @@ from grounded.trial import Trial
 
 LEAST = 20  # samples that are one value
 MOVED, SHARE = 20.0, 0.1  # standard deviations of the position's noise, and of all that it moves
+WINDOWS = 40  # of a piece, in each of which the way is compared
+SHAPE = 0.5  # coherence from which two ways have a shape in common
+LATE_S = 0.5  # [s] that a sensor may be late
 
 
 @dataclass(frozen=True)
 class Dead:
-    """State j stays at a value while state i moves by so much more than it says."""
+    """State j stays at a value while state i moves by so much more than it says.
+
+    `noise`: or scatters about it by so much, without a trace of that motion.
+    """
 
     relation: Integral
     value: float
     moved: float
+    noise: float = 0.0
 
     def told(self, model: Model, where: str = "") -> str:
         """One clause, after the velocity's name."""
         i, j = self.relation.i, self.relation.j
         (q, of_q), unit = list(model.states.items())[i], list(model.states.values())[j]
-        return (
-            f"stays at {self.value:.4g} {unit}{where}, while {q} moves by {self.moved:.3g} {of_q}"
-        )
+        while_ = f"while {q} moves by {self.moved:.3g} {of_q}"
+        if self.noise:
+            return (
+                f"shows nothing but noise of {self.noise:.2g} {unit} about {self.value:.4g}{where},"
+                f" {while_}"
+            )
+        return f"stays at {self.value:.4g} {unit}{where}, {while_}"
 
 
 def dead_rates(
@@ -51,7 +65,10 @@ def dead_rates(
     for relation in integrals(model) if relations is None else relations:
         rate = trial.states[:, relation.j]
         known = rate[np.isfinite(rate)]
-        if len(known) < LEAST or np.ptp(known) > 0:
+        if len(known) < LEAST:
+            continue
+        if np.ptp(known) > 0:
+            found += _noise_alone(model, trial, relation)
             continue
         value, moved, noise, own, way = float(known[0]), 0.0, 0.0, 0.0, 0.0
         for piece in pieces([trial], [relation.i, relation.j]):
@@ -62,6 +79,42 @@ def dead_rates(
         if min(moved, own) > max(MOVED * noise, SHARE * way, SHARE * own):
             found.append(Dead(relation, value, moved))
     return found
+
+
+def _noise_alone(model: Model, trial: Trial, relation: Integral) -> list[Dead]:
+    """The velocity, if it shows neither the size nor the shape of its position's motion."""
+    if not relation.exact:
+        return []
+    angle, told = [model.angle_mask[relation.i]], []
+    turns = list(model.states.values())[relation.i] == "rad"
+    for piece in pieces([trial], [relation.i, relation.j]):
+        k = len(piece) // WINDOWS
+        if k < 1:
+            continue
+        said = np.concatenate([[0.0], np.cumsum(relation.c * piece[:-1, 1] * trial.dt)])
+        moved = np.diff(piece[:, 0])[:, None]
+        wrapped(moved, angle)
+        if turns and np.abs(moved).max() > np.pi / 2:
+            return []  # degrees, or too few samples a turn: what jumps of a turn left is no motion
+        way = np.concatenate([[0.0], np.cumsum(moved[:, 0])])
+        a, b = (s[k:] - s[:-k] for s in (way, said))
+        noise = float(np.std(np.diff(way, n=2))) / np.sqrt(6)
+        hidden = np.std(b) > SHARE * np.std(a) or np.ptp(way) < MOVED * noise
+        if hidden or np.std(a) < 3 * noise or _alike(a, b, round(LATE_S / trial.dt)) > SHAPE:
+            return []
+        told.append((float(np.mean(piece[:, 1])), float(np.ptp(way)), float(np.std(piece[:, 1]))))
+    return [Dead(relation, *max(told, key=lambda one: one[1]))] if told else []
+
+
+def _alike(a: Array, b: Array, most: int) -> float:
+    """The largest correlation of two signals, either of them late by up to so many samples."""
+    best = 0.0
+    for late in range(-min(most, len(a) // 2), min(most, len(a) // 2) + 1):
+        x, y = (a[late:], b[: len(b) - late]) if late >= 0 else (a[:late], b[-late:])
+        spread = float(np.std(x) * np.std(y))
+        if spread > 0:
+            best = max(best, abs(float(np.mean((x - x.mean()) * (y - y.mean())))) / spread)
+    return best
 
 
 def judge_dead(
@@ -82,6 +135,8 @@ def judge_dead(
                 f"Check the path of [log.state.{name}], or leave that table out and estimate "
                 f"{name} ([estimate])"
             )
-            clause = f"{name} {of_it[0][1].told(model)}: its sensor shows nothing"
+            noisy = any(one.noise for _, one in of_it)
+            why = "it is another's signal, or its sensor is off" if noisy else ""
+            clause = f"{name} {of_it[0][1].told(model)}: {why or 'its sensor shows nothing'}"
             raise unusable(trials, [k for k, _ in of_it], clause, mend)
     return found

@@ -10,8 +10,8 @@ from grounded import Model, Param, Search, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.attribution import attribute
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.report import Unconfirmed
-from grounded.diagnosis.unconfirmed import unconfirmed
+from grounded.diagnosis.report import Diagnosis, Ranked, Unconfirmed, Verdict
+from grounded.diagnosis.unconfirmed import marked, unconfirmed
 from grounded.diagnosis.validation import decide as decide_module
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision, _likelier, causes, decide, shares
@@ -25,6 +25,7 @@ from grounded.experiments.pendulum import pendulum_task
 from grounded.filter.tempering import Tempering
 from grounded.models.pendulum import model as crude_pendulum
 from grounded.plant import Plant
+from grounded_trials.report.diagnosis_words import in_vain
 
 DT = 0.02
 FRICTION, BIAS, WAVE = 0.4, -0.08, 0.05
@@ -272,6 +273,12 @@ def test_what_one_trial_shows_is_told_with_its_place_and_is_no_cause(rare, neede
     found = unconfirmed(claims, decision.doubtful)
     if needed == "saturation:u":
         assert not found  # every trial shows the friction
+        rows = marked(
+            [Ranked(n, claimed=n == needed) for n in best.hypothesis.names], best.hypothesis.names
+        )
+        assert {r.effect for r in rows if r.no_better} == {"viscous_friction:v"}
+        (said,) = in_vain(Diagnosis(Verdict("unknown"), ranking=rows))
+        assert "viscous_friction:v" in said
         return
     (one,) = found
     assert one.effect == "saturation:u" and one.trial == "t3" and one.seen == (1, 5)

@@ -10,6 +10,7 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.errors import GroundedError, NextCommand
 from grounded.instruments.constant import constant_of
+from grounded.instruments.dead import dead_rates
 from grounded.instruments.kinematics import integrals, turned
 from grounded.instruments.lag import at_samples, lag_between
 from grounded.instruments.preflight import preflight
@@ -225,6 +226,33 @@ def test_a_velocity_that_shows_nothing_in_one_log_becomes_missing_there():
 def test_a_velocity_that_no_log_shows_stops_the_diagnosis():
     with pytest.raises(GroundedError, match=r"w stays at 0\.25 .*\[log\.state\.w\]"):
         preflight(ARM, arm(dead))
+
+
+def of_another_axis(x):
+    """A gyro that hardly turns: its noise, about its own small bias."""
+    noise = 0.01 * np.random.default_rng(len(x)).normal(size=len(x))
+    return np.column_stack([x[:, 0], 0.002 + noise])
+
+
+def test_a_velocity_that_is_another_axis_s_noise_is_one_that_shows_nothing():
+    """Seen: a damping of 1e136 1/s explained it."""
+    with pytest.raises(GroundedError, match=r"w shows nothing but noise .*\[log\.state\.w\]"):
+        preflight(ARM, arm(of_another_axis))
+    trials = arm()
+    trials[1] = replace(trials[1], states=of_another_axis(trials[1].states))
+    found = preflight(ARM, trials)
+    (one,) = (f for f in found.findings if f.kind == "stuck")
+    assert one.signal == "w" and "number 2" in one.finding and "noise of 0.01" in one.finding
+    assert np.isnan(found.trials[1].states[:, 1]).all()
+
+
+@pytest.mark.parametrize("late", [0, 8, -8])
+def test_a_velocity_in_a_far_smaller_unit_has_the_shape_of_its_position_however_late(late):
+    small = [
+        replace(t, states=np.column_stack([t.states[:, 0], np.roll(t.states[:, 1], late) / 57.3]))
+        for t in arm()
+    ]
+    assert not any(dead_rates(ARM, t) for t in small)
 
 
 def test_what_stands_still_has_no_dead_sensor():

@@ -1,6 +1,8 @@
 """A workspace from somebody else's log: what is found, what is asked, and that it then works."""
 
 import json
+import re
+import tomllib
 
 import numpy as np
 import pytest
@@ -488,6 +490,10 @@ def test_a_robot_with_one_axis_has_a_line_and_a_step_from_its_start(tmp_path):
     x, v = rows[:, names.index("x")], rows[:, names.index("v")]
     assert x[0] == 0.5 and v[0] == v[-1] == 0 and len(rows) == done.json["horizon"] + 1
     np.testing.assert_allclose(np.diff(x) / 0.05, (v[1:] + v[:-1]) / 2, atol=0.02)
+    held = grounded("-C", made.folder, "target", "line", "--to", "x=-1", "--hold", "1", "--json")
+    names, rows = read_target(made.folder / "target.csv")
+    assert len(rows) == held.json["horizon"] + 1 and (rows[-20:, 1:] == [-1, 0]).all()
+    assert grounded("-C", made.folder, "target", "line", "--hold", "-1").code == 1
     further = grounded("-C", made.folder, "target", "line", "--size", "2", "--json").json
     assert further["columns"]["x"] == [0.5, 2.5]
     step = grounded("-C", made.folder, "target", "step", "--to", "x=1", "--json").json
@@ -572,3 +578,30 @@ def test_next_ingests_proposes_and_exports(tmp_path):
     found = json.loads(done.out)
     assert found["trials"][0]["candidate"] == "c0001" and found["propose"]["candidate"] == "c0002"
     assert (tmp_path / "w/c0002.npz").exists() and (tmp_path / "w/grounded_runner.py").exists()
+
+
+def test_a_target_on_another_grid_is_brought_to_it_by_the_command_that_the_error_names(tmp_path):
+    """`[task] dt` was changed below a target.csv that `init` had written."""
+    made = workspaces.make(tmp_path / "w")
+    file = made.folder / "grounded.toml"
+    before = read_target(made.folder / "target.csv")[1]
+    file.write_text(file.read_text().replace("dt = 0.05", "dt = 0.025"))
+    refused = grounded("-C", made.folder, "propose")
+    assert refused.code == 1 and "line 3" in refused.err
+    named = refused.err.replace("\\\n", "").split("next: grounded ")[1].split()
+    assert grounded(*named).code == 0
+    after = read_target(made.folder / "target.csv")[1]
+    np.testing.assert_allclose(after[::2], before, atol=1e-9)
+    assert grounded("-C", made.folder, "propose").code == 0
+
+
+def test_the_weights_of_an_end_that_a_comment_offers_follow_the_target(tmp_path):
+    made = workspaces.make(tmp_path / "w")
+    file = made.folder / "grounded.toml"
+    file.write_text(file.read_text().replace("[reward]", "[reward]\n# terminal = { psi = 7 }"))
+    file.write_text(re.sub(r"(?m)^(state|terminal) = .*$", "", file.read_text()))
+    assert grounded("-C", made.folder, "target", "line", "--to", "x=2").code == 0
+    (offered,) = re.findall(r"(?m)^# terminal = (.*)$", file.read_text())
+    weights = tomllib.loads(f"at = {offered}\n{file.read_text()}")
+    for name, weight in weights["reward"]["state"].items():
+        assert weights["at"][name] == pytest.approx(10 * weight)

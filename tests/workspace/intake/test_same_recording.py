@@ -13,6 +13,7 @@ from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.ingest import ingest_log
 from grounded_trials.workspace.proposing import propose_in
+from recorded import record, waiting
 from workspaces import make
 
 TABLE = """
@@ -94,3 +95,19 @@ def test_what_is_left_of_a_trial_of_ours_is_that_trial(w, tmp_path):
     assert (again.trial, again.known) == (first.trial, True) and again.utility == first.utility
     with pytest.raises(GroundedError, match=holding(first.trial, "discard")):
         ingest_log(w, tmp_path / "p.mcap", data=True)
+
+
+@pytest.mark.parametrize("rows", [-40, -110])
+def test_a_shorter_copy_of_a_run_is_no_second_run(tmp_path, rows):
+    """Behind a lead-in it counted as one, whose scatter was 5e-8: "an improvement, 1.00"."""
+    w = waiting(tmp_path)
+    whole = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 1.0, after=1.0)
+    first = w.ingest(whole)
+    assert first.candidate == "c0002" and not first.known
+    part = "\n".join(whole.read_text().splitlines()[:rows])  # of 401: 0.4 and 1.1 s
+    (tmp_path / "b.csv").write_text(part)
+    again = w.ingest(tmp_path / "b.csv", candidate="c0002")
+    assert (again.trial, again.known) == (first.trial, True)
+    assert any(first.trial in note for note in again.notes)
+    with pytest.raises(GroundedError, match=holding(first.trial, "discard")):
+        w.ingest(tmp_path / "b.csv", candidate="c0001")

@@ -105,6 +105,16 @@ def correction_line(correction: Correction) -> str:
     return f"correction:{correction.channel}, a curve over {over}, {gain}; it is no cause"
 
 
+def in_vain(diagnosis: Diagnosis) -> list[str]:
+    """Which effects are likely by their evidence and yet no causes, a sentence each."""
+    return [
+        f"{row.effect} is likely by itself, by {figure(row.evidence, 3)} nats, but held-out trials "
+        "are predicted no better with it"
+        for row in diagnosis.ranking
+        if row.no_better
+    ]
+
+
 def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """What changed between two groups of trials, or the values that trials do not share."""
     if diagnosis.changed is not None:

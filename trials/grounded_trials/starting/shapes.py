@@ -38,6 +38,7 @@ class Drive:
     accel: float = 1.0  # [m/s^2] along the path
     lateral: float = 4.0  # [m/s^2] across it
     laps: float = 1.0
+    hold: float = 0.0  # [s] at rest at its end
 
 
 def path_target(shape: str, drive: Drive, model: Model, dt: float) -> dict[str, Array]:
@@ -63,10 +64,11 @@ def path_target(shape: str, drive: Drive, model: Model, dt: float) -> dict[str, 
     along, x, y, heading = _path(shape, drive)
     curvature = np.abs(np.gradient(heading, along))
     limit = np.minimum(drive.speed, np.sqrt(drive.lateral / np.maximum(curvature, 1e-9)))
+    limit[-1] *= not drive.hold
     speed = _reachable(along, limit, drive.accel)
     middle = 0.5 * (speed[1:] + speed[:-1])
     when = np.concatenate([[0.0], np.cumsum(np.diff(along) / np.maximum(middle, 1e-6))])
-    t = dt * np.arange(np.ceil(when[-1] / dt - 1e-6) + 1)
+    t = _grid(when[-1] + drive.hold, dt)
     columns = {position[0]: np.interp(t, when, x), position[1]: np.interp(t, when, y)}
     rate = np.gradient(heading, along) * speed
     for role, values in {"heading": heading, "speed": speed, "heading_rate": rate}.items():
@@ -78,8 +80,12 @@ def path_target(shape: str, drive: Drive, model: Model, dt: float) -> dict[str, 
 
 def _check(drive: Drive) -> None:
     for name, value in vars(drive).items():
-        if not 0 < value < np.inf:
+        if not (0 < value < np.inf or (name == "hold" and value == 0)):
             raise GroundedError(f"--{name} must be positive, found {value:g}")
+
+
+def _grid(seconds: float, dt: float) -> Array:
+    return dt * np.arange(np.ceil(seconds / dt - 1e-6) + 1)
 
 
 def line_target(
@@ -110,7 +116,7 @@ def line_target(
     limit[-1] = 0.0
     speed = _reachable(along, limit, drive.accel)
     when = np.concatenate([[0.0], np.cumsum(2 * np.diff(along) / (speed[1:] + speed[:-1]))])
-    t = dt * np.arange(np.ceil(when[-1] / dt - 1e-6) + 1)
+    t = _grid(when[-1] + drive.hold, dt)
     share, rate = np.interp(t, when, along) / length, np.interp(t, when, speed) / length
     columns = {name: start.get(name, 0.0) + share * far for name, far in way.items()}
     rates = velocities(model)

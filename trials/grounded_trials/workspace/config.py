@@ -7,6 +7,7 @@ Changes (tomlkit) leave the user's comments and layout alone.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
@@ -248,6 +249,10 @@ def set_target(
     )
     if same or (not own and not reward.get("terminal")):
         _change(file, "reward", {"state": _inline(weights)})
+        ends = _inline({state: 10 * weight for state, weight in weights.items()}).as_string()
+        text = file.read_text(encoding="utf-8")
+        told = re.sub(r"(?m)^(# terminal = ).*$", lambda found: found[1] + ends, text, count=1)
+        write_atomically(file, told.encode())
 
 
 def _change(file: Path, where: str, changes: Mapping[str, Any]) -> None:

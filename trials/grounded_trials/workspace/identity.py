@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 ROWS = "rows_s"  # of a log's metadata: the time between a table's rows that repeat a command
 ESTIMATED_WITH = "estimated_with"  # likewise: adopted effects of the model that found its speeds
+LASTED = "source_seconds"  # likewise: how long the log is
 READ_BY = "read_by"  # likewise: the keys of [log] that changed its signals
 # a candidate's metadata, in the order of the file
 _FIELDS: Mapping[str, Callable[[str], Any]] = {

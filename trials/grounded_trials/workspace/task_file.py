@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task
@@ -42,7 +42,8 @@ def build_task(config: Config, model: Model, folder: Path, read: Reader | None =
         return _build(config, model, folder, read or read_target)
     except GroundedError as error:
         named = str(error).startswith((config.file.name, str(folder), config.task.target))
-        raise GroundedError(f"{'' if named else config.file.name + ': '}{error}") from None
+        where = "" if named else f"{config.file.name}: "
+        raise GroundedError(f"{where}{error}", error.then) from None
 
 
 def _build(config: Config, model: Model, folder: Path, read: Reader) -> Task:
@@ -50,8 +51,8 @@ def _build(config: Config, model: Model, folder: Path, read: Reader) -> Task:
     table = config.task
     check_names(table.start, [*states, *inputs], "[task] start: state")
     check_names(table.latency, inputs, "[task] latency: input")
-    path = (folder / table.target).resolve()
-    if not path.is_relative_to(folder.resolve()):
+    path = folder / table.target
+    if not path.resolve().is_relative_to(folder.resolve()):
         raise GroundedError(f"[task] target = '{table.target}' lies outside the workspace")
     if table.target:
         target, input_target = target_arrays(path, states, inputs, table.dt, table.horizon, read)
@@ -216,7 +217,8 @@ def target_arrays(
         i = int(np.argmax(off > 0.01 * dt))
         raise GroundedError(
             f"{path.name} line {i + 2}: t = {t[i]:g} s, expected {t[0] + i * dt:g} s: rows must be "
-            f"[task] dt = {dt:g} s apart"
+            f"[task] dt = {dt:g} s apart; the command below resamples them",
+            NextCommand("target", (str(path),)),
         )
     target = np.full((horizon + 1, len(states)), np.nan)
     given = {name: values[: horizon + 1, names.index(name)] for name in names[1:]}

@@ -10,6 +10,7 @@ from grounded.diagnosis.report import Diagnosis, TrialValue
 from grounded.diagnosis.verdict import told_apart
 from grounded_trials.report.diagnosis_words import (
     gap_sentence,
+    in_vain,
     made_from,
     utility_sentence,
     verdict_lines,
@@ -57,6 +58,7 @@ def _details(diagnosis: Diagnosis, since: Since) -> list[Block]:
     found = drawn(where_figure(diagnosis), title=True)
     if diagnosis.ranking:
         found += [Block("heading", "Effects that were weighed"), effect_table(diagnosis, since)]
+        found += [Block("text", f"{text}.") for text in in_vain(diagnosis)]
     found += _alike(diagnosis) + _by_trial(diagnosis)
     found += leftover_table(diagnosis)
     away = any(row.runs_away for row in diagnosis.prediction_error if row.whole_trial)

@@ -25,7 +25,7 @@ from grounded_trials.store.store import hash_file
 from grounded_trials.workspace.adopted import but_late_sensors, planner_of
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import ESTIMATED_WITH, StoredTrial, sha256
+from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, StoredTrial, sha256
 from grounded_trials.workspace.intake.estimating import (
     EstimateTable,
     read_estimate,
@@ -208,6 +208,8 @@ def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignL
         kept = but_late_sensors(config.model.effects)
         source[ESTIMATED_WITH] = ",".join(str(effect["name"]) for effect in kept)
     series = mapped_signals(files, mapping, states, model.input_names)
+    ends = [(int(one.t.min()), int(one.t.max())) for one in series.values() if len(one.t)]
+    source[LASTED] = f"{1e-9 * (max(e for _, e in ends) - min(b for b, _ in ends)):.6f}"
     return ForeignLog(workspace, path, mapping, estimate, series, source)
 
 

@@ -20,7 +20,7 @@ from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import FILE_LIMIT
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import ESTIMATED_WITH, READ_BY, ROWS
+from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, ROWS
 from grounded_trials.workspace.intake.foreign import ForeignLog, begun, mapping_of, read_foreign
 from grounded_trials.workspace.intake.stored_before import refuse_as_another
 from grounded_trials.workspace.proposing import standing_in
@@ -73,7 +73,7 @@ def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: b
     if data:
         if not trial.candidate:
             return Read(trial, content)
-        kept = ("system", "source", "source_sha256", "estimated", ESTIMATED_WITH, READ_BY)
+        kept = ("system", "source", "source_sha256", "estimated", ESTIMATED_WITH, LASTED, READ_BY)
         about = {k: v for k, v in meta.items() if k in kept}
         about |= {"kind": "data", "ran": trial.candidate}
         notes = _elsewhere(workspace, trial.candidate, policy)

@@ -19,7 +19,7 @@ from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.resample import ABSOLUTE_S
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import ESTIMATED_WITH, StoredTrial, sha256
+from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, StoredTrial, sha256
 from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.proposing import standing_in
 
@@ -120,7 +120,8 @@ def same_recording(
     """The stored trial that a file is a copy of, or a part: what is left of a damaged one, say.
 
     The bytes of the file don't tell. That at the same times of its clock all rows are the same
-    does; whole runs whose clock begins at zero may be alike where a simulator repeats itself.
+    does; whole runs whose clock begins at zero may be alike where a simulator repeats itself, in a
+    log as long as the other.
 
     Args:
         workspace: that may have stored it.
@@ -140,7 +141,7 @@ def same_recording(
             continue
         here = trial
         if one.meta["start_ns"] != meta["start_ns"]:
-            if log is None or (there := _from(log, int(one.meta["start_ns"]))) is None:
+            if log is None or (there := _from(log, one)) is None:
                 continue
             here = there
         alike = _alike(one, here)
@@ -155,16 +156,19 @@ def same_recording(
                 f"discard {one.stored.id}, then ingest it again",
                 NextCommand("discard", (one.stored.id,)),
             )
-        if stamped or here.finite_steps < one.measured.finite_steps:
+        lasted = one.meta.get(LASTED)
+        cut = lasted is not None and log is not None and lasted != log.source[LASTED]
+        if stamped or cut or here.finite_steps < one.measured.finite_steps:
             return one
     return None
 
 
-def _from(log: ForeignLog, start_ns: int) -> Trial | None:
-    """A log as a trial that begins at a time of its clock; None where it can't be cut there."""
+def _from(log: ForeignLog, one: StoredTrial) -> Trial | None:
+    """A log as a trial that begins when a stored one does; None where it can't be cut there."""
     with suppress(GroundedError):
         _, found = log.cut("")
-        return log.cut("", 1e-9 * (start_ns - found.origin_ns))[0]
+        after = 1e-9 * (int(one.meta["start_ns"]) - found.origin_ns)
+        return log.cut(one.trial.candidate or "", after)[0]
     return None
 
 
