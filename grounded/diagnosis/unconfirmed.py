@@ -3,7 +3,7 @@
 Or of one motion that the trials repeat (`validation.motions`). They are never causes. Each is told
 with the trial, the time and the region that show it, where a further trial would have to go. What
 most trials show as likely, and none predicts better by, is a fault of the likelihood: it is marked
-in the table, so that nobody asks why its nats make no cause; what ties with a cause is told as tied.
+in the table, so that nobody asks why its nats make no cause; what ties is told as tied.
 """
 
 from __future__ import annotations
