@@ -2,10 +2,11 @@
 
 What is late by d is off by -d S', the change of its velocity S. Other things are off along the way
 or across it as well: a slipping wheel by k S' along it, an unmodelled side slip by k S' across it,
-a point that is tracked l ahead of the modelled one by l omega across it. So a delay is what is left
-beside a tracked point; and of a body whose sideways velocity nothing measures, along and across
-both have to show it. One position that is late alone looks half as late along and across, too: so
-each by itself has to show the same delay, or which of them it is stays for the physics to say.
+a point that is tracked l ahead of the modelled one by l omega across it, a body that drifts by as
+much all the time. So a delay is what is surely left beside these; and of a body whose sideways
+velocity nothing measures, along and across both have to show it. One position that is late alone
+looks half as late along and across, too: so each by itself has to show the same delay, or which of
+them it is stays for the physics to say.
 """
 
 from __future__ import annotations
@@ -58,7 +59,10 @@ def late_positions(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -
         return None
     if lag.delay < max(SURE * lag.std, LEAST_STEPS * dt) or _apart(ways, lag, dt):
         return None
-    for left, std in _left(ways, lag.delay / dt, dt, apart=len(plane.speed) < 2):
+    apart = len(plane.speed) < 2
+    if any(std > UNSURE * late for late, std in _left(ways, 0.0, dt, apart=apart)):
+        return None
+    for left, std in _left(ways, lag.delay / dt, dt, apart=apart):
         if std > UNSURE * lag.delay or abs(left) > max(AGREE * std, CLOSE * lag.delay):
             return None
     return Late((both[0].i, both[1].i), lag)
@@ -88,7 +92,7 @@ def _left(
     h = max(3, round(SMOOTH_S / dt))
     window = np.hanning(2 * h + 3)[1:-1]
     window /= window.sum()
-    rests, designs = [np.empty(0)], [np.empty((0, 4 if apart else 3))]
+    rests, designs = [np.empty(0)], [np.empty((0, 6 if apart else 5))]
     for moved, said in ways:
         at = np.arange(len(moved)) + steps
         early = np.stack([at_samples(moved[:, k], at) for k in (0, 1)], axis=1)
@@ -105,7 +109,8 @@ def _left(
         along = (slope * ahead).sum(axis=1, keepdims=True) * ahead
         turn = (slope * side).sum(axis=1, keepdims=True) / size
         late = [along, slope - along] if apart else [slope]
-        design = np.stack([*(-one for one in late), turn * side, -turn * ahead], axis=2)
+        others = [turn * side, -turn * ahead, ahead, side]
+        design = np.stack([*(-one for one in late), *others], axis=2)
         for k in (0, 1):
             rests.append((z - s)[:, k] - (z - s)[:, k].mean())
             designs.append(design[:, k] - design[:, k].mean(axis=0))

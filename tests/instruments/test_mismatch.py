@@ -284,6 +284,16 @@ def test_one_position_that_is_late_alone_does_not_make_both_late(alone, monkeypa
     assert "sensor_delay:" + "xy"[alone] not in found.settled
 
 
+def test_a_delay_that_a_constant_drift_makes_as_well_is_none(monkeypatch):
+    """A blind case: a car that drifted by 0.3 m/s along its way was given sensors 57 ms late."""
+    found = {False: (0.0, 0.013), True: (0.03, 0.013)}  # [s], after the shift and before it
+    name = "grounded.instruments.late_position._left"
+    monkeypatch.setattr(name, lambda ways, steps, *_, **__: [found[steps == 0]])
+    assert not delayed(preflight(BOAT, logged(BOAT, positions_late(0.15))).findings)
+    found[True] = (0.15, 0.013)
+    assert delayed(preflight(BOAT, logged(BOAT, positions_late(0.15))).findings)
+
+
 def test_what_nothing_measures_sideways_makes_no_position_late():
     found = preflight(PLAIN, logged(PLAIN, positions_late(0.3)))
     assert not delayed(found.findings)
@@ -302,5 +312,11 @@ def test_a_tracked_point_or_a_slip_makes_no_position_late(model):
         y[:, 3] += 0.3 * np.gradient(np.convolve(x[:, 3], np.ones(5) / 5, "same"), DT)
         return y
 
-    for fault in (lambda x: x, ahead, slipping):
+    def drifting(x: Array) -> Array:  # by as much to its side all the time
+        y = np.array(x)
+        y[1:, 0] += 0.2 * DT * np.cumsum(np.cos(x[:-1, 2]) - np.sin(x[:-1, 2]))
+        y[1:, 1] += 0.2 * DT * np.cumsum(np.sin(x[:-1, 2]) + np.cos(x[:-1, 2]))
+        return y
+
+    for fault in (lambda x: x, ahead, slipping, drifting):
         assert not delayed(preflight(model, logged(model, fault)).findings)
