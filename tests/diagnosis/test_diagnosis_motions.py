@@ -11,7 +11,7 @@ from grounded.diagnosis.likelihood.data import PIECES, prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.motions import motions, repeats, without_others
-from grounded.effects import Library
+from grounded.effects import Library, wrap
 
 DT, STEPS = 0.05, 120
 WAVE, OMEGA = 0.4, 2.0
@@ -106,3 +106,21 @@ def test_numbers_of_an_adopted_wave_are_held_where_one_motion_is_repeated(speeds
     data = prepare(model, trials, np.zeros(1))
     held = without_others(Predictor(data), data.y, ["periodic:v"], Library())
     assert [held.params[name].spread > 0 for name in ("k", *names)] == [True] + [free] * 3
+
+
+def test_an_adopted_delay_of_two_sensors_as_one_is_not_asked_for_again():
+    """The model that has it offers `sensor_delay:x` alone: every later diagnosis failed."""
+    model = Model(
+        states={"x": "m", "v": "m/s", "beam": "rad"},
+        inputs={"u": "rad"},
+        params={"tau": Param(0.1, "s", std=0.1)},
+        derivative=lambda s, a, p: {"x": s.v, "v": s.beam, "beam": (a.u - s.beam) / p.tau},
+        name="ball",
+    )
+    late = wrap(Library().effect("sensor_delay:x+v", model), {"d": 0.06}, DT)
+    t = np.arange(STEPS + 1) * DT
+    y, u = np.full((STEPS + 1, late.n), np.nan), np.sin(t[:-1, None])
+    y[:, :3] = np.sin(t[:, None] + np.arange(3))
+    trials = [Trial(y, u + i, DT, late.state_names, ("u",)) for i in range(2)]
+    data = prepare(late, trials, np.zeros(1))
+    assert without_others(Predictor(data), data.y, ["sensor_delay:x+v"], Library()) is data.model

@@ -74,9 +74,12 @@ def without_others(
     """
     data, model, held = predictor.data, predictor.data.model, set[str]()
     for name in adopted if data.count > 1 else ():
+        family, _, target = name.partition(":")
+        if not library.family(family).loose or target not in library.family(family).targets(model):
+            continue  # of what has it already: two sensors that were late as one are so no more
         effect = library.effect(name, model, data.scales)
         own = {q.name: param_name(name, q.name) for q in effect.quantities}
-        if not effect.family.loose or not all(p in model.params for p in own.values()):
+        if not all(p in model.params for p in own.values()):
             continue
         values = {q: model.params[p].value for q, p in own.items()}
         h = Hypothesis().plus(effect, values)
