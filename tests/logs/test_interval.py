@@ -5,7 +5,7 @@ import pytest
 
 from grounded_trials.logs.command_steps import changes_of, phase_of
 from grounded_trials.starting.begin import begin
-from grounded_trials.starting.interval import changes_every
+from grounded_trials.starting.interval import changes_every, round_interval
 
 MODEL = """from grounded import Model, Param
 
@@ -42,6 +42,10 @@ def gaps(every, rows, seed=0, jitter=0.0, drift=0.0, held=0.3, odd=0):
         (0.02, 0.01, {}),
         (0.02, 0.01, {"held": 0.0}),  # not 0.025 s, of which it is within a row
         (0.02, 0.005, {"held": 0.0}),
+        (0.0333333, 0.005, {"jitter": 0.001}),
+        (0.0166667, 0.002, {}),
+        (0.008, 0.002, {}),  # not 0.00833333 s, of which it is within a row
+        (0.00833333, 0.002, {}),
     ],
 )
 def test_the_interval_is_found_in_what_rows_show(every, rows, more):
@@ -108,3 +112,27 @@ def test_commands_with_stamps_of_their_own_are_late_by_nothing():
     at, late = changes_of(t, np.arange(50.0))
     assert not late.any()
     assert phase_of(at * 1e-9, 0.02, late * 1e-9) == (pytest.approx(0.003), 0.0)
+
+
+@pytest.mark.parametrize("hz", [2, 7.5, 12, 15, 24, 25, 30, 45, 50, 60, 75, 90, 100, 120, 125, 144])
+def test_the_interval_of_a_loop_is_that_of_its_rows(hz):
+    """0.04 s was written for 30 Hz, beside 25 Hz the nearest that was known."""
+    assert round_interval(1 / hz) == pytest.approx(1 / hz, rel=3e-3)
+
+
+def test_jitter_does_not_make_an_odd_interval():
+    assert [round_interval(0.0333333 * off) for off in (0.98, 1.0, 1.02)] == [0.0333333] * 3
+    assert round_interval(0.0303) == pytest.approx(1 / 33, rel=1e-5)
+    assert (round_interval(1e-5), round_interval(90.0)) == (0.001, 0.5)
+
+
+def test_a_camera_s_log_has_its_interval(tmp_path):
+    rng = np.random.default_rng(2)
+    t = np.arange(300) / 30 + rng.uniform(-2e-3, 2e-3, 300)
+    force = np.round(rng.normal(0, 1, 300), 3)
+    v = np.cumsum(force) / 30
+    columns = np.column_stack([t, np.cumsum(v) / 30, v, force])
+    np.savetxt(tmp_path / "r.csv", columns, "%.5f", ",", header="t,x,v,force", comments="")
+    (tmp_path / "m.py").write_text(MODEL)
+    found = begin(tmp_path / "w", tmp_path / "r.csv", model=tmp_path / "m.py")
+    assert found.dt == 0.0333333 and found.horizon == 200

@@ -18,13 +18,15 @@ from grounded_trials.logs.inspect_guess import Guess
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.signals import Series, SignalSpec, read_signals
 
-STEPS = (0.001, 0.002, 0.0025, 0.004, 0.005, 0.008, 0.01, 0.02, 0.025, 0.04, 0.05, 0.1, 0.2, 0.5)
+RATES = (1000, 500, 400, 250, 200, 125, 120, 100, 60, 50, 40, 30, 25, 20, 15, 10, 5, 2)  # [Hz]
+STEPS = tuple(float(f"{1 / rate:.6g}") for rate in RATES)  # [s], as it is written
 GUESSED = 0.05  # [s]
 LONGEST = 0.1  # [s]; what changes more rarely may be a test signal's steps
 ENOUGH = 20  # times between changes
 NEARLY_ALL = 0.95  # of them are multiples of the interval
 ONCE = 0.25  # of them are the interval itself
 APART = 1.5  # rows, from which an interval is another one than theirs
+NEAR = 0.03  # of an interval: it is one of STEPS, whose rows come that nearly so often
 OFF = 0.05  # of an interval, that the mean of the times between changes may be from it
 EXACT, LOOSE = 0.1, 0.25  # of an interval: how far a multiple may be off it
 
@@ -53,9 +55,21 @@ def interval_of(
                 "that is dt; --dt says otherwise"
             )
             return held, ": that in which the log's commands change", note
-        step = min(STEPS, key=lambda step: abs(np.log(step / rows)))
-        return step, f": that of the {whose}", ""
+        return round_interval(rows), f": that of the {whose}", ""
     return GUESSED, ": a guess, no input or state was found", ""
+
+
+def round_interval(rows: float) -> float:
+    """The interval of a loop whose rows come so often [s]: of a usual rate, else of whole Hz or ms.
+
+    It is not shorter than the shortest of `STEPS`, nor longer than the longest.
+    """
+    usual = min(STEPS, key=lambda step: abs(np.log(step / rows)))
+    if abs(usual / rows - 1) < NEAR or not STEPS[0] < rows < STEPS[-1]:
+        return usual
+    whole = (1e-3 * max(round(1e3 * rows), 1), 1 / max(round(1 / rows), 1))
+    nearest = min(whole, key=lambda step: abs(step - rows))
+    return float(f"{nearest if abs(nearest / rows - 1) < NEAR else rows:.6g}")
 
 
 def _held(report: LogReport, inputs: Sequence[Guess], rows: float) -> float | None:
@@ -85,16 +99,19 @@ def changes_every(gaps: Array, rows: float) -> float | None:
     """
     if len(gaps) < ENOUGH:
         return None
-    for step in reversed(STEPS):
+    found: dict[float, float] = {}  # how far the mean is off each that will do
+    for step in STEPS:
         if not APART * rows < step <= LONGEST:
             continue
         near = step * min(max(EXACT, 1.05 * rows / step), LOOSE)
         whole = np.maximum(np.rint(gaps / step), 1)
         on = np.abs(gaps - whole * step) <= near
         often = on.mean() >= NEARLY_ALL and (on & (whole == 1)).mean() >= ONCE
-        if often and abs(float((gaps / whole)[on].mean()) / step - 1) < OFF:
-            return step
-    return None
+        if often:
+            found[step] = abs(float((gaps / whole)[on].mean()) / step - 1)
+    fits = [step for step, off in found.items() if off < OFF]
+    near = [step for step in fits if step > max(fits) / (1 + 2 * OFF)]  # 120 and 125 Hz
+    return min(near, key=found.__getitem__, default=None)
 
 
 def _topic(report: LogReport, guess: Guess) -> Any:
