@@ -13,11 +13,12 @@ from cli import grounded
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from grounded_trials.logs.inspect_pairs import velocities
+from grounded_trials.logs.joint_names import from_base
 from grounded_trials.starting.begin import begin
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, path_target
 from grounded_trials.workspace.task_file import equal_weights, read_target
-from ros_bags import arm_bag, car_bag
+from ros_bags import arm_bag, car_bag, commanded_arm_bag
 from shared_data import data
 
 
@@ -50,6 +51,43 @@ def test_the_joints_of_an_arm_by_name(tmp_path):
     assert paths["elbow_velocity"] == "/joint_states.velocity[1]"
     assert paths["shoulder_effort"] == "/joint_states.effort[0]"
     assert any("1.000" in r for g in found.states for r in g.reasons)
+
+
+@pytest.mark.parametrize("order", [("shoulder", "elbow"), ("elbow", "shoulder")])
+def test_torques_in_an_array_without_names_are_told_by_the_motion_of_each_joint(tmp_path, order):
+    """A skeleton without gravity fits the smaller torque best, whichever joint it is given to."""
+    found = begin(tmp_path / "arm", commanded_arm_bag(tmp_path / "bag", order))
+    paths = {guess.name: guess.path for guess in found.inputs}
+    for i, joint in enumerate(order):
+        assert paths[f"{joint}_effort"] == f"/effort_controller/commands.data[{i}]"
+    assert not found.unsure
+    roles = Workspace(tmp_path / "arm").base_model.roles
+    assert roles["level"] == ("shoulder_position", "elbow_position")  # from the base
+
+
+def test_torques_that_motion_does_not_tell_apart_are_unsure_and_both_are_named(tmp_path):
+    found = begin(tmp_path / "arm", commanded_arm_bag(tmp_path / "bag", goals=False))
+    inputs = {guess.name: guess for guess in found.inputs}
+    both = [f"/effort_controller/commands.data[{i}]" for i in range(2)]
+    assert [inputs[f"{joint}_effort"].path for joint in ("shoulder", "elbow")] == both
+    assert inputs["shoulder_effort"].others == (both[1],)
+    assert inputs["elbow_effort"].others == (both[0],)
+    assert {guess.name for guess in found.unsure} >= {"shoulder_effort", "elbow_effort"}
+
+
+@pytest.mark.parametrize(
+    "joints, ordered",
+    [
+        (("elbow_joint", "shoulder_joint"), (1, 0)),
+        (("elbow", "shoulder_lift", "shoulder_pan", "wrist_2", "wrist_1"), (2, 1, 0, 4, 3)),
+        (("ankle", "hip_pitch", "hip_yaw", "knee"), (2, 1, 3, 0)),
+        (("joint1", "joint10", "joint2"), (0, 2, 1)),
+        (("left_elbow", "left_shoulder", "right_elbow"), (0, 1, 2)),  # of two limbs
+        (("tilt", "elbow"), (0, 1)),
+    ],
+)
+def test_joints_are_counted_from_the_base(joints, ordered):
+    assert from_base(joints) == tuple(joints[i] for i in ordered)
 
 
 MODEL = """from grounded import Model, Param

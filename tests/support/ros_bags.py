@@ -97,3 +97,51 @@ def arm_bag(folder, scale=1.0):
         w = w + DT * (tau - 0.2 * w) / np.array([0.3, 0.1])
         q = q + DT * w
     return bag(folder, topics, messages)
+
+
+def commanded_arm_bag(folder, order=("shoulder", "elbow"), goals=True, seed=0):
+    """A vertical arm whose JointState is in the order of the alphabet, its commands without names.
+
+    Args:
+        folder: of the bag.
+        order: of the torques in the array of commands.
+        goals: new ones every second; False: it hangs at rest, the torques are noise of the loop.
+        seed: of goals and noise.
+    """
+    rng, own, h = np.random.default_rng(seed), ("shoulder", "elbow"), 0.002
+    topics = {
+        "/joint_states": "sensor_msgs/msg/JointState",
+        "/effort_controller/commands": "std_msgs/msg/Float64MultiArray",
+    }
+    q, w, goal, near, u = np.zeros((5, 2))
+    layout = T["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
+    messages = []
+    for k in range(10_000):
+        t = START + k * 2 * 10**6
+        measured = q + 5e-4 * rng.normal(size=2), w + 0.01 * rng.normal(size=2)
+        if k % 500 == 0 and goals:
+            goal = rng.uniform(-0.9, 1.1, 2)
+        if k % 5 == 0:
+            names = ["elbow_joint", "shoulder_joint"]
+            both = [one[::-1] for one in measured]
+            messages.append(("/joint_states", t, joints(t, names, *both, np.zeros(0))))
+        if k % 10 == 0:
+            near = near + 0.05 * (goal - near)
+            u = [16, 4] * (near - measured[0]) - [2.5, 0.35] * measured[1]
+            sent = np.array([u[own.index(name)] for name in order])
+            message = T["std_msgs/msg/Float64MultiArray"](layout=layout, data=sent)
+            messages.append(("/effort_controller/commands", t + 10**6, message))
+        w = w + h * _arm_acceleration(q, w, u)
+        q = q + h * w
+    return bag(folder, topics, messages)
+
+
+def _arm_acceleration(q, w, u):
+    """Of two links of 0.35 and 0.3 m, 2 and 1.2 kg, from hanging down, with viscous friction."""
+    h, own = 0.0546 * np.cos(q[1]), 0.0303
+    turning = 0.0546 * np.sin(q[1])
+    fall = 1.53 * np.sin(q[0] + q[1])
+    mass = np.array([[0.2202 + own + 2 * h, own + h], [own + h, own]])
+    push = turning * (2 * w[0] * w[1] + w[1] ** 2) - fall - 7.26 * np.sin(q[0]) - 0.35 * w[0]
+    pull = -turning * w[0] ** 2 - fall - 0.12 * w[1]
+    return np.linalg.solve(mass, u + np.array([push, pull]))

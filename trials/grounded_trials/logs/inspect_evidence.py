@@ -7,7 +7,7 @@ its rivals with the log's own samples:
 - units: what a ROS type measures, against the unit that the model states;
 - derivatives: where the model says dq/dt = w, the samples of w must follow those of q. Their slope
   tells degrees (57.3) and signs (-1);
-- steps: of the rivals for an input, the one with which the model's steps fit the log best.
+- steps: of the rivals for an input, the one with which the model's steps fit the log clearly best.
 
 Every guess that is changed or confirmed says by what; where the numbers can't decide it stays
 unsure.
@@ -18,12 +18,10 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import islice, product
 
 import numpy as np
 
 from grounded.model import Model
-from grounded_trials.formats.messages import Floats
 from grounded_trials.logs.following import follows
 from grounded_trials.logs.inspect_guess import SIMULATED_S, Guess
 from grounded_trials.logs.inspect_log import LogReport
@@ -31,10 +29,10 @@ from grounded_trials.logs.inspect_pairs import (
     COMBINATIONS,
     FOLLOWS,
     Signals,
-    moved_to,
     paired,
     velocities,
 )
+from grounded_trials.logs.inspect_steps import by_steps
 from grounded_trials.logs.joint_names import JOINT_UNITS, in_order, joint_names, of_joint
 from grounded_trials.logs.stated_units import Stated, factor_between
 
@@ -45,7 +43,6 @@ UNITS = (  # what the end of a path measures, in ROS's conventions (REP 103)
     (r"linear_acceleration\.[xyz]$|accel\.linear\.[xyz]$", "m/s^2"),
     (r"linear\.[xyz]$|drive\.speed$", "m/s"),
 )
-BETTER = 0.9  # of the rival's error: less decides
 
 
 def weigh(
@@ -67,7 +64,7 @@ def weigh(
     units = {**model.states, **model.inputs}
     joints = joint_names(log) if joints is None else joints
     guesses = {guess.name: guess for guess in (*states, *inputs)}
-    guesses = {name: of_joint(guess, units[name], joints) for name, guess in guesses.items()}
+    guesses = {name: of_joint(guess, units[name], joints, log) for name, guess in guesses.items()}
     guesses |= in_order(guesses, units, joints, log)
     guesses = {name: _unit(guess, units[name]) for name, guess in guesses.items()}
     guesses |= _speed_asked(guesses, model, log)
@@ -79,7 +76,7 @@ def weigh(
     pairs = [(q, w) for q, w in velocities(model).items() if q in guesses and w in guesses]
     for pair in sorted(pairs, key=lambda qw: not any(guesses[name].path for name in qw)):
         guesses |= paired(guesses, pair, signals, units, log)
-    guesses |= _steps(model, guesses, signals)
+    guesses |= by_steps(model, guesses, signals)
     guesses |= _taken_by_inputs(guesses, model)
     guesses = {name: _as_logged(guess, log) for name, guess in guesses.items()}
     guesses = {name: as_stated(stated, units[name], guess) for name, guess in guesses.items()}
@@ -187,42 +184,3 @@ def _speed(guesses: Mapping[str, Guess], model: Model, signals: Signals) -> dict
     why = f"no name says it; it goes with the speed of {' and '.join(position)}, correlation "
     why += f"{best:.3f}, {slope:.3g} times as large"
     return {name: replace(guesses[name], path=path, others=rivals[:3], reasons=(why,))}
-
-
-def _steps(model: Model, guesses: Mapping[str, Guess], signals: Signals) -> dict[str, Guess]:
-    """Inputs that are unsure, decided by the model's one-step predictions where they can."""
-    unsure = [n for n in model.input_names if guesses[n].path and guesses[n].others]
-    known = [*model.state_names, *model.input_names]
-    if not unsure or not all(guesses[name].path for name in known):
-        return {}
-    units = {**model.states, **model.inputs}
-    choices = [(guesses[n].path, *guesses[n].others) for n in unsure]
-    errors: dict[tuple[str, ...], float] = {}
-    for chosen in islice(product(*choices), COMBINATIONS):
-        paths = {n: guesses[n].path for n in known} | dict(zip(unsure, chosen, strict=True))
-        gridded = signals.grid(list(paths.values()))
-        if gridded is not None and len(set(paths.values())) == len(paths):
-            own = signals.stated
-            scales = [guesses[name].scale * own.factor(paths[name], units[name]) for name in known]
-            errors[chosen] = _one_step(model, gridded[0], gridded[1], scales)
-    ranked = sorted(errors, key=errors.__getitem__)
-    if len(ranked) < 2 or not errors[ranked[0]] < BETTER * errors[ranked[1]]:
-        return {}
-    gain = 100 * (1 - errors[ranked[0]] / errors[ranked[1]])
-    found = {}
-    for name, path in zip(unsure, ranked[0], strict=True):
-        why = f"with it the model's steps fit {gain:.0f} % better than with the next best"
-        moved = moved_to(guesses[name], path)
-        found[name] = replace(moved, sure=True, reasons=(*moved.reasons, why))
-    return found
-
-
-def _one_step(model: Model, step: float, columns: list[Floats], scales: list[float]) -> float:
-    """Root mean square of the model's steps against the log's, each state in its own deviation."""
-    values = np.column_stack(columns) * scales
-    x, u = values[:, : model.n], values[:-1, model.n :]
-    with np.errstate(all="ignore"):
-        predicted = model.system.step(x[:-1], u, model.values, step)
-    change = np.maximum(model.difference(x[1:], x[:-1]).std(axis=0), 1e-12)
-    error = model.difference(x[1:], predicted) / change
-    return float(np.sqrt(np.nanmean(np.minimum(error**2, 1e4))))

@@ -1,9 +1,13 @@
-"""Which joint each number of a JointState is, and which states of a model are those joints."""
+"""Which joint each number of a JointState is, and which states of a model are those joints.
+
+A JointState names its joints, often in the order of the alphabet; an array of commands names none.
+Models, and controllers, count from the base.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from grounded_trials.formats.mcap_records import Channel, Messages
@@ -12,6 +16,10 @@ from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.log_files import log_records
 
 JOINT_UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
+LIMB = ("base", "waist", "torso", "shoulder", "upper", "elbow", "fore", "wrist", "hand", "finger")
+LEG = ("hip", "thigh", "knee", "shin", "ankle", "foot", "toe")
+WITHIN = ("yaw", "pan", "lift", "pitch", "flex", "roll")  # of the joints of one part
+SIDES = ("left", "right", "front", "rear")  # of several limbs
 
 
 def joint_names(log: LogReport) -> dict[str, tuple[str, ...]]:
@@ -51,16 +59,40 @@ def _names_in(batch: Messages, encoding: str) -> set[tuple[str, ...]]:
     return found
 
 
-def of_joint(guess: Guess, unit: str, joints: Mapping[str, tuple[str, ...]]) -> Guess:
-    """A state whose name holds a joint's is that joint's number of its unit."""
+def from_base(joints: Sequence[str]) -> tuple[str, ...]:
+    """The joints of one limb from its base on, by parts of the body or numbers; else as given."""
+    if any(_first(SIDES, joint) < len(SIDES) for joint in joints):
+        return tuple(joints)
+    numbers = {joint: [int(n) for n in re.findall(r"\d+", joint)] for joint in joints}
+    for parts in (LIMB, LEG):
+        part = {joint: _first(parts, joint) for joint in joints}
+        if len(parts) not in part.values():
+            within = {
+                joint: (part[joint], _first(WITHIN, joint), numbers[joint]) for joint in joints
+            }
+            return tuple(sorted(joints, key=within.__getitem__))
+    counted = len({re.sub(r"\d+", "", joint) for joint in joints}) == 1
+    return tuple(sorted(joints, key=numbers.__getitem__)) if counted else tuple(joints)
+
+
+def _first(words: Sequence[str], joint: str) -> int:
+    """Which of some words a joint's name holds; how many there are for none."""
+    return next((i for i, word in enumerate(words) if word in joint.lower()), len(words))
+
+
+def of_joint(
+    guess: Guess, unit: str, joints: Mapping[str, tuple[str, ...]], log: LogReport
+) -> Guess:
+    """A state whose name holds a joint's is that joint's number of its unit, if the log has it."""
+    there = _there(log)
     for topic, names in joints.items():
         for i, joint in enumerate(names):
             if not _holds(guess.name, joint):
                 continue
             kind = next((k for k, u in JOINT_UNITS.items() if u == unit), None)
             kind = kind or ("position" if unit in ("m", "1") else None)
-            if kind is not None:
-                path = f"{topic}.{kind}[{i}]"
+            path = f"{topic}.{kind}[{i}]"
+            if path in there:
                 others = tuple(p for p in (guess.path, *guess.others) if p and p != path)
                 why = f"{topic} names its joint {i} '{joint}'"
                 return replace(guess, path=path, sure=True, others=others[:3], reasons=(why,))
@@ -73,22 +105,40 @@ def in_order(
     joints: Mapping[str, tuple[str, ...]],
     log: LogReport,
 ) -> dict[str, Guess]:
-    """As many names of a unit as there are joints, none of them found: taken in their order."""
+    """As many names of a unit as there are joints, none of them found: taken from the base on."""
     found: dict[str, Guess] = {}
     if len(joints) != 1:
         return found
     topic, names = next(iter(joints.items()))
+    order, there = from_base(names), _there(log)
     for kind, unit in JOINT_UNITS.items():
         those = [name for name, guess in guesses.items() if units[name] == unit]
         if len(those) != len(names) or any(guesses[name].path for name in those):
             continue
         commanded = _commands(log, len(names)) if kind == "effort" else []
-        for i, name in enumerate(those):
-            paths = [*(f"{command}[{i}]" for command in commanded), f"{topic}.{kind}[{i}]"]
-            why = (f"in the order of the joints: {i} is '{names[i]}'",)
-            others = tuple(paths[1:])
-            found[name] = replace(guesses[name], path=paths[0], others=others, reasons=why)
+        own = [next((j for j in names if _holds(name, j)), "") for name in those]
+        for name, joint in zip(those, own if set(own) == set(names) else order, strict=True):
+            at = order.index(joint)
+            paths = [f"{command}[{at}]" for command in commanded]
+            paths += [path] if (path := f"{topic}.{kind}[{names.index(joint)}]") in there else []
+            if not paths:
+                continue
+            why = f"in the order of the joints from the base, {at} is '{joint}'"
+            why = f"no name says it; {why}" if commanded else why
+            rest = [f"{c}[{i}]" for c in commanded for i in range(len(names)) if i != at]
+            others = (*paths[1:], *rest)
+            found[name] = replace(guesses[name], path=paths[0], others=others, reasons=(why,))
     return found
+
+
+def _there(log: LogReport) -> set[str]:
+    """The numbers of a log; efforts where they are told: many a robot has them all at zero."""
+    return {
+        field.path
+        for topic in log.topics
+        for field in topic.fields
+        if field.low != field.high or ".effort[" not in field.path
+    }
 
 
 def _commands(log: LogReport, count: int) -> list[str]:

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 from grounded.errors import GroundedError, nearest
 from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
+from grounded_trials.logs.joint_names import from_base
 from grounded_trials.logs.stated_units import factor_between, unit_in_name
 from grounded_trials.starting.skeletons import (
     BALANCE,
@@ -220,7 +221,7 @@ def skeleton(
 ) -> Skeleton:
     """The skeleton of a kind, named after what is in the log; for the rest see `generic`."""
     if kind == "arm":
-        return arm(next(iter(joints.values())) if joints else ("joint1", "joint2"))
+        return arm(from_base(next(iter(joints.values()))) if joints else ("joint1", "joint2"))
     ackermann = any("Ackermann" in topic.type for topic in log.topics)
     if kind == "car" and not ackermann:
         return _car(log)

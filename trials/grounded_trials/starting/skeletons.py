@@ -207,7 +207,7 @@ BALANCE = Skeleton(
 
 
 def arm(joints: Sequence[str]) -> Skeleton:
-    """An arm whose joints don't feel each other, named after them."""
+    """An arm whose joints don't feel each other, named after them, in order from the base."""
     short = [re.sub(r"_?joint_?", "", joint) or joint for joint in joints]
     distinct = len(set(short)) == len(joints)
     bare = [re.sub(r"\W+", "_", joint).strip("_") for joint in (short if distinct else joints)]
