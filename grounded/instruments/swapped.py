@@ -1,7 +1,9 @@
 """Two columns of a log in each other's place: found by a position and its velocity.
 
 As they are logged the one does not move as the other says; with two columns exchanged it does, by
-the right amount and in the right direction. No unmodelled effect does that.
+the right amount and in the right direction. No unmodelled effect does that. Joints of one manoeuvre
+move alike, so that each goes roughly as the other's velocity says: there an exchange is believed
+if it mends both.
 """
 
 from __future__ import annotations
@@ -42,15 +44,18 @@ def swapped_columns(
     known = range(model.n) if shown is None else shown
     some = [i for i in known if np.isfinite(trial.states[:, i]).any()]
     exact = [r for r in relations if r.exact and {r.i, r.j} <= set(some)]
-    broken = [r for r in exact if _broken(trial, r)]
+    odd = {r: left for r in exact if (left := _mirrored_too(trial, r)) > 1 - WHOLE}
+    broken = [r for r in odd if _together(trial, r)[0] < BROKEN]
     names = [*trial.state_names, *trial.input_names]
     columns = [*some, *range(model.n, model.n + model.m)]
     touched = {i for r in broken for i in (r.i, r.j)}
-    found = {
-        f"{names[pair[0]]} and {names[pair[1]]}": _left(_exchanged(trial, pair), exact)
-        for pair in combinations(columns, 2)
-        if touched & set(pair)
-    }
+    found = {}
+    for pair in combinations(columns, 2):
+        both = [odd[r] for r in odd if {r.i, r.j} & set(pair)]
+        if touched & set(pair) or len(both) > 1:
+            left = _left(_exchanged(trial, pair), exact)
+            if touched & set(pair) or CLEARLY * left < min(both):
+                found[f"{names[pair[0]]} and {names[pair[1]]}"] = left
     least = CLEARLY * max(min(found.values(), default=1.0), ROUNDING)
     found = {pair: left for pair, left in found.items() if left < min(least, 1 - WHOLE)}
     return " (or ".join(found) + ")" * (len(found) - 1)
@@ -104,10 +109,9 @@ def _together(trial: Trial, relation: Integral) -> tuple[float, float]:
     return best if some else (1.0, 1.0)
 
 
-def _broken(trial: Trial, relation: Integral) -> bool:
-    """Neither alike nor mirrored, over any window."""
-    mirrored = replace(relation, c=-relation.c)
-    return _together(trial, relation)[0] < BROKEN and _left(trial, [mirrored]) > 1 - WHOLE
+def _mirrored_too(trial: Trial, relation: Integral) -> float:
+    """1 - cosine of a relation as it is, or of the other sign: what is mirrored is no exchange."""
+    return min(_left(trial, [replace(relation, c=sign * relation.c)]) for sign in (1, -1))
 
 
 def _left(trial: Trial, relations: Sequence[Integral]) -> float:

@@ -67,6 +67,34 @@ def test_two_pairs_that_would_mend_it_are_both_named():
     assert found == "x and y (or vx and vy)"
 
 
+def side_by_side(ratio: float) -> Trial:
+    """Two joints on their way together, one further, and then on by itself for a little."""
+    rng, t = np.random.default_rng(0), np.linspace(0, 1, 101)
+    way = 10 * t**3 - 15 * t**4 + 6 * t**5
+    turn = 0.3 * np.sin(2 * np.pi * t) * way
+    x = np.column_stack([way + turn, ratio * way])
+    states = np.hstack([x, np.gradient(x, 0.02, axis=0)])
+    states += rng.normal(size=states.shape) * [5e-4, 5e-4, 0.01, 0.01]
+    return Trial(states, np.zeros((100, 2)), 0.02, PLANE.state_names, PLANE.input_names)
+
+
+@pytest.mark.parametrize("ratio", [0.4, 0.8, 2.5])
+@pytest.mark.parametrize("pair", [(0, 1), (2, 3)])
+def test_joints_that_move_alike_are_told_by_both(ratio, pair):
+    """Each goes roughly as the other's velocity says, but half as far."""
+    trial = side_by_side(ratio)
+    assert swapped_columns(PLANE, trial) == ""
+    assert swapped_columns(PLANE, with_columns(trial, *pair)) == "x and y (or vx and vy)"
+
+
+def test_one_joint_that_moves_further_than_its_velocity_says_is_no_exchange():
+    trial = side_by_side(0.5)
+    for factor in (0.5, 2.0, -1.0):
+        states = trial.states * [factor, 1.0, 1.0, 1.0]
+        other = Trial(states, trial.inputs, 0.02, PLANE.state_names, PLANE.input_names)
+        assert swapped_columns(PLANE, other) == ""
+
+
 def test_a_sign_a_scale_a_delay_or_a_drifting_position_are_no_exchange():
     trial = driven(SLED, 1)
     x, v = np.array(trial.states).T
