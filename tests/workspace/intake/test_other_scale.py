@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from facts import holds
+from grounded import Model
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
-from grounded_trials.workspace.intake.other_scale import other_units
+from grounded_trials.workspace.intake.other_scale import other_units, units_tried
 from grounded_trials.workspace.intake.who_drove import follows, latest
 from recorded import record, waiting
 from workspaces import make
@@ -74,18 +75,34 @@ def driven(tmp_path_factory):
         ("r", 2.5),  # its turn was said to be in degrees
         ("psi r", 0.7),
         ("x y psi u r", 1.2),
+        ("drive turn", 1e3),  # in mV, both
     ],
 )
 def test_the_columns_and_their_factor_are_named(driven, tmp_path, names, factor):
     w, trial, meta = driven
-    by = [factor if name in names.split() else 1.0 for name in trial.state_names]
-    odd = replace(trial, states=trial.states * by)
+    by, sent = (
+        [factor if name in names.split() else 1.0 for name in every]
+        for every in (trial.state_names, trial.input_names)
+    )
+    odd = replace(trial, states=trial.states * by, inputs=trial.inputs * sent)
     write_trial(tmp_path / "odd.mcap", odd, {k: meta[k] for k in ("kind", "task")})
     with pytest.raises(GroundedError) as refused:
         w.ingest(tmp_path / "odd.mcap")
     assert holds(str(refused.value), " and ".join(names.split()), f"times {1 / factor:.3g}")
     named = w.ingest(tmp_path / "odd.mcap", candidate=trial.candidate)
     assert any(f"{1 / factor:.3g}" in warning for warning in named.warnings)
+
+
+def test_an_encoder_of_one_joint_the_other_way_round_is_tried(tmp_path):
+    """Neither all angles nor the position alone: its velocity turns with it."""
+    arm = Model(
+        states={"a": "rad", "b": "rad", "va": "rad/s", "vb": "rad/s"},
+        inputs={"ta": "N m", "tb": "N m", "fan": "1"},
+        derivative=lambda s, a, p: {"a": s.va, "b": s.vb, "va": a.ta, "vb": a.tb - s.vb},
+    )
+    tried = {(tuple(names), factor) for names, factor in units_tried(arm)}
+    assert {(("a", "va"), -1.0), (("b", "vb"), -1.0)} <= tried
+    assert {(("ta", "tb"), 1e-3), (("ta", "tb"), 1e3)} <= tried
 
 
 @pytest.mark.parametrize("seed", range(6))

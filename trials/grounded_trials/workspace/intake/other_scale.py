@@ -59,16 +59,21 @@ def other_units(
     if plain is None or (plain.alike and plain.error < NEARLY):
         return (), 1.0
     trial, late = trial.until(task.horizon), latest(task)
+    least, best = UNITS_LEAVE * _left(plain), (tuple[str, ...](), 1.0, np.inf)
     for names, factor in units_tried(task.model):
         found = follows(own.policy, _multiplied(trial, names, factor), late)
         if found is None or not found.alike or found.error >= NEARLY:
             continue
-        left, most = _left(found), UNITS_LEAVE * _left(plain)
-        if left < most and (not plain.alike or evidence(plain, found) > DECISIVE):
-            if found.error < EXACT:
-                return tuple(names), float(factor)
-            any_, by = _any_factor(task.model, own.policy, trial, plain, late, 0.5 * left)
-            return (any_, by) if any_ else (tuple(names), float(factor))
+        if (left := _left(found)) < least and (
+            not plain.alike or evidence(plain, found) > DECISIVE
+        ):
+            least, best = left, (tuple(names), float(factor), found.error)
+    names, factor, error = best
+    if names and error >= EXACT:
+        any_, by = _any_factor(task.model, own.policy, trial, plain, late, 0.5 * least)
+        return (any_, by) if any_ else (names, factor)
+    if names:
+        return names, factor
     return _any_factor(task.model, own.policy, trial, plain, late, LEAVES * _left(plain))
 
 
@@ -111,6 +116,22 @@ def _scaled_together(model: Model) -> Iterator[tuple[str, ...]]:
         names = tuple(name for name, unit in model.states.items() if unit in units)
         if len(names) > 1:
             yield names
+    yield from (*_of_one_sensor(model), *_of_one_unit(model))
+
+
+def _of_one_sensor(model: Model) -> list[tuple[str, ...]]:
+    """A position and its velocity: an encoder that is mounted the other way round turns both."""
+    from grounded.instruments.kinematics import integrals
+
+    names = model.state_names
+    return [(names[one.i], names[one.j]) for one in integrals(model) if one.exact]
+
+
+def _of_one_unit(model: Model) -> list[tuple[str, ...]]:
+    """Inputs of one unit: whoever logs one torque in N mm does so with all."""
+    units = list(model.inputs.values())
+    every = dict.fromkeys(unit for unit in units if units.count(unit) > 1)
+    return [tuple(n for n, own in model.inputs.items() if own == unit) for unit in every]
 
 
 def _factor(policy: Policy, trial: Trial, names: Sequence[str], start: float) -> float:
@@ -155,14 +176,16 @@ def units_tried(model: Model) -> Iterator[tuple[Sequence[str], float]]:
     pure = [name for name, unit in model.inputs.items() if unit == "1"]
     yield from ((names, f) for f in (np.pi / 180, 180 / np.pi) for names in angular if names)
     yield from ((pure, f) for f in PERCENT if pure)
-    yield from ((names, f) for f in (*THOUSAND, -1.0) for names in single)
+    together = [*single, *_of_one_unit(model), *_of_one_sensor(model)]
+    yield from ((names, f) for f in (*THOUSAND, -1.0) for names in together)
 
 
 def units_told(names: Sequence[str], by: float, mapped: bool) -> str:
     """What is wrong with the units of a log, and what mends it; `mapped`: by a [log] table."""
     which = " and ".join(names)
     if by == -1:
-        mend = f"multiply its scale by -1 in {FILE}'s [log] (1 where none is given)"
+        its = "its scale" if len(names) == 1 else "the scale of each"
+        mend = f"multiply {its} by -1 in {FILE}'s [log] (1 where none is given)"
         alone = f"append {which} times -1 and run it again, or take it in with --data"
         return f"with {which} of the other sign: {mend if mapped else alone}"
     size = f"{max(abs(by), 1 / abs(by)):.4g} times too {'large' if abs(by) < 1 else 'small'}"
