@@ -29,7 +29,13 @@ from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.intake.odd_run import odd_run
 from grounded_trials.workspace.intake.other_scale import other_units, units_told
-from grounded_trials.workspace.intake.reading import Read, cut_log, read_log_file, read_own_trial
+from grounded_trials.workspace.intake.reading import (
+    Read,
+    crossed_in,
+    cut_log,
+    read_log_file,
+    read_own_trial,
+)
 from grounded_trials.workspace.intake.run_start import (
     LOOSE,
     Recording,
@@ -188,6 +194,8 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             f"diagnosis, or with --candidate {ran} all the same",
             NextCommand("ingest", (str(path), "--data")),
         )
+    if read.log and (named := crossed_in(read.log)):
+        raise GroundedError(f"{path} is not read as a run of {ran}: {'; '.join(named)}")
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
     if other:
         raise GroundedError(

@@ -21,6 +21,7 @@ from grounded_trials.store.own_files import FILE_LIMIT
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, ROWS
+from grounded_trials.workspace.intake.crossed import crossed
 from grounded_trials.workspace.intake.foreign import ForeignLog, begun, mapping_of, read_foreign
 from grounded_trials.workspace.intake.stored_before import refuse_as_another
 from grounded_trials.workspace.proposing import standing_in
@@ -154,12 +155,17 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
     return Read(
         trial,
         encoded,
-        (*log.unlike_units, *log.unread, *found.warnings),
+        (*crossed_in(log), *log.unlike_units, *log.unread, *found.warnings),
         found.reports,
         notes=() if candidate else tuple(begun(found, trial.dt, trial.input_names)),
         log=log,
         last_s=(found.last_ns - found.start_ns) * 1e-9,
     )
+
+
+def crossed_in(log: ForeignLog) -> tuple[str, ...]:
+    """The signals of a log that [log] seems to read from each other's column."""
+    return crossed(log.workspace.base_model, log.mapping)
 
 
 def _outstanding(workspace: Folder, path: Path) -> str:

@@ -1,0 +1,49 @@
+"""Two signals that [log] reads from each other's column, by what the columns are called.
+
+A state and an input have no relation that data must keep: an angle of a beam that is read from the
+servo's column is as smooth as its own. The names tell, where each fits the other signal better.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from itertools import combinations
+
+from grounded.model import Model
+from grounded_trials.logs.log_table import LogMapping
+from grounded_trials.logs.stated_units import bare_command
+from grounded_trials.workspace.config import FILE
+
+
+def crossed(model: Model, mapping: LogMapping) -> tuple[str, ...]:
+    """Sentences on signals that are read from each other's column; axes may be called as one likes.
+
+    Args:
+        model: whose states and inputs they are.
+        mapping: which column each is read from.
+    """
+    paths = {name: one.path for name, one in {**mapping.states, **mapping.inputs}.items()}
+    axes = model.roles.get("position", ())  # north may be the x of one and the y of another
+    return tuple(
+        f"{a} is read from {paths[a]} and {b} from {paths[b]}: by their names they are exchanged "
+        f"in {FILE}'s [log]"
+        for a, b in combinations(paths, 2)
+        if not {a, b} <= set(axes) and _crossed(a, b, paths)
+    )
+
+
+def _crossed(a: str, b: str, paths: Mapping[str, str]) -> bool:
+    """Whether each name fits the other's column better, and that one well enough."""
+    return all(
+        _alike(one, paths[other]) > _alike(one, paths[one])
+        and _alike(one, paths[other]) >= _alike(other, paths[other])
+        for one, other in ((a, b), (b, a))
+    )
+
+
+def _alike(name: str, path: str) -> float:
+    """The share of words that a name and the end of a path have in common, without the unit."""
+    last = re.split(r"[./]", bare_command(path).strip('"'))[-1]
+    own, found = (set(re.findall(r"[a-z]+|\d+", one.lower())) for one in (name, last))
+    return len(own & found) / max(len(own | found), 1)
