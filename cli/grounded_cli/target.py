@@ -48,7 +48,8 @@ def command(
     With --hold a path ends at rest and stays there.
 
     The target there was is kept as target.csv.bak, and [task] horizon follows; so do the weights in
-    [reward] state, unless you chose them. Earlier trials stay, for fit and diagnose; the search
+    [reward] state, unless you chose them, and with them input_change of inputs that have [limits],
+    where it is what `init --blank` wrote. Earlier trials stay, for fit and diagnose; the search
     begins anew.
     """
     from grounded_trials.starting.shapes import (
@@ -75,9 +76,9 @@ def command(
         columns = swing_up(model, dt, seconds)
     else:
         columns = _recorded(workspace, shape)
-    before = _weights(workspace)
+    before, changed = _weights(workspace, "state"), _weights(workspace, "input_change")
     path = workspace.target(columns)
-    weights = _weights(workspace)
+    weights, changes = _weights(workspace, "state"), _weights(workspace, "input_change")
     rows = len(next(iter(columns.values())))
     ranges = {name: (float(v.min()), float(v.max())) for name, v in columns.items()}
     if json_:
@@ -90,6 +91,9 @@ def command(
     if weights != before:
         told = ", ".join(f"{name} = {number(weight)}" for name, weight in weights.items())
         sentence(f"[reward] state is new, 1 for an error as large as a range here: {told}")
+    if changes != changed:
+        told = ", ".join(f"{name} = {number(weight)}" for name, weight in changes.items())
+        sentence(f"[reward] input_change is new, 0.04 / (range of [limits])^2: {told}")
     moving = {model.states[name] for name, ends in ranges.items() if ends != (0, 0)}
     if still := [name for name in ranges if model.states[name] not in moving]:
         remark(
@@ -101,11 +105,11 @@ def command(
     show(f"\n{next_line(NextCommand('propose'))}")
 
 
-def _weights(workspace: Workspace) -> dict[str, float]:
+def _weights(workspace: Workspace, kind: str) -> dict[str, float]:
     import tomllib
 
     written = tomllib.loads(workspace.config.file.read_text(encoding="utf-8"))
-    return dict(written.get("reward", {}).get("state", {}))
+    return dict(written.get("reward", {}).get(kind, {}))
 
 
 def _values(pairs: tuple[str, ...]) -> dict[str, float]:

@@ -1,6 +1,7 @@
 """A workspace from a model alone, and the robot's program that comes with it."""
 
 import importlib.util
+import re
 import tomllib
 from functools import cache
 from importlib.metadata import EntryPoint
@@ -82,6 +83,39 @@ def test_the_first_plan_says_what_the_task_leaves_open(blank):
     limits = text.replace("[limits]", "[limits]\nforce = [-2, 2]").replace("= 30", "= 40")
     (folder / "grounded.toml").write_text(limits)
     assert not [one for one in blank.propose().proposal.notes if "[limits] has none" in one]
+
+
+def rewarded(w):
+    return tomllib.loads((w.folder / "grounded.toml").read_text())["reward"]
+
+
+def test_a_target_renews_the_weight_on_changes_that_limits_give(blank):
+    """0.01 belongs to an input from -1 to 1: in degrees it is 2000 times too heavy."""
+    config = blank.folder / "grounded.toml"
+    assert rewarded(blank)["input_change"] == {"force": 0.01}
+    blank.target({"x": np.linspace(0, 1, 41)})
+    assert rewarded(blank)["input_change"] == {"force": 0.01}  # no limits
+    limited = config.read_text().replace("[limits]", "[limits]\nforce = [-45, 45]")
+    config.write_text(limited)
+    told = grounded("-C", blank.folder, "target", "step", "--to", "x=1", "--seconds", "2").out
+    assert holds(told, "input_change", "4.938e-06")
+    assert rewarded(blank)["input_change"] == {"force": 4.938e-06}
+    assert blank.task.reward.input_change[0] == 4.938e-06
+    again = grounded("-C", blank.folder, "target", "step", "--to", "x=2", "--seconds", "2").out
+    assert "input_change" not in again
+
+
+@pytest.mark.parametrize(
+    "chosen", ["input_change = { force = 0.02 }", "state = { x = 3.0, v = 1.0 }"]
+)
+def test_a_weight_that_somebody_chose_stays(blank, chosen):
+    config = blank.folder / "grounded.toml"
+    key = chosen.split(" = ")[0]
+    text = re.sub(rf"(?m)^{key} = .*$", chosen, config.read_text())
+    config.write_text(text.replace("[limits]", "[limits]\nforce = [-45, 45]"))
+    before = rewarded(blank)["input_change"]
+    blank.target({"x": np.linspace(0, 1, 41)})
+    assert rewarded(blank)["input_change"] == before
 
 
 def test_a_target_that_nobody_has_drawn_is_told(blank):

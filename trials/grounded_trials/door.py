@@ -168,7 +168,7 @@ class Workspace(Folder):
         from grounded_trials.workspace.task_file import replace_target
 
         here = self._afresh()
-        path = replace_target(here.config, columns, here.base_model.states)
+        path = replace_target(here.config, columns, here.base_model)
         self.forget()
         return path
 

@@ -20,15 +20,15 @@ from grounded.model import Model
 from grounded.task import Task
 from grounded.utility import Reward
 from grounded_trials.starting.examples import fresh_folder, toml_of
-from grounded_trials.starting.first_toml import change_weight
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.first_plan import holding_input
 from grounded_trials.workspace.model_file import load_module, model_in
-from grounded_trials.workspace.task_file import write_target
+from grounded_trials.workspace.task_file import change_weight, write_target
 
 DT, HORIZON = 0.05, 100  # [s], steps
 COMMAND = 'command = "python drive.py {candidate} {trial}"   # or by hand: propose, drive, ingest'
+CHANGES = "# for an input from -1 to 1: `target` sets it by its limits until you change a weight"
 DRIVE = '''"""The robot's program: runs a candidate, writes its trial. `grounded run` calls it so:
 
     python drive.py candidates/c0001.mcap runs/c0001-1.mcap
@@ -109,7 +109,8 @@ def write_blank(folder: Path, file: str | Path, dt: float | None = None) -> None
         drive = DRIVE.format(states=dict(model.states), inputs=dict(model.inputs))
         write_atomically(folder / "drive.py", drive.encode())
         name = f"{model.name or file.stem}: target, weights and limits are yours"
-        write_atomically(folder / FILE, toml_of(task, name, COMMAND).encode())
+        text = toml_of(task, name, COMMAND).replace("\ninput_change", f"\n{CHANGES}\ninput_change")
+        write_atomically(folder / FILE, text.encode())
 
 
 def _loads_alone(folder: Path, file: Path) -> None:

@@ -11,11 +11,7 @@ from grounded.model import Model
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import key
 from grounded_trials.workspace.config import FILE
-from grounded_trials.workspace.task_file import equal_weights, write_target
-
-UNKNOWN = {"%": (-100.0, 100.0)}  # what an input may be, by its unit, where nothing says it
-CHANGE = 0.01  # the weight on the changes of an input from -1 to 1
-CHANGES = 4 * CHANGE
+from grounded_trials.workspace.task_file import change_weight, equal_weights, write_target
 
 
 def write_first(
@@ -87,17 +83,6 @@ def write_first(
         "",
     ]
     write_atomically(folder / FILE, "\n".join(lines).encode())
-
-
-def change_weight(limits: tuple[float, float] | None, unit: str) -> float:
-    """The first weight on an input's changes: a part of its whole range costs as much in any unit.
-
-    Args:
-        limits: lowest and highest value; None where nothing says them: -1 to 1, or -100 to 100 %.
-        unit: of the input.
-    """
-    low, high = limits or UNKNOWN.get(unit, (-1.0, 1.0))
-    return CHANGES / (high - low) ** 2 if high > low else CHANGE
 
 
 def _inline(values: Mapping[str, float]) -> str:

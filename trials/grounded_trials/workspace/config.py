@@ -233,10 +233,13 @@ def set_target(
     steps: int,
     weights: Mapping[str, float],
     before: Mapping[str, float],
+    changes: Mapping[str, tuple[float, float]],
 ) -> None:
-    """Replaces [task] target and horizon, and the state weights of [reward] that nobody chose.
+    """Replaces [task] target and horizon, and the weights of [reward] that nobody chose.
 
-    Those are none, `before`, which belonged to the last target, or 1 each, of `init --blank`.
+    Of states those are none, `before`, which belonged to the last target, or 1 each, of `init
+    --blank`. Where they are, so are what that wrote for the `changes` of inputs, by name the weight
+    without [limits] and by them.
     """
     import tomlkit
 
@@ -248,7 +251,12 @@ def set_target(
         for unchosen in (before, dict.fromkeys(before, 1.0))
     )
     if same or (not own and not reward.get("terminal")):
-        _change(file, "reward", {"state": _inline(weights)})
+        renewed: dict[str, Any] = {"state": _inline(weights)}
+        written = dict(reward.get("input_change", {}))
+        blank = {name: new for name, (old, new) in changes.items() if written.get(name) == old}
+        if blank:
+            renewed["input_change"] = _inline(written | blank)
+        _change(file, "reward", renewed)
         ends = _inline({state: 10 * weight for state, weight in weights.items()}).as_string()
         text = file.read_text(encoding="utf-8")
         told = re.sub(r"(?m)^(# terminal = ).*$", lambda found: found[1] + ends, text, count=1)

@@ -116,6 +116,9 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
 ROW_LIMIT = 200_002
 LEAST = 0.1  # range of a column of the target that weights go by
 UNKNOWN = 1.0  # in its own unit: that of a column that is constant, as all of its unit
+FULL = {"%": (-100.0, 100.0)}  # what an input may be, by its unit, where nothing says it
+CHANGE = 0.01  # the weight on the changes of an input from -1 to 1
+CHANGES = 4 * CHANGE
 
 
 def read_target(path: Path) -> tuple[list[str], Array]:
@@ -231,8 +234,9 @@ def target_arrays(
     return target, np.stack(columns, axis=1)
 
 
-def replace_target(config: Config, columns: Mapping[str, Array], units: Mapping[str, str]) -> Path:
+def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -> Path:
     """Writes target.csv and its length to grounded.toml, see `Workspace.target`."""
+    units = model.states
     name = config.task.target or "target.csv"
     path = config.file.parent / name
     before: dict[str, float] = {}
@@ -243,8 +247,19 @@ def replace_target(config: Config, columns: Mapping[str, Array], units: Mapping[
         path.replace(path.with_name(path.name + ".bak"))
     write_target(path, config.task.dt, dict(columns))
     weights = {state: round(w, 6) for state, w in equal_weights(columns, units).items()}
-    set_target(config.file, name, len(next(iter(columns.values()))) - 1, weights, before)
+    rows = len(next(iter(columns.values())))
+    set_target(config.file, name, rows - 1, weights, before, _changes(config, model))
     return path
+
+
+def _changes(config: Config, model: Model) -> dict[str, tuple[float, float]]:
+    """The weights on changes of inputs that have [limits]: without them, and by them."""
+    both = zip(*_limits(config, list(model.input_names)), model.inputs.items(), strict=True)
+    return {
+        name: (change_weight(None, unit), float(f"{change_weight((low, high), unit):.4g}"))
+        for low, high, (name, unit) in both
+        if math.isfinite(high - low)
+    }
 
 
 def equal_weights(columns: Mapping[str, Array], units: Mapping[str, str]) -> dict[str, float]:
@@ -270,6 +285,17 @@ def equal_weights(columns: Mapping[str, Array], units: Mapping[str, str]) -> dic
         for name, own in ranges.items()
     }
     return {name: width**-2 for name, width in widths.items()}
+
+
+def change_weight(limits: tuple[float, float] | None, unit: str) -> float:
+    """The first weight on an input's changes: a part of its whole range costs as much in any unit.
+
+    Args:
+        limits: lowest and highest value; None where nothing says them: -1 to 1, or -100 to 100 %.
+        unit: of the input.
+    """
+    low, high = limits or FULL.get(unit, (-1.0, 1.0))
+    return CHANGES / (high - low) ** 2 if high > low else CHANGE
 
 
 def write_target(path: Path, dt: float, columns: dict[str, Array]) -> None:
