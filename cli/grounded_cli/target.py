@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
@@ -15,36 +16,39 @@ if TYPE_CHECKING:
     from grounded.frozen import Array
     from grounded_trials import Workspace
 
+SECONDS = 5.0  # of a step or a swing-up
+
 
 @click.command("target")
 @click.argument("shape", metavar="SHAPE|FILE")
 @click.option("--size", type=float, default=2.0, help="Length, or radius [m] (2).")
-@click.option("--speed", type=float, default=1.0, help="At most [m/s] (1).")
-@click.option("--accel", type=float, default=1.0, help="Along the path, at most [m/s^2] (1).")
+@click.option("--speed", type=float, help="At most [m/s] (1).")
+@click.option("--accel", type=float, help="Along the path, at most [m/s^2] (1).")
 @click.option("--lateral", type=float, default=4.0, help="Across it, at most [m/s^2] (4).")
 @click.option("--laps", type=float, default=1.0, help="Of a circle or figure-8 (1).")
 @click.option("--hold", type=float, default=0.0, help="At rest at a path's end [s] (0).")
 @click.option("--to", multiple=True, metavar="STATE=VALUE", help="Where a line or step ends.")
-@click.option("--seconds", type=float, default=5.0, help="Of a step or swing-up (5).")
+@click.option("--seconds", type=float, help="Of a step or swing-up (5), of a line to a STATE.")
 @in_workspace
 @as_json
 def command(
     shape: str,
     size: float,
-    speed: float,
-    accel: float,
+    speed: float | None,
+    accel: float | None,
     lateral: float,
     laps: float,
     hold: float,
     to: tuple[str, ...],
-    seconds: float,
+    seconds: float | None,
     json_: bool,
 ) -> None:
     """Write target.csv: a line, circle, figure-8, step or swing-up, or a recorded run.
 
     FILE is a log, read through [log], or a CSV with columns `t` and states. Paths start from rest
     and keep to the speeds and accelerations given. A line with --to, and that of a robot with one
-    axis, goes from [task] start to rest, in the states' own units; a step begins at [task] start.
+    axis, goes from [task] start to rest, in the states' own units, in --seconds if they are given,
+    with --speed or --accel where one of them is; a step begins at [task] start.
     With --hold a path ends at rest and stays there.
 
     The target there was is kept as target.csv.bak, and [task] horizon follows; so do the weights in
@@ -65,15 +69,30 @@ def command(
     workspace = open_workspace()
     model, dt = workspace.base_model, workspace.config.task.dt
     start, ends = workspace.config.task.start, _values(to)
-    drive = Drive(size, speed, accel, lateral, laps, hold)
+    paces = {"speed": speed, "accel": accel}
+    kept = [key for key, given in paces.items() if given is not None]
+    drive = replace(
+        Drive(size=size, lateral=lateral, laps=laps, hold=hold),
+        **{key: given for key, given in paces.items() if given is not None},
+    )
+    long = SECONDS if seconds is None else seconds
     if shape == "line" and (ends or not has_plane(model)):
-        columns = line_target(ends, start, drive, model, dt)
+        if seconds is not None and len(kept) > 1:
+            raise click.UsageError(
+                "of --seconds, --speed and --accel a line has two: leave one away"
+            )
+        columns = line_target(ends, start, drive, model, dt, seconds, "".join(kept[:1]))
+    elif shape == "step":
+        columns = step_target(ends, model, dt, long, start)
+    elif shape == "swing-up":
+        columns = swing_up(model, dt, long)
+    elif seconds is not None:
+        raise click.UsageError(
+            "--seconds is of a step, a swing-up or a line --to STATE=VALUE; how fast a path is "
+            "driven --speed and --accel say"
+        )
     elif shape in PATHS:
         columns = path_target(shape, drive, model, dt)
-    elif shape == "step":
-        columns = step_target(ends, model, dt, seconds, start)
-    elif shape == "swing-up":
-        columns = swing_up(model, dt, seconds)
     else:
         columns = _recorded(workspace, shape)
     before, changed = _weights(workspace, "state"), _weights(workspace, "input_change")

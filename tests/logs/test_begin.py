@@ -517,6 +517,45 @@ def test_a_path_keeps_to_its_speeds_and_starts_from_rest(tmp_path):
         assert np.abs(error).max() < 0.2
 
 
+@pytest.mark.parametrize(
+    "paces, most",
+    [
+        ((), 0.5858),  # with --accel 1
+        (("--accel", "0.5"), 1.0),  # faster up to the middle: 4 * 2 / 4**2
+        (("--speed", "0.6"), 0.6),
+        (("--speed", "9"), 1.0),
+    ],
+)
+def test_a_line_takes_the_seconds_that_are_given(tmp_path, paces, most):
+    """They were left aside without a word: 4 s had become 2.8 s."""
+    made = workspaces.make(tmp_path / "w")
+    words = ("target", "line", "--to", "x=2", "--seconds", "4", *paces)
+    done = grounded("-C", made.folder, *words, "--json").json
+    assert done["horizon"] == 80 and done["columns"]["x"] == [0.0, 2.0]
+    assert done["columns"]["v"][1] == pytest.approx(most, abs=0.03)
+    names, rows = read_target(made.folder / "target.csv")
+    x, v = rows[:, names.index("x")], rows[:, names.index("v")]
+    assert x[-1] == 2.0 and v[-1] == 0.0 and x[-2] < 2.0
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (("line", "--to", "x=2", "--accel", "0.4"), "--accel 0.5"),
+        (("line", "--to", "x=2", "--speed", "0.4"), "--speed 0.4"),
+        (("line", "--to", "x=2", "--speed", "1", "--accel", "1"), "--seconds"),
+        (("circle",), "--seconds"),
+        (("run.csv",), "--seconds"),
+    ],
+)
+def test_seconds_that_a_target_can_t_take_are_refused(tmp_path, words, said):
+    made = workspaces.make(tmp_path / "w")
+    before = (made.folder / "target.csv").read_text()
+    refused = grounded("-C", made.folder, "target", *words, "--seconds", "4")
+    assert refused.code and said in refused.err
+    assert (made.folder / "target.csv").read_text() == before
+
+
 def test_a_robot_with_one_axis_has_a_line_and_a_step_from_its_start(tmp_path):
     """A boom was told to have a role 'position' of two states; a step began at 0."""
     cart = workspaces.MODEL.replace(', "speed": "v"', "").replace('"position": ("x",)', "")

@@ -12,7 +12,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from grounded.errors import GroundedError
-from grounded_trials.formats.text_tables import column_units
+from grounded_trials.formats.text_tables import column_units, cut_off
 from grounded_trials.logs.inspect_log import inspect_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
 
@@ -204,6 +204,10 @@ def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path
     path.write_text("Time [ms],x\n0,1.5\n20,2.5\n4")
     found = read_signals(path, {"x": SignalSpec("/csv.x")})["x"]
     assert found.values.tolist() == [1.5, 2.5] and found.t.tolist() == [0, 20_000_000]
+    assert "'4'" in cut_off(path) and any("'4'" in one for one in inspect_log(path).remarks)
+    for whole in ("t,x\n0,1.5\n20,2.5", "t,x\n0,1.5\n20,2.5\n", "t,x\n0,1.5\n\n\n"):
+        path.write_text(whole)
+        assert not cut_off(path)
     path.write_text("elapsed_us,x\n0,1.5\n20,2.5\n")
     assert read_signals(path, {"x": SignalSpec("/csv.x")})["x"].t.tolist() == [0, 20_000]
 

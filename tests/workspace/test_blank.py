@@ -118,6 +118,19 @@ def test_a_weight_that_somebody_chose_stays(blank, chosen):
     assert rewarded(blank)["input_change"] == before
 
 
+def test_a_plan_that_stays_far_from_where_its_target_ends_is_told(blank):
+    """Inputs were so dear that it got 0.03 m of 0.1 m; nothing was at a limit, nothing said."""
+    config, way = blank.folder / "grounded.toml", np.linspace(0, 1, 41)
+    config.write_text(config.read_text().replace("[limits]", "[limits]\nforce = [-50, 50]"))
+    blank.target({"x": way**2 * (3 - 2 * way)})
+    told = blank.propose().proposal.notes
+    assert not [one for one in told if "the plan ends" in one]
+    dear = "input_change = { force = 2000 }"
+    config.write_text(re.sub(r"(?m)^input_change = .*$", dear, config.read_text()))
+    (note,) = (one for one in blank.propose().proposal.notes if "the plan ends" in one)
+    assert holds(note, "x", "1.0 m", "[reward]")
+
+
 def test_a_target_that_nobody_has_drawn_is_told(blank):
     blank.target({"x": np.zeros(41), "v": np.zeros(41)})
     assert any("`target`" in one for one in blank.propose().proposal.notes)

@@ -83,6 +83,24 @@ def column_units(path: Path) -> dict[str, str]:
     return {f"/csv.{name}": unit[1] for name, unit in said.items() if unit and '"' not in unit[1]}
 
 
+def cut_off(path: Path) -> str:
+    """That the last row of a text table was cut off and is left out; "" where it is whole."""
+    if path.suffix.lower() not in (".csv", ".tsv", ".txt"):
+        return ""
+    with _opened(path) as stream:
+        head, last = _head([stream.readline(LOOK) for _ in range(PREAMBLE + 2)], path), ""
+        _pass_over(stream, head)
+        for line in stream:
+            last = line
+    short = last.strip() and len(_cells(last, head.mark)) < len(head.names)
+    if not short or not _is_cut([last]):
+        return ""
+    return (
+        f"its last row, {last.strip()[:80]!r}, was cut off and is left out: the file ends in the "
+        "middle of it, what came after is lost"
+    )
+
+
 def _opened(path: Path) -> TextIO:
     """The text in its encoding: UTF-8, UTF-16 where it says so, else that of Windows."""
     with path.open("rb") as stream:

@@ -8,7 +8,7 @@ column: position, heading, speed, heading_rate.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -89,7 +89,13 @@ def _grid(seconds: float, dt: float) -> Array:
 
 
 def line_target(
-    to: Mapping[str, float], start: Mapping[str, float], drive: Drive, model: Model, dt: float
+    to: Mapping[str, float],
+    start: Mapping[str, float],
+    drive: Drive,
+    model: Model,
+    dt: float,
+    seconds: float | None = None,
+    kept: str = "",
 ) -> dict[str, Array]:
     """Columns of a straight line in the states, from rest to rest, with their rates.
 
@@ -99,10 +105,13 @@ def line_target(
         drive: speed and acceleration of the state that goes farthest, in its unit.
         model: whose states they are.
         dt: control interval [s].
+        seconds: that it takes from rest to rest; None: as `drive` says.
+        kept: which of the drive's "speed" and "accel" holds with those, the other follows; "":
+            neither has to.
 
     Raises:
-        GroundedError: for a name that is no state, a line of no length, or where several axes may
-            be meant.
+        GroundedError: for a name that is no state, a line of no length, where several axes may be
+            meant, or where the line can't take so long.
     """
     _check(drive)
     to = to or {(name := _axis(model)): start.get(name, 0.0) + drive.size}
@@ -111,16 +120,43 @@ def line_target(
     length = max(map(abs, way.values()))
     if not 0 < length < np.inf:
         raise GroundedError(f"the line ends where it starts, at {_told(to)}: --to says where else")
+    if seconds is not None:
+        drive = _in_time(drive, length, seconds, kept)
     along = np.linspace(0, length, FINE)
     limit = np.full(FINE, drive.speed)
     limit[-1] = 0.0
     speed = _reachable(along, limit, drive.accel)
     when = np.concatenate([[0.0], np.cumsum(2 * np.diff(along) / (speed[1:] + speed[:-1]))])
+    if seconds is not None:
+        when *= seconds / when[-1]  # but for what FINE points leave
     t = _grid(when[-1] + drive.hold, dt)
     share, rate = np.interp(t, when, along) / length, np.interp(t, when, speed) / length
     columns = {name: start.get(name, 0.0) + share * far for name, far in way.items()}
     rates = velocities(model)
     return columns | {rates[q]: rate * far for q, far in way.items() if rates.get(q, q) not in way}
+
+
+def _in_time(drive: Drive, length: float, seconds: float, kept: str) -> Drive:
+    """The drive with which a line takes so long: no faster than it has to be, nor more abrupt."""
+    if not 0 < seconds < np.inf:
+        raise GroundedError(f"--seconds must be positive, found {seconds:g}")
+    least = 4 * length / seconds**2  # faster up to the middle, slower from there
+    if kept == "speed":
+        if drive.speed * seconds <= length:
+            raise GroundedError(
+                f"{length:g} in {seconds:g} s is faster than --speed {drive.speed:g}: it takes "
+                f"more than {length / drive.speed:.3g} s, or leave --speed away"
+            )
+        accel = drive.speed**2 / (drive.speed * seconds - length)
+        return replace(drive, accel=accel if drive.speed * seconds < 2 * length else least)
+    if kept == "accel" and drive.accel < least * (1 - 1e-9):
+        raise GroundedError(
+            f"{length:g} in {seconds:g} s from rest to rest needs --accel {least:.3g} at least, "
+            f"found {drive.accel:g}: with that it takes {2 * np.sqrt(length / drive.accel):.3g} s"
+        )
+    accel = max(drive.accel, least)
+    root = np.sqrt(max((accel * seconds) ** 2 - 4 * accel * length, 0.0))
+    return replace(drive, accel=accel, speed=float(accel * seconds - root) / 2)
 
 
 def has_plane(model: Model) -> bool:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 MOSTLY = 0.9  # of a plan's cost
 HELD = 0.8  # of a plan's steps: an input is at a limit nearly all the time
+SHORT = 0.25  # of the way to where a target ends: the plan does not get there
 MISSED = 0.1  # of the way that a target asks for: the plan falls short
 STILL = 1e-6  # of the rates under the held input: under another one the robot stands
 BEGUN = (0.0, 1.0, -1.0)  # beside the held input: a thrust by its square has no slope at 0
@@ -59,7 +60,7 @@ def left_open(workspace: Folder, first: Candidate | None) -> list[str]:
                 "less weight there, errors would count for more"
             )
     if first is not None:
-        found += _held_back(task, first)
+        found += _held_back(task, first) or _falls_short(task, first)
     found += _held_before(workspace)
     name = str(workspace.config.task.target)
     rows = len(workspace.read_target((workspace.folder / name).resolve())[1])
@@ -88,6 +89,27 @@ def _held_back(task: Task, first: Candidate) -> list[str]:
     return [
         f"{' and '.join(held)}, and still {missed}: the target seems to ask for more "
         "than [limits] allow. Widen them if the robot may get more, or draw a slower target"
+    ]
+
+
+def _falls_short(task: Task, first: Candidate) -> list[str]:
+    """Where a plan ends far from where its target ends, though no input is at its limit."""
+    from grounded.diagnosis.error_report import measured
+
+    if not (groups := weighed_groups(task)):
+        return []
+    names, what = groups[0]
+    states, unit = [task.model.state_names.index(n) for n in names], task.model.states[names[0]]
+    way = np.vstack([task.start, task.target])[:, states]
+    left = task.model.difference(first.predicted_states[-1], task.target[-1])[states]
+    off, far = float(np.linalg.norm(left)), float(np.linalg.norm(np.ptp(way, axis=0)))
+    if not off > SHORT * far > 0:
+        return []
+    return [
+        f"the plan ends {measured(off, unit)} from where the target does, which takes {what} "
+        f"over {measured(far, unit)}: by [reward] it is not worth more, or the model does not get "
+        "there in that time. Weigh inputs and their changes less, draw a slower target, or look at "
+        "model.py"
     ]
 
 

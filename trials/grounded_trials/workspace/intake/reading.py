@@ -14,6 +14,8 @@ from pathlib import Path
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.trial import Trial
+from grounded_trials.formats.text_tables import cut_off
+from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.samples import SignalReport
 from grounded_trials.logs.stated_units import same_unit
 from grounded_trials.plain_file import read_file
@@ -155,7 +157,13 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
     return Read(
         trial,
         encoded,
-        (*crossed_in(log), *log.unlike_units, *log.unread, *found.warnings),
+        (
+            *filter(None, map(cut_off, log_files(log.path))),
+            *crossed_in(log),
+            *log.unlike_units,
+            *log.unread,
+            *found.warnings,
+        ),
         found.reports,
         notes=() if candidate else tuple(begun(found, trial.dt, trial.input_names)),
         log=log,
