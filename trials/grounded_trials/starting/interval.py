@@ -110,8 +110,10 @@ def changes_every(gaps: Array, rows: float) -> float | None:
         if often:
             found[step] = abs(float((gaps / whole)[on].mean()) / step - 1)
     fits = [step for step, off in found.items() if off < OFF]
-    near = [step for step in fits if step > max(fits) / (1 + 2 * OFF)]  # 120 and 125 Hz
-    return min(near, key=found.__getitem__, default=None)
+    if not fits:
+        return None
+    alike = [step for step in fits if step > max(fits) / (1 + 2 * OFF)]  # 120 and 125 Hz
+    return min(alike, key=found.__getitem__)
 
 
 def _topic(report: LogReport, guess: Guess) -> Any:
