@@ -9,6 +9,7 @@ finds the first.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -189,6 +190,11 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             NextCommand("ingest", (str(path), "--data")),
         )
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
+    if log and (guessed := [n for n in log.names[0] if n not in log.logged]):
+        said += (
+            f" Or {' and '.join(guessed)}, which [estimate] finds here, {_is(guessed)} not what "
+            "its program steered by: have it log its own, and map that in [log] too."
+        )
     if other:
         raise GroundedError(
             f"{said} Take it in with --candidate {other}, with --candidate {ran} all the same, or "
@@ -201,6 +207,10 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         f"the same{begins}",
         NextCommand("ingest", (str(path), "--data")),
     )
+
+
+def _is(names: Sequence[str]) -> str:
+    return "is" if len(names) == 1 else "are"
 
 
 def _may_have_run(workspace: Folder) -> list[Candidate]:
