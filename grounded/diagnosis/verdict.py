@@ -313,8 +313,12 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
             return f"{number(value)} %"
         return f"{number(abs(value))} % {more if value >= 0 else less}"
 
-    def kept(found: re.Match[str]) -> str:  # of a quantity that is estimated, or [left out]
-        return found[1] if set(re.findall(r"\{(\w)[%}]", found[1])) <= set(params) else ""
+    told = {name for name, e in params.items() if e.value != 0}
+
+    def kept(found: re.Match[str]) -> str:  # of quantities that are estimated and not zero
+        parts = found[1].split(" & ")
+        known = [p for p in parts if {*re.findall(r"\{(\w)[%}]", p)} <= told]
+        return " and ".join(known or parts[1:] and parts[:1])
 
     if (
         isinstance(effect.family, ParamFamily)

@@ -253,7 +253,7 @@ def one_friction(one: Effect, other: Effect) -> bool:
 joint_friction = LossFamily(
     name="joint_friction",
     equation="u_eff = u - c sign(w) - b w   (u<-w)",
-    sentence="{driven} loses {c} to dry friction[ and {b} times {source} to viscous friction]",
+    sentence="{driven} loses [{c} to dry friction & {b} times {source} to viscous friction]",
     targets=pairs_of,
     quantities=_friction,
     lookalikes=("coulomb_friction", "viscous_friction", "dead_zone", "stiction", "parameter"),
