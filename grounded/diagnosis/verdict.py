@@ -17,6 +17,7 @@ from grounded.diagnosis.error_report import (
 )
 from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
 from grounded.diagnosis.ruler_words import floor, improvement, rest, worsened
+from grounded.effects import like_a_load
 from grounded.model import Model, all_at_bounds
 from grounded.result import percent
 
@@ -83,6 +84,7 @@ def verdict(
     shares = [f" ({percent(one.share)} of the gain)" * several for one in credit]
     words = [sentence(map(str.__add__, causes, shares)), improvement(rows), worsened(rows)]
     words.append(runaway(rows))
+    words += [LOAD] * like_a_load(claims.data.model, claims.names)
     words += [f"{told_apart(group, same)}." for group in groups[:1]]
     words += [one.sentence() for one in claims.one_clock[:1]]
     more = 0
@@ -102,6 +104,10 @@ def verdict(
     return replace(said, look_for=more if more > most else 0)
 
 
+LOAD = (
+    "Gains of several joints at once are what a load does, or a link's mass that is off: give the "
+    "model a parameter for it before you adopt them."
+)
 ONE_MOTION = "All trials repeat one motion: numbers that fit it need not hold in another."
 
 
@@ -318,7 +324,7 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     def kept(found: re.Match[str]) -> str:  # of quantities that are estimated and not zero
         parts = found[1].split(" & ")
         known = [p for p in parts if {*re.findall(r"\{(\w)[%}]", p)} <= told]
-        return " and ".join(known or parts[1:] and parts[:1])
+        return " and ".join(known or (parts[1:] and parts[:1]))
 
     if (
         isinstance(effect.family, ParamFamily)
