@@ -226,7 +226,7 @@ def test_sentences_are_english():
         return sentence([meaning(effect, known)])
 
     assert said("delay:steering+throttle+u", d=0.04) == (
-        "The steering and the throttle and the input u arrive 0.04 s later than modelled."
+        "The steering, the throttle and the input u arrive 0.04 s later than modelled."
     )
     assert said("delay:u", d=0.04) == "The input u arrives 0.04 s later than modelled."
     assert said("offset:v", c=0.1) == "The speed v drifts by 0.1 m/s^2."

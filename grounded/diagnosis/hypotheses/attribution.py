@@ -29,6 +29,7 @@ from grounded.diagnosis.likelihood.refine import clean
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect
 from grounded.progress import interruptible
+from grounded.result import listed
 
 HOPEFUL = 4  # larger sets that are fitted to the end
 TUNED = 2  # sets whose constants are set by the data
@@ -79,7 +80,7 @@ def so_far(search: HypothesisSearch, most: int) -> str:
     )
     causes = [*best.hypothesis.names, *["calibrated parameters"] * (best.hypothesis.spread > 0)]
     return (
-        f"so far, of {len(search.fits)} hypotheses: {' and '.join(causes) or 'no cause'}; "
+        f"so far, of {len(search.fits)} hypotheses: {listed(causes) or 'no cause'}; "
         f"{seconds:.2g} s ahead predictions miss {rows}"
     )
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.model import Model
+from grounded.result import listed
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.logs.inspect_log import inspect_log
@@ -293,7 +294,7 @@ def begun(found: Gridded, dt: float, inputs: Sequence[str]) -> Iterator[str]:
     if slow:
         every = 1 / max(one.rate_hz for one in slow)
         yield (
-            f"the commands of {' and '.join(one.name for one in slow)} come every {every:.3g} s, "
+            f"the commands of {listed(one.name for one in slow)} come every {every:.3g} s, "
             f"[task] dt is {dt:g} s: is dt = {every:.3g} meant?"
         )
     if found.row_s > dt / 20:

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.result import listed
 from grounded.search.candidate import Candidate, Tried
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
@@ -170,7 +171,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         f"correct the stamps, times {slow:g}, and ingest it again"
     )
     if candidate is not None:
-        seem = f"{' and '.join(units)}, times {by:.6g}, would be its run: another unit, or sign?"
+        seem = f"{listed(units)}, times {by:.6g}, would be its run: another unit, or sign?"
         doubts = [seem if units else pace or why]
         if log and not (found and found.opens_alike):
             doubts.append(
@@ -192,7 +193,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
     if log and (guessed := [n for n in log.names[0] if n not in log.logged]):
         said += (
-            f" Or {' and '.join(guessed)}, which [estimate] finds here, {_is(guessed)} not what "
+            f" Or {listed(guessed)}, which [estimate] finds here, {_is(guessed)} not what "
             "its program steered by: have it log its own, and map that in [log] too."
         )
     if other:
