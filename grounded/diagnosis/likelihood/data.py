@@ -161,6 +161,8 @@ def prepare(
         commands[i, T:] = trial.inputs[T - 1]
         held[i] = before if trial.start_inputs is None else trial.start_inputs
     states = np.concatenate([trial.states[: T + 1] for trial, T in used])
+    for memory, shown in true_values(model, hidden).items():
+        states[:, memory] = states[:, shown]
     steps = np.concatenate([trial.inputs[:T] for trial, T in used])
     state_at, step_at, valid, trial_of = _cut(lengths)
     most = max(1, int(MOST_NUMBERS / (step_at.shape[1] * model.n**2 * 4)))
@@ -183,6 +185,17 @@ def prepare(
         ids=tuple(trial.id for trial, _ in used),
         hidden=tuple(model.state_names.index(name) for name in hidden),
     )
+
+
+def true_values(model, hidden):
+    names = model.state_names
+    own = [n for n in names if n not in hidden]
+    found = {}
+    for name in hidden:
+        of = [names.index(n) for n in own if name.startswith(f"{n}_true")]
+        if of and not name.endswith("_clock"):
+            found[names.index(name)] = of[-1]
+    return found
 
 
 def _check(model: Model, trials: Sequence[Trial]) -> None:
