@@ -32,7 +32,9 @@ def true_values(names: Sequence[str], memory: Collection[str]) -> dict[int, int]
     found = {}
     for i, name in enumerate(names):
         if name in memory and not name.endswith("_clock"):
-            logs = [k for k, n in enumerate(names) if n not in memory and name.startswith(f"{n}_true")]
+            logs = [
+                k for k, n in enumerate(names) if n not in memory and name.startswith(f"{n}_true")
+            ]
             found |= {i: logs[-1]} if logs else {}
     return found
 

@@ -61,7 +61,7 @@ def test_a_state_that_nothing_measured_bounds_no_probe(diagnosed):
         states = trial.states.copy()
         states[:, 1] = np.nan
         trials.append(replace(trial, states=states))
-    task = _near(w.planner.plan, trials)
+    task = _near(w.planner, trials)
     reached = np.concatenate([trial.states[:, 0] for trial in trials])
     assert task.safety_low[0] == pytest.approx(reached.min() - 0.5 * np.ptp(reached))
     assert np.isinf(task.safety_low[1]) and np.isinf(task.safety_high[1])

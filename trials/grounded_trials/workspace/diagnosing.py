@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from grounded.instruments.finding import Finding
     from grounded.policy import Policy
     from grounded.search.candidate import Candidate
+    from grounded.search.planner import Planner
     from grounded.task import Task
     from grounded.trial import Trial
     from grounded_trials.workspace.folder import Folder
