@@ -29,13 +29,10 @@ def true_values(names: Sequence[str], memory: Collection[str]) -> dict[int, int]
     Returns:
         Indices into `names`: of the memory, of the state.
     """
-    found = {}
+    found, own = {}, [(k, n) for k, n in enumerate(names) if n not in memory]
     for i, name in enumerate(names):
         if name in memory and not name.endswith("_clock"):
-            logs = [
-                k for k, n in enumerate(names) if n not in memory and name.startswith(f"{n}_true")
-            ]
-            found |= {i: logs[-1]} if logs else {}
+            found |= {i: k for k, n in own if name.startswith(f"{n}_true")}
     return found
 
 

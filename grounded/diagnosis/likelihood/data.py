@@ -70,7 +70,7 @@ class Data:
 
     @cached_property
     def told(self) -> Any:
-        """Of which states trials say anything, even if only where their fit begins, (n,) of bool."""
+        """Of which states trials say anything, if only where their fit begins, (n,) of bool."""
         return np.isfinite(self.states).any(axis=0)
 
     @cached_property
