@@ -29,11 +29,13 @@ def true_values(names: Sequence[str], memory: Collection[str]) -> dict[int, int]
     Returns:
         Indices into `names`: of the memory, of the state.
     """
-    found, own = {}, [(k, n) for k, n in enumerate(names) if n not in memory]
-    for i, name in enumerate(names):
-        if name in memory and not name.endswith("_clock"):
-            found |= {i: k for k, n in own if name.startswith(f"{n}_true")}
-    return found
+    own = [(k, n) for k, n in enumerate(names) if n not in memory]
+    return {
+        i: k
+        for i, name in enumerate(names)
+        for k, n in own
+        if name in memory and name.startswith(f"{n}_true") and not name.endswith("_clock")
+    }
 
 
 def memory_of(wrapped: Model, base: Model, trial: Trial) -> Array:
