@@ -201,8 +201,8 @@ def promised(search: HypothesisSearch, fit: Fitted) -> float:
     A scan alone can't tell: coloured noise or parameters, fitted without an effect, hide it, and
     make way only as it grows. Nothing of this is remembered.
     """
-    starts = [fit, *search.one_more(fit, search.most)]
-    fits = refine(search.predictor, starts, iterations=AT_FIRST, worth=search.score)
+    starts = search.one_more(fit, search.most)
+    fits = refine(search.predictor, [fit, *starts], iterations=AT_FIRST, worth=search.score)
     more = [search.score(f) for f in fits if len(f.hypothesis.names) > len(fit.hypothesis.names)]
     as_many = [search.score(f) for f in (fit, *fits) if f.hypothesis.names == fit.hypothesis.names]
     return max(more, default=-np.inf) - max(as_many)

@@ -259,8 +259,8 @@ class HypothesisSearch(FittedHypotheses):
 
     def extended(self, fit: Fitted, count: int = 0, iterations: int = 7) -> list[Fitted]:
         """The fit with each shortlisted effect added, refined."""
-        starts = [fit, *self.one_more(fit, count or self.most)]
-        return self.refined(starts, iterations, rivals=True)[1:]
+        starts = self.one_more(fit, count or self.most)
+        return self.refined([fit, *starts], iterations, rivals=True)[1:]
 
     def one_more(self, fit: Fitted, count: int) -> list[Start]:
         """Where a fit with each shortlisted effect added starts."""

@@ -109,9 +109,7 @@ def motions(predictor: Predictor, less: Hypothesis, h: Hypothesis, track: Array)
 class _Paths:
     """What `h` adds to `less` along each trial, and the states there on which rates may depend."""
 
-    def __init__(
-        self, predictor: Predictor, less: Hypothesis, h: Hypothesis, track: Array
-    ) -> None:
+    def __init__(self, predictor: Predictor, less: Hypothesis, h: Hypothesis, track: Array) -> None:
         data, x = predictor.data, track[:-1]
         added = data.model.difference(predictor.next(less, x), predictor.next(h, x))
         self.signal, self.states = _by_trial(data, added), _states(data)
