@@ -43,7 +43,7 @@ HALF = 0.5  # of its say: a trial with less moves as the others do
 
 
 def repeats(search: FittedHypotheses, fit: Fitted, less: Fitted, name: str) -> int:
-    """How many trials repeat the one motion that bears an effect out; 0 where others do, too.
+    """How many trials make the motion that bears an effect out, or nearly; 0: others do, too.
 
     Args:
         search: whose evidence counts.
