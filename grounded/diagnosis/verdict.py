@@ -203,10 +203,7 @@ def next_trial(
     if seen:
         one = seen[0]
         if one.repeats:
-            return (
-                f"Run a trial that moves differently: those that show {one.effect} repeat one "
-                "motion."
-            )
+            return f"Run a trial that moves differently: those that show {one.effect} move alike."
         why = (unrepeatable or {}).get(one.trial)
         if why is None:
             return f"Repeat trial {one.trial}: hardly another one shows {one.effect}."
