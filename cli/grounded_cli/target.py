@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded.errors import NextCommand
+from grounded.result import listed
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, remark, sentence, show, show_json
 from grounded_trials.wording import with_unit
@@ -117,7 +118,7 @@ def command(
     if still := [name for name in ranges if model.states[name] not in moving]:
         remark(
             "note",
-            f"{' and '.join(still)} {'stay' if len(still) > 1 else 'stays'} at 0 in the target, "
+            f"{listed(still)} {'stay' if len(still) > 1 else 'stays'} at 0 in the target, "
             "which says nothing of what is a small error there: choose the weight in "
             "[reward] state",
         )

@@ -243,7 +243,7 @@ def _information(
     if unseen is not None and unseen.any():
         hidden = [replace(run, states=np.where(unseen, np.nan, run.states)) for run in runs]
         data = noise.data(task, hidden)
-    elif not data.seen.any(axis=(0, 1)).all():
+    elif not data.told.all():
         iterations = SETTLED  # a state that nothing measured has no track yet
     start = [(h, noise.model, track)]
     fits = refine(Predictor(data), start, iterations=iterations, fixed_noise=True)

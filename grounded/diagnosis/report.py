@@ -107,7 +107,7 @@ class Unconfirmed(Document):
     """A likely effect that few trials show, most of all `trial` from `start` to `end` [s].
 
     seen: how many trials hold most of what it does, of how many; region: where it does. repeats:
-    they all make one motion, of which nothing tells it from whatever else repeats with that.
+    they all make one motion, or nearly one: nothing tells it from whatever else repeats with that.
     """
 
     effect: str
@@ -126,7 +126,7 @@ class Unconfirmed(Document):
         few, all_ = self.seen
         if self.repeats:
             made = f"{few} of {all_}" if few < all_ else f"all {all_}"
-            rest = f"or whatever else repeats with the one motion of {made} trials"
+            rest = f"or whatever else repeats with the motion of {made} trials"
             return f"unconfirmed: {self.meaning}, {rest}"
         where = "" if self.region is None else f", mostly where {self.region.when}"
         start, end = number(self.start), number(self.end)

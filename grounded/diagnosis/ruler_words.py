@@ -15,6 +15,7 @@ from grounded.diagnosis.error_report import (
     noise_of,
     number,
 )
+from grounded.result import listed
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Agreement
@@ -42,7 +43,7 @@ def improvement(rows: Sequence[RulerRow]) -> str:
             for name in best[: NAMED - 1]
         ]
         if parts:
-            return f"{_ahead(row)} miss {' and '.join(parts)}."
+            return f"{_ahead(row)} miss {listed(parts)}."
     return f"{_ahead(first)} hardly change." if first else ""
 
 

@@ -18,7 +18,7 @@ from grounded.diagnosis.error_report import (
 from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
 from grounded.diagnosis.ruler_words import floor, improvement, rest, worsened
 from grounded.model import Model, all_at_bounds
-from grounded.result import percent
+from grounded.result import listed, percent
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.validation.claims import Claims
@@ -59,6 +59,8 @@ def verdict(
         one_motion: that all trials repeat.
         given: by parameter, those held with which alone it is known (`Identifiable.given`).
     """
+    from grounded.effects import like_a_load
+
     told = [one for one in seen if not one.repeats] + [one for one in seen if one.repeats][:1]
     once = [sentence([one.sentence()]) for one in told]
     left = remainder[0].sentence() if remainder else ""
@@ -83,6 +85,7 @@ def verdict(
     shares = [f" ({percent(one.share)} of the gain)" * several for one in credit]
     words = [sentence(map(str.__add__, causes, shares)), improvement(rows), worsened(rows)]
     words.append(runaway(rows))
+    words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed])
     words += [f"{told_apart(group, same)}." for group in groups[:1]]
     words += [one.sentence() for one in claims.one_clock[:1]]
     more = 0
@@ -102,6 +105,10 @@ def verdict(
     return replace(said, look_for=more if more > most else 0)
 
 
+LOAD = (
+    "Gains of several joints at once are what a load does, or a link's mass that is off: give the "
+    "model a parameter for it before you adopt them."
+)
 ONE_MOTION = "All trials repeat one motion: numbers that fit it need not hold in another."
 
 
@@ -126,7 +133,7 @@ def _causes(
         else:
             text = f"the model's own parameters are off: {_moved(claims)}"
             held = dict.fromkeys(other for n in _off(claims)[:NAMED] for other in given.get(n, ()))
-            text += f", with {' and '.join(held)} as written" * bool(held)
+            text += f", with {listed(held)} as written" * bool(held)
         found.append(text)
     return tuple(found)
 
@@ -196,10 +203,7 @@ def next_trial(
     if seen:
         one = seen[0]
         if one.repeats:
-            return (
-                f"Run a trial that moves differently: those that show {one.effect} repeat one "
-                "motion."
-            )
+            return f"Run a trial that moves differently: those that show {one.effect} move alike."
         why = (unrepeatable or {}).get(one.trial)
         if why is None:
             return f"Repeat trial {one.trial}: hardly another one shows {one.effect}."
@@ -299,7 +303,7 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     words.setdefault("s", "s" if len(targets) == 1 else "")
     driven, _, source = effect.site.target.partition("<-")
     words["log"] = "[log]"
-    words["target"] = " and ".join(called(model, n) for n in targets)
+    words["target"] = listed(called(model, n) for n in targets)
     if isinstance(effect.family, ParamFamily):
         words["target"] = effect.site.target
     words |= {"driven": called(model, driven), "source": called(model, source)}
@@ -313,8 +317,12 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
             return f"{number(value)} %"
         return f"{number(abs(value))} % {more if value >= 0 else less}"
 
-    def kept(found: re.Match[str]) -> str:  # of a quantity that is estimated, or [left out]
-        return found[1] if set(re.findall(r"\{(\w)[%}]", found[1])) <= set(params) else ""
+    told = {name for name, e in params.items() if e.value != 0}
+
+    def kept(found: re.Match[str]) -> str:  # of quantities that are estimated and not zero
+        parts = found[1].split(" & ")
+        known = [p for p in parts if {*re.findall(r"\{(\w)[%}]", p)} <= told]
+        return listed(known or (parts[1:] and parts[:1]))
 
     if (
         isinstance(effect.family, ParamFamily)
@@ -358,7 +366,7 @@ def sentence(clauses: Iterable[str]) -> str:
 def told_apart(group: Sequence[str], same: Sequence[Sequence[str]]) -> str:
     """What is said of a tie: that these data can't break it, or that no data can."""
     if group in same:
-        return f"{' and '.join(group)} are one thing in this model"
+        return f"{listed(group)} are one thing in this model"
     return f"The data can't tell {tied(group)}"
 
 

@@ -17,6 +17,7 @@ from grounded.diagnosis.error_report import (
     Where,
     furthest,
 )
+from grounded.diagnosis.hypotheses.attribution import promised
 from grounded.diagnosis.hypotheses.correction import correction
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
@@ -26,7 +27,7 @@ from grounded.diagnosis.ruler_words import contested, open_noise
 from grounded.diagnosis.unconfirmed import another_look, marked, unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import by_trial
 from grounded.diagnosis.validation.claims import Claims
-from grounded.diagnosis.validation.decide import SLIGHT, Decision
+from grounded.diagnosis.validation.decide import SLIGHT, SURE, Decision
 from grounded.diagnosis.validation.held_out import shrinkage, utility_prediction
 from grounded.diagnosis.validation.limits import Limits, identifiable
 from grounded.diagnosis.validation.measured import Measured, root_mean_square
@@ -68,10 +69,16 @@ class Writer:
 
     @property
     def unfinished(self) -> bool:
-        """Whether as many effects as were looked for leave more than noise."""
+        """Whether as many effects as were looked for leave more than noise, or promise another one.
+
+        Nothing need be above a floor that holds the model's own error too (`at_most`): there
+        evidence is asked.
+        """
         if self.known.no_cause or len(self.claims.names) < self.most:
             return False
-        return any(one.above for one in self.measured.remainders())
+        if any(one.above for one in self.measured.remainders()):
+            return True
+        return self.measured.at_most and promised(self.search, self.best) > SURE
 
     def worth_more_than(self, other: Writer) -> bool:
         """Whether predictions gain by one effect more what is worth a name (`SLIGHT`)."""

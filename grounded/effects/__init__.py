@@ -27,7 +27,7 @@ from grounded.effects.family import (
     scales_of,
     wrapping_order,
 )
-from grounded.effects.joint import one_friction
+from grounded.effects.joint import like_a_load, one_friction
 from grounded.effects.memory import memory_of, memory_start
 from grounded.effects.registry import Library
 from grounded.effects.wrap import param_name, wrap
@@ -48,6 +48,7 @@ __all__ = [
     "SensorLagFamily",
     "Site",
     "acting_order",
+    "like_a_load",
     "memory_of",
     "memory_start",
     "one_friction",

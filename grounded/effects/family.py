@@ -167,7 +167,8 @@ class Family:
         sentence: what it means in the workshop. {target} and quantities are filled in; {s} is a
             verb's ending, {g%} a percentage, {g%stronger|weaker} one with its direction,
             {k>by|less, by} words by the sign of a quantity that then stands without it; what
-            stands in [] is left out where a quantity {b} in it is a constant.
+            stands in [] is left out where a quantity {b} in it is a constant, or zero; of parts
+            with & between them, one at least is told.
         targets: all targets of a model to which it can apply, joined by "+".
         quantities: the numbers to estimate at a site.
         lookalikes: families that the same data may explain.

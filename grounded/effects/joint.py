@@ -26,7 +26,7 @@ joint's velocity; the inertia matrix is positive there, elsewhere it changes sig
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -232,6 +232,25 @@ def alone(model: Model, tau: str, w: str) -> bool:
     return bool(others < ONLY * by[0, i] and np.ptp(by[:, i]) < ONLY * by[0, i])
 
 
+GAINS = ("input_gain", "rate_gain", "added_inertia")
+
+
+def like_a_load(model: Model, names: Collection[str]) -> bool:
+    """Whether two at least of these effects change the inertia of joints that share one.
+
+    Each alone is a gear, a motor. What an arm carries, or a link's mass that is off, is in all of
+    the inertia matrix and in gravity: without a parameter for it, gains stand in its place.
+    """
+    gains = {name for name in names if name.partition(":")[0] in GAINS}
+    if len(gains) < 2:
+        return False
+    coupled = [pair.split("<-") for pair in pairs_of(model)]
+    coupled = [pair for pair in coupled if not alone(model, *pair)]
+    said = {f"input_gain:{tau}" for tau, _ in coupled} | {f"rate_gain:{w}" for _, w in coupled}
+    said |= {f"added_inertia:{tau}<-{w}" for tau, w in coupled}
+    return len(said & gains) > 1
+
+
 def renamed(model: Model) -> dict[str, str]:
     """Names that a joint has already where its inertia is constant: {dropped: kept}."""
     found: dict[str, str] = {}
@@ -253,7 +272,7 @@ def one_friction(one: Effect, other: Effect) -> bool:
 joint_friction = LossFamily(
     name="joint_friction",
     equation="u_eff = u - c sign(w) - b w   (u<-w)",
-    sentence="{driven} loses {c} to dry friction[ and {b} times {source} to viscous friction]",
+    sentence="{driven} loses [{c} to dry friction & {b} times {source} to viscous friction]",
     targets=pairs_of,
     quantities=_friction,
     lookalikes=("coulomb_friction", "viscous_friction", "dead_zone", "stiction", "parameter"),

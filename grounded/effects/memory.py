@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,25 @@ def settled(model: Model, a: Named, p: Named) -> dict[str, Any]:
     """What the memories of inputs hold after the inputs a were held for long, by `input_family`."""
     found = getattr(model.step, "settled", None)
     return {} if found is None else dict(found(a, p))
+
+
+def true_values(names: Sequence[str], memory: Collection[str]) -> dict[int, int]:
+    """Which memory states hold true values behind a late log, each with the state that logs them.
+
+    Args:
+        names: of all states, (n,).
+        memory: those among them that adopted effects added.
+
+    Returns:
+        Indices into `names`: of the memory, of the state.
+    """
+    own = [(k, n) for k, n in enumerate(names) if n not in memory]
+    return {
+        i: k
+        for i, name in enumerate(names)
+        for k, n in own
+        if name in memory and name.startswith(f"{n}_true") and not name.endswith("_clock")
+    }
 
 
 def memory_of(wrapped: Model, base: Model, trial: Trial) -> Array:
@@ -42,11 +62,8 @@ def memory_start(wrapped: Model, base: Model, trial: Trial) -> Array:
     inputs = Named("input", base.input_names, list(held))
     params = Named("parameter", wrapped.param_names, list(wrapped.values))
     known = settled(wrapped, inputs, params)
-    start = []
-    for name in wrapped.state_names[base.n :]:
-        states = [i for i, n in enumerate(base.state_names) if name.startswith(f"{n}_true")]
-        if states and not name.endswith("_clock"):
-            start.append(float(trial.states[0, states[-1]]))
-        else:
-            start.append(float(known.get(name.rpartition("_")[0], 0.0)))
+    names, n = wrapped.state_names, base.n
+    start = [float(known.get(name.rpartition("_")[0], 0.0)) for name in names[n:]]
+    for memory, logged in true_values(names, names[n:]).items():
+        start[memory - n] = float(trial.states[0, logged])
     return np.array(start)

@@ -29,6 +29,7 @@ from grounded.instruments.other_units import FACTORS, described, unusable
 from grounded.instruments.rows import Gap, Row, gaps, per_step
 from grounded.instruments.swapped import exchanged
 from grounded.model import Model
+from grounded.result import listed
 from grounded.trial import Trial
 
 BAD, GROSS = 0.5, 0.7  # of what should move, unexplained: looked into, and stated
@@ -266,9 +267,9 @@ def stop_at_folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -
 def _said(model: Model, change: Change) -> str:
     names = [model.state_names[i] for i in change.states]
     if change.swap:
-        return exchanged(" and ".join(names))
+        return exchanged(listed(names))
     if change.factor == -1.0:
-        return f"{' and '.join(names)}: the sign looks wrong, scale = -1"
+        return f"{listed(names)}: the sign looks wrong, scale = -1"
     return ", ".join(described(model, i, change.factor) for i in change.states)
 
 
@@ -292,7 +293,7 @@ def unexplained(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> I
             continue  # at rest in a current
         name, *by = (model.state_names[i] for i in (row.i, *row.by))
         rate = float(np.median([gap.rate for gap in some]))
-        what = " and ".join([", ".join(by[:-1]), by[-1]] if len(by) > 1 else by)
+        what = listed(by)
         text = (
             f"does not move as {what} {'say' if len(by) > 1 else 'says'} (its change is off by "
             f"{rate:.3g} {model.states[name]} a second): check units, axes, signs"

@@ -24,6 +24,7 @@ from grounded.instruments.kinematics import integrals
 from grounded.instruments.other_units import unusable
 from grounded.instruments.short_runs import Ahead, Fit
 from grounded.model import Model
+from grounded.result import listed
 from grounded.trial import Trial
 
 CLEAR = 1.0  # [nats] by which a change must lower the errors of a trial
@@ -142,7 +143,7 @@ def mended_by(model: Model, told: Told) -> str:
     """What to do about it."""
     if told.mistake.swap:
         return "Correct the log, or the paths in [log]; or the model, if the log is right"
-    tables = " and ".join(f"[log.input.{model.input_names[j]}]" for j in told.mistake.inputs)
+    tables = listed(f"[log.input.{model.input_names[j]}]" for j in told.mistake.inputs)
     by = f"{1 / told.mistake.factor:.6g}"
     limits = "as well" if told.mistake.factor > 1 else "if they were read from the log"
     return f"Multiply the scale in {tables} by {by} (1 where none is given), and [limits] {limits}"
@@ -155,7 +156,7 @@ def described(model: Model, told: Told) -> str:
     error = f"{told.mended:.2g} rather than {told.logged:.2g}{unit}"
     proof = f"misses {model.state_names[told.state]} by {error} 0.25 s ahead"
     if not told.mistake.swap:
-        names = " and ".join(model.input_names[j] for j in told.mistake.inputs)
+        names = listed(model.input_names[j] for j in told.mistake.inputs)
         one = len(told.mistake.inputs) == 1
         factor, large = told.mistake.factor, told.mistake.factor > 1
         times = f"{factor if large else 1 / factor:.4g}"
@@ -180,8 +181,8 @@ def _pair(model: Model, mistake: Mistake) -> str:
         a, b = (model.input_names[j] for j in mistake.inputs)
         signed = zip(mistake.inputs, mistake.signs, strict=True)
         odd = [model.input_names[j] for j, sign in signed if sign < 0]
-        return f"{a} and {b}" + f", with the sign of {' and '.join(odd)}," * bool(odd)
-    return ", ".join(" and ".join(model.state_names[i] for i in pair) for pair in mistake.states)
+        return f"{a} and {b}" + f", with the sign of {listed(odd)}," * bool(odd)
+    return ", ".join(listed(model.state_names[i] for i in pair) for pair in mistake.states)
 
 
 def _exchanges(model: Model, shown: Sequence[int]) -> Iterator[Mistake]:

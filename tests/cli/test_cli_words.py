@@ -8,6 +8,7 @@ import pytest
 
 from cli import grounded, process
 from facts import holds
+from grounded.result import listed
 from reported import cart, copied
 from workspaces import CONFIG, MODEL, make
 
@@ -198,3 +199,8 @@ def test_a_range_is_rounded_to_what_a_person_measures():
     assert _span(-3.46e-17, 0.5) == "0.000 to 0.500"
     assert _span(0.0, 4.2e-5) == "0.000000 to 0.000042"
     assert _span(0.0, 12.0) == "0.00 to 12.00"
+
+
+def test_names_are_listed_as_a_sentence_has_them():
+    told = [listed(some) for some in ((), ("a",), "ab", "abc")]
+    assert told == ["", "a", "a and b", "a, b and c"]

@@ -226,7 +226,7 @@ def test_sentences_are_english():
         return sentence([meaning(effect, known)])
 
     assert said("delay:steering+throttle+u", d=0.04) == (
-        "The steering and the throttle and the input u arrive 0.04 s later than modelled."
+        "The steering, the throttle and the input u arrive 0.04 s later than modelled."
     )
     assert said("delay:u", d=0.04) == "The input u arrives 0.04 s later than modelled."
     assert said("offset:v", c=0.1) == "The speed v drifts by 0.1 m/s^2."
@@ -245,6 +245,9 @@ def test_sentences_are_english():
         "The throttle gets 5 % weaker every second (a battery that sags)."
     )
     assert said("parameter:k", d=0.1) == "The parameter k should be 1.1 1/s instead of 1."
+    dry, sticky = "0.4 N to dry friction", "0.1 N s/m times the speed v to viscous friction"
+    for c, b, told in ((0.4, 0.1, f"{dry} and {sticky}"), (0.4, 0.0, dry), (0.0, 0.1, sticky)):
+        assert said("joint_friction:u<-v", c=c, b=b) == f"The input u loses {told}."
     for effect in Library().candidates(model):
         known = {q.name: Estimate(0.1, 0, (0.1, 0.1), q.unit) for q in effect.quantities}
         text = meaning(effect, known)

@@ -14,7 +14,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import sensitivities_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, wrap
-from grounded.effects.joint import FAMILIES, dry, has_viscous, pairs_of
+from grounded.effects.joint import FAMILIES, dry, has_viscous, like_a_load, pairs_of
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
@@ -88,6 +88,15 @@ def test_a_pair_is_a_torque_and_the_velocity_of_its_own_joint():
     assert pairs_of(pendulum) == ["torque<-omega"]
     names = [effect.name for effect in Library().candidates(arm)]
     assert {f"joint_friction:{pair}" for pair in PAIRS} <= set(names)
+
+
+def test_gains_of_several_joints_of_an_arm_are_like_a_load():
+    """A payload was told as an elbow 20 % weaker and both joints slower, "adopt them"."""
+    (tau, w), (other, _) = (pair.split("<-") for pair in PAIRS)
+    assert like_a_load(arm, [f"input_gain:{other}", f"rate_gain:{w}", f"delay:{tau}"])
+    assert like_a_load(arm, [f"input_gain:{tau}", f"added_inertia:{PAIRS[1]}"])
+    assert not like_a_load(arm, [f"input_gain:{tau}", f"joint_friction:{PAIRS[1]}"])
+    assert not like_a_load(pendulum, ["input_gain:torque", "rate_gain:omega"])
 
 
 def test_where_inertia_is_constant_the_joint_has_its_old_names():

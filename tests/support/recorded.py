@@ -12,10 +12,22 @@ LOGGED = CONFIG + "".join(
 RATE = 100  # [Hz]
 
 
-def record(w, path, policy, before, seed=0, until=None, after=1.0, jog=0.0, rate=RATE, late=0):
+def record(
+    w,
+    path,
+    policy,
+    before,
+    seed=0,
+    until=None,
+    after=1.0,
+    jog=0.0,
+    rate=RATE,
+    late=0,
+    noise=(0.002, 0.01),
+):
     """Runs a policy on the model, with a load the policy fights, and logs all of it as a table.
 
-    `late`: rows by which the program and the log get the position late.
+    `late`: rows by which the program and the log get the position late. `noise`: of x [m], v [m/s].
     """
     model, dt, rng = w.task.model, policy.dt, np.random.default_rng(seed)
     z, force, rows, sent = np.array(w.task.start, float), 0.0, [], policy.past.copy()
@@ -24,7 +36,7 @@ def record(w, path, policy, before, seed=0, until=None, after=1.0, jog=0.0, rate
     end = begin + every * policy.horizon if until is None else begin + round(until * rate)
     last = end + round(after * rate) if until is None else end
     for k in range(last):
-        felt = z + rng.normal(0, [0.002, 0.01])
+        felt = z + rng.normal(0, noise)
         past.append(felt[0])
         felt[0] = past[max(0, k - late)]
         step, part = divmod(k - begin, every)

@@ -109,7 +109,10 @@ ARM = Model(
 
 
 def test_angles_are_told_before_their_rates_whatever_those_cost():
-    """Of an arm that stopped 5 degrees off, only how fast it still turned was told."""
+    """Of an arm that stopped 5 degrees off, only how fast it still turned was told.
+
+    And of one whose elbow swung, only angles, though the swing was most of what it cost.
+    """
     arm = replace(task(), model=ARM, target=np.zeros((H + 1, 4)))
     states = off(0.09, 0.02)
     states[:, 2:] = 3.0, 4.0
@@ -119,7 +122,9 @@ def test_angles_are_told_before_their_rates_whatever_those_cost():
         reward = replace(arm.reward, **{k: np.array(v, float) for k, v in weights.items()})
         return [one.what for one in off_target_of(replace(arm, reward=reward), [trial])]
 
-    assert told(terminal=[1, 1, 1, 1]) == ["shoulder", "elbow"]
+    assert told(terminal=[1, 1, 1, 1]) == ["shoulder", "elbow", "d_elbow"]
+    assert told(terminal=[1, 1, 1, 0.5]) == ["shoulder", "elbow", "d_shoulder"]
+    assert told(terminal=[1, 1, 1e-6, 1e-6]) == ["shoulder", "elbow"]
     assert told(terminal=[1, 0, 1, 1]) == ["shoulder", "d_elbow"]
     assert told(terminal=[0, 0, 1, 1]) == ["d_shoulder", "d_elbow"]
 

@@ -10,6 +10,7 @@ from grounded.diagnosis.patterns import probes
 from grounded.effects import Library
 from grounded.errors import NextCommand
 from grounded_trials import Workspace
+from grounded_trials.workspace.adopted import planner_of
 from grounded_trials.workspace.diagnosing import _near, _probe, read_diagnosis
 from grounded_trials.workspace.handover import checked_candidate
 from grounded_trials.workspace.proposing import to_run
@@ -61,10 +62,15 @@ def test_a_state_that_nothing_measured_bounds_no_probe(diagnosed):
         states = trial.states.copy()
         states[:, 1] = np.nan
         trials.append(replace(trial, states=states))
-    task = _near(w.planner.plan, trials)
+    task = _near(w.planner, trials)
     reached = np.concatenate([trial.states[:, 0] for trial in trials])
     assert task.safety_low[0] == pytest.approx(reached.min() - 0.5 * np.ptp(reached))
     assert np.isinf(task.safety_low[1]) and np.isinf(task.safety_high[1])
+    late = planner_of(w.task, [{"name": "sensor_delay:x", "d": 1.5 * w.task.dt}])
+    task, n = _near(late, [late.lift(trial) for trial in trials]), w.task.model.n
+    assert task.model.n > n  # what is remembered of x is known at the start alone: no room at all
+    assert np.isinf(task.safety_low[n:]).all() and np.isinf(task.safety_high[n:]).all()
+    assert np.isfinite(task.safety_low[0])
 
 
 def test_the_sentence_of_a_probe_names_its_size_and_the_command_that_makes_it(diagnosed):

@@ -25,14 +25,16 @@ from grounded.diagnosis.hypotheses.search import (
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
-from grounded.diagnosis.likelihood.refine import clean
+from grounded.diagnosis.likelihood.refine import clean, refine
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect
 from grounded.progress import interruptible
+from grounded.result import listed
 
 HOPEFUL = 4  # larger sets that are fitted to the end
 TUNED = 2  # sets whose constants are set by the data
 FORETOLD = (2.0, 0.05)  # scatters, and least gain, from which what predicts better is grown too
+AT_FIRST = 8  # iterations of a further effect that is tried
 HALVES = 2  # single effects that are also grown where another hypothesis is likelier
 RESTARTED = 3  # large effects that are also fitted from a start of their own
 
@@ -79,7 +81,7 @@ def so_far(search: HypothesisSearch, most: int) -> str:
     )
     causes = [*best.hypothesis.names, *["calibrated parameters"] * (best.hypothesis.spread > 0)]
     return (
-        f"so far, of {len(search.fits)} hypotheses: {' and '.join(causes) or 'no cause'}; "
+        f"so far, of {len(search.fits)} hypotheses: {listed(causes) or 'no cause'}; "
         f"{seconds:.2g} s ahead predictions miss {rows}"
     )
 
@@ -194,13 +196,26 @@ def _halves(search: HypothesisSearch, starts: Sequence[Fitted]) -> list[Fitted]:
     return [f for f in likely if f not in starts and score(f) > score(null) + LARGE_GAIN]
 
 
+def promised(search: HypothesisSearch, fit: Fitted) -> float:
+    """By how much the likeliest of one effect more is likelier than a fit, at a first fit [nats].
+
+    A scan alone can't tell: coloured noise or parameters, fitted without an effect, hide it, and
+    make way only as it grows. Nothing of this is remembered.
+    """
+    starts = search.one_more(fit, search.most)
+    fits = refine(search.predictor, [fit, *starts], iterations=AT_FIRST, worth=search.score)
+    more = [search.score(f) for f in fits if len(f.hypothesis.names) > len(fit.hypothesis.names)]
+    as_many = [search.score(f) for f in (fit, *fits) if f.hypothesis.names == fit.hypothesis.names]
+    return max(more, default=-np.inf) - max(as_many)
+
+
 def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
     """The likeliest of up to `most` effects: add one, then swap each for what goes better."""
     size = len(best.hypothesis.effects)
     while 1 <= size < most:
         starts = _starts(search, size, best)
         halves = _halves(search, starts) if size == 1 else []
-        grown = [search.extended(start, 8) for start in starts]
+        grown = [search.extended(start, AT_FIRST) for start in starts]
         grown += [search.extended(half, 4) for half in halves]
         firsts = [max(fits, key=search.score) for fits in grown if fits]  # each has its own noise
         search.finished(list(dict.fromkeys([*search.of_size(size + 1)[:HOPEFUL], *firsts])), 10)

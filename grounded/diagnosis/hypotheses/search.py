@@ -259,8 +259,13 @@ class HypothesisSearch(FittedHypotheses):
 
     def extended(self, fit: Fitted, count: int = 0, iterations: int = 7) -> list[Fitted]:
         """The fit with each shortlisted effect added, refined."""
-        starts: list[Fitted | tuple] = [fit]  # type: ignore[type-arg]
-        for look in self.shortlist(fit, count or self.most):
+        starts = self.one_more(fit, count or self.most)
+        return self.refined([fit, *starts], iterations, rivals=True)[1:]
+
+    def one_more(self, fit: Fitted, count: int) -> list[Start]:
+        """Where a fit with each shortlisted effect added starts."""
+        starts: list[Start] = []
+        for look in self.shortlist(fit, count):
             h = fit.hypothesis
             starts += [
                 (h.plus(look.effect, values), fit.noise, fit.track)
@@ -272,7 +277,7 @@ class HypothesisSearch(FittedHypotheses):
         for effect in self.together:
             if not delayed([effect]) & delayed(fit.hypothesis.effects):
                 starts += [self.anew(fit, effect, {"d": d}) for d in effect.free[0].grid[LATE]]
-        return self.refined(starts, iterations, rivals=True)[1:]
+        return starts
 
     def without(self, fit: Fitted, name: str) -> Fitted:
         """The fit with one effect taken out, its noise and track kept: where rivals are sought."""

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from grounded.effects import Scales, scales_of
+from grounded.effects.memory import true_values
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
@@ -62,6 +63,17 @@ class Data:
         return int(self.valid.sum())
 
     @cached_property
+    def behind(self) -> Mapping[int, int]:
+        """Hidden true values, not even known at the start, each with the state that logs them."""
+        names = self.model.state_names
+        return true_values(names, [names[i] for i in self.hidden])
+
+    @cached_property
+    def told(self) -> Any:
+        """Of which states trials say anything, if only where their fit begins, (n,) of bool."""
+        return np.isfinite(self.states).any(axis=0)
+
+    @cached_property
     def filled(self) -> Array:
         """Measured states, flat; NaN replaced by the last value."""
         return _filled(self.states)
@@ -78,6 +90,7 @@ class Data:
         if self.hidden:
             begins = np.isin(self.state_at, np.cumsum([0, *(self.lengths + 1)]))
             there[..., list(self.hidden)] &= begins[..., None]
+            there[..., list(self.behind)] = False
         run = np.concatenate([np.ones((len(self.valid), 1)), self.valid], axis=1)
         return np.ascontiguousarray((there * run[:, :, None]).swapaxes(0, 1))
 
@@ -137,7 +150,9 @@ def prepare(
         latency: transport delay of the inputs [s] that is already modelled (m,).
         past: the input held before t = 0 where a trial does not say (m,).
         hidden: states that no sensor has (the memory of adopted effects): known at the start, what
-            the trials say of them later is where their fit begins.
+            the trials say of them later is where their fit begins. True values behind a late log
+            are known nowhere: theirs begins at the log, for a model that carried them on from the
+            start of a long trial has drifted, and where it lacks a speed it says nothing.
 
     Raises:
         GroundedError: for trials of other states or inputs, of different dt, or empty ones.
@@ -161,6 +176,8 @@ def prepare(
         commands[i, T:] = trial.inputs[T - 1]
         held[i] = before if trial.start_inputs is None else trial.start_inputs
     states = np.concatenate([trial.states[: T + 1] for trial, T in used])
+    behind = true_values(model.state_names, hidden)
+    states[:, list(behind)] = states[:, list(behind.values())]
     steps = np.concatenate([trial.inputs[:T] for trial, T in used])
     state_at, step_at, valid, trial_of = _cut(lengths)
     most = max(1, int(MOST_NUMBERS / (step_at.shape[1] * model.n**2 * 4)))

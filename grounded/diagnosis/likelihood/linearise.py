@@ -369,8 +369,7 @@ def prior(data: Data) -> Array:
     """Variances (n,) of states that were not measured when a run began."""
     found = []
     for i, name in enumerate(data.model.state_names):
-        known = bool(data.seen[..., i].any())
-        found.append(data.scales.spread(name) ** 2 if known else WIDE**2)
+        found.append(data.scales.spread(name) ** 2 if data.told[i] else WIDE**2)
     return np.array(found)
 
 

@@ -60,7 +60,7 @@ class Doubtful:
     name: str
     nats: float
     fit: Fitted  # with it
-    repeats: int = 0  # trials that make the one motion that bears it out; 0: few trials do
+    repeats: int = 0  # trials that make the motion that bears it out; 0: few trials do
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,7 +76,7 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
         found.append(f"state {name} never moved, so nothing can be said of what acts on it")
     if data.skipped:
         found.append(f"{data.skipped} stretches of the trials were left out, to bound memory")
-    empty = [n for i, n in enumerate(data.model.state_names) if not data.seen[..., i].any()]
+    empty = [n for n, told in zip(data.model.state_names, data.told, strict=True) if not told]
     for name in (name for name in empty if name not in left_out):
         found.append(f"state {name} was never measured")
     if len(unmoved) + len(empty) + len(data.hidden) == data.model.n:

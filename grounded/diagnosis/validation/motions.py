@@ -11,6 +11,11 @@ Two trials repeat one motion, for an effect, where what it adds to the rates is 
 function of time in both, and so is a state on which the rates may depend in another way. Compared
 are means over tenths of the trial, so that a feedback that chatters, or noise, makes no motion
 another one.
+
+What is a function of time alone, a wave or a trend, adds the same to all trials, whatever they do.
+Candidates for one target move alike but for a few per cent: a function of a state that they share
+follows the wave in all of them but for as much. So there a trial's nats count by the part of its
+motion that is not that of the motion with most say.
 """
 
 from __future__ import annotations
@@ -34,10 +39,11 @@ from grounded.model import Model, Param
 REPEATS = 0.03  # of a signal's power: trials that differ by less are one motion
 TENTHS = 10  # stretches whose means are compared
 LENGTH = 0.2  # of a trial's steps by which another one may be longer
+HALF = 0.5  # of its say: a trial with less moves as the others do
 
 
 def repeats(search: FittedHypotheses, fit: Fitted, less: Fitted, name: str) -> int:
-    """How many trials repeat the one motion that bears an effect out; 0 where others do, too.
+    """How many trials make the motion that bears an effect out, or nearly; 0: others do, too.
 
     Args:
         search: whose evidence counts.
@@ -50,13 +56,17 @@ def repeats(search: FittedHypotheses, fit: Fitted, less: Fitted, name: str) -> i
         return 0
     if np.bincount(data.trial_of).max() >= PIECES:
         return 0  # a log so long makes many motions, and would do without the others
-    motion = motions(search.predictor, h.minus(name), h, fit.track)
-    size = np.bincount(motion)
+    paths = _Paths(search.predictor, h.minus(name), h, fit.track)
+    motion = paths.motions()
     lost = 0.5 * (less.rss + less.logdet - fit.rss - fit.logdet)
-    by = np.bincount(motion[data.trial_of], lost, len(size))
-    most = int(by.argmax())
-    alone = search.tempering.factor * (by.sum() - by[most]) < CLAIM
-    return int(size[most]) if alone and size[most] > 1 else 0
+    nats = search.tempering.factor * np.bincount(data.trial_of, lost, data.count)
+    most = int(np.bincount(motion, nats).argmax())
+    say = (motion != most).astype(float)
+    if getattr(h.effects[h.names.index(name)].family, "timed", False):
+        first = int(np.flatnonzero(motion == most)[0])
+        say *= [paths.apart(first, trial) for trial in range(data.count)]
+    alike = int((say < HALF).sum())
+    return alike if alike > 1 and say @ nats < CLAIM else 0
 
 
 def without_others(
@@ -96,31 +106,48 @@ def how_many(predictor: Predictor) -> int:
 
 def motions(predictor: Predictor, less: Hypothesis, h: Hypothesis, track: Array) -> Any:
     """Which motion each trial makes, (S,) of int, for what `h` adds to `less` along a track."""
-    data, x = predictor.data, track[:-1]
-    added = data.model.difference(predictor.next(less, x), predictor.next(h, x))
-    signal, states = _by_trial(data, added), _states(data)
-    power = np.array([float(np.nanmean(one**2)) for one in signal])
-    means = np.concatenate([_tenths(one) for one in states])
-    spread = np.nanvar(means, axis=0)
-    moves = spread > 1e-9 * np.nanmean(means**2, axis=0)
-    led, found = list[int](), np.zeros(data.count, int)
+    return _Paths(predictor, less, h, track).motions()
 
-    def same(i: int, j: int) -> bool:
-        steps = min(len(signal[i]), len(signal[j]))
-        if max(len(signal[i]), len(signal[j])) > (1 + LENGTH) * steps:
-            return False
-        acts, moved = (
-            _tenths(some[i][:steps]) - _tenths(some[j][:steps]) for some in (signal, states)
-        )
-        apart = np.nanmean(moved**2, axis=0)[moves] / spread[moves]
-        acts_alike = np.nanmean(acts**2) <= REPEATS * (power[i] + power[j])
-        return bool(acts_alike and len(apart) and apart.min() <= 2 * REPEATS)
 
-    for i in range(data.count):
-        leader = next((k for k, j in enumerate(led) if same(i, j)), len(led))
-        led += [i] * (leader == len(led))
-        found[i] = leader
-    return found
+class _Paths:
+    """What `h` adds to `less` along each trial, and the states there on which rates may depend."""
+
+    def __init__(self, predictor: Predictor, less: Hypothesis, h: Hypothesis, track: Array) -> None:
+        data, x = predictor.data, track[:-1]
+        added = data.model.difference(predictor.next(less, x), predictor.next(h, x))
+        self.signal, self.states = _by_trial(data, added), _states(data)
+        self.power = [float(np.nanmean(one**2)) for one in self.signal]
+        means = np.concatenate([_tenths(one) for one in self.states])
+        self.spread = np.nanvar(means, axis=0)
+        self.moves = self.spread > 1e-9 * np.nanmean(means**2, axis=0)
+
+    def motions(self) -> Any:
+        """Which motion each trial makes, (S,) of int."""
+        led, found = list[int](), np.zeros(len(self.signal), int)
+        for i in range(len(found)):
+            leader = next((k for k, j in enumerate(led) if self.same(i, j)), len(led))
+            led += [i] * (leader == len(led))
+            found[i] = leader
+        return found
+
+    def same(self, i: int, j: int) -> bool:
+        """Whether two trials repeat one motion."""
+        acts = np.nanmean(self._between(self.signal, i, j) ** 2)
+        alike = acts <= REPEATS * (self.power[i] + self.power[j])
+        return bool(alike and self.apart(i, j) <= REPEATS)
+
+    def apart(self, i: int, j: int) -> float:
+        """By which part of its power two trials differ in the state that differs least, 0 to 1."""
+        length, other = len(self.signal[i]), len(self.signal[j])
+        if max(length, other) > (1 + LENGTH) * min(length, other) or not self.moves.any():
+            return 1.0
+        moved = np.nanmean(self._between(self.states, i, j) ** 2, axis=0)[self.moves]
+        return float(min((0.5 * moved / self.spread[self.moves]).min(), 1.0))
+
+    def _between(self, each: list[Array], i: int, j: int) -> Array:
+        """What two trials differ by, over as many steps as both have, in means over tenths."""
+        steps = min(len(self.signal[i]), len(self.signal[j]))
+        return _tenths(each[i][:steps]) - _tenths(each[j][:steps])
 
 
 def _by_trial(data: Data, values: Array) -> list[Array]:

@@ -65,3 +65,29 @@ def test_an_estimated_speed_knows_what_came_before_the_run_and_after_it(blind, t
         off.append(blind.trials()[-1].trial.states[:, 1] - truth)
     assert np.abs(np.mean(off, axis=0)[[0, -1]]).max() < 0.03
     assert np.sqrt(np.mean(np.square(off))) < 0.03
+
+
+ITS_OWN = LOGGED + "[estimate]\nmeasured = { x = 0.002 }\n"
+ROUGH = (0.002, 0.5)  # m, m/s: a speed by differences
+
+
+@pytest.mark.parametrize("before", [0.0, 0.8])
+def test_a_run_is_known_by_the_speeds_that_its_program_made_itself(tmp_path, before):
+    """Four of five true logs were refused, the others begun two rows early."""
+    w = waiting(tmp_path, ITS_OWN)
+    policy = w.candidate("c0002")[0].policy
+    path = record(w, tmp_path / "a.csv", policy, before, noise=ROUGH)
+    found = w.ingest(path)
+    assert found.candidate == "c0002" and bool(found.notes) == bool(before)
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    k, stored = round(before * RATE) + 5 * np.arange(policy.horizon), w.trials()[-1].trial
+    np.testing.assert_allclose(stored.inputs[:, 0], table[k, 3], atol=1e-4)
+    assert np.std(stored.states[:-1, 1] - table[k, 2]) > 0.3  # estimated all the same
+    assert any("an estimate in its place" in one for one in found.warnings)
+
+
+def test_who_is_refused_where_speeds_are_estimated_is_told_to_log_them(tmp_path):
+    w = waiting(tmp_path, ONLY_POSITIONS)
+    path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.8, noise=ROUGH)
+    with pytest.raises(GroundedError, match=r"Or v, which \[estimate\] finds here, is not what"):
+        w.ingest(path)

@@ -22,6 +22,7 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.model import Model
+from grounded.result import listed
 from grounded_trials.logs.following import follows
 from grounded_trials.logs.inspect_guess import SIMULATED_S, Guess
 from grounded_trials.logs.inspect_log import LogReport
@@ -181,6 +182,6 @@ def _speed(guesses: Mapping[str, Guess], model: Model, signals: Signals) -> dict
         return {name: replace(guesses[name], others=())}
     best, slope, path = good[0]
     rivals = tuple(p for value, _, p in good[1:] if best - value < 0.05)
-    why = f"no name says it; it goes with the speed of {' and '.join(position)}, correlation "
+    why = f"no name says it; it goes with the speed of {listed(position)}, correlation "
     why += f"{best:.3f}, {slope:.3g} times as large"
     return {name: replace(guesses[name], path=path, others=rivals[:3], reasons=(why,))}

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from grounded.diagnosis.error_report import Gap, RulerRow, furthest
 from grounded.diagnosis.report import Correction, Diagnosis, Estimate
 from grounded.instruments.finding import Finding
+from grounded.result import listed
 from grounded_trials.wording import changed, count, figure, percent, ranges, shown, with_unit
 
 MOST = 3  # parameters that are named
@@ -98,7 +99,7 @@ def credit_of(diagnosis: Diagnosis, effect: str) -> str:
 
 def correction_line(correction: Correction) -> str:
     """What a correction does, and that it is none of the causes."""
-    over = " and ".join(correction.over)
+    over = listed(correction.over)
     gain = f"takes away {percent(correction.held_out_gain)} of the held-out squared error"
     if not correction.adoptable:
         return f"a curve of {correction.channel} over {over} predicts held-out trials no better"
@@ -199,13 +200,13 @@ def held_sentence(diagnosis: Diagnosis) -> str:
             held.setdefault(name, []).append(by)
         parts = [f"{by:+.2g} % for 1 % more {name}" for name, by in one.given.items()]
         free = with_unit(f"+- {figure(one.prior * one.left, 2)}", e.unit)
-        said.append(f"{one.parameter} {' and '.join(parts)} ({free} with all free)")
+        said.append(f"{one.parameter} {listed(parts)} ({free} with all free)")
     if len(said) > MOST:
         said = [
             f"{len(some)} values {min(some):+.2g} to {max(some):+.2g} % for 1 % more {name}"
             for name, some in held.items()
         ]
-    told = f"{' and '.join(held)} as written, which these trials don't tell: {', '.join(said)}"
+    told = f"{listed(held)} as written, which these trials don't tell: {', '.join(said)}"
     return told * bool(said)
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from grounded.effects.memory import true_values
 from grounded.frozen import Array
 from grounded.rollout import augmented
 from grounded.search.planner import Planner
@@ -84,15 +85,11 @@ def anchored(planner: Planner, trial: Trial) -> Trial:
     """
     lifted, n = planner.lift(trial), planner.task.model.n
     names = planner.plan.model.state_names
-    behind = [
-        (i, [k for k in range(n, len(names)) if names[k].startswith(f"{names[i]}_true")])
-        for i in range(n)
-    ]
-    if not any(memory for _, memory in behind):
+    behind = true_values(names, names[n:])
+    if not behind:
         return lifted
     drift, states = residuals(planner.plan, lifted), np.array(lifted.states)
-    for i, memory in behind:
-        states[1:, memory] += drift[:, [i]]
+    states[1:, list(behind)] += drift[:, list(behind.values())]
     return replace(lifted, states=states)
 
 

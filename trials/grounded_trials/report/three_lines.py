@@ -9,6 +9,7 @@ from grounded.diagnosis.error_report import measured
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.ruler_words import open_noise, rest, telling, worsened
 from grounded.diagnosis.verdict import told_apart
+from grounded.result import listed
 from grounded.task import Task
 from grounded_trials.wording import count, shown
 from grounded_trials.workspace.off_target import weighed_groups
@@ -73,7 +74,7 @@ def gained(
         parts.append(f"{what} by {' instead of '.join(ends)}")
     held = "" if row.held_out != "no" else ", not held out"
     ahead = f"{'Over whole trials' if row.whole_trial else f'{row.horizon_s:.3g} s ahead'}{held}"
-    return f"{ahead} {who} misses {' and '.join(parts)}." if parts else ""
+    return f"{ahead} {who} misses {listed(parts)}." if parts else ""
 
 
 def gained_most(diagnosis: Diagnosis, task: Task) -> list[tuple[list[str], str]]:

@@ -15,7 +15,7 @@ from typing import Any
 
 from grounded.diagnosis.report import Diagnosis, Estimate, Made
 from grounded.errors import GroundedError, NextCommand, nearest
-from grounded.result import Result, percent
+from grounded.result import Result, listed, percent
 from grounded.search.planner import Planner
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.workspace.config import ModelTable, as_toml, set_in_model
@@ -166,7 +166,7 @@ def undo_adoption(workspace: Folder) -> Undone:
     names, before = [str(name) for name in last["names"]], last["before"]
     if _written(model) != last["after"]:
         was = as_toml(before["params"], before["effects"])
-        had = " and ".join(f"{name} = {value.as_string()}" for name, value in was.items())
+        had = listed(f"{name} = {value.as_string()}" for name, value in was.items())
         raise GroundedError(
             f"[model] in {file} was changed after {', '.join(names)} was adopted, by `fit --apply` "
             f"or by hand, which would be lost. Before, it had {had}: write there what "

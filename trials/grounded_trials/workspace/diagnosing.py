@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from grounded.instruments.finding import Finding
     from grounded.policy import Policy
     from grounded.search.candidate import Candidate
+    from grounded.search.planner import Planner
     from grounded.task import Task
     from grounded.trial import Trial
     from grounded_trials.workspace.folder import Folder
@@ -262,7 +263,7 @@ def _probe(
     ties = {*found.indistinguishable} - {*found.equivalent}
     offer = write or bool(ties)
     why = "none of those tried stays inside [safety], or near where trials have been"
-    plan = _near(planner.plan, trials)
+    plan = _near(planner, trials)
     for room in (0 * strays, strays):
         inside = _narrower(plan, room.max(axis=0))
         made = None if inside is None else probe(inside, base, found, trials, library)
@@ -304,17 +305,18 @@ def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:
     )
 
 
-def _near(task: Task, trials: Sequence[Trial]) -> Task:
+def _near(planner: Planner, trials: Sequence[Trial]) -> Task:
     """A task whose states without [safety] stay near where trials have been: half as far again.
 
     Doublets that sharpen a number have flown a quadrotor 100 m below the ground. A state that
-    nothing measures may go anywhere.
+    nothing measures may go anywhere, and so may what effects remember.
     """
+    task = planner.plan
     been = np.vstack([trial.states for trial in trials])
     known = np.isfinite(been)
     low = np.where(known, been, np.inf).min(axis=0)
     high = np.where(known, been, -np.inf).max(axis=0)
-    unknown = ~known.any(axis=0) | (np.arange(task.model.n) >= been.shape[1])
+    unknown = ~known.any(axis=0) | (np.arange(task.model.n) >= planner.task.model.n)
     low, high = np.where(unknown, 0.0, low), np.where(unknown, 0.0, high)
     free = task.model.angle_mask | unknown
     room = np.where(free, np.inf, 0.5 * (high - low))

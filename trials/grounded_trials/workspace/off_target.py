@@ -18,6 +18,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 FEW = 2  # groups of states that are told: positions and angles before their rates, then by cost
+MOST = 0.5  # of the cost of being off: what makes more of it is told, too
 REST = 0.1  # of the mean step of a target: one that moves less in the last step is at rest
 
 
@@ -86,7 +87,10 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
             values["end"] = float(np.sqrt(np.mean([e[-1] @ e[-1] for e in each])))
         ranked.append((any(units[k] == f"{unit}/s" for unit in units), -cost, k))
         found[k] = OffTarget(what.removeprefix("the "), units[k], **values)
-    return tuple(found[k] for k in sorted(k for *_, k in sorted(ranked)[:FEW]))
+    told = sorted(k for *_, k in sorted(ranked)[:FEW])
+    dear = MOST * sum(cost for _, cost, _ in ranked)
+    told += [k for _, cost, k in ranked if cost < dear and k not in told]
+    return tuple(found[k] for k in told)
 
 
 def reaches(task: Task) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 from grounded.figures.body import Body, motion
 from grounded.figures.figure import WIDTHS, Curve, Dot, Figure, Panel, enlarging, legend
 from grounded.frozen import Array
+from grounded.result import listed
 from grounded_trials.report.bodies import body_in, is_mechanism
 from grounded_trials.report.findings import Findings, Log, Run, compared
 from grounded_trials.report.scene import Scene, scene_of
@@ -79,7 +80,7 @@ def path_figure(findings: Findings) -> Figure | None:
                 f"dashed. The curves are paths of {body.watched}."
             )
     if body is None and not scene.spatial:
-        caption.append(f"No plane among the roles: {' and '.join(scene.names)}.")
+        caption.append(f"No plane among the roles: {listed(scene.names)}.")
     if body is not None and not body.unit:
         caption.append(
             "How long its links are is not known (a parameter l, or l1, l2 ... in m says it): "

@@ -6,7 +6,8 @@ States that no sensor gives are estimated along the whole of it, see `estimating
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -14,13 +15,14 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.model import Model
+from grounded.result import listed
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.logs.inspect_log import inspect_log
 from grounded_trials.logs.log_files import log_files, log_records
 from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signals
 from grounded_trials.logs.resample import Gridded, Span, to_grid
-from grounded_trials.logs.signals import Series
+from grounded_trials.logs.signals import Series, read_signals
 from grounded_trials.store.store import hash_file
 from grounded_trials.workspace.adopted import but_late_sensors, planner_of
 from grounded_trials.workspace.config import FILE
@@ -48,6 +50,7 @@ class ForeignLog:
     estimate: EstimateTable | None
     series: dict[str, Series]  # what it holds
     source: dict[str, str]  # its name, hash and estimated states, for the trial's metadata
+    own: Mapping[str, Series] = field(default_factory=dict)  # states that its program made itself
 
     def cut(self, candidate: str, start: float | None = None) -> tuple[Trial, Gridded]:
         """The trial in it, and how it was sampled.
@@ -123,7 +126,7 @@ class ForeignLog:
         if not self.estimate:
             return series
         names = self.workspace.base_model.state_names
-        return with_estimates(series, self.estimate, self._estimating, names)
+        return {**with_estimates(series, self.estimate, self._estimating, names), **self.own}
 
     @cached_property
     def _estimating(self) -> Task:
@@ -135,15 +138,21 @@ class ForeignLog:
         return planner_of(self.workspace.task, kept).plan
 
     @property
-    def unread(self) -> tuple[str, ...]:
-        """States that [log] maps and [estimate] calls not measured: nobody reads their signals."""
+    def _beside(self) -> tuple[str, ...]:
+        """States that [log] maps and [estimate] calls not measured."""
         if not self.estimate:
             return ()
+        names, measured = self.workspace.base_model.state_names, self.estimate.measured
+        return tuple(n for n in names if n in self.mapping.states and n not in measured)
+
+    @property
+    def unread(self) -> tuple[str, ...]:
+        """What becomes of those: a run is known by them, but its trial has estimates instead."""
         return tuple(
-            f"{name} is in [log], but not in [estimate] measured, so its signal is not read: add "
-            f"{name} = its scatter at standstill there, or take [log.state.{name}] out"
-            for name in self.workspace.base_model.state_names
-            if name in self.mapping.states and name not in self.estimate.measured
+            f"{name} is in [log], but not in [estimate] measured: a run is known by it, and its "
+            f"trial has an estimate in its place. For the logged one add {name} = its scatter at "
+            "standstill there"
+            for name in self._beside
         )
 
     @cached_property
@@ -153,11 +162,21 @@ class ForeignLog:
 
     @cached_property
     def as_seen(self) -> ForeignLog | None:
-        """The log with its late states as late as the robot's program had them; None: none is."""
+        """The log as the robot's program had it, if it is not this; None: it is.
+
+        Its late states are as late as they came, and speeds that the program made itself by
+        differences, a filter, an observer are its own, not the smoother's.
+        """
         states = self.workspace.base_model.state_names
         late = {n: s for n, s in self.series.items() if n in states and s.spec.delay_s}
         seen = {n: replace(s, spec=replace(s.spec, delay_s=0.0)) for n, s in late.items()}
-        return replace(self, series={**self.series, **seen}) if seen else None
+        own = dict[str, Series]()
+        if specs := {n: self.mapping.states[n] for n in self._beside}:
+            with suppress(GroundedError):  # a log may lack them
+                own = read_signals(log_files(self.path), specs)
+        if not seen and not own:
+            return None
+        return replace(self, series={**self.series, **seen, **own}, own=own)
 
     @cached_property
     def recording(self) -> Recording | None:
@@ -275,7 +294,7 @@ def begun(found: Gridded, dt: float, inputs: Sequence[str]) -> Iterator[str]:
     if slow:
         every = 1 / max(one.rate_hz for one in slow)
         yield (
-            f"the commands of {' and '.join(one.name for one in slow)} come every {every:.3g} s, "
+            f"the commands of {listed(one.name for one in slow)} come every {every:.3g} s, "
             f"[task] dt is {dt:g} s: is dt = {every:.3g} meant?"
         )
     if found.row_s > dt / 20:

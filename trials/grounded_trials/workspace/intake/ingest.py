@@ -9,6 +9,7 @@ finds the first.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -16,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.result import listed
 from grounded.search.candidate import Candidate, Tried
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
@@ -175,7 +177,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         f"correct the stamps, times {slow:g}, and ingest it again"
     )
     if candidate is not None:
-        seem = f"{' and '.join(units)}, times {by:.6g}, would be its run: another unit, or sign?"
+        seem = f"{listed(units)}, times {by:.6g}, would be its run: another unit, or sign?"
         doubts = [seem if units else pace or why]
         if log and not (found and found.opens_alike):
             doubts.append(
@@ -197,6 +199,11 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     if read.log and (named := crossed_in(read.log)):
         raise GroundedError(f"{path} is not read as a run of {ran}: {'; '.join(named)}")
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
+    if log and (guessed := [n for n in log.names[0] if n not in log.logged]):
+        said += (
+            f" Or {listed(guessed)}, which [estimate] finds here, {_is(guessed)} not what "
+            "its program steered by: have it log its own, and map that in [log] too."
+        )
     if other:
         raise GroundedError(
             f"{said} Take it in with --candidate {other}, with --candidate {ran} all the same, or "
@@ -209,6 +216,10 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         f"the same{begins}",
         NextCommand("ingest", (str(path), "--data")),
     )
+
+
+def _is(names: Sequence[str]) -> str:
+    return "is" if len(names) == 1 else "are"
 
 
 def _may_have_run(workspace: Folder) -> list[Candidate]:

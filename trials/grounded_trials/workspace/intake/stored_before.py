@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.result import listed
 from grounded.trial import Trial, scattered
 from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.resample import ABSOLUTE_S
@@ -99,7 +100,7 @@ def estimated_otherwise(workspace: Folder, log: ForeignLog) -> tuple[str, ...]:
     )
     with_, was = (", ".join(s.split(",")) or "no effect" for s in (now, before))
     return (
-        f"{' and '.join(log.source['estimated'].split(','))} is estimated with {with_} in the "
+        f"{listed(log.source['estimated'].split(','))} is estimated with {with_} in the "
         f"model, in {names} with {was}: to have them alike, `discard` those and ingest their logs "
         "again",
     )
