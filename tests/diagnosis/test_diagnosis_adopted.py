@@ -21,7 +21,7 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Estimate
 from grounded.diagnosis.unconfirmed import unconfirmed
 from grounded.diagnosis.validation.decide import Doubtful
-from grounded.diagnosis.validation.limits import limits
+from grounded.diagnosis.validation.limits import knowable, limits
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library, memory_of, memory_start, wrap
 from grounded.errors import NextCommand
@@ -208,6 +208,10 @@ def test_true_values_behind_a_late_log_begin_where_the_log_is(trials):
     np.testing.assert_array_equal(data.y[..., now], data.y[..., place])
     assert not data.seen[..., now].any() and data.told[now] and not data.told[speed]
     assert limits(data).sentences == ("state v was never measured",)
+    offered = Library().candidates(better, data.scales)
+    names = [effect.name for effect in knowable(data, offered)]
+    assert "coulomb_friction:v" in names and "sensor_delay:x" in names
+    assert "offset:x" in {effect.name for effect in offered} - {*names}  # a log moves nothing
     search = HypothesisSearch(data, ())
     fit, true = search.nulls(), np.concatenate([states for _, states in found])
     begun = true[data.state_at[:, 0]]
