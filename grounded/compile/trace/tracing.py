@@ -12,8 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from grounded.compile.names import Named, check_names, raised_at, wrong_value
 from grounded.compile.problem import STAGES, Integrator, Kind
 from grounded.compile.trace.expression import Expression, NotTraceable, node_of
