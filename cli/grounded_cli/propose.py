@@ -76,6 +76,12 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
         show(f"\n{next_line(proposed.then)}")
 
 
+def _otherwise(candidate: Candidate, best: Tried) -> bool:
+    """Whether the model gives the best one, on which this one is based, clearly something else."""
+    off = abs(candidate.expected_of_base - best.utility)
+    return candidate.base == best.candidate.id and off > UNLIKE * abs(candidate.predicted_gain)
+
+
 def _so_far(candidate: Candidate, best: Tried) -> str:
     """The best one's utility; beside it what the model gives it, and why, as far as that is known.
 
@@ -83,9 +89,9 @@ def _so_far(candidate: Candidate, best: Tried) -> str:
     its runs once something near it was repeated. What is left, the model does not replay.
     """
     text = f"{number(best.utility)} by {best.candidate.id}"
-    same, told = candidate.expected_of_base, UNLIKE * abs(candidate.predicted_gain)
-    if candidate.base != best.candidate.id or not abs(same - best.utility) > told:
+    if not _otherwise(candidate, best):
         return text
+    same, told = candidate.expected_of_base, UNLIKE * abs(candidate.predicted_gain)
     if same < ASTRAY * best.utility:
         return f"{text}, which the same model does not replay: it gives {number(same)}"
     text = f"{text}, to which the same model gives {number(same)}"
@@ -211,7 +217,7 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     if best is None or candidate.id in tried or not math.isfinite(missed[-1]):
         return text
     gain = candidate.predicted_gain
-    if candidate.base != best.candidate.id or gain > -best.utility:  # no utility is above 0
+    if not _otherwise(candidate, best) or gain > -best.utility:  # no utility is above 0
         gain = candidate.predicted_utility - best.utility
     if not gain > 0:
         return text

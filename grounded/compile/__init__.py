@@ -93,20 +93,19 @@ def system_from(signature: Signature, integrator: Integrator) -> System:
     trouble = jit.trouble()
     if trouble:
         return TracedSystem(signature, found, integrator, f"not compiled: {trouble}")
+    system, place = CompiledSystem(signature, found, integrator), where(signature.function)
     try:
-        system = CompiledSystem(signature, found, integrator)
-        operations = system.operations
+        operations, wide = system.operations, system.n * (system.n + system.m) > MAX_PLACES
+        if operations <= MAX_COMPILED and not wide:
+            return system
+        size = f"{operations:,} operations of {system.n} states"
     except TooLong as error:
-        note = f"not compiled, {where(signature.function)}: its derivatives take {error}"
-        return _differenced(signature, integrator, note)
-    if operations > MAX_COMPILED or system.n * (system.n + system.m) > MAX_PLACES:
-        size = f"{system.n} states and {operations:,} operations would take too long"
-        place = where(signature.function)
-        if len(found.graph.live(found.outputs)) > MAX_STEPS:
-            return TracedSystem(signature, found, integrator, f"not compiled, {place}: {size}")
-        note = f"compiled but for its derivatives, {place}: {size}"
-        return CompiledSteps(signature, found, integrator, note)
-    return system
+        size = str(error)
+    slow = f"({place}): to compile {size} would take too long; it is planned with all the same"
+    if len(found.graph.live(found.outputs)) > MAX_STEPS:
+        return TracedSystem(signature, found, integrator, f"not compiled {slow}, more slowly")
+    note = f"compiled but for its derivatives {slow}, more slowly"
+    return CompiledSteps(signature, found, integrator, note)
 
 
 def _differenced(signature: Signature, integrator: Integrator, note: str) -> System:

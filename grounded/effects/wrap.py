@@ -116,6 +116,8 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
     step, memory = build(effect, whole, dt)
     vars(step)["timestep"] = getattr(model.step, "timestep", 0.0)
     vars(step)["settled"] = _settled(effect)
+    written = model.step or model.derivative
+    vars(step)["__wrapped__"] = getattr(written, "__wrapped__", written)  # `where`: the user's
     return Model(
         states={**model.states, **memory},
         inputs=model.inputs,

@@ -28,6 +28,8 @@ from grounded.compile.run.interpreted import Quadratic, linearised
 from grounded.frozen import Array, wrapped
 
 PASSES = 4
+SHARES = (0.5, 0.25, 0.0)  # of the gains on the known part: what is left where no pass is better
+SAME = 1e-9  # of what inputs do together: less, in difference, is rounding
 RIDGE = 1e-6  # of a known quantity's own variance
 
 
@@ -50,6 +52,10 @@ def measured_gains(problem: Problem, z: Array, u: Array, K: Array, measured: int
         q = linearised(problem.system, problem, z, u)
         noise = _disturbances(problem, z)
         best, least, gains = dropped, _cost(q, dropped, noise), K
+        for less in (share * dropped for share in SHARES):
+            cost = _cost(q, less, noise)
+            if cost < least:
+                best, least = less, cost
         for _ in range(PASSES):
             gains = _swept(q, K, _estimates(q, gains, noise, known), known)
             cost = _cost(q, gains, noise)
@@ -89,12 +95,20 @@ def _swept(q: Quadratic, K: Array, estimates: Array, known: NDArray[np.bool_]) -
     V = np.diag(q.l_zz[-1])
     for t in range(len(K) - 1, -1, -1):
         free = K[t].any(axis=1)
-        Q_zz, Q_uz, Q_uu = _quadratic(q, t, V)
-        if free.any():
-            full = -np.linalg.solve(Q_uu[np.ix_(free, free)], Q_uz[free])
+        VB = V @ q.B[t]
+        Q_uu, Q_uz = np.diag(q.l_uu) + q.B[t].T @ VB, q.l_uz + VB.T @ q.A[t]
+        if free.any() and np.isfinite(Q_uu).all() and np.isfinite(Q_uz).all():
+            full = -_least_squares(Q_uu[np.ix_(free, free)], Q_uz[free])
             gains[t][free] = np.where(known, full @ estimates[t], 0.0)
-        V = _closed(Q_zz, Q_uz, Q_uu, gains[t])
+        V = _before(q, t, V, gains[t])
     return gains
+
+
+def _least_squares(Q_uu: Array, Q_uz: Array) -> Array:
+    """Q_uu^-1 Q_uz, in each input's own unit; inputs that do the same share it, idle ones get 0."""
+    size = np.sqrt(np.where(np.diag(Q_uu) > 0, np.diag(Q_uu), 1.0))
+    shared = np.linalg.lstsq(Q_uu / np.outer(size, size), Q_uz / size[:, None], rcond=SAME)[0]
+    return np.asarray(shared / size[:, None], np.float64)
 
 
 def _cost(q: Quadratic, K: Array, noise: Array) -> float:
@@ -102,19 +116,17 @@ def _cost(q: Quadratic, K: Array, noise: Array) -> float:
     V = np.diag(q.l_zz[-1])
     total = float(noise @ np.diag(V))
     for t in range(len(K) - 1, -1, -1):
-        V = _closed(*_quadratic(q, t, V), K[t])
+        V = _before(q, t, V, K[t])
         total += float(noise @ np.diag(V))
     return total if np.isfinite(total) else np.inf
 
 
-def _quadratic(q: Quadratic, t: int, V: Array) -> tuple[Array, Array, Array]:
-    """Q_zz, Q_uz, Q_uu of a step, with the value V after it."""
-    A, B = q.A[t], q.B[t]
-    VA, VB = V @ A, V @ B
-    return np.diag(q.l_zz[t]) + A.T @ VA, q.l_uz + B.T @ VA, np.diag(q.l_uu) + B.T @ VB
+def _before(q: Quadratic, t: int, V: Array, K: Array) -> Array:
+    """The value of a step with gains K, with V after it.
 
-
-def _closed(Q_zz: Array, Q_uz: Array, Q_uu: Array, K: Array) -> Array:
-    """The value of a step with gains K."""
-    cross = K.T @ Q_uz
-    return Q_zz + cross + cross.T + K.T @ Q_uu @ K
+    A sum of squares (Joseph's form) and symmetric to the last bit: in the shorter Q_zz + K'Q_uz +
+    ..., what rounding leaves of asymmetry grows by K'B' each step, up to a negative cost.
+    """
+    loop, cross = q.A[t] + q.B[t] @ K, K.T @ q.l_uz
+    value = loop.T @ V @ loop + K.T @ (q.l_uu[:, None] * K) + cross + cross.T + np.diag(q.l_zz[t])
+    return np.asarray(0.5 * (value + value.T))

@@ -9,9 +9,10 @@ import pytest
 from grounded.compile import Problem, system_of
 from grounded.compile.kernel_words import MAX_INPUTS
 from grounded.compile.run import jit
+from grounded.compile.run.compiled import Kernels
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.graph import TooLong
-from grounded.compile.trace.tracing import Signature, trace
+from grounded.compile.trace.tracing import Signature, Variant, trace
 from grounded.engine import Engine, each, running
 from grounded.solve.ddp import solve
 from problems import SPECS, problem
@@ -189,6 +190,48 @@ def test_too_many_operations_are_not_compiled(monkeypatch):
         graph = Graph(limit=3)
         for i in range(5):
             graph.const(float(i))
+
+
+def too_long(*args):
+    raise TooLong("more than 10 operations")
+
+
+def test_derivatives_too_long_to_be_written_out_are_exact_all_the_same(monkeypatch):
+    """Adopted effects on an arm: `diagnose` and `fit` ended in `TooLong`."""
+    whole, rng = problem("car").system, np.random.default_rng(0)
+    x, u = rng.uniform(0.2, 0.9, (5, whole.n)), rng.uniform(0.2, 0.9, (5, whole.m))
+    at = (x, u, problem("car").p, 0.05, 0.05)
+    expected = whole.sensitivities(*at)
+
+    with monkeypatch.context() as patch:  # by its parameters alone
+        patch.setattr(Kernels, "full", too_long)
+        system = problem("car").system
+        assert system.how == "compiled"
+        for _ in range(2):
+            for mine, theirs in zip(system.sensitivities(*at), expected, strict=True):
+                np.testing.assert_allclose(mine, theirs, **TIGHT)
+
+    monkeypatch.setattr("grounded.compile.run.compiled.SMALL", 0)
+    monkeypatch.setattr(Variant, "entries", too_long)
+    system = problem("car").system
+    assert system.how == "compiled steps" and "more than 10 operations" in system.note
+    for mine, theirs in zip(system.sensitivities(*at), expected, strict=True):
+        np.testing.assert_allclose(mine, theirs, **TIGHT)
+
+
+def test_what_is_not_finite_reaches_no_other_derivative():
+    """At x = 0 the root of x has none; y's own, and that of a branch not taken, have theirs."""
+
+    def step(s, a, p, dt):
+        other = np.where(s.y > 0, s.y * s.y, np.sqrt(s.x))
+        return {"x": np.sqrt(s.x) + p.k * s.y, "y": np.maximum(a.u, s.y) + other}
+
+    names = {"states": ("x", "y"), "inputs": ("u",), "params": ("k",)}
+    system = traced(step, kind="step", **names)
+    at = (np.array([[0.0, 2.0]]), np.array([[1.0]]), np.array([3.0]), 0.1)
+    f_x, f_u, f_p = system.sensitivities(*at)
+    assert np.isinf(f_x[0, 0, 0]) and f_x[0, 0, 1] == 3.0 and f_p[0, 0, 0] == 2.0
+    assert f_x[0, 1].tolist() == [0.0, 5.0] and f_u[0].tolist() == [[0.0], [0.0]]
 
 
 def test_a_failed_sweep_names_the_same_step():

@@ -94,6 +94,13 @@ def test_an_adopted_effect_is_the_one_that_was_diagnosed(effect):
     )
 
 
+def test_messages_about_a_wrapped_model_name_the_users_own_file():
+    once = wrap(ONE_EACH[0], typical(ONE_EACH[0]), DT)
+    effect = Library().effect("input_gain:throttle", once)
+    twice = wrap(effect, typical(effect), DT)
+    assert once.system.source == twice.system.source == car.system.source
+
+
 @pytest.mark.parametrize("effect", ONE_EACH, ids=lambda e: e.name)
 def test_an_adopted_effect_compiles_and_its_derivatives_are_right(effect):
     wrapped = wrap(effect, typical(effect), DT)

@@ -7,6 +7,7 @@ from grounded.compile.run.interpreted import linearised
 from grounded.model import Model, Param
 from grounded.rollout import simulate
 from grounded.search.first_policy import first_policy
+from grounded.solve import ddp
 from grounded.solve.measured import measured_gains
 from grounded.task import Task
 from grounded.utility import Reward
@@ -40,15 +41,51 @@ def lagging():
     return planner_of(task, [{"name": "first_order_lag:moment", "tau": 0.08}])
 
 
-def disturbed(problem, run, K):
+def two_axes(s, a, p):
+    return {
+        "q": s.w,
+        "r": s.v,
+        "w": 100 * a.moment + 30 * a.other,
+        "v": 30 * a.moment + 200 * a.other - 5 * s.q,
+    }
+
+
+def twins(s, a, p):
+    """Both moments do the same."""
+    return {**two_axes(s, a, p), "w": a.moment + a.other, "v": a.moment + a.other - 5 * s.q}
+
+
+def lagging_by_two(derivative, weight):
+    """Two axes whose moments lag, at rest; inputs cost `weight`."""
+    model = Model(
+        states={"q": "rad", "r": "rad", "w": "rad/s", "v": "rad/s"},
+        inputs={"moment": "N m", "other": "N m"},
+        params={},
+        derivative=derivative,
+    )
+    zero, H = np.zeros(2), 120
+    task = Task(
+        model=model,
+        dt=0.02,
+        target=np.tile([1.0, 0.5, 0.0, 0.0], (H + 1, 1)),
+        reward=Reward(np.array([10.0, 10.0, 1.0, 1.0]), np.zeros(4), np.full(2, weight), zero),
+        start=np.zeros(4),
+        past=zero,
+        low=np.full(2, -1e3),
+        high=np.full(2, 1e3),
+    )
+    return planner_of(task, [{"name": "first_order_lag:moment+other", "tau": 0.02}])
+
+
+def disturbed(problem, run, K, measured=2):
     """How large disturbances of the measured states have grown by the end of the loop."""
     q, noise = linearised(problem.system, problem, run.z, run.inputs), np.zeros(problem.nz)
-    noise[:2] = 1e-4
+    noise[:measured] = 1e-4
     S = np.diag(noise)
     for t in range(len(K)):
         loop = q.A[t] + q.B[t] @ K[t]
         S = loop @ S @ loop.T + np.diag(noise)
-    return float(np.sqrt(np.trace(S[:2, :2])))
+    return float(np.sqrt(np.trace(S[:measured, :measured])))
 
 
 def test_a_loop_without_the_lags_output_stays_stable(lagging):
@@ -85,3 +122,26 @@ def test_a_clamped_input_keeps_no_gain(lagging):
     clamped[3:6] = 0.0
     K = measured_gains(problem, found.z, found.u, clamped, 2)
     assert not K[3:6].any() and K[10].any()
+
+
+def test_rounding_does_not_grow_where_inputs_are_cheap():
+    """An arm of two joints got 900 N m/rad where its plan had 30, and a singular matrix."""
+    planner = lagging_by_two(two_axes, 1e-6)
+    problem = planner.plan.problem()
+    found = ddp.solve(problem, np.zeros((problem.horizon, 2)))
+    run = simulate(problem, planner.plan.policy(found.u, found.K, found.z[:-1]))
+    K = measured_gains(problem, found.z, found.u, found.K, 4)
+    assert np.abs(K).max() < 2 * np.abs(found.K).max()
+    full, made = (disturbed(problem, run, k, 4) for k in (found.K, K))
+    assert made < 4 * full
+
+
+def test_inputs_that_cost_nothing_and_do_the_same_are_shared():
+    """Q_uu is singular there, and DDP goes on with a damping of its own."""
+    planner = lagging_by_two(twins, 0.0)
+    problem = planner.plan.problem()
+    found = ddp.solve(problem, np.zeros((problem.horizon, 2)))
+    assert found.ok
+    K = measured_gains(problem, found.z, found.u, found.K, 4)
+    np.testing.assert_allclose(K[:, 0], K[:, 1], atol=1e-6 * np.abs(K).max())
+    assert np.isfinite(K).all() and K.any() and not K[:, :, 4:6].any()

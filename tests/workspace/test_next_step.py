@@ -471,6 +471,8 @@ def test_trust_sets_the_promised_gain_against_the_last_misses(tmp_path):
     assert holds(_so_far(poor, best), f"{poor.predicted_utility - poor.predicted_gain:.4g}")
     now = ran_standing(folder, best)
     assert f"{poor.predicted_gain:.4g}" in _came_true(poor, ran[:2], now)
+    near = replace(made, predicted_gain=0.95 * gain)  # not told to be replayed otherwise
+    assert f"a gain of {gain:.4g}" in _came_true(near, ran[:2], now)
     beyond = replace(made, predicted_gain=1 - best.utility)  # no utility is above 0
     assert f"a gain of {gain:.4g}" in _came_true(beyond, ran[:2], now)
 

@@ -51,6 +51,7 @@ from grounded.compile.run.arguments import (
     zeros,
 )
 from grounded.compile.run.traced import TracedSystem
+from grounded.compile.trace.graph import TooLong
 from grounded.compile.trace.tracing import Signature, Trace, Variant
 from grounded.frozen import Array
 
@@ -74,6 +75,7 @@ class Kernels:
         )
         self._libraries: dict[Any, jit.Library] = {}
         self._lock = threading.RLock()
+        self.too_long = False  # its derivatives by the parameters, to be compiled
 
     def batch(self) -> jit.Library:
         """Step and, unless derivatives are left out, linearise, of many samples."""
@@ -171,13 +173,25 @@ class CompiledSystem(TracedSystem):
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
     ) -> tuple[Array, Array, Array]:
         """See `System.sensitivities`."""
-        if self.n * (self.n + self.m + self.k) > MAX_PLACES:
+        full = self._full(p, dt)
+        if full is None:
             return super().sensitivities(x, u, p, dt, smoothing)
         N, n = len(x), self.n
         f_x, f_u, f_p = zeros((N, n, n)), zeros((N, n, self.m)), zeros((N, n, self.k))
         out = {"f_x": f_x, "f_u": f_u, "f_p": f_p}
-        self._batch(self._compiled(p, dt).full()["linearise"], (x, u, p, dt, smoothing), out)
+        self._batch(full["linearise"], (x, u, p, dt, smoothing), out)
         return f_x, f_u, f_p
+
+    def _full(self, p: Array, dt: float) -> jit.Library | None:
+        """Derivatives by the parameters too; None where they are too many to compile."""
+        kernels = self._compiled(p, dt)
+        if self.n * (self.n + self.m + self.k) > MAX_PLACES or kernels.too_long:
+            return None
+        try:
+            return kernels.full()
+        except TooLong:
+            kernels.too_long = True
+            return None
 
     def _batch(
         self, kernel: Any, point: tuple[Array, Array, Array, float, float], out: dict[str, Array]

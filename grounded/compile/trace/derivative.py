@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from grounded.compile.trace.graph import Graph
 
 Tangent = Mapping[int, int]  # variable -> node of the derivative; absent means zero
+FLAT = ("floor", "rint", "trunc", "equal")  # their derivative is zero wherever there is one
 Rule = Callable[[Graph, int, tuple[int, ...]], tuple[int, ...]]
 
 
@@ -41,7 +42,7 @@ def jacobian(
 def _tangent(graph: Graph, i: int, tangents: Mapping[int, Tangent]) -> dict[int, int]:
     node = graph.nodes[i]
     moving = [a for a in node.args if tangents[a]]
-    if not moving or node.op in ("floor", "rint", "trunc", "equal"):
+    if not moving or node.op in FLAT:
         return {}
     if node.op == "blend":
         return _blend(graph, node.args, tangents)

@@ -12,13 +12,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from grounded.compile.names import Named, check_names, raised_at, wrong_value
 from grounded.compile.problem import STAGES, Integrator, Kind
 from grounded.compile.trace.expression import Expression, NotTraceable, node_of
 from grounded.compile.trace.functions import rebound
 from grounded.compile.trace.graph import MAX_NODES, Graph, Program, TooLong
+from grounded.compile.trace.tangents import Tangents
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 
@@ -163,19 +162,24 @@ class Variant:
 
     def __init__(self, found: Trace, sizes: tuple[int, int, int]) -> None:
         self.trace, self.sizes = found, sizes
-        self._programs: dict[int, tuple[Program, list[tuple[int, int]]]] = {}
+        self._known: dict[int, Tangents] = {}
+
+    def _variables(self, width: int) -> list[int]:
+        """The leaves of the first `width` of x, u, p."""
+        letters = [(s, i) for s, size in zip("xup", self.sizes, strict=True) for i in range(size)]
+        return [self.trace.graph.leaf(*letter) for letter in letters[:width]]
 
     def entries(self, width: int) -> list[tuple[int, int, int]]:
-        """(row, column, node) of the non-zero derivatives by the first `width` of x, u, p."""
+        """(row, column, node) of the non-zero derivatives by the first `width` of x, u, p.
+
+        Raises:
+            TooLong: when they are more operations than can be compiled.
+        """
         from grounded.compile.trace.derivative import jacobian
 
-        graph = self.trace.graph
-        letters = [
-            (letter, i) for letter, size in zip("xup", self.sizes, strict=True) for i in range(size)
-        ]
-        variables = [graph.leaf(*letter) for letter in letters[:width]]
+        variables = self._variables(width)
         column = {v: c for c, v in enumerate(variables)}
-        rows = jacobian(graph, self.trace.outputs, variables)
+        rows = jacobian(self.trace.graph, self.trace.outputs, variables)
         return sorted((r, column[v], i) for r, row in enumerate(rows) for v, i in row.items())
 
     def operations(self) -> int:
@@ -191,16 +195,9 @@ class Variant:
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
     ) -> tuple[Array, Array]:
         """The outputs (N, r), and their Jacobian by the first `width` of x, u, p (N, r, width)."""
-        if width not in self._programs:
-            entries = self.entries(width) if width else []
-            outputs = [*self.trace.outputs, *(i for _, _, i in entries)]
-            program = Program(self.trace.graph, outputs)
-            self._programs[width] = program, [(r, c) for r, c, _ in entries]
-        run, places = self._programs[width]
+        if width not in self._known:
+            graph, outputs = self.trace.graph, self.trace.outputs
+            self._known[width] = Tangents(graph, outputs, self._variables(width))
         leaves = _uniform(p, dt) | {("x", i): column for i, column in enumerate(x.T)}
-        found = run(leaves | {("u", j): column for j, column in enumerate(u.T)}, smoothing)
-        values = found[: len(found) - len(places)]
-        J = np.zeros((len(x), len(values), width))
-        for (r, c), value in zip(places, found[len(values) :], strict=True):
-            J[:, r, c] = value
-        return np.stack([np.broadcast_to(v, len(x)) for v in values], axis=1), J
+        leaves |= {("u", j): column for j, column in enumerate(u.T)}
+        return self._known[width](leaves, smoothing, len(x))
