@@ -16,6 +16,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
+from grounded.result import listed
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
@@ -182,7 +183,7 @@ def units_tried(model: Model) -> Iterator[tuple[Sequence[str], float]]:
 
 def units_told(names: Sequence[str], by: float, mapped: bool) -> str:
     """What is wrong with the units of a log, and what mends it; `mapped`: by a [log] table."""
-    which = " and ".join(names)
+    which = listed(names)
     if by == -1:
         its = "its scale" if len(names) == 1 else "the scale of each"
         mend = f"multiply {its} by -1 in {FILE}'s [log] (1 where none is given)"
