@@ -8,6 +8,7 @@ import pytest
 from facts import holds
 from grounded import Model
 from grounded.errors import GroundedError
+from grounded.result import listed
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.intake.other_scale import other_units, units_tried
@@ -88,7 +89,7 @@ def test_the_columns_and_their_factor_are_named(driven, tmp_path, names, factor)
     write_trial(tmp_path / "odd.mcap", odd, {k: meta[k] for k in ("kind", "task")})
     with pytest.raises(GroundedError) as refused:
         w.ingest(tmp_path / "odd.mcap")
-    assert holds(str(refused.value), " and ".join(names.split()), f"times {1 / factor:.3g}")
+    assert holds(str(refused.value), listed(names.split()), f"times {1 / factor:.3g}")
     named = w.ingest(tmp_path / "odd.mcap", candidate=trial.candidate)
     assert any(f"{1 / factor:.3g}" in warning for warning in named.warnings)
 
