@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.effects.memory import true_values
 from grounded.frozen import Array
 from grounded.rollout import augmented
 from grounded.search.planner import Planner
@@ -83,6 +82,8 @@ def anchored(planner: Planner, trial: Trial) -> Trial:
     The true value behind an old or lagging log is carried on by the model alone and drifts. What
     the model then misses of the log is that drift: it is added to the memory.
     """
+    from grounded.effects.memory import true_values
+
     lifted, n = planner.lift(trial), planner.task.model.n
     names = planner.plan.model.state_names
     behind = true_values(names, names[n:])
