@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
@@ -70,19 +69,15 @@ def command(
     workspace = open_workspace()
     model, dt = workspace.base_model, workspace.config.task.dt
     start, ends = workspace.config.task.start, _values(to)
-    paces = {"speed": speed, "accel": accel}
-    kept = [key for key, given in paces.items() if given is not None]
-    drive = replace(
-        Drive(size=size, lateral=lateral, laps=laps, hold=hold),
-        **{key: given for key, given in paces.items() if given is not None},
-    )
+    paces = {k: v for k, v in (("speed", speed), ("accel", accel)) if v is not None}
+    drive = Drive(size=size, lateral=lateral, laps=laps, hold=hold, **paces)
     long = SECONDS if seconds is None else seconds
     if shape == "line" and (ends or not has_plane(model)):
-        if seconds is not None and len(kept) > 1:
+        if seconds is not None and len(paces) > 1:
             raise click.UsageError(
                 "of --seconds, --speed and --accel a line has two: leave one away"
             )
-        columns = line_target(ends, start, drive, model, dt, seconds, "".join(kept[:1]))
+        columns = line_target(ends, start, drive, model, dt, seconds, next(iter(paces), ""))
     elif shape == "step":
         columns = step_target(ends, model, dt, long, start)
     elif shape == "swing-up":
@@ -96,9 +91,9 @@ def command(
         columns = path_target(shape, drive, model, dt)
     else:
         columns = _recorded(workspace, shape)
-    before, changed = _weights(workspace, "state"), _weights(workspace, "input_change")
+    before = _reward(workspace)
     path = workspace.target(columns)
-    weights, changes = _weights(workspace, "state"), _weights(workspace, "input_change")
+    reward = _reward(workspace)
     rows = len(next(iter(columns.values())))
     ranges = {name: (float(v.min()), float(v.max())) for name, v in columns.items()}
     if json_:
@@ -108,12 +103,13 @@ def command(
     for name, (low, high) in ranges.items():
         text = with_unit(f"{number(low)} to {number(high)}", model.states[name])
         show(field(name, text, "  "))
-    if weights != before:
-        told = ", ".join(f"{name} = {number(weight)}" for name, weight in weights.items())
-        sentence(f"[reward] state is new, 1 for an error as large as a range here: {told}")
-    if changes != changed:
-        told = ", ".join(f"{name} = {number(weight)}" for name, weight in changes.items())
-        sentence(f"[reward] input_change is new, 0.04 / (range of [limits])^2: {told}")
+    for kind, by in (
+        ("state", "1 for an error as large as a range here"),
+        ("input_change", "0.04 / (range of [limits])^2"),
+    ):
+        if (weights := reward.get(kind, {})) != before.get(kind, {}):
+            told = ", ".join(f"{name} = {number(weight)}" for name, weight in weights.items())
+            sentence(f"[reward] {kind} is new, {by}: {told}")
     moving = {model.states[name] for name, ends in ranges.items() if ends != (0, 0)}
     if still := [name for name in ranges if model.states[name] not in moving]:
         remark(
@@ -125,11 +121,11 @@ def command(
     show(f"\n{next_line(NextCommand('propose'))}")
 
 
-def _weights(workspace: Workspace, kind: str) -> dict[str, float]:
+def _reward(workspace: Workspace) -> dict[str, dict[str, float]]:
     import tomllib
 
     written = tomllib.loads(workspace.config.file.read_text(encoding="utf-8"))
-    return dict(written.get("reward", {}).get(kind, {}))
+    return dict(written.get("reward", {}))
 
 
 def _values(pairs: tuple[str, ...]) -> dict[str, float]:

@@ -75,10 +75,15 @@ def dead_rates(
             said = relation.c * value * trial.dt * np.arange(len(piece))
             moved = max(moved, float(np.ptp(piece[:, 0] - said)))
             own, way = max(own, float(np.ptp(piece[:, 0]))), max(way, float(np.ptp(said)))
-            noise = max(noise, float(np.std(np.diff(piece[:, 0], n=2))) / np.sqrt(6))
+            noise = max(noise, _noise(piece[:, 0]))
         if min(moved, own) > max(MOVED * noise, SHARE * way, SHARE * own):
             found.append(Dead(relation, value, moved))
     return found
+
+
+def _noise(position: Array) -> float:
+    """The standard deviation of a position's white noise, by its second differences."""
+    return float(np.std(np.diff(position, n=2)) / np.sqrt(6))
 
 
 def _noise_alone(model: Model, trial: Trial, relation: Integral) -> list[Dead]:
@@ -98,7 +103,7 @@ def _noise_alone(model: Model, trial: Trial, relation: Integral) -> list[Dead]:
             return []  # degrees, or too few samples a turn: what jumps of a turn left is no motion
         way = np.concatenate([[0.0], np.cumsum(moved[:, 0])])
         a, b = (s[k:] - s[:-k] for s in (way, said))
-        noise = float(np.std(np.diff(way, n=2))) / np.sqrt(6)
+        noise = _noise(way)
         hidden = np.std(b) > SHARE * np.std(a) or np.ptp(way) < MOVED * noise
         if hidden or np.std(a) < 3 * noise or _alike(a, b, round(LATE_S / trial.dt)) > SHAPE:
             return []

@@ -84,8 +84,9 @@ def without_others(
     """
     data, model, held = predictor.data, predictor.data.model, set[str]()
     for name in adopted if data.count > 1 else ():
-        family, _, target = name.partition(":")
-        if not library.family(family).loose or target not in library.family(family).targets(model):
+        of, _, target = name.partition(":")
+        family = library.family(of)
+        if not family.loose or target not in family.targets(model):
             continue  # of what has it already: two sensors that were late as one are so no more
         effect = library.effect(name, model, data.scales)
         own = {q.name: param_name(name, q.name) for q in effect.quantities}
