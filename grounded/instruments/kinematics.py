@@ -24,6 +24,7 @@ from grounded.trial import Trial, stretches
 
 SHORT = 1e-6  # [s], a step that shows the rates
 FAST = 0.2  # of the largest speed: below it a course means little
+OWN = 200  # logged samples that show how a model's own position follows its velocity
 AGREE = 0.9  # length of the mean of unit vectors that point the same way
 TURNED_AWAY = np.deg2rad(20)  # what no side slip makes
 
@@ -58,6 +59,28 @@ def lag_of(model: Model, relation: Integral, trials: Sequence[Trial]) -> Lag | N
         w = relation.c * piece[:, 1]
         pairs.append((moved[1:-1, 0] / dt, over_steps(w)))
     return lag_between(pairs, dt)
+
+
+def own_lag(model: Model, relation: Integral, trials: Sequence[Trial]) -> float:
+    """How late a model itself has a velocity behind its position's rate [s], from logged samples.
+
+    A simulator's steps move a position by the velocity before or after them: half of such a step,
+    which no sensor makes.
+    """
+    dt, (i, j, c) = trials[0].dt, (relation.i, relation.j, relation.c)
+    x = np.concatenate([trial.states[:-1] for trial in trials])
+    u = np.concatenate([trial.inputs for trial in trials])
+    known = np.isfinite(x[:, [i, j]]).all(axis=1) & np.isfinite(u).all(axis=1)
+    at = np.flatnonzero(known)[:: max(1, int(known.sum()) // OWN)]
+    if not len(at):
+        return 0.0
+    before = np.nan_to_num(x[at], nan=0.0)  # what no sensor shows
+    after = model.system.step(before, u[at], model.values, dt)
+    changed = c * (after[:, j] - before[:, j])
+    moved = model.difference(after, before)[:, i] / dt - c * (after[:, j] + before[:, j]) / 2
+    size = float(changed @ changed)
+    late = float(moved @ changed) / size * dt if size > 0 else 0.0
+    return late if np.isfinite(late) and abs(late) < dt else 0.0
 
 
 def over_steps(w: Array) -> Array:

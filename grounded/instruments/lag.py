@@ -244,3 +244,12 @@ def at_samples(x: Array, at: Any) -> Array:
     a, b, c, d = (line[k + i] for i in range(4))
     value = b + 0.5 * p * (c - a + p * (2 * a - 5 * b + 4 * c - d + p * (3 * (b - c) + d - a)))
     return np.where((at < -1e-9) | (at > T - 1 + 1e-9), np.nan, value)
+
+
+def earlier(x: Array, steps: float) -> Array:
+    """X as it was so many steps later; missing at the end."""
+    at = np.arange(len(x)) + steps
+    whole = round(steps)
+    if abs(steps - whole) < 0.05:
+        return np.concatenate([x[whole:], np.full(min(whole, len(x)), np.nan)])
+    return at_samples(x, at)

@@ -1,11 +1,12 @@
-"""Mistakes of a log that only the model can tell: commands in each other's column, or in percent.
+"""Mistakes of a log that only the model can tell: exchanged commands, percent, a turned sensor.
 
 Positions and velocities are held against one another without any physics (`swapped`,
 `other_units`). Commands can't be: the log of a robot whose wheels are exchanged is as good as any,
 it only turns the other way. So the model predicts each trial as it is logged and with the log
 changed, and both times what a plain calibration can do is done (`short_runs`): a model that is
 merely crude gains nothing by the change, a mistaken log gains most of what its commands do. The
-same tells two joints that are exchanged with their velocities, which agree with each other.
+same tells two joints that are exchanged with their velocities, which agree with each other, and a
+sensor that counts the other way than the model.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from grounded.trial import Trial
 
 CLEAR = 1.0  # [nats] by which a change must lower the errors of a trial
 HALF = 0.5  # of the error of one state at least
+PART = 0.7  # the same, of a turned sensor: a wrong sign is off by twice what the right one explains
 HINT = 0.5  # [nats], of the model as it is: less is not looked into
 LIKE = 4.0  # times what the model says, or a part of it: what gain an exchanged input may have
 SEEN = 0.5  # [nats] by which commands in their own unit must do better than none
@@ -48,6 +50,7 @@ class Mistake:
 
     Args:
         states: pairs of states, each in the other's column.
+        turned: states that are logged with the other sign, a position with its velocity.
         inputs: two that are, or all that are in another unit.
         factor: how many times too large these are, below 1 too small; 1 for an exchange.
         unit: what that is, in words.
@@ -55,6 +58,7 @@ class Mistake:
     """
 
     states: tuple[tuple[int, int], ...] = ()
+    turned: tuple[int, ...] = ()
     inputs: tuple[int, ...] = ()
     factor: float = 1.0
     unit: str = ""
@@ -62,7 +66,7 @@ class Mistake:
 
     @property
     def swap(self) -> bool:
-        """Two columns in each other's place."""
+        """Two columns in each other's place, or of the other sign: no other unit."""
         return self.factor == 1.0
 
     def mended(self, trial: Trial) -> Trial:
@@ -70,6 +74,7 @@ class Mistake:
         x, u = np.array(trial.states), np.array(trial.inputs)
         for pair in self.states:
             x[:, pair] = x[:, pair[::-1]]
+        x[:, self.turned] *= -1
         if self.swap:
             u[:, self.inputs] = u[:, self.inputs[::-1]]
         else:
@@ -104,13 +109,13 @@ def mistaken(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Tol
         trials: of its states and inputs.
         shown: states that a sensor has.
     """
-    changes = [*_exchanges(model, shown), *_units(model, trials)] if trials else []
+    changes = [*_exchanges(model, shown), *_turned(model, shown), *_units(model, trials)]
     some = range(0, len(trials), max(1, -(-len(trials) // TRIALS)))
     starts = STARTS if len(changes) < MANY else FEWER
     found: dict[Mistake, dict[int, tuple[Fit, Fit]]] = {}
     sound: dict[Mistake, set[int]] = {}
     with np.errstate(all="ignore"):
-        for k in some if changes else ():
+        for k in some:
             for change, fits in _each(model, trials[k], shown, changes, starts):
                 if fits is None:
                     sound.setdefault(change, set()).add(k)
@@ -141,6 +146,12 @@ def judge_commands(model: Model, trials: Sequence[Trial], hidden: Sequence[str] 
 
 def mended_by(model: Model, told: Told) -> str:
     """What to do about it."""
+    if turned := told.mistake.turned:
+        tables = listed(f"[log.state.{model.state_names[i]}]" for i in turned)
+        return (
+            f"Turn the sign in {tables} (scale = -1 where none is given) and in the robot's "
+            "program; or in the model, if the log is right"
+        )
     if told.mistake.swap:
         return "Correct the log, or the paths in [log]; or the model, if the log is right"
     tables = listed(f"[log.input.{model.input_names[j]}]" for j in told.mistake.inputs)
@@ -165,10 +176,9 @@ def described(model: Model, told: Told) -> str:
             f"(in {told.mistake.unit}?): {'divided by that' if large else f'times {times}'} "
             f"the model {proof}"
         )
-    said = " (or ".join(_pair(model, one) for one in (told.mistake, *told.others))
-    said += ")" * len(told.others)
-    text = f"the columns of {said} look exchanged: only the other way round does the model"
-    text = f"{text} predict what the robot does ({proof})"
+    said, *others = (_named(model, one) for one in (told.mistake, *told.others))
+    text = said + "".join(f" (or {other})" for other in others)
+    text = f"{text}: only the other way round does the model predict what the robot does ({proof})"
     mirror = _mirrored(model, told.mistake)
     if mirror:
         names = ", ".join(mirror[:-1]) + " and " * (len(mirror) > 1) + mirror[-1]
@@ -176,13 +186,18 @@ def described(model: Model, told: Told) -> str:
     return text
 
 
-def _pair(model: Model, mistake: Mistake) -> str:
+def _named(model: Model, mistake: Mistake) -> str:
+    if turned := mistake.turned:
+        some = listed(model.state_names[i] for i in turned)
+        return f"{some} look{'s' * (len(turned) == 1)} turned, logged with the other sign"
     if mistake.inputs:
         a, b = (model.input_names[j] for j in mistake.inputs)
         signed = zip(mistake.inputs, mistake.signs, strict=True)
         odd = [model.input_names[j] for j, sign in signed if sign < 0]
-        return f"{a} and {b}" + f", with the sign of {listed(odd)}," * bool(odd)
-    return ", ".join(listed(model.state_names[i] for i in pair) for pair in mistake.states)
+        said = f"{a} and {b}" + f", with the sign of {listed(odd)}," * bool(odd)
+    else:
+        said = ", ".join(listed(model.state_names[i] for i in pair) for pair in mistake.states)
+    return f"the columns of {said} look exchanged"
 
 
 def _exchanges(model: Model, shown: Sequence[int]) -> Iterator[Mistake]:
@@ -198,8 +213,18 @@ def _exchanges(model: Model, shown: Sequence[int]) -> Iterator[Mistake]:
             yield Mistake(states=((a.i, b.i), (a.j, b.j)))
 
 
+def _turned(model: Model, shown: Sequence[int]) -> Iterator[Mistake]:
+    """Each state with the one that it is the rate of, or whose rate it is: a sensor turns both."""
+    pairs = [(r.i, r.j) for r in integrals(model) if r.exact and {r.i, r.j} <= set(shown)]
+    alone = [(i,) for i in shown if not any(i in pair for pair in pairs)]
+    for group in sorted((*pairs, *alone)):
+        yield Mistake(turned=group)
+
+
 def _units(model: Model, trials: Sequence[Trial]) -> Iterator[Mistake]:
     """Other units of all inputs of one unit; of a pure number by the largest that was sent."""
+    if not trials:
+        return
     units = list(model.inputs.values())
     for unit in dict.fromkeys(units):
         same = tuple(j for j, one in enumerate(units) if one == unit)
@@ -257,15 +282,15 @@ def _compared(
     if not change.swap:
         after = mended.best(signed[:1], free=False)
         seen = change.factor < 1 or before.score > still + CLEAR  # too small, they do nothing
-        return (before, after) if seen and _better(before, after) else None
-    if _better(before, after):
-        turned = [*signed, -signed[0]] if change.inputs else signed
-        before = logged.best([*turned, np.zeros(model.m)])
-    return (before, after) if _better(before, after) else None
+        return (before, after) if seen and _better(change, before, after) else None
+    if _better(change, before, after):
+        before = logged.best([*signed, *_odd_signs(model, change), np.zeros(model.m)])
+    return (before, after) if _better(change, before, after) else None
 
 
-def _better(before: Fit, after: Fit) -> bool:
-    return before.score - after.score > CLEAR and bool((after.rms < HALF * before.rms).any())
+def _better(change: Mistake, before: Fit, after: Fit) -> bool:
+    part = PART if change.turned else HALF
+    return before.score - after.score > CLEAR and bool((after.rms < part * before.rms).any())
 
 
 def _plausible(change: Mistake, fit: Fit) -> bool:
@@ -286,6 +311,14 @@ def _signed(model: Model, change: Mistake) -> list[Array]:
     for j in change.inputs if change.swap else ():
         found.append(np.where(np.arange(model.m) == j, -1.0, 1.0))
     return found
+
+
+def _odd_signs(model: Model, change: Mistake) -> list[Array]:
+    """Signs of the inputs with which a log may be explained as it is: all turned, or one."""
+    if not (change.inputs or change.turned):
+        return []
+    one = [np.where(np.arange(model.m) == j, -1.0, 1.0) for j in range(model.m)]
+    return [-np.ones(model.m), *(one if change.turned and model.m > 1 else ())]
 
 
 def _best(found: Mapping[Mistake, Mapping[int, tuple[Fit, Fit]]]) -> Told:

@@ -39,9 +39,10 @@ from grounded.instruments.kinematics import (
     course,
     integrals,
     lag_of,
+    own_lag,
     turned,
 )
-from grounded.instruments.lag import LEAST_S, SURE, Lag, at_samples
+from grounded.instruments.lag import LEAST_S, SURE, Lag, earlier
 from grounded.instruments.late_position import late_positions
 from grounded.instruments.mismatch import (
     Mismatch,
@@ -287,12 +288,14 @@ class _Bench:
         return in_degrees(name, self.model.states[name])
 
     def late(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
-        """A delay: no sensor is early, so it is the later one's."""
+        """A delay that is not the model's own: no sensor is early, so it is the later one's."""
         d, least = float(abs(lag.delay)), max(LEAST_STEPS * self.dt, LEAST_S)
+        own = own_lag(self.model, relation, self.trials) if relation.exact else 0.0
+        beyond = max(min(own, 0.0) - lag.delay, lag.delay - max(own, 0.0))
         q, w = (self.model.state_names[k] for k in (relation.i, relation.j))
-        if d + SURE * lag.std < least:  # neither can be late alone by what counts
+        if beyond + SURE * lag.std < least:  # neither can be late alone by what counts
             self.in_step |= {q, w}
-        if d < max(SURE * lag.std, least):
+        if beyond < max(SURE * lag.std, least):
             return
         i, name, other = (relation.i, q, f"{w} says")
         if lag.delay > 0:
@@ -314,7 +317,7 @@ class _Bench:
         if lag.filtered:
             text = f"follows {other} through a filter of {d:.3g} s"
             return put_right(name, text, "lag", "", delay_s=d, std_s=lag.std)
-        self.put(i, [_earlier(x, d / self.dt) for x in self.column(i)])
+        self.put(i, [earlier(x, d / self.dt) for x in self.column(i)])
         text, log = f"{d:.3g} s later than {other}", f"delay_s = {d:.3g}"
         return put_right(name, text, "delay", log, delay_s=d, std_s=lag.std)
 
@@ -387,12 +390,3 @@ class _Bench:
             size = float(np.sqrt(lag.low * lag.high))
             text = f"shows {100 * size:.3g} % of the speed of {where}: a sensor, or slip"
             yield Finding(name, text, "scale", scale=size)
-
-
-def _earlier(x: Array, steps: float) -> Array:
-    """X as it was so many steps later; missing at the end."""
-    at = np.arange(len(x)) + steps
-    whole = round(steps)
-    if abs(steps - whole) < 0.05:
-        return np.concatenate([x[whole:], np.full(min(whole, len(x)), np.nan)])
-    return at_samples(x, at)

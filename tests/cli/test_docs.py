@@ -274,7 +274,7 @@ def test_files_and_modules_that_a_page_names_are_there(page):
         assert path.endswith("NAME.py") or (ROOT / path).exists(), f"{path} is not there"
     folders = ("grounded", "trials", "cli", "tests", "benchmarks")
     files = {path.name for folder in folders for path in (ROOT / folder).rglob("*.py")}
-    files |= {"model.py", "real.py", "drive.py", "grounded_runner.py"}  # a user's own
+    files |= {"model.py", "real.py", "drive.py", "rig.py", "grounded_runner.py"}  # a user's own
     for name in re.findall(r"`(\w+\.py)`", text):
         assert name in files, f"{name} is not there"
     for name in set(re.findall(r"\bgrounded(?:_trials|_cli)?(?:\.[a-z]\w*)+", text)):

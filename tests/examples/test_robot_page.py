@@ -1,6 +1,10 @@
-"""docs/robot.md as printed: its ROS node runs with stubs of ROS, its C++ compiles and agrees."""
+"""docs/robot.md as printed: its ROS node runs with stubs of ROS, its C++ compiles and agrees.
+
+And docs/own-program.md, whose rig runs in time that only its sleeping moves.
+"""
 
 import json
+import random
 import re
 import runpy
 import shutil
@@ -16,7 +20,8 @@ import grounded.policy
 from cli import grounded as command
 from ros_bags import car_bag, odometry
 
-PAGE = (Path(__file__).parents[2] / "docs" / "robot.md").read_text("utf-8")
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = (DOCS / "robot.md").read_text("utf-8")
 
 
 def block(language, containing):
@@ -24,6 +29,12 @@ def block(language, containing):
     blocks = re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
     (found,) = (text for text in blocks if containing in text)
     return found
+
+
+def named_file(name):
+    """A file that docs/own-program.md gives in full."""
+    page = (DOCS / "own-program.md").read_text("utf-8")
+    return re.search(rf"<!-- file: {name} -->\n```python\n(.*?)```", page, re.DOTALL)[1]
 
 
 @pytest.fixture(scope="module")
@@ -140,3 +151,61 @@ def test_the_cpp_of_the_page_agrees_with_the_policy(car, tmp_path):
     off[:, 3] = np.angle(np.exp(1j * off[:, 3]))
     expected = np.array(made["feedforward"]) + np.einsum("tij,tj->ti", np.array(made["gain"]), off)
     assert np.allclose(found, np.clip(expected, made["low"], made["high"]), atol=1e-9)
+
+
+@pytest.fixture
+def virtual(monkeypatch):
+    """A clock that only sleeping moves: twenty seconds of driving take none."""
+    now = [100.0]
+
+    def sleep(seconds):
+        now[0] += seconds
+
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    monkeypatch.setattr("time.sleep", sleep)
+
+
+@pytest.mark.slow
+def test_the_page_of_a_program_of_your_own_leads_to_a_run_within_a_centimetre(
+    tmp_path, monkeypatch, virtual
+):
+    for name in ("model.py", "drive.py", "rig.py"):
+        (tmp_path / name).write_text(named_file(name))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def drive(*words):
+        for name in ("rig", "grounded_runner"):
+            monkeypatch.delitem(sys.modules, name, raising=False)  # a new process each
+        monkeypatch.setattr(sys, "argv", ["drive.py", *words])
+        runpy.run_path("drive.py")
+
+    def told(*words):
+        done = command(*words)
+        assert done.code == 0, done.err
+        return json.loads(done.out) if "--json" in words else done.out
+
+    random.seed(7)
+    drive("hand.csv")
+    told("init", "ball", "--from", "hand.csv", "--model", "model.py")
+    told("-C", "ball", "ingest", "--data", "hand.csv")
+    found = told("-C", "ball", "diagnose", "--json")
+    true = {"linkage": 0.0015, "lag": 0.12}
+    assert set(found["verdict"]["effects"]) == {"offset:v", "coulomb_friction:v"}
+    for name, value in true.items():
+        assert found["parameters"][name]["value"] == pytest.approx(value, rel=0.06)
+    told("-C", "ball", "adopt", "offset:v", "coulomb_friction:v")
+
+    file = Path("ball/grounded.toml")
+    text = file.read_text().replace("start = { }", "start = { x = -0.1 }")
+    file.write_text(re.sub(r"servo = \[.*\]\nseen_in.*", "servo = [-45, 45]", text))
+    told("-C", "ball", "target", "line", "--to", "x=0.1", "--seconds", "2.5", "--hold", "1")
+    told("-C", "ball", "propose")
+    told("-C", "ball", "export", "c0001", "--runner", "-o", "c0001.npz")
+    drive("r1.csv", "c0001.npz")
+    ran = told("-C", "ball", "next", "r1.csv", "--json")
+    assert Path("ball/c0002.npz").is_file()
+    rows = np.loadtxt("r1.csv", delimiter=",", skiprows=1)
+    target = np.loadtxt("ball/target.csv", delimiter=",", skiprows=1)
+    off = rows[: len(target), 1] - target[:, 1]
+    assert np.sqrt(np.mean(off**2)) < 0.012, ran

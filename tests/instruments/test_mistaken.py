@@ -136,6 +136,45 @@ def test_exchanged_joints_with_their_velocities_are_named_in_one_run():
     assert told is not None and holds(described(arm, told), "t1 and t2")
 
 
+def ball(rub=0.0, tilt=0.0, lag=0.05, linkage=0.1):
+    """A ball that rolls on a beam which a servo tilts."""
+
+    def rates(s, a, p):
+        return {
+            "x": s.v,
+            "v": 7.0 * np.sin(s.beam + tilt) - rub * np.tanh(s.v / 0.01),
+            "beam": (p.linkage * a.servo - s.beam) / p.lag,
+        }
+
+    return Model(
+        name="ball",
+        states={"x": "m", "v": "m/s", "beam": "rad"},
+        inputs={"servo": "rad"},
+        params={"linkage": Param(linkage, "1", 0.05, 0.2), "lag": Param(lag, "s", 0.01, 0.3)},
+        derivative=rates,
+    )
+
+
+ROLLED = ball(rub=0.1, tilt=0.02, lag=0.12, linkage=0.085)
+
+
+@pytest.mark.parametrize("turned", [(0, 1), (2,)])
+def test_a_sensor_that_counts_the_other_way_is_named_with_its_velocity(turned):
+    trials = [driven(ROLLED, k) for k in range(2)]
+    assert mistaken(ball(), trials, every(ball())) is None
+    told = mistaken(ball(), [Mistake(turned=turned).mended(t) for t in trials], every(ball()))
+    assert told is not None and told.mistake.turned == turned and not told.others
+    names = [ball().state_names[i] for i in turned]
+    assert holds(described(ball(), told), *names, "the other sign")
+    assert all(f"[log.state.{name}]" in mended_by(ball(), told) for name in names)
+
+
+@pytest.mark.parametrize("gain", [-1.0, 0.0, 0.3])
+def test_a_turned_dead_or_weak_input_is_no_turned_sensor(gain):
+    trials = [driven(ROLLED, k, gains=np.array([gain])) for k in range(2)]
+    assert mistaken(ball(), trials, every(ball())) is None
+
+
 @pytest.mark.parametrize(
     ("factor", "unit"), [(100.0, "percent"), (255.0, "8 bits"), (1000.0, "thousandths")]
 )
