@@ -205,8 +205,8 @@ BOMBS: dict[str, tuple[Callable[[], bytes], str]] = {
     "zeros, zstd": (lambda: _zeros("zstd", 200, 500 * 2**20), "/t.x"),
     "zeros, zstd, in smaller chunks": (lambda: _zeros("zstd", 250, 90 * 2**20), "/t.x"),
     "zeros, lz4": (lambda: _zeros("lz4", 6, 100 * 2**20), "/t.x"),
-    "tiny messages": (lambda: _tiny_messages(2_000_000), "/t.x"),
-    "300,000 chunks": (lambda: _chunks(300_000), "/t.x"),
+    "tiny messages": (lambda: _tiny_messages(500_000), "/t.x"),
+    "75,000 chunks": (lambda: _chunks(75_000), "/t.x"),
     "items of fixed lists": (lambda: _ranges(1_000_000, 30), "/t.x[:]"),
     "IDL, typedefs of typedefs": (lambda: idl(_typedefs()), "/t.x"),
     "IDL, a long constant": (lambda: idl(_constants()), "/t.x"),
@@ -220,13 +220,18 @@ BOMBS: dict[str, tuple[Callable[[], bytes], str]] = {
     "ROS, types that double": (lambda: ros(_ros_doubling(), [bytes(300_000)] * 3), "/t.x"),
     "metadata and attachments": (_attachments, "/t.x"),
     "gaps between records": (_gaps, "/t.x"),
+    "a trial of 100,000 steps, a chunk each": (lambda: _trial(100_000, 1.0), ""),
+}
+LONG: dict[str, tuple[Callable[[], bytes], str]] = {  # a minute each: with the study alone
+    "2,000,000 tiny messages": (lambda: _tiny_messages(2_000_000), "/t.x"),
+    "300,000 chunks": (lambda: _chunks(300_000), "/t.x"),
     "a trial of 400,000 steps, a chunk each": (lambda: _trial(400_000, 1.0), ""),
 }
 
 
 def bomb(name: str, folder: Path) -> tuple[Path, str]:
     """Writes a bomb; the file and the path to read in it."""
-    build, text = BOMBS[name]
+    build, text = (BOMBS | LONG)[name]
     path = folder / "bomb.mcap"
     path.write_bytes(build())
     return path, text
@@ -310,7 +315,7 @@ def explode(name: str, folder: Path) -> dict[str, Cost]:
     size = Path(path).stat().st_size / 1e6
     saved = folder / "saved.mcap"
     costs = {
-        "read": measured([path, BOMBS[name][1]], _READ),
+        "read": measured([path, (BOMBS | LONG)[name][1]], _READ),
         "inspect": measured(["inspect", path]),
         "recover": measured(["recover", path, "-o", str(saved)]),
     }
@@ -320,7 +325,7 @@ def explode(name: str, folder: Path) -> dict[str, Cost]:
 
 def main() -> None:
     """Prints a line a bomb: python tests/support/bombs.py [NAME ...]"""
-    for name in BOMBS:
+    for name in BOMBS | LONG:
         if sys.argv[1:] and not any(re.search(word, name) for word in sys.argv[1:]):
             continue
         with tempfile.TemporaryDirectory() as folder:
