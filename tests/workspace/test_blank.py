@@ -14,7 +14,9 @@ from cli import grounded
 from facts import holding, holds
 from grounded.errors import GroundedError
 from grounded.policy import load
+from grounded.trial import Trial
 from grounded_trials import Workspace
+from grounded_trials.store.trial_file import write_trial
 
 ROOT = Path(__file__).resolve().parents[2]
 MODEL = """
@@ -129,6 +131,22 @@ def test_a_plan_that_stays_far_from_where_its_target_ends_is_told(blank):
     config.write_text(re.sub(r"(?m)^input_change = .*$", dear, config.read_text()))
     (note,) = (one for one in blank.propose().proposal.notes if "the plan ends" in one)
     assert holds(note, "x", "1.0 m", "[reward]")
+
+
+@pytest.mark.parametrize(("noise", "told"), [(1e-5, False), (0.3, True)])
+def test_gains_that_shake_an_input_by_the_sensors_noise_are_told(blank, tmp_path, noise, told):
+    config, way = blank.folder / "grounded.toml", np.linspace(0, 1, 41)
+    config.write_text(config.read_text().replace("[limits]", "[limits]\nforce = [-8, 8]"))
+    blank.target({"x": way**2 * (3 - 2 * way)})
+    rng, t = np.random.default_rng(0), 0.05 * np.arange(101)
+    states = np.stack([np.sin(t), np.cos(t) + noise * rng.standard_normal(101)], axis=1)
+    inputs = -np.sin(t[:-1, None]) + 0.3 * np.cos(t[:-1, None])
+    trial = Trial(states, inputs, 0.05, ("x", "v"), ("force",))
+    write_trial(tmp_path / "hand.mcap", trial, {"kind": "data"})
+    blank.ingest(tmp_path / "hand.mcap", data=True)
+    notes = [one for one in blank.propose().proposal.notes if "noise" in one]
+    assert len(notes) == told
+    assert all(holds(one, "force", "N rms", "v (0.", "input_change") for one in notes)
 
 
 def test_a_target_that_nobody_has_drawn_is_told(blank):

@@ -1,7 +1,8 @@
 """What the first plan of a task should tell whoever runs it: what is left open, or out.
 
 A task may name no limits, ask for more than they allow, weigh inputs so much that errors hardly
-count, or begin from an input under which the robot does not stay where it starts.
+count or so little that the sensors' noise shakes them, or begin from an input under which the robot
+does not stay where it starts.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ MOSTLY = 0.9  # of a plan's cost
 HELD = 0.8  # of a plan's steps: an input is at a limit nearly all the time
 SHORT = 0.25  # of the way to where a target ends: the plan does not get there
 MISSED = 0.1  # of the way that a target asks for: the plan falls short
+SHAKEN = 0.05  # of what [limits] allow an input, else of what a plan uses of it
+MEDIAN = 0.6745  # standard deviations that half of all normal numbers lie within
 STILL = 1e-6  # of the rates under the held input: under another one the robot stands
 BEGUN = (0.0, 1.0, -1.0)  # beside the held input: a thrust by its square has no slope at 0
 
@@ -61,6 +64,7 @@ def left_open(workspace: Folder, first: Candidate | None) -> list[str]:
             )
     if first is not None:
         found += _held_back(task, first) or _falls_short(task, first)
+        found += _shaken(workspace, first)
     found += _held_before(workspace)
     name = str(workspace.config.task.target)
     rows = len(workspace.read_target((workspace.folder / name).resolve())[1])
@@ -111,6 +115,45 @@ def _falls_short(task: Task, first: Candidate) -> list[str]:
         "there in that time. Weigh inputs and their changes less, draw a slower target, or look at "
         "model.py"
     ]
+
+
+def _shaken(workspace: Folder, first: Candidate) -> list[str]:
+    """Inputs that the sensors' noise moves much through the gains, before anything was run."""
+    from grounded.diagnosis.error_report import measured
+
+    task, gain, found = workspace.task, first.policy.gain, []
+    if gain is None:
+        return []
+    noise = sensor_noise(workspace)
+    parts = gain[:, :, : task.model.n] ** 2 * noise**2  # (H, m, n)
+    rms = np.sqrt(parts.sum(axis=2).mean(axis=0))
+    planned = np.ptp(first.predicted_inputs, axis=0)
+    given = np.isfinite(task.high - task.low)
+    allowed = np.where(given, np.nan_to_num(task.high - task.low, posinf=0.0), planned)
+    for j, (name, unit) in enumerate(task.model.inputs.items()):
+        if not rms[j] > SHAKEN * allowed[j] > 0:
+            continue
+        k = int(np.argmax(parts[:, j].mean(axis=0)))
+        state, its = list(task.model.states.items())[k]
+        found.append(
+            f"the sensors' noise moves {name} by {measured(rms[j], unit)} rms through the gains, "
+            f"most of it that of {state} ({measured(noise[k], its)}): for a calmer {name} give "
+            f"[reward] input_change of {name} more weight, or filter {state}"
+        )
+    return found
+
+
+def sensor_noise(workspace: Folder) -> Array:
+    """The white noise of each state (n,) by second differences of the latest log; 0 without one.
+
+    A motion that is smooth from sample to sample hides none of it.
+    """
+    found, trials = np.zeros(workspace.base_model.n), workspace.task_trials(measured=True)
+    for j, column in enumerate(trials[-1].states.T if trials else ()):
+        bends = np.abs(np.diff(column, n=2))
+        bends = bends[np.isfinite(bends)]
+        found[j] = np.median(bends) / (MEDIAN * np.sqrt(6)) if len(bends) else 0.0
+    return found
 
 
 def _most_missed(task: Task, plan: Trial) -> str:
