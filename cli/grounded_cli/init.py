@@ -4,13 +4,23 @@ from __future__ import annotations
 
 import shlex
 import sys
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
 
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, next_line
-from grounded_cli.terminal import field, names_in, progress, remark, sentence, show, show_json
+from grounded_cli.terminal import (
+    LABEL,
+    field,
+    names_in,
+    progress,
+    remark,
+    sentence,
+    show,
+    show_json,
+)
 
 if TYPE_CHECKING:
     from grounded_trials.logs.inspect_guess import Guess
@@ -117,16 +127,18 @@ def _tell(begun: Begun) -> None:
     show(field("grid", f"{begun.dt:g} s, {begun.horizon} steps", "  "))
     show(field("target", begun.target, "  "))
     show("")
-    for guess in (*begun.states, *begun.inputs):
+    both = (*begun.states, *begun.inputs)
+    aligned = partial(field, indent="  ", width=max(LABEL, *(len(guess.name) for guess in both)))
+    for guess in both:
         mark = "" if guess.sure else "UNSURE "
         none = f"{'no name' if guess.others else 'nothing'} in the log fits"
-        show(field(guess.name, f"{mark}{guess.path or none}", "  "))
+        show(aligned(guess.name, f"{mark}{guess.path or none}"))
         for reason in guess.reasons:
-            show(field("", reason, "  "))
+            show(aligned("", reason))
         if guess.others and not guess.sure:
             or_ = "or" if guess.path else "perhaps"
             more = f" or {len(guess.others) - FEW} more" * (len(guess.others) > FEW)
-            show(field("", f"{or_} {', '.join(guess.others[:FEW])}{more}", "  "))
+            show(aligned("", f"{or_} {', '.join(guess.others[:FEW])}{more}"))
     for note in begun.notes:
         remark("note", note)
     look = "; look at what is UNSURE in its [log]" if begun.unsure else ""

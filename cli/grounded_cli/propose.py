@@ -11,7 +11,7 @@ import click
 from grounded.search.candidate import LITTLE
 from grounded.search.step_size import Step
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
-from grounded_cli.terminal import field, number, progress, remark, show, show_json
+from grounded_cli.terminal import LABEL, field, number, progress, remark, show, show_json
 from grounded_trials.wording import count, percent, with_unit
 
 if TYPE_CHECKING:
@@ -70,8 +70,10 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
     if standing.incumbent is not None:
         show(field("so far", _so_far(candidate, standing.incumbent), "  "))
     show(field("trust", _trust(candidate, standing, workspace), "  "))
-    for name, text in _extent(candidate, workspace.task):
-        show(field(name, text, "  "))
+    rows = _extent(candidate, workspace.task)
+    width = max(LABEL, *(len(name) for name, _ in rows))
+    for name, text in rows:
+        show(field(name, text, "  ", width))
     if last:
         show(f"\n{next_line(proposed.then)}")
 

@@ -18,6 +18,7 @@ from grounded_trials.wording import MARKS, columns, figure, glued, wrapped
 
 number = figure
 BARS = "▁▂▃▄▅▆▇█"
+LABEL = 10  # columns of what stands before a text
 
 
 # Our own marks in a text, which are no characters: what strangers' files say can't be anything else
@@ -85,9 +86,9 @@ def lines(text: str, first: str, rest: str) -> list[str]:
     return wrapped(placed(text), first, rest)
 
 
-def field(label: str, text: str, indent: str = "") -> str:
+def field(label: str, text: str, indent: str = "", width: int = LABEL) -> str:
     """A label and its text, wrapped to the terminal under itself; a number keeps its %."""
-    head = f"{indent}{label:<10} "
+    head = f"{indent}{label:<{width}} "
     first, *rest = lines(text, head, " " * len(head)) or [head.rstrip()]
     return "\n".join([first.replace(label, tinted(label), 1) if label else first, *rest])
 

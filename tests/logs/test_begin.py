@@ -11,6 +11,7 @@ from rosbags.rosbag2 import StoragePlugin
 import workspaces
 from cli import grounded
 from grounded.errors import GroundedError
+from grounded.instruments.kinematics import integrals
 from grounded_trials import Workspace
 from grounded_trials.logs.inspect_pairs import velocities
 from grounded_trials.logs.joint_names import from_base
@@ -682,3 +683,21 @@ def test_the_weights_of_an_end_that_a_comment_offers_follow_the_target(tmp_path)
     weights = tomllib.loads(f"at = {offered}\n{file.read_text()}")
     for name, weight in weights["reward"]["state"].items():
         assert weights["at"][name] == pytest.approx(10 * weight)
+
+
+def test_a_generic_skeleton_has_the_rates_that_its_log_shows_and_an_actuator_as_input(tmp_path):
+    """It had all four numbers follow an input `u`, which the log did not have, with lags."""
+    rng, t = np.random.default_rng(0), 0.02 * np.arange(500)
+    servo = 10 * np.sign(np.sin(2 * t)) + rng.normal(0, 1, len(t))
+    ball, speed = 80 * np.sin(1.3 * t), 104 * np.cos(1.3 * t) + rng.normal(0, 2, len(t))
+    beam = 3 * np.sin(2.2 * t)
+    table = np.column_stack([t, ball, speed, beam, servo])
+    header = "t,ball_mm,ball_vel_mm_s,beam_deg,servo_deg"
+    np.savetxt(tmp_path / "rig.csv", table, "%.5f", ",", header=header, comments="")
+    made = grounded("init", tmp_path / "w", "--from", tmp_path / "rig.csv")
+    assert made.code == 0, made.err
+    model = Workspace(tmp_path / "w").base_model
+    assert model.state_names == ("ball_mm", "ball_vel_mm_s", "beam_deg")
+    assert model.input_names == ("servo_deg",) and model.states["ball_vel_mm_s"] == "mm/s"
+    (relation,) = integrals(model)
+    assert (relation.i, relation.j, round(relation.c, 6)) == (0, 1, 1.0)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from itertools import islice, product
+from itertools import islice, permutations, product
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ from grounded_trials.logs.stated_units import Stated
 
 SLOPE = 0.01
 FOLLOWS = 0.8  # correlation of a rate with the derivative of its position
+SURELY = 0.95  # the same, where no name says that it is one
 COMBINATIONS, LONGEST = 64, 20_000  # tried at most; samples of a grid
 FEW = 8  # numbers without a name that are tried as a position or a rate
 MANY = 60  # numbers that are tried in place of one whose name gives it and that does not follow
@@ -142,6 +143,30 @@ def _derivative(q: Guess, w: Guess, signals: Signals, units: Mapping[str, str]) 
         why += f", but {best.slope:.3g} times as large"
         found_w = replace(found_w, sure=False)
     return {q.name: found_q, w.name: replace(found_w, reasons=(*found_w.reasons, why))}
+
+
+def rates_among(log: LogReport, paths: Sequence[str]) -> dict[str, tuple[str, float]]:
+    """Which numbers are the rate of which: {position: (rate, how much of it a unit of that is)}.
+
+    Only where one unit or a power of ten of it lies between them; each is one pair's at most.
+    """
+    signals, found = Signals(log, (), (), Stated.by(log.files)), []
+    signals.read(paths)
+    for a, b in permutations(paths, 2):
+        gridded = signals.grid((a, b))
+        if gridded is None:
+            continue
+        step, (position, rate) = gridded
+        like = follows(position, rate, step)
+        power = 10.0 ** round(np.log10(max(like.slope, 1e-9)))
+        if like.correlation > SURELY and abs(like.slope / power - 1) < SAME:
+            found.append((like.correlation, a, b, 1 / power))
+    pairs: dict[str, tuple[str, float]] = {}
+    for _, a, b, times in sorted(found, reverse=True):
+        taken = {one for q, (w, _) in pairs.items() for one in (q, w)}
+        if not taken & {a, b}:
+            pairs[a] = (b, times)
+    return pairs
 
 
 def moved_to(guess: Guess, path: str) -> Guess:

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 from grounded.errors import GroundedError, nearest
 from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
+from grounded_trials.logs.inspect_pairs import rates_among
 from grounded_trials.logs.joint_names import from_base
 from grounded_trials.logs.stated_units import factor_between, unit_in_name
 from grounded_trials.starting.skeletons import (
@@ -34,6 +35,7 @@ COMMANDED = re.compile(
     "cmd|command|desired|setpoint|target|input|throttle|torque|tau|effort|volt|pwm|duty|motor|steer"
     r"|goal|control|_con|_ref|stellgr|stellwert|sollwert|_soll\b|befehl|consigne|commande|comando"
 )
+ACTUATOR = re.compile("servo|actuator")  # a command, or where it stands
 
 HEADING = re.compile(r"(^|[/._])(yaw|psi|heading|theta|th|orientation)([/._\d]|$)")
 SENSED = re.compile(
@@ -59,10 +61,10 @@ def called_input(name: str, path: str) -> bool:
 
 
 def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = None) -> Skeleton:
-    """Every number that moves is a state that follows the inputs with a lag.
+    """Every number that moves is a state: one whose rate is another's value, else one with a lag.
 
     Inputs are those that are named, else those that are called like one, else those whose value is
-    held for several samples while others move.
+    held for several samples while others move, else what is called after an actuator.
 
     Args:
         log: whose numbers they are.
@@ -80,14 +82,18 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
         names = list(reversed(found))
         called = [n for n in names if called_input(n, found[n].path)]
         held = [n for n in names if found[n].held > HELD]
-        inputs = (called or (held if 2 * len(held) < len(names) else []))[:INPUTS] or ["u"]
+        driven = [n for n in names if ACTUATOR.search(n.lower())]
+        held = held if 2 * len(held) < len(names) else []
+        inputs = (called or held or driven)[:INPUTS] or ["u"]
     states = [name for name in reversed(found) if name not in inputs][:MOST] or ["x"]
-    unit = {name: known.get(one.path, "1") for name, one in found.items()}
+    rates = _rates(log, {name: found[name].path for name in states if name in found})
+    unit = {n: known.get(f.path) or unit_in_name(f.path) or "1" for n, f in found.items()}
     per = {i: f"/({u})" * (u != "1") for i in inputs if (u := unit.get(i, "1"))}
     gains = {
         f"gain_{s}_{i}": f'0.0, "{unit.get(s, "1")}{per[i]}", -100.0, 100.0'
         for s in states
         for i in inputs
+        if s not in rates
     }
     turned = {s: found[s] for s in states if unit.get(s) == "rad"}
     return Skeleton(
@@ -95,13 +101,25 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
         "Numbers that follow the inputs with a lag: write down what moves your robot",
         {s: unit.get(s, "1") for s in states},
         {i: unit.get(i, "1") for i in inputs},
-        {f"tau_{s}": '1.0, "s", 0.01, 100.0' for s in states} | gains,
+        {f"tau_{s}": '1.0, "s", 0.01, 100.0' for s in states if s not in rates} | gains,
         [
-            f'"{s}": ({" + ".join(f"p.gain_{s}_{i} * a.{i}" for i in inputs)} - s.{s}) / p.tau_{s}'
+            f'"{s}": {rates[s]}'
+            if s in rates
+            else f'"{s}": ({" + ".join(f"p.gain_{s}_{i} * a.{i}" for i in inputs)} - s.{s})'
+            f" / p.tau_{s}"
             for s in states
         ],
         tuple(s for s, one in turned.items() if min(-(one.low or 0.0), one.high or 0.0) > 3.0),
     )
+
+
+def _rates(log: LogReport, paths: Mapping[str, str]) -> dict[str, str]:
+    """Of each position, by name, its rate as an expression: another number of the log."""
+    names = {path: name for name, path in paths.items()}
+    return {
+        names[position]: f"{times:g} * " * (times != 1) + f"s.{names[rate]}"
+        for position, (rate, times) in rates_among(log, list(names)).items()
+    }
 
 
 def _word(path: str) -> str:
