@@ -3,6 +3,7 @@
 import json
 import re
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -674,15 +675,16 @@ def test_a_target_on_another_grid_is_brought_to_it_by_the_command_that_the_error
 
 
 def test_the_weights_of_an_end_that_a_comment_offers_follow_the_target(tmp_path):
-    made = workspaces.make(tmp_path / "w")
-    file = made.folder / "grounded.toml"
-    file.write_text(file.read_text().replace("[reward]", "[reward]\n# terminal = { psi = 7 }"))
-    file.write_text(re.sub(r"(?m)^(state|terminal) = .*$", "", file.read_text()))
-    assert grounded("-C", made.folder, "target", "line", "--to", "x=2").code == 0
-    (offered,) = re.findall(r"(?m)^# terminal = (.*)$", file.read_text())
-    weights = tomllib.loads(f"at = {offered}\n{file.read_text()}")
+    """A user's own remark was overwritten, too."""
+    made = begin(tmp_path / "w", car_bag(tmp_path / "bag"))
+    file, mine = Path(made.workspace) / "grounded.toml", "# terminal = { psi = 7 }"
+    file.write_text(file.read_text().replace("[reward]", f"{mine}\n[reward]"))
+    assert grounded("-C", made.workspace, "target", "line", "--to", "x=2").code == 0
+    (own, offered) = re.findall(r"(?m)^# terminal = .*$", file.read_text())
+    weights = tomllib.loads(f"{offered.removeprefix('# ')}\n{file.read_text()}")
+    assert own == mine and weights["terminal"].keys() == weights["reward"]["state"].keys()
     for name, weight in weights["reward"]["state"].items():
-        assert weights["at"][name] == pytest.approx(10 * weight)
+        assert weights["terminal"][name] == pytest.approx(10 * weight)
 
 
 def test_a_generic_skeleton_has_the_rates_that_its_log_shows_and_an_actuator_as_input(tmp_path):

@@ -10,7 +10,7 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import key
-from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.config import FILE, OFFERED
 from grounded_trials.workspace.task_file import change_weight, equal_weights, write_target
 
 
@@ -67,7 +67,7 @@ def write_first(
         f"state = {_inline(weights)}",
         "# terminal, of the last step alone: where the run is to END at rest on its target",
         "# (docking, parking) and overshoots, 10 to 100 times state, the speeds' too",
-        f"# terminal = {_inline({name: 10 * weight for name, weight in weights.items()})}",
+        f"# terminal = {_inline({name: OFFERED * weight for name, weight in weights.items()})}",
         "# of (a_t - a_{t-1})^2: 0.04 / (range of [limits])^2, 0.01 of an input from -1 to 1",
         f"input_change = {_inline(changes)}",
         "",

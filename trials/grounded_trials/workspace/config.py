@@ -8,8 +8,11 @@ Changes (tomlkit) leave the user's comments and layout alone.
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -19,6 +22,7 @@ from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import Table, read_toml
 
 FILE = "grounded.toml"
+OFFERED = 10  # times the weight of a state: what a comment of `init` offers for the run's end
 
 
 @dataclass(frozen=True)
@@ -243,8 +247,9 @@ def set_target(
     """
     import tomlkit
 
-    _change(file, "task", {"target": name, "horizon": steps})
-    reward = tomlkit.parse(file.read_text(encoding="utf-8")).get("reward", {})
+    document = tomlkit.parse(file.read_text(encoding="utf-8"))
+    _put(document, "task", {"target": name, "horizon": steps})
+    reward = document.get("reward", {})
     own = dict(reward.get("state", {}))
     same = own.keys() == before.keys() and any(
         all(abs(own[k] - w) <= 1e-3 * abs(w) for k, w in unchosen.items())
@@ -256,22 +261,40 @@ def set_target(
         blank = {name: new for name, (old, new) in changes.items() if written.get(name) == old}
         if blank:
             renewed["input_change"] = _inline(written | blank)
-        _change(file, "reward", renewed)
-        ends = _inline({state: 10 * weight for state, weight in weights.items()}).as_string()
-        text = file.read_text(encoding="utf-8")
-        told = re.sub(r"(?m)^(# terminal = ).*$", lambda found: found[1] + ends, text, count=1)
-        write_atomically(file, told.encode())
+        _put(document, "reward", renewed)
+    text = tomlkit.dumps(document)
+    if same and own:
+        text = re.sub(r"(?m)^# terminal = .*$", partial(_offered, before=own, now=weights), text)
+    write_atomically(file, text.encode())
+
+
+def _offered(found: re.Match[str], before: Mapping[str, float], now: Mapping[str, float]) -> str:
+    """What `init` offers for the end, OFFERED times the weights of states; else what was there."""
+    with suppress(tomllib.TOMLDecodeError, TypeError, AttributeError):
+        told = tomllib.loads(found[0].removeprefix("# "))["terminal"]
+        if told.keys() == before.keys() and all(
+            abs(told[k] - OFFERED * w) <= 1e-3 * OFFERED * w for k, w in before.items()
+        ):
+            ends = _inline({name: OFFERED * weight for name, weight in now.items()})
+            return f"# terminal = {ends.as_string()}"
+    return found[0]
 
 
 def _change(file: Path, where: str, changes: Mapping[str, Any]) -> None:
     import tomlkit
 
     document = tomlkit.parse(file.read_text(encoding="utf-8"))
+    _put(document, where, changes)
+    write_atomically(file, tomlkit.dumps(document).encode())
+
+
+def _put(document: Any, where: str, changes: Mapping[str, Any]) -> None:
+    import tomlkit
+
     table: Any = document.setdefault(where, tomlkit.table())
     table.update({name: value for name, value in changes.items() if value})
     for name in [name for name, value in changes.items() if not value]:
         table.pop(name, None)  # empty is what it is without
-    write_atomically(file, tomlkit.dumps(document).encode())
 
 
 def _inline(values: Mapping[str, Any]) -> Any:
