@@ -12,7 +12,7 @@ from grounded.instruments.preflight import preflight
 from grounded.model import Model, Param
 from grounded.trial import Trial
 from grounded_trials import Workspace
-from grounded_trials.formats.mcap_writer import encode_doubles, encode_lists
+from grounded_trials.formats.mcap_writer import encode_doubles, rows_of_lists
 from grounded_trials.formats.protobuf import double_tag, doubles_tag, uniform_doubles
 
 RING = """
@@ -124,7 +124,7 @@ def test_messages_of_many_numbers_are_read_in_one_piece():
 def test_lists_of_numbers_are_read_in_one_piece():
     rng = np.random.default_rng(0)
     lists = [rng.standard_normal((5, count)) for count in (2, 40)]
-    messages = encode_lists(lists)
+    messages = [row.tobytes() for row in rows_of_lists(lists)]
     buffer, lengths = b"".join(messages), [len(message) for message in messages]
     end = np.cumsum(lengths)
     fields = [(doubles_tag(1, 2), 2), (doubles_tag(2, 40), 40)]

@@ -1,7 +1,8 @@
 """Writing MCAP: protobuf channels of named doubles, a table of strings, attached files.
 
-The only importer of the mcap package. Files are not compressed: a trial is small, its numbers
-compress badly, and so equal input gives equal bytes whatever the version of a compressor.
+The only importer of the mcap package; candidates are written whole (`mcap_whole`). Files are not
+compressed: a trial is small, its numbers compress badly, and so equal input gives equal bytes
+whatever the version of a compressor.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from grounded_trials.formats.mcap_records import (
 from grounded_trials.formats.protobuf import double_tag, doubles_tag, varint
 
 LIBRARY = "grounded"
+Rows = np.ndarray[Any, np.dtype[np.uint8]]  # encoded messages of one length (N, bytes)
 
 
 class _Writer:
@@ -153,30 +155,36 @@ class DoublesEncoder:
 
 def encode_doubles(values: Array) -> list[bytes]:
     """The messages of `DoublesEncoder` for many rows, (N, count)."""
+    return [row.tobytes() for row in rows_of(values)]
+
+
+def rows_of(values: Array) -> Rows:
+    """The same as an array (N, bytes)."""
     tags = [double_tag(number) for number in range(1, values.shape[1] + 1)]
-    return _encoded(list(zip(tags, values.T[:, :, None], strict=True)), len(values))
+    return _joined(list(zip(tags, values.T[:, :, None], strict=True)))
 
 
-def encode_lists(lists: Sequence[Array]) -> list[bytes]:
-    """Messages of packed repeated doubles, numbered from 1; an empty list is absent.
+def rows_of_lists(lists: Sequence[Array]) -> Rows:
+    """Messages of packed repeated doubles, numbered from 1: (N, bytes); an empty list is absent.
 
     Each list has a row for each message, (N, count).
     """
-    fields = [
-        (doubles_tag(number, values.shape[1]), values)
-        for number, values in enumerate(lists, start=1)
-        if values.shape[1]
-    ]
-    return _encoded(fields, len(lists[0]))
+    return _joined(
+        [
+            (doubles_tag(number, values.shape[1]), values)
+            for number, values in enumerate(lists, start=1)
+            if values.shape[1]
+        ]
+    )
 
 
-def _encoded(fields: Sequence[tuple[bytes, Array]], count: int) -> list[bytes]:
+def _joined(fields: Sequence[tuple[bytes, Array]]) -> Rows:
     """Rows of fields, each the same prefix and then the row's doubles (N, ...)."""
-    parts = list[np.ndarray[Any, np.dtype[np.uint8]]]()
+    parts = list[Rows]()
     for prefix, values in fields:
         data = np.ascontiguousarray(values, dtype="<f8").view(np.uint8)
-        parts += [np.tile(np.frombuffer(prefix, np.uint8), (count, 1)), data]
-    return [row.tobytes() for row in np.hstack(parts)]
+        parts += [np.tile(np.frombuffer(prefix, np.uint8), (len(values), 1)), data]
+    return np.hstack(parts)
 
 
 def _bytes(number: int, data: bytes) -> bytes:

@@ -7,7 +7,6 @@ flipped; `sha256` in its metadata finds a file that was written again with other
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 from collections.abc import Iterable
 from pathlib import Path
@@ -54,7 +53,8 @@ def candidate_bytes(
         GroundedError: if the policy holds a number that is not finite, the shapes do not fit, or
             an entry of `meta` is reserved.
     """
-    from grounded_trials.formats.mcap_writer import LogWriter, encode_doubles, encode_lists
+    from grounded_trials.formats.mcap_whole import Column, whole_file
+    from grounded_trials.formats.mcap_writer import rows_of, rows_of_lists
 
     _refuse_unfinite(policy)
     H, n, m = policy.horizon, len(policy.state_names), len(policy.input_names)
@@ -72,22 +72,15 @@ def candidate_bytes(
         policy=json.dumps(_policy_table(policy)),
     )
     table["sha256"] = _hash(table, [*_controls(policy), states, inputs])
-    stream = io.BytesIO()
-    log = LogWriter(stream)
-    log.metadata("grounded", table)
-    log.attachment("about", "text/plain", _ABOUT)
-    topic = log.channel("/policy", "Policy", ["feedforward", "gain", "reference"], repeated=True)
-    state = log.channel("/predicted_state", "State", policy.state_names)
-    input = log.channel("/predicted_input", "Input", policy.input_names)
-    controls, moves = encode_lists(_controls(policy)), encode_doubles(inputs)
-    for k, reached in enumerate(encode_doubles(states)):
-        time = round(k * policy.dt * 1e9)
-        if k < H:
-            log.message(topic, time, controls[k])
-            log.message(input, time, moves[k])
-        log.message(state, time, reached)
-    log.finish()
-    return stream.getvalue()
+    times = np.array([round(k * policy.dt * 1e9) for k in range(H + 1)])
+    controls = rows_of_lists(_controls(policy))
+    lists = ("feedforward", "gain", "reference")
+    columns = (
+        Column("/policy", "Policy", lists, controls, times[:-1], repeated=True),
+        Column("/predicted_state", "State", policy.state_names, rows_of(states), times),
+        Column("/predicted_input", "Input", policy.input_names, rows_of(inputs), times[:-1]),
+    )
+    return whole_file(table, _ABOUT, columns, written=(0, 2, 1))
 
 
 def read_candidate(
