@@ -8,10 +8,14 @@ from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.linearise import gains_of, linearise
+from grounded.diagnosis.likelihood.noise import noise_guess
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.step import bounded
 from grounded.effects import Library
 from grounded.experiments.pendulum import FRICTION, HEAVIER, pendulum_task
 from grounded.experiments.pendulum import model as real_pendulum
+from grounded.filter.kalman import innovations, smoother
 from grounded.models.arm import model as arm
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
@@ -136,3 +140,30 @@ def test_no_force_moves_an_angle_beside_its_own_rate():
     added = ("offset", "trend", "coupling", "periodic")
     names = [e.name for e in Library().candidates(arm) if e.family.name in added]
     assert {n.partition(":")[2].partition("<-")[0] for n in names} == {"q1_vel", "q2_vel"}
+
+
+def test_what_fills_up_a_shorter_run_grows_without_bound_nowhere():
+    """An arm's diagnosis ended in "Eigenvalues did not converge": 100 steps beside 196."""
+    falling = Model(
+        states={"q": "rad", "w": "rad/s"},
+        inputs={"u": "rad/s^2"},
+        params={"g": Param(400.0, "1/s^2", std=40.0)},
+        derivative=lambda s, a, p: {"q": s.w, "w": a.u + p.g * s.q},
+    )
+    rng, trials = np.random.default_rng(0), []
+    for steps in (12, 190):
+        states = np.column_stack([np.sin(0.1 * np.arange(steps + 1))] * 2)
+        states += 1e-3 * rng.standard_normal(states.shape)
+        inputs = -400 * states[:-1, :1]
+        trials.append(Trial(states, inputs, 0.05, ("q", "w"), ("u",)))
+    data = prepare(falling, trials)
+    assert data.idle.any() and not data.idle.all()
+    predictor, h = Predictor(data), Hypothesis((), shift=np.zeros(1), spread=1.0)
+    noise = noise_guess(data.y[1:] - data.y[:-1], data.seen, np.ones(2))
+    F, d, r = linearise(predictor, h, data.y)
+    assert not d[data.idle].any()
+    g = gains_of(predictor, h, noise, data.y, F)
+    white, filtered = innovations(g, d, r, track=True)
+    adjoint = smoother(g, white[..., 0])
+    for found in (g.k, white, filtered, *vars(adjoint).values()):
+        assert found is None or (np.isfinite(found).all() and np.abs(found).max() < 1e150)

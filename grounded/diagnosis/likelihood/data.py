@@ -95,6 +95,11 @@ class Data:
         return np.ascontiguousarray((there * run[:, :, None]).swapaxes(0, 1))
 
     @cached_property
+    def idle(self) -> Any:
+        """Steps that fill up shorter runs and were not run, (L, B) of bool."""
+        return self.valid.T == 0
+
+    @cached_property
     def time(self) -> Array:
         """Time since the trial began at the start of each step, (L, B) [s]."""
         flat = np.concatenate([np.arange(T) * self.dt for T in self.lengths])

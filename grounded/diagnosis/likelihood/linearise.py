@@ -95,6 +95,8 @@ def linearise(
             if by_d.any() or by_r.any():
                 break
     d[..., 1 + len(theta) : count] = of_shifts
+    if data.idle.any():  # nothing is seen there: what would grow without bound stays as it is
+        F, d[data.idle] = np.where(data.idle[..., None, None], np.eye(model.n), F), 0.0
     return F, d, r
 
 

@@ -315,7 +315,7 @@ def clean(predictor: Predictor, fit: Fitted, rounds: int = 8) -> Fitted:
 def _rises(work: Work, fit: Fitted) -> float:
     """How far the point where the work stands is above its best so far; then it is kept."""
     rise = np.inf if work.best is None else fit.evidence - work.best.evidence
-    if not (rise > 0 and np.isfinite(fit.evidence)):
+    if not (rise > 0 and np.isfinite(fit.evidence) and np.isfinite(fit.gram).all()):
         return 0.0
     work.still = not rise > 0.03
     work.moving = work.moving or rise > 1.0
