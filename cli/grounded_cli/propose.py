@@ -102,12 +102,16 @@ def _so_far(candidate: Candidate, best: Tried) -> str:
     start, rest = same - candidate.base_as_run, candidate.base_as_run - best.utility
     why = []
     if abs(start) > told:
-        why.append(f"{number(start)} of that because its runs began elsewhere than [task] start")
+        why.append(f"{_signed(start)} because its runs began elsewhere than [task] start")
     if abs(rest) > told and math.isfinite(best.standard_error):
         within = abs(rest) <= LUCKY * best.standard_error
         known = "within the scatter of its runs" if within else "more than its runs scatter"
-        why.append(f"{number(rest)} of {'it' if why else 'that'} is {known}")
-    return "; ".join([text, *why])
+        why.append(f"{_signed(rest)} that it does not explain, {known}")
+    return f"{text}: {' and '.join(why)}" if why else text
+
+
+def _signed(gain: float) -> str:
+    return f"{number(abs(gain))} {'more' if gain > 0 else 'less'}"
 
 
 def _what(candidate: Candidate, standing: Standing, task: Task) -> str:

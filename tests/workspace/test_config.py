@@ -147,7 +147,6 @@ WRONG = [
     ("horizon = 40", "horizon = 1" + "0" * 30, ["horizon"]),
     ('target = "target.csv"', 'target = "t.csv"', ["t.csv does not exist", "[task] target"]),
     ('target = "target.csv"', 'target = "/etc/passwd"', ["outside the workspace"]),
-    ('target = "target.csv"', 'target = ""', ["target"]),
     ("horizon = 40", "horizon = 40\nfeedback = 1", ["[task] feedback", "true or false"]),
     (
         "horizon = 40",

@@ -117,7 +117,7 @@ class _Paths:
         data, x = predictor.data, track[:-1]
         added = data.model.difference(predictor.next(less, x), predictor.next(h, x))
         self.signal, self.states = _by_trial(data, added), _states(data)
-        self.power = [float(np.nanmean(one**2)) for one in self.signal]
+        self.power = [float(_power(one, none=0.0)) for one in self.signal]
         means = np.concatenate([_tenths(one) for one in self.states])
         self.spread = np.nanvar(means, axis=0)
         self.moves = self.spread > 1e-9 * np.nanmean(means**2, axis=0)
@@ -133,7 +133,7 @@ class _Paths:
 
     def same(self, i: int, j: int) -> bool:
         """Whether two trials repeat one motion."""
-        acts = np.nanmean(self._between(self.signal, i, j) ** 2)
+        acts = _power(self._between(self.signal, i, j))
         alike = acts <= REPEATS * (self.power[i] + self.power[j])
         return bool(alike and self.apart(i, j) <= REPEATS)
 
@@ -142,7 +142,7 @@ class _Paths:
         length, other = len(self.signal[i]), len(self.signal[j])
         if max(length, other) > (1 + LENGTH) * min(length, other) or not self.moves.any():
             return 1.0
-        moved = np.nanmean(self._between(self.states, i, j) ** 2, axis=0)[self.moves]
+        moved = _power(self._between(self.states, i, j), axis=0)[self.moves]
         return float(min((0.5 * moved / self.spread[self.moves]).min(), 1.0))
 
     def _between(self, each: list[Array], i: int, j: int) -> Array:
@@ -165,6 +165,14 @@ def _states(data: Data) -> list[Array]:
     known = [names.index(n) for n in dynamic(data.model) if n in names]
     seen = [i for i in known if data.seen[..., i].any() and i not in data.hidden]
     return np.split(data.filled[:, seen], np.cumsum(data.lengths + 1)[:-1])
+
+
+def _power(values: Array, axis: int | None = None, none: float = np.inf) -> Any:
+    """The mean square of what is known; `none` where nothing is, as of a trial left out."""
+    known = np.isfinite(values)
+    count = known.sum(axis=axis)
+    total = (np.where(known, values, 0.0) ** 2).sum(axis=axis)
+    return np.where(count > 0, total / np.maximum(count, 1), none)
 
 
 def _tenths(values: Array) -> Array:

@@ -30,9 +30,9 @@ PLANE = Model(
 )
 
 
-def reading(model, *columns):
+def reading(model, *columns, form="/csv.{}"):
     paths = {
-        name: SignalSpec(f"/csv.{column}")
+        name: SignalSpec(form.format(column))
         for name, column in zip((*model.states, *model.inputs), columns, strict=True)
     }
     states = {name: paths[name] for name in model.states}
@@ -55,6 +55,18 @@ def test_what_the_names_of_columns_say(model, columns, pairs):
     found = crossed(model, reading(model, *columns))
     assert len(found) == len(pairs)
     assert all(holds(text, part) for text, part in zip(found, pairs, strict=True))
+
+
+@pytest.mark.parametrize("form", ["/cmd/{}.data", "/{}/value.data", '"/cmd-{}".data'])
+def test_a_message_of_a_number_alone_is_named_by_its_topic(form):
+    boat = Model(
+        states={"v": "m/s"},
+        inputs={"port": "1", "starboard": "1"},
+        derivative=lambda s, a, p: {"v": a.port + a.starboard},
+    )
+    assert crossed(boat, reading(boat, "v", "port", "starboard", form=form)) == ()
+    (told,) = crossed(boat, reading(boat, "v", "starboard", "port", form=form))
+    assert holds(told, "port", "starboard", "exchanged")
 
 
 def test_an_input_in_the_column_of_a_state_is_told_at_ingest(tmp_path):

@@ -275,7 +275,7 @@ def _offered(found: re.Match[str], before: Mapping[str, float], now: Mapping[str
         if told.keys() == before.keys() and all(
             abs(told[k] - OFFERED * w) <= 1e-3 * OFFERED * w for k, w in before.items()
         ):
-            ends = _inline({name: OFFERED * weight for name, weight in now.items()})
+            ends = _inline({name: float(f"{OFFERED * w:.6g}") for name, w in now.items()})
             return f"# terminal = {ends.as_string()}"
     return found[0]
 

@@ -105,7 +105,9 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
         weights[kind] = np.array([given.get(name, 0.0) for name in names])
     table.finish()
     tracked = any(w.any() for w in (weights["state"], weights["terminal"]))
-    if config.task.target and not tracked:
+    if not config.task.target:  # nothing to follow: what errors would cost says nothing
+        weights |= {kind: np.zeros(len(states)) for kind in ("state", "terminal")}
+    elif not tracked:
         raise GroundedError(
             "[reward] weighs no state: there is nothing to follow; add for example "
             f"state = {{ {states[0]} = 1.0 }}"

@@ -15,6 +15,8 @@ from grounded_trials.logs.log_table import LogMapping
 from grounded_trials.logs.stated_units import bare_command
 from grounded_trials.workspace.config import FILE
 
+UNNAMED = ("data", "value")  # what a number is called that its topic names
+
 
 def crossed(model: Model, mapping: LogMapping) -> tuple[str, ...]:
     """Sentences on signals that are read from each other's column; axes may be called as one likes.
@@ -43,7 +45,11 @@ def _crossed(a: str, b: str, paths: Mapping[str, str]) -> bool:
 
 
 def _alike(name: str, path: str) -> float:
-    """The share of words that a name and the end of a path have in common, without the unit."""
-    last = re.split(r"[./]", bare_command(path).strip('"'))[-1]
+    """The share of words that a name and the end of a path have in common, without the unit.
+
+    Of a message that holds a number alone, `/cmd/port.data`, the topic is what names it.
+    """
+    words = re.split(r"[./]", bare_command(path).strip('"'))
+    last = next((one for one in reversed(words) if one and one not in UNNAMED), "")
     own, found = (set(re.findall(r"[a-z]+|\d+", one.lower())) for one in (name, last))
     return len(own & found) / max(len(own | found), 1)

@@ -32,6 +32,7 @@ from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.intake.odd_run import odd_run
 from grounded_trials.workspace.intake.other_scale import other_units, units_told
 from grounded_trials.workspace.intake.reading import (
+    NoneWaits,
     Read,
     crossed_in,
     cut_log,
@@ -88,7 +89,10 @@ def ingest_log(
     if kind == TRIAL:
         read = read_own_trial(workspace, path, candidate, data)
     else:
-        read = read_log_file(workspace, path, candidate, data)
+        try:
+            read = read_log_file(workspace, path, candidate, data)
+        except NoneWaits as error:
+            raise _by_its_commands(workspace, path, error) from None
     read = _copied(workspace, path, read, "" if data else candidate)
     read = _recognised(workspace, path, read, candidate)
     if read.log and (other := estimated_otherwise(workspace, read.log)):
@@ -129,6 +133,17 @@ def ingest_log(
         off_target=off_target_of(workspace.task, judged),
         then=after_log(workspace, verdict, now),
     )
+
+
+def _by_its_commands(workspace: Folder, path: Path, error: NoneWaits) -> GroundedError:
+    """The same error with the command that fits the log: of the best, another one, or data."""
+    if not error.best:
+        return error
+    try:
+        _recognised(workspace, path, read_log_file(workspace, path, error.best, False), None)
+    except GroundedError as refused:
+        return GroundedError(str(error), refused.then)
+    return error
 
 
 def _copied(workspace: Folder, path: Path, read: Read, wanted: str | None) -> Read:

@@ -176,17 +176,23 @@ def crossed_in(log: ForeignLog) -> tuple[str, ...]:
     return crossed(log.workspace.base_model, log.mapping)
 
 
-def _outstanding(workspace: Folder, path: Path) -> str:
-    now = standing_in(workspace)
-    waiting = now.outstanding
-    if waiting is None:
-        best = now.incumbent.candidate.id if now.incumbent else ""
-        raise GroundedError(
+class NoneWaits(GroundedError):
+    """No candidate is waiting for a trial; `best` may have been run again."""
+
+    def __init__(self, path: Path, best: str) -> None:
+        super().__init__(
             f"{path} doesn't say which candidate it ran, and none is waiting for a trial: name it "
             "with --candidate ID, or use --data for a log that ran none",
             NextCommand("ingest", (str(path), "--candidate", best)) if best else None,
         )
-    return waiting.id
+        self.best = best
+
+
+def _outstanding(workspace: Folder, path: Path) -> str:
+    now = standing_in(workspace)
+    if now.outstanding is None:
+        raise NoneWaits(path, now.incumbent.candidate.id if now.incumbent else "")
+    return now.outstanding.id
 
 
 def _about(workspace: Folder, candidate: str) -> dict[str, str]:
