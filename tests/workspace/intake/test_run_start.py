@@ -410,3 +410,29 @@ def test_a_delay_is_no_surer_than_the_rows_of_a_table(w, tmp_path):
     assert late.params["d"].interval == pytest.approx((0.0596, 0.0804))
     assert late.params["d"].std == pytest.approx(0.005, rel=0.01)
     assert lag.params["d"] is d["d"]
+
+
+def test_a_log_while_nothing_waits_is_offered_as_what_its_commands_are(tmp_path):
+    """A drive by hand was offered as the best candidate's run: it cost -3,943."""
+    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
+    policy = w.propose().candidate.policy
+    w.ingest(record(w, tmp_path / "first.csv", policy, 0.0))
+    again = record(w, tmp_path / "again.csv", policy, 0.0, seed=1)
+    table = np.loadtxt(again, delimiter=",", skiprows=1)
+    table[:, 3] = 2 * np.sin(np.arange(len(table)) // 10)
+    hand = tmp_path / "hand.csv"
+    np.savetxt(hand, table, "%.5f", ",", header="t,x,v,force", comments="")
+    for log, then in ((again, ("--candidate", "c0001")), (hand, ("--data",))):
+        with pytest.raises(GroundedError) as refused:
+            w.ingest(log)
+        assert refused.value.then == NextCommand("ingest", (str(log), *then))
+
+
+def test_logs_are_data_without_a_target_whatever_errors_would_weigh(tmp_path):
+    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
+    log = record(w, tmp_path / "drive.csv", w.propose().candidate.policy, 0.0)
+    config = w.folder / "grounded.toml"
+    config.write_text(config.read_text().replace('target = "target.csv"', 'target = ""'))
+    other = Workspace(w.folder)
+    taken = other.ingest(log, data=True)
+    assert other.trials()[0].stored.id == taken.trial and not other.task.reward.state.any()

@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import recorded
 from cli import grounded
 from facts import holding, holds
 from grounded.errors import GroundedError, NextCommand
@@ -386,29 +385,3 @@ def test_a_run_of_another_workspace_s_candidate_is_told(tmp_path):
     assert any("another workspace" in warning for warning in told.warnings)
     assert not there.ingest(tmp_path / "bare.mcap").warnings
     assert not there.ingest(log.trial_file, data=True).notes
-
-
-def test_a_log_while_nothing_waits_is_offered_as_what_its_commands_are(tmp_path):
-    """A drive by hand was offered as the best candidate's run: it cost -3,943."""
-    w = Workspace(make(tmp_path / "w", config=recorded.LOGGED).folder)
-    policy = w.propose().candidate.policy
-    w.ingest(recorded.record(w, tmp_path / "first.csv", policy, 0.0))
-    again = recorded.record(w, tmp_path / "again.csv", policy, 0.0, seed=1)
-    table = np.loadtxt(again, delimiter=",", skiprows=1)
-    table[:, 3] = 2 * np.sin(np.arange(len(table)) // 10)
-    hand = tmp_path / "hand.csv"
-    np.savetxt(hand, table, "%.5f", ",", header="t,x,v,force", comments="")
-    for log, then in ((again, ("--candidate", "c0001")), (hand, ("--data",))):
-        with pytest.raises(GroundedError) as refused:
-            w.ingest(log)
-        assert refused.value.then == NextCommand("ingest", (str(log), *then))
-
-
-def test_logs_are_data_without_a_target_whatever_errors_would_weigh(tmp_path):
-    w = Workspace(make(tmp_path / "w", config=recorded.LOGGED).folder)
-    log = recorded.record(w, tmp_path / "drive.csv", w.propose().candidate.policy, 0.0)
-    config = w.folder / "grounded.toml"
-    config.write_text(config.read_text().replace('target = "target.csv"', 'target = ""'))
-    other = Workspace(w.folder)
-    taken = other.ingest(log, data=True)
-    assert other.trials()[0].stored.id == taken.trial and not other.task.reward.state.any()
