@@ -191,6 +191,37 @@ def test_what_holds_the_start_is_held_before_it_or_asked_for(tmp_path):
     assert not notes("{ v = 1.0 }")  # in motion, which no input holds
 
 
+FAN = """
+from grounded import Model, Param
+
+def rate(s, a, p):
+    return {"h": s.v, "v": 9.81 * (s.fan / 2700 - 1) - 2 * s.v, "fan": (56 * a.pwm - s.fan) / p.lag}
+
+model = Model(states={"h": "m", "v": "m/s", "fan": "rpm"}, inputs={"pwm": "%"},
+              params={"lag": Param(0.3, "s")}, derivative=rate)
+"""
+
+
+def test_a_start_that_another_state_would_hold_is_told_with_it(tmp_path):
+    """The advice was to widen [safety]: the fan of a ball in a tube stood still at the start."""
+    (tmp_path / "fan.py").write_text(FAN)
+    w = Workspace.create(tmp_path / "w", model=tmp_path / "fan.py")
+    w.target({"h": np.linspace(0.2, 0.6, 101)})
+    file = w.folder / "grounded.toml"
+    limits = "[safety]\nh = [0.15, 0.9]\n[limits]\npwm = [0, 100]"
+    file.write_text(file.read_text().replace("[limits]", limits))
+    proposed = Workspace(w.folder).propose()
+    assert proposed.standing.ending == "not allowed"
+    (note,) = (n for n in proposed.proposal.notes if "counts as held" in n)
+    assert "fan = 2700, pwm = 48.21" in note and "v changes" in note
+    assert not any("widen" in n for n in proposed.proposal.notes)
+    text = re.sub(
+        r"(?m)^start = .*$", "start = { h = 0.2, fan = 2700, pwm = 48.21 }", file.read_text()
+    )
+    file.write_text(text)
+    assert Workspace(w.folder).propose().candidate is not None
+
+
 def test_a_model_that_stands_without_input_needs_none(blank):
     assert not blank.config.task.start and not blank.task.past.any()
 

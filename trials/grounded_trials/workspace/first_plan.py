@@ -22,6 +22,8 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import tracking_error, weighed_groups
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from grounded.frozen import Array
     from grounded.search.candidate import Candidate
 
@@ -31,12 +33,18 @@ SHORT = 0.25  # of the way to where a target ends: the plan does not get there
 MISSED = 0.1  # of the way that a target asks for: the plan falls short
 SHAKEN = 0.05  # of what [limits] allow an input, else of what a plan uses of it
 MEDIAN = 0.6745  # standard deviations that half of all normal numbers lie within
-STILL = 1e-6  # of the rates under the held input: under another one the robot stands
+STILL = 1e-3  # of the rates under the held input: under another one the robot stands
 BEGUN = (0.0, 1.0, -1.0)  # beside the held input: a thrust by its square has no slope at 0
 
 
-def left_open(workspace: Folder, first: Candidate | None) -> list[str]:
-    """What a task leaves open, or out, that whoever runs its first plan should know."""
+def left_open(workspace: Folder, first: Candidate | None, ending: str) -> list[str]:
+    """What a task leaves open, or out, that whoever runs its first plan should know.
+
+    Args:
+        workspace: where nothing was run yet.
+        first: its plan; None where there is none.
+        ending: why, see `standing.Ending`.
+    """
     task, found = workspace.task, []
     free = [
         name
@@ -65,7 +73,13 @@ def left_open(workspace: Folder, first: Candidate | None) -> list[str]:
     if first is not None:
         found += _held_back(task, first) or _falls_short(task, first)
         found += _shaken(workspace, first)
-    found += _held_before(workspace)
+    held = _held_before(workspace)
+    found += held
+    if ending == "not allowed" and not held:
+        found.append(
+            "nothing was run yet: widen [safety], or draw a target whose run stays inside "
+            "(`target`), and propose again"
+        )
     name = str(workspace.config.task.target)
     rows = len(workspace.read_target((workspace.folder / name).resolve())[1])
     if rows > task.horizon + 1:
@@ -175,39 +189,51 @@ def _most_missed(task: Task, plan: Trial) -> str:
 
 
 def _held_before(workspace: Folder) -> list[str]:
-    """That the robot does not stand at the start under the input held before, but would under one.
+    """That the robot does not stand at its start, but would under another input held before.
 
-    Nothing is said of an input whose value somebody gave, nor where it makes no difference: without
-    a price on changes and without latency the first command is as if nothing had been held.
+    Or with other values of states that nobody gave, a fan's speed say. Nothing is said of an input
+    whose value somebody gave, nor where it makes no difference: without a price on changes and
+    without latency the first command is as if nothing had been held.
     """
     task, config = workspace.task, workspace.config.task
     assert task.latency is not None
-    if any(name in config.start for name in task.model.input_names):
+    names, states = task.model.input_names, task.model.state_names
+    free = np.array(
+        [s not in config.start and np.isnan(x) for s, x in zip(states, task.target[0], strict=True)]
+    )
+    chosen = any(name in config.start for name in names)
+    priced = bool(task.reward.input_change.any() or task.latency.any())
+    stands = None if chosen or not priced else standing(task, np.zeros(len(states), np.bool_))
+    if stands is None and free.any():
+        stands = standing(task, free)
+    if stands is None:
         return []
-    if not (task.reward.input_change.any() or task.latency.any()):
-        return []
-    still = holding_input(task)
-    if still is None:
-        return []
-    names, rate = task.model.input_names, moved_at_start(task, task.past) / task.dt
+    units, given = {**task.model.states, **task.model.inputs}, np.append(task.start, task.past)
+    rate = moved_at_start(task, task.past) / task.dt
     k = int(np.argmax(np.abs(rate)))
-    state = task.model.state_names[k]
-    unit = task.model.states[state]
-    both = zip(names, task.past, strict=True)
-    held = ", ".join(with_unit(f"{name} = {u:.4g}", task.model.inputs[name]) for name, u in both)
-    told = ", ".join(f"{name} = {u:.4g}" for name, u in zip(names, still, strict=True))
+    other = [
+        (n, at, to)
+        for n, at, to in zip(units, given, stands, strict=True)
+        if n in names or abs(to - at) > STILL * (1 + abs(to))
+    ]
+    held = ", ".join(with_unit(f"{name} = {at:.4g}", units[name]) for name, at, _ in other)
+    told = ", ".join(f"{name} = {to:.4g}" for name, _, to in other)
     return [
-        f"before the start {held} counts as held, under which {state} changes at once, by "
-        f"{with_unit(f'{rate[k]:.3g}', unit)} a second; the plan begins from there, and after its "
-        f"end the runner holds it again. If the robot stands until then, give {FILE}'s [task] what "
-        f"holds it: start = {{ {told} }}"
+        f"at the start {held} counts as held, under which {states[k]} changes at once, by "
+        f"{with_unit(f'{rate[k]:.3g}', units[states[k]])} a second; the plan begins from there, "
+        "and after its end the runner holds that input again. If the robot stands until then, give "
+        f"{FILE}'s [task] what holds it: start = {{ {told} }}"
     ]
 
 
-def holding_input(task: Task) -> Array | None:
-    """Inputs (m,) inside the limits under which the start stays as it is.
+def standing(task: Task, free: NDArray[np.bool_]) -> Array | None:
+    """States and inputs (n + m,) inside the limits that stay as they are, from where a run starts.
 
-    None where the input held before the start does that, or nothing does: the start is in motion.
+    None where it stands under the input held before, or nothing holds it: the start is in motion.
+
+    Args:
+        task: whose start it is.
+        free: (n,), states that may be others than those of the start.
     """
     from grounded.search.first_guess import trim
 
@@ -215,12 +241,15 @@ def holding_input(task: Task) -> Array | None:
     if not away > 1e-9:
         return None
     still = np.tile(task.start, (2, 1))
-    for move in BEGUN:
-        begun = np.clip(task.past + move, task.low, task.high)
+    middle, inside = task.past.copy(), np.isfinite(task.high - task.low)
+    middle[inside] = 0.5 * (task.low[inside] + task.high[inside])
+    for first in [*(task.past + move for move in BEGUN), middle]:
+        begun = np.clip(first, task.low, task.high)
         one = replace(task, target=still, input_target=None, past=begun)
-        u: Array = trim(one, still, np.ones(task.model.n, dtype=np.bool_))[1][0]
-        if np.abs(moved_at_start(task, u)).max() <= STILL * away:
-            return u
+        x, u = (found[0] for found in trim(one, still, ~free))
+        moved = np.abs(moved_at_start(replace(task, start=x), u))
+        if (moved <= STILL * away).all():
+            return np.append(x, u)
     return None
 
 

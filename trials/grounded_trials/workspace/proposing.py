@@ -107,12 +107,7 @@ def propose_in(workspace: Folder) -> Proposed:
     if not proposal.standing.history:
         from grounded_trials.workspace.first_plan import left_open
 
-        notes += left_open(workspace, candidate)
-        if proposal.standing.ending == "not allowed":
-            notes.append(
-                "nothing was run yet: widen [safety], or draw a target whose run stays inside "
-                "(`target`), and propose again"
-            )
+        notes += left_open(workspace, candidate, proposal.standing.ending)
     if doubt := proposal.standing.doubt:
         from grounded.search.standing import LOST
 
