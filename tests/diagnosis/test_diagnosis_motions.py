@@ -7,10 +7,11 @@ import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import PIECES, prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.validation.motions import motions, repeats, without_others
+from grounded.diagnosis.validation.motions import motions, of_no_size, repeats, without_others
 from grounded.effects import Library, wrap
 
 DT, STEPS = 0.05, 120
@@ -153,3 +154,27 @@ def test_an_adopted_delay_of_two_sensors_as_one_is_not_asked_for_again():
     trials = [Trial(y, u + i, DT, late.state_names, ("u",)) for i in range(2)]
     data = prepare(late, trials, np.zeros(1))
     assert without_others(Predictor(data), data.y, ["sensor_delay:x+v"], Library()) is data.model
+
+
+@pytest.mark.parametrize(
+    "name, values, nothing",
+    [
+        ("periodic:v", shake, False),
+        ("periodic:v", {"A": 0.0, "B": 0.0, "omega": 4.7}, True),  # its cart is shaken otherwise
+        ("offset:v", {"c": 0.0}, True),
+        ("patch:v", {"c": 1.0, "x0": 0.3, "radius": 0.2}, False),  # the place alone tells
+        ("patch:v", {"c": 1.0, "x0": 40.0, "radius": 3.0}, True),
+    ],
+)
+def test_what_may_as_well_be_nothing_or_lies_where_nobody_was_is_no_cause(name, values, nothing):
+    """A patch was claimed 3 m from where the boat ever was, -4.17 +- 11, and advised."""
+    model, trials = carts(APART)
+    data = prepare(model, trials, np.zeros(1))
+    search = HypothesisSearch(data, ())
+    h = Hypothesis().plus(Library().effect(name, model, data.scales), values)
+    if name.startswith("patch"):
+        fit = SimpleNamespace(hypothesis=h)
+    else:
+        (fit,) = search.refined([search.fresh(h)], 8)
+    found = of_no_size(search.predictor, fit, data.trial_of)
+    assert found == [name] * nothing

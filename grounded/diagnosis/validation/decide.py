@@ -31,8 +31,8 @@ from grounded.diagnosis.hypotheses.plainest import plainer
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
-from grounded.diagnosis.validation.motions import repeats
-from grounded.diagnosis.validation.ruler import Ruler
+from grounded.diagnosis.validation.motions import of_no_size, repeats
+from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.diagnosis.validation.single_steps import borne_out
 from grounded.diagnosis.validation.visits import acting, few_trials
 from grounded.effects import ParamFamily
@@ -299,6 +299,7 @@ def _pruned(
         idle = (
             undone
             or [n for n, count in repeated.items() if count]
+            or of_no_size(search.predictor, fit, folds(search.data))
             or [
                 name
                 for name, less in without.items()

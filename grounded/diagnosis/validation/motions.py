@@ -20,7 +20,7 @@ motion that is not that of the motion with most say.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -30,6 +30,7 @@ from grounded.diagnosis.hypotheses.explored import CLAIM, FittedHypotheses
 from grounded.diagnosis.likelihood.data import PIECES, Data
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, param_name
 from grounded.effects.places import dynamic
@@ -39,6 +40,7 @@ from grounded.model import Model, Param
 REPEATS = 0.03  # of a signal's power: trials that differ by less are one motion
 TENTHS = 10  # stretches whose means are compared
 LENGTH = 0.2  # of a trial's steps by which another one may be longer
+KNOWN = 2.0  # standard deviations from zero of a size that is known
 HALF = 0.5  # of its say: a trial with less moves as the others do
 
 
@@ -67,6 +69,40 @@ def repeats(search: FittedHypotheses, fit: Fitted, less: Fitted, name: str) -> i
         say *= [paths.apart(first, trial) for trial in range(data.count)]
     alike = int((say < HALF).sum())
     return alike if alike > 1 and say @ nats < CLAIM else 0
+
+
+def of_no_size(predictor: Predictor, fit: Fitted, trial_of: Array) -> list[str]:
+    """The loose effects of a fit that may as well be nothing, or lie where nobody was.
+
+    Of a wave of half a period what it adds where something was measured is known, what it is is
+    not: no size is known to KNOWN deviations. The size of a patch of ground hangs on its place: it
+    counts where a trial came within a radius of that.
+
+    Args:
+        predictor: of the data of the fit.
+        fit: with the effects.
+        trial_of: what each run is left out with (B,), for the scatter between them.
+    """
+    found, sizes, at = [], dict[str, list[int]](), 0
+    for effect, values in fit.hypothesis.pairs:
+        if effect.family.loose and "radius" in values:
+            found += [effect.name] * (not _visited(predictor.data, values))
+        elif effect.family.loose:
+            sizes[effect.name] = [at + k for k, q in enumerate(effect.free) if not q.grid]
+        at += len(effect.free)
+    if sizes:
+        theta, stds = fit.hypothesis.theta, standard_deviations(predictor, fit, trial_of)[0]
+        found += [n for n, own in sizes.items() if (np.abs(theta[own]) < KNOWN * stds[own]).all()]
+    return found
+
+
+def _visited(data: Data, values: Mapping[str, float]) -> bool:
+    """Whether a trial came within a radius of a place (x0, y0, ...)."""
+    names = data.model.state_names
+    where = [name for name in names if f"{name}0" in values]
+    own = data.filled[:, [names.index(name) for name in where]]
+    away = own - np.array([values[f"{name}0"] for name in where])
+    return bool(((away**2).sum(axis=1) < values["radius"] ** 2).any())
 
 
 def without_others(
