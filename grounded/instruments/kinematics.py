@@ -11,11 +11,12 @@ too, so that only what no physics does is put right: a mirrored heading, one in 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from grounded.effects import places
+from grounded.effects.memory import true_values
 from grounded.effects.registry import partner
 from grounded.frozen import Array, wrapped
 from grounded.instruments.lag import Lag, lag_between
@@ -48,6 +49,18 @@ def integrals(model: Model) -> list[Integral]:
     ]
     carried = [(i, k) for i, n in enumerate(names) if (k := partner(model, n))]
     return found + [Integral(i, names.index(k), 1.0, exact=False) for i, k in carried]
+
+
+def logged_behind(model: Model, shown: Sequence[int]) -> list[Integral]:
+    """The same between the late logs of states whose true values adopted effects keep as memory."""
+    names = model.state_names
+    memory = [name for i, name in enumerate(names) if i not in shown]
+    log = true_values(names, memory)
+    return [
+        replace(one, i=log[one.i], j=log[one.j])
+        for one in integrals(model)
+        if one.exact and {one.i, one.j} <= log.keys()
+    ]
 
 
 def lag_of(model: Model, relation: Integral, trials: Sequence[Trial]) -> Lag | None:

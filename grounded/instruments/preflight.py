@@ -39,6 +39,7 @@ from grounded.instruments.kinematics import (
     course,
     integrals,
     lag_of,
+    logged_behind,
     own_lag,
     turned,
 )
@@ -259,6 +260,12 @@ class _Bench:
                 yield from self.constant(relation)
             if relation.exact and clear and clear.mean >= SMOOTH * self.dt:
                 yield self.smoothed(relation, clear)
+
+        for relation in logged_behind(self.model, self.shown):  # how late both are is adopted
+            lag = lag_of(self.model, relation, self.trials)
+            if lag is not None and lag.coherence > ALIKE and lag.filtered and lag.delay > 0:
+                q = self.model.state_names[relation.i]
+                yield self.in_time(relation.j, lag, f"the derivative of {q}")
 
     def unit(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """Sign and unit, which are put right; a scale, which may be either sensor's."""

@@ -10,7 +10,7 @@ import pytest
 from test_diagnosis import DT, cart
 
 from cli import grounded
-from grounded import Trial
+from grounded import Model, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
@@ -333,3 +333,64 @@ def test_a_trial_that_diverged_counts_up_to_there():
     inputs = run.inputs.copy()
     inputs[2] = np.nan
     assert replace(run, inputs=inputs).known_steps == 2
+
+
+LATE, FILTER = 0.1, 0.07
+
+
+def seen_late(trials=3, steps=260):
+    """A disturbed cart behind a motor, seen by a late camera; its program filters the speed."""
+    model = Model(
+        name="motor",
+        states={"x": "m", "v": "m/s", "f": "m/s^2"},
+        inputs={"u": "m/s^2"},
+        roles={"position": ("x",), "speed": "v"},
+        derivative=lambda s, a, p: {"x": s.v, "v": s.f - 0.8 * s.v, "f": (a.u - s.f) / 0.2},
+    )
+    rng, runs, back = np.random.default_rng(2), [], round(LATE / DT)
+    for _ in range(trials):
+        t = np.arange(steps + back) * DT
+        u = 0.6 * np.sin(rng.uniform(1, 3) * t) + 0.4 * np.sign(np.sin(rng.uniform(2, 4) * t))
+        x, states = np.zeros(3), [np.zeros(3)]
+        for value in u:
+            x = model.system.step(x[None], np.array([[value]]), model.values, DT)[0]
+            x = x + np.array([0.0, 0.01, 0.0]) * rng.standard_normal(3)
+            states.append(x)
+        y = np.array(states)[back:]
+        y[:, :2] = np.array(states)[: steps + 1, :2]  # what was so long ago
+        for k in range(1, len(y)):
+            y[k, 1] = y[k - 1, 1] + DT / (FILTER + DT) * (y[k, 1] - y[k - 1, 1])
+        y += np.array([0.002, 0.004, 0.01]) * rng.standard_normal(y.shape)
+        names = (model.state_names, model.input_names)
+        runs.append(Trial(y, u[back:, None], DT, *names, start_inputs=u[back - 1 : back]))
+    return model, runs
+
+
+@pytest.mark.slow
+def test_an_adopted_delay_predicts_as_diagnosed_and_the_filter_behind_it_is_still_seen():
+    """Adopting exactly what was claimed made predictions worse than model.py, and a new cause."""
+    model, runs = seen_late()
+    first = diagnose(model, runs)
+    assert first.effects == ("sensor_delay:x+v",)
+    (told,) = (f for f in first.preflight if f.kind == "lag")
+    d = first.ranking[0].params["d"].value
+    assert d == pytest.approx(LATE, abs=0.01) and told.signal == "v"
+    better = wrap(Library().effect("sensor_delay:x+v", model), {"d": d}, DT)
+    lifted = [
+        replace(
+            run,
+            states=np.hstack([run.states, memory_of(better, model, run)]),
+            state_names=better.state_names,
+        )
+        for run in runs
+    ]
+    hidden = better.state_names[model.n :]
+    again = diagnose(better, lifted, DiagnosisOptions(hidden=hidden, but=("sensor_delay:x+v",)))
+    (same,) = (f for f in again.preflight if f.kind == "lag")
+    assert same.signal == "v" and same.delay_s == pytest.approx(told.delay_s, rel=0.1)
+    assert not again.effects
+    for one, now in zip(first.prediction_error, again.prediction_error, strict=True):
+        for name in ("x", "v"):
+            assert now.crude[name] < one.crude[name], (one, name)
+            if one.horizon_s > LATE:  # what comes after the logs that a moved one reads ahead
+                assert now.crude[name] < 1.5 * one.with_effects[name], (one, name)

@@ -116,7 +116,7 @@ class HypothesisSearch(FittedHypotheses):
         residual = data.model.difference(predicted, track[1:])
         scale = np.array([data.scales.spread(n) for n in data.model.state_names])
         scale[list(data.hidden)] = 0.0  # nothing disturbs a memory
-        noise = noise_guess(residual, data.seen, scale)
+        noise = noise_guess(residual, data.seen, scale).behind(data.now)
         if late := [data.model.state_names.index(name) for name in delayed(h.effects)]:
             log_r = noise.log_r.copy()  # a delay hides it: from above, it finds its way down
             log_r[late] = np.logaddexp(noise.log_q, log_r + math.log(2))[late] + math.log(LOUD)

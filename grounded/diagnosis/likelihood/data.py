@@ -69,6 +69,14 @@ class Data:
         return true_values(names, [names[i] for i in self.hidden])
 
     @cached_property
+    def now(self) -> Mapping[int, int]:
+        """Late logs, each with its true value of the moment: the first memory behind it."""
+        first: dict[int, int] = {}
+        for i, log in sorted(self.behind.items()):
+            first.setdefault(log, i)
+        return first
+
+    @cached_property
     def told(self) -> Any:
         """Of which states trials say anything, if only where their fit begins, (n,) of bool."""
         return np.isfinite(self.states).any(axis=0)

@@ -26,6 +26,7 @@ matters, and one pass for all of them.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -108,6 +109,19 @@ class NoiseModel:
         if self.structure.tau is None:
             return np.zeros((runs, 0))
         return np.tile(np.exp(self.log_c), (runs, 1))
+
+    def behind(self, now: Mapping[int, int]) -> NoiseModel:
+        """The same with what disturbs late logs in their true values of the moment, {log: true}.
+
+        A late log is an old true value and nothing else: what it seems to be disturbed by was seen
+        late. Were nothing to disturb the true value, no log would ever correct it.
+        """
+        if not now:
+            return self
+        log_q, floor = self.log_q.copy(), self.floor.copy()
+        for log, true in now.items():
+            log_q[true], floor[true], log_q[log] = log_q[log], floor[log], floor[log]
+        return replace(self, log_q=log_q, log_c=log_q.copy(), floor=floor)
 
     def allowing(self, structure: Structure, dt: float) -> NoiseModel:
         """The same noise, free to be coloured (or not): where its fit starts."""
