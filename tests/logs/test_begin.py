@@ -500,6 +500,8 @@ def test_a_column_that_stays_has_the_range_of_its_unit():
     columns = {"x": 2 * t, "y": 0 * t, "psi": 0 * t, "v": 0.01 * t}
     weights = equal_weights(columns, units)
     assert weights == pytest.approx({"x": 0.25, "y": 0.25, "psi": 1.0, "v": 100.0})
+    both = equal_weights({"x": 9 * t, "y": 3 * t, "v": t}, units, ("x", "y"))
+    assert both["x"] == both["y"] == equal_weights({"x": 9 * t}, units)["x"]  # of one position
     assert equal_weights({"x": 5 + 0 * t}, units) == pytest.approx({"x": 0.04})  # a step
 
 

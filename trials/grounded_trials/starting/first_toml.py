@@ -11,6 +11,7 @@ from grounded.model import Model
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import key
 from grounded_trials.workspace.config import FILE, OFFERED
+from grounded_trials.workspace.off_target import position_names
 from grounded_trials.workspace.task_file import change_weight, equal_weights, write_target
 
 
@@ -40,7 +41,7 @@ def write_first(
     """
     dt, whose = grid
     write_target(folder / "target.csv", dt, dict(columns))
-    weights = equal_weights(columns, model.states)
+    weights = equal_weights(columns, model.states, position_names(model))
     changes = {name: change_weight(ranges[name], model.inputs[name]) for name in model.input_names}
     limits = [
         f"{key(name)} = [{found[0]:.6g}, {found[1]:.6g}]"

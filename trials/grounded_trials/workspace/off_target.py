@@ -127,6 +127,11 @@ def position_axes(model: Model) -> list[int]:
     return axes + roles.get("altitude", [])[: 3 - len(axes)]
 
 
+def position_names(model: Model) -> list[str]:
+    """The same by name."""
+    return [model.state_names[i] for i in position_axes(model)]
+
+
 def roles_of(model: Model) -> dict[str, list[int]]:
     """The states that play each role, by index."""
     index = {name: i for i, name in enumerate(model.state_names)}

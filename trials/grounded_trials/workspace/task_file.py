@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from io import TextIOWrapper
 from pathlib import Path
@@ -238,17 +238,21 @@ def target_arrays(
 
 def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -> Path:
     """Writes target.csv and its length to grounded.toml, see `Workspace.target`."""
-    units = model.states
+    from grounded_trials.workspace.off_target import position_names
+
+    units, place = model.states, position_names(model)
     name = config.task.target or "target.csv"
     path = config.file.parent / name
     before: dict[str, float] = {}
     if path.is_file():
         with suppress(GroundedError, ValueError):  # one that can't be read is replaced
             names, values = read_target(path)
-            before = equal_weights(dict(zip(names[1:], values.T[1:], strict=True)), units)
+            given = dict(zip(names[1:], values.T[1:], strict=True))
+            before = equal_weights(given, units, place)
         path.replace(path.with_name(path.name + ".bak"))
     write_target(path, config.task.dt, dict(columns))
-    weights = {state: round(w, 6) for state, w in equal_weights(columns, units).items()}
+    equal = equal_weights(columns, units, place)
+    weights = {state: round(w, 6) for state, w in equal.items()}
     rows = len(next(iter(columns.values())))
     set_target(config.file, name, rows - 1, weights, before, _changes(config, model))
     return path
@@ -264,7 +268,9 @@ def _changes(config: Config, model: Model) -> dict[str, tuple[float, float]]:
     }
 
 
-def equal_weights(columns: Mapping[str, Array], units: Mapping[str, str]) -> dict[str, float]:
+def equal_weights(
+    columns: Mapping[str, Array], units: Mapping[str, str], together: Collection[str] = ()
+) -> dict[str, float]:
     """Weights by which an error as large as a column's range, at least LEAST, costs 1.
 
     A column that is constant has no range: its size counts, as of a step. One that is zero gets the
@@ -274,10 +280,13 @@ def equal_weights(columns: Mapping[str, Array], units: Mapping[str, str]) -> dic
     Args:
         columns: of the target, by state.
         units: of the model's states.
+        together: axes of one position: a metre costs the same along each, by the largest range.
     """
     ranges = {
         name: float(np.ptp(values) or np.abs(values).max()) for name, values in columns.items()
     }
+    widest = max((own for name, own in ranges.items() if name in together), default=0.0)
+    ranges |= {name: widest for name in ranges if name in together}
     size: dict[str, float] = {}
     for name, own in ranges.items():
         unit = units.get(name, "")
