@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import click
@@ -110,6 +111,13 @@ def command(
         if (weights := reward.get(kind, {})) != before.get(kind, {}):
             told = ", ".join(f"{name} = {number(weight)}" for name, weight in weights.items())
             sentence(f"[reward] {kind} is new, {by}: {told}")
+    bounds = workspace.config.safety.pairs(list(model.states))
+    for name, (low, high) in ranges.items():
+        least, most = bounds.get(name, (-math.inf, math.inf))
+        if low < least or high > most:
+            bound = least if low < least else most
+            goes = with_unit(number(low if low < least else high), model.states[name])
+            remark("note", f"{name} goes to {goes}, beyond its bound in [safety], {number(bound)}")
     moving = {model.states[name] for name, ends in ranges.items() if ends != (0, 0)}
     if still := [name for name in ranges if model.states[name] not in moving]:
         remark(

@@ -705,3 +705,15 @@ def test_a_generic_skeleton_has_the_rates_that_its_log_shows_and_an_actuator_as_
     assert model.input_names == ("servo_deg",) and model.states["ball_vel_mm_s"] == "mm/s"
     (relation,) = integrals(model)
     assert (relation.i, relation.j, round(relation.c, 6)) == (0, 1, 1.0)
+
+
+def test_a_target_beyond_safety_is_told_when_it_is_drawn(tmp_path):
+    """A step to 60 m, of 60 cm, was drawn without a word."""
+    made = workspaces.make(tmp_path / "w")
+    file = made.folder / "grounded.toml"
+    file.write_text(re.sub(r"(?m)^\[safety\]\n(?:\w.*\n)*", "", file.read_text()))
+    file.write_text(file.read_text() + "\n[safety]\nx = [-2.0, 2.0]\n")
+    near = grounded("-C", made.folder, "target", "step", "--to", "x=1.5")
+    far = grounded("-C", made.folder, "target", "step", "--to", "x=60")
+    assert near.code == far.code == 0
+    assert "[safety]" not in near.err and "[safety]" in far.err and "60" in far.err
