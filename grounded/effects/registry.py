@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.effects import actuator, friction, geometry, joint, places, rate, sensor
+from grounded.effects import actuator, friction, geometry, joint, medium, places, rate, sensor
 from grounded.effects.correction import correction
 from grounded.effects.family import Effect, Family, ParamFamily, Quantity, RateFamily, Scales, Site
 from grounded.errors import GroundedError, nearest
@@ -56,6 +56,7 @@ BUILT_IN: tuple[Family, ...] = (
     *rate.FAMILIES,
     *friction.FAMILIES,
     *geometry.FAMILIES,
+    *medium.FAMILIES,
     *sensor.FAMILIES,
     parameter,
 )
