@@ -3,8 +3,8 @@
 With the heading psi and velocities u ahead, v to the side of a plane (x' = u cos psi - v sin psi,
 y' = u sin psi + v cos psi; `places.body_velocity`), all over ground:
 
-    current      the medium moves with (a, b) over ground, and what the model says of u, v holds of
-                 the velocity through it:  V_c(s): u + a cos psi + b sin psi, v - a sin psi + b cos psi
+    current      the medium moves by (a, b) over ground, and what the model says of u, v holds of
+                 the velocity through it: with V_c adding (a, b), turned into the vehicle's axes,
 
                      s+ = V_c(f(V_-c(s))),     x+ = ... + dt a,    y+ = ... + dt b
 
@@ -16,8 +16,8 @@ another size for each. What turns with the axes (v r, -u r) comes out as it was.
 drag of its own does not feel a current; what pushes it all the same (a wind on a hull, a floor that
 tilts) is the second.
 
-T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2011, section 8.3: equations
-of motion including ocean currents, in terms of the relative velocity.
+T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2011, section 8.3:
+equations of motion with ocean currents, in terms of the relative velocity.
 """
 
 from __future__ import annotations
@@ -89,8 +89,8 @@ def _carried(model: Model) -> list[str]:
     c = {"a": 0.1, "b": 0.2}
     start = through_it(effect, Named("state", names, list(x.T)), c)
     after = model.system.step(np.stack(list(start.values()), axis=-1), u, model.values, dt)
-    after = over_ground(effect, Named("state", names, list(after.T)), c, dt)
-    felt = max(float(np.abs(after[n] - plain[:, names.index(n)]).max()) for n in found)
+    moved = over_ground(effect, Named("state", names, list(after.T)), c, dt)
+    felt = max(float(np.abs(moved[n] - plain[:, names.index(n)]).max()) for n in found)
     return ["+".join(found)] if felt > FELT * dt else []
 
 
