@@ -38,8 +38,10 @@ from grounded.effects.family import (
     Values,
     per,
 )
+from grounded.frozen import Array
 from grounded.model import Model
 
+SAME = 1e-6  # of the squared length: what may differ
 FELT = 1e-4  # [1/s^2]: what a medium that moves by 0.2 changes of a velocity's rate at least
 
 
@@ -80,18 +82,36 @@ def _pushed(model: Model) -> list[str]:
 
 def _carried(model: Model) -> list[str]:
     """Velocities of a model to which it is not the same whether the medium moves."""
+    felt, _ = _felt(model)
+    return _pushed(model) if np.abs(felt).max(initial=0.0) > FELT else []
+
+
+def renamed(model: Model) -> dict[str, str]:
+    """{dropped: kept}: a push is a current where the drag is linear and alike both ways."""
+    felt, axes = _felt(model)
+    lengths = float(np.sum(felt * felt)) * float(np.sum(axes * axes))
+    same = lengths > 0 and float(np.sum(felt * axes)) ** 2 > (1 - SAME) * lengths
+    return {f"push_world:{n}": f"current:{n}" for n in _carried(model)} if same else {}
+
+
+def _felt(model: Model) -> tuple[Array, Array]:
+    """What a medium that moves adds to the rates of (u, v), and its velocity in their axes.
+
+    (S, 2) each, at S samples; (0, 2) of a model that has no such velocities.
+    """
     if not (found := places.body_velocity(model)):
-        return []
+        return np.zeros((0, 2)), np.zeros((0, 2))
     effect = current.at(Site(model, found, Scales()))
     (x, u), dt = places.samples(model, 8), places.probe(model, places.SHORT)
-    names = model.state_names
+    names, c = model.state_names, {"a": 0.1, "b": 0.2}
     plain = model.system.step(x, u, model.values, dt)
-    c = {"a": 0.1, "b": 0.2}
-    start = through_it(effect, Named("state", names, list(x.T)), c)
-    after = model.system.step(np.stack(list(start.values()), axis=-1), u, model.values, dt)
+    start = Named("state", names, list(x.T))
+    seen = np.stack(list(through_it(effect, start, c).values()), axis=-1)
+    after = model.system.step(seen, u, model.values, dt)
     moved = over_ground(effect, Named("state", names, list(after.T)), c, dt)
-    felt = max(float(np.abs(moved[n] - plain[:, names.index(n)]).max()) for n in found)
-    return ["+".join(found)] if felt > FELT * dt else []
+    axes = _in_its_axes(start, c, effect.site)
+    felt = [(moved[n] - plain[:, names.index(n)]) / dt for n in found]
+    return np.stack(felt, axis=-1), np.stack([axes[n] for n in found], axis=-1)
 
 
 def _two(unit: str) -> tuple[Quantity, ...]:

@@ -121,7 +121,7 @@ class Library:
         idle, outright = derived_states(model), outright_states(model)
         integrals = places.integrated(model)
         geometric = set(integrals) - set(places.velocities(model))
-        same = aliases(model, idle | outright) | joint.renamed(model)
+        same = aliases(model, idle | outright) | joint.renamed(model) | medium.renamed(model)
         for family in self.families:
             for target in family.targets(model):
                 driven = target.partition("<-")

@@ -150,6 +150,12 @@ def test_what_has_no_drag_feels_no_current():
     assert offered(boat_of(X=0.0, XX=0.0, Y=0.0)) == {"push_world:u+v"}
 
 
+def test_a_linear_drag_that_is_alike_both_ways_leaves_one_name():
+    """A current is then a push: the data could never tell them apart."""
+    assert offered(boat_of(X=0.7, XX=0.0, Y=0.7)) == {"current:u+v"}
+    assert len(offered(boat)) == len(offered(boat_of(X=0.7, XX=0.0, Y=0.8))) == 2
+
+
 @pytest.mark.parametrize(
     ("parts", "truth"),
     [
