@@ -75,7 +75,8 @@ def values_of(
     if family == "periodic":
         phase = rng.uniform(0, 2 * np.pi)
         values |= {"A": top * np.cos(phase), "B": top * np.sin(phase)}
-    if family in ("drift_world", "drift_body", "slope"):
+    if family in ("drift_world", "drift_body", "slope", "push_world", "current"):
+        top = size * scales.peak(effect.site.target) if family == "current" else top
         angle = rng.uniform(0, 2 * np.pi)
         values |= {"a": top * np.cos(angle), "b": top * np.sin(angle)}
     if family == "patch":

@@ -20,6 +20,7 @@ from grounded.effects import (
     Effect,
     InputFamily,
     LossFamily,
+    MediumFamily,
     MemoryFamily,
     RateFamily,
     SensorDelayFamily,
@@ -27,12 +28,14 @@ from grounded.effects import (
     SensorLagFamily,
 )
 from grounded.effects.family import coupled
+from grounded.effects.medium import over_ground, through_it
 from grounded.effects.registry import partner
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.trial import Trial
 
 FINE = 6  # integration steps a control step
+TINY = 1e-6  # [s] over which a moving medium's own rate is taken
 NUDGE = 1e-2  # of an input's unit: the difference by which its own part of a rate is known
 
 # What is outside the library acts on received inputs: f(u (m,), state of its own, t, dt) -> u
@@ -161,7 +164,21 @@ class _Run:
         return out
 
     def rates(self, x: Array, u: Array, t: float) -> Array:
-        """ds/dt of the real system, effects inside."""
+        """ds/dt of the real system over ground: of one in a medium, as that moves and it turns."""
+        s = Named("state", self.names, list(x))
+        for effect, values in self.truth.effects:
+            if isinstance(effect.family, MediumFamily):
+                seen = through_it(effect, s, values)
+                own = self.through_the_medium(np.array(list(seen.values())), u, t)
+                ahead = [
+                    value + TINY * rate for value, rate in zip(seen.values(), own, strict=True)
+                ]
+                after = over_ground(effect, Named("state", self.names, ahead), values, TINY)
+                return (np.array([after[n] for n in self.names]) - x) / TINY
+        return self.through_the_medium(x, u, t)
+
+    def through_the_medium(self, x: Array, u: Array, t: float) -> Array:
+        """ds/dt with all other effects inside."""
         model = self.truth.model
         s, a = Named("state", self.names, list(x)), Named("input", model.input_names, list(u))
         assert model.derivative is not None

@@ -1,10 +1,11 @@
 """Unmodelled effects: what a model may lack, one family of physics a file.
 
 Read `family` first (what an effect is), then any of the families: `actuator`, `joint`, `friction`,
-`rate`, `geometry`, `sensor`. `places` says where in a model they can act. `registry` has the
-`Library` of all families: what of it applies to a model, and the way from a name to its effect.
-`wrap` adds an effect to a model, which is then a plain model again. A new family is a value in one
-of these files, or comes from a package of your own by the entry point group `grounded.effects`.
+`rate`, `geometry`, `medium`, `sensor`. `places` says where in a model they can act. `registry` has
+the `Library` of all families: what of it applies to a model, and the way from a name to its effect.
+`wrap` adds an effect to a model, which is then a plain model again; `order` says which of several
+is wrapped first. A new family is a value in one of these files, or comes from a package of your own
+by the entry point group `grounded.effects`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from grounded.effects.family import (
     Family,
     InputFamily,
     LossFamily,
+    MediumFamily,
     MemoryFamily,
     ParamFamily,
     Quantity,
@@ -23,12 +25,11 @@ from grounded.effects.family import (
     SensorFamily,
     SensorLagFamily,
     Site,
-    acting_order,
     scales_of,
-    wrapping_order,
 )
 from grounded.effects.joint import like_a_load, one_friction
 from grounded.effects.memory import memory_of, memory_start
+from grounded.effects.order import acting_order, wrapping_order
 from grounded.effects.registry import Library
 from grounded.effects.wrap import param_name, wrap
 
@@ -38,6 +39,7 @@ __all__ = [
     "InputFamily",
     "Library",
     "LossFamily",
+    "MediumFamily",
     "MemoryFamily",
     "ParamFamily",
     "Quantity",

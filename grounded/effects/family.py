@@ -8,6 +8,7 @@ diagnosis, and listed in docs/effects.md.
     MemoryFamily    u_eff, z+ = advance(u, z, c, dt)        the same, with a memory z
     LossFamily      u_eff = u - loss(w, u, c)               what a driven motion takes off an input
     RateFamily      ds/dt = model + rate(s, a, own, t, c)   added to the rates of states
+    MediumFamily    f seen from axes that move with (c)     what it floats or flies in moves itself
     SensorFamily    y = measure(s, c),  s = recover(y, c)   what is logged of a state
     ParamFamily     p + c                                   the model's own parameter is wrong
 
@@ -23,8 +24,8 @@ Several effects act in one order, for prediction, probes and adopted models alik
 A transport delay commutes with all that does not depend on time, so it may as well act last; there
 a fraction of a step blends two samples of what is delivered, not two commands that a nonlinear
 effect has yet to see. Of two effects the one that is wrapped LAST acts FIRST on a command, so
-wrapping goes from the model outwards: parameters, losses, limits of rates, rates, sensors (late
-ones last, delays before filters), inputs.
+wrapping goes from the model outwards: parameters, losses, limits of rates, rates, a medium, sensors
+(late ones last, delays before filters), inputs (`order`).
 """
 
 from __future__ import annotations
@@ -250,6 +251,18 @@ class RateFamily(Family):
 
 
 @dataclass(frozen=True)
+class MediumFamily(Family):
+    """The model, and the rates found beside it, act relative to a medium that moves (`medium`).
+
+    shift(s, c, site) -> {velocity: the medium's own, in the axes of that state}
+    drift(c, site) -> {position: the medium's velocity over ground}
+    """
+
+    shift: Callable[[Any, Any, Site], Values] = lambda s, c, site: {}
+    drift: Callable[[Any, Site], Values] = lambda c, site: {}
+
+
+@dataclass(frozen=True)
 class SensorFamily(Family):
     """measure(value, c) -> logged value of the target state; recover is its inverse."""
 
@@ -346,41 +359,3 @@ def scales_of(model: Model, states: Array, inputs: Array, dt: float, duration: f
             marks = np.quantile(np.abs(column), np.linspace(0, 1, 21))
             quantiles[name] = tuple(float(q) for q in marks)
     return Scales(low, high, quantiles, dt, duration)
-
-
-def acting_order(families: Sequence[Family]) -> list[int]:
-    """Indices of the effects on inputs, the one that acts first on a command first."""
-    own = [i for i, f in enumerate(families) if isinstance(f, InputFamily | MemoryFamily)]
-    return sorted(own, key=lambda i: getattr(families[i], "transport", False))
-
-
-def joining_order(old: Sequence[Family], new: Sequence[Family]) -> list[tuple[bool, int]]:
-    """The order in which new effects join a model that has others: (whether new, which one).
-
-    They were fitted on the model with the old ones in it: on commands they act before these, on all
-    else after them.
-    """
-    first = [i for i, f in enumerate(new) if isinstance(f, InputFamily | MemoryFamily)]
-    last = [i for i in range(len(new)) if i not in first]
-    return [
-        *((True, i) for i in first),
-        *((False, i) for i in range(len(old))),
-        *((True, i) for i in last),
-    ]
-
-
-def wrapping_order(families: Sequence[Family]) -> list[int]:
-    """Indices of all effects, the one that is wrapped first (the innermost) first."""
-    inputs = acting_order(families)
-    rest = [i for i in range(len(families)) if i not in inputs]
-    return [*sorted(rest, key=lambda i: _depth(families[i])), *reversed(inputs)]
-
-
-def _depth(family: Family) -> int:
-    if isinstance(family, ParamFamily | LossFamily):
-        return 0 if isinstance(family, ParamFamily) else 1
-    if isinstance(family, RateFamily):
-        return 2 if family.parts else 3
-    if isinstance(family, SensorDelayFamily | SensorLagFamily):  # their memories begin at the log
-        return 5 if isinstance(family, SensorDelayFamily) else 6
-    return 4

@@ -18,6 +18,7 @@ from grounded.model import Model
 POSITIONS = (("x", "y"), ("north", "east"), ("px", "py"), ("pos_x", "pos_y"))
 HEADINGS = ("psi", "yaw", "heading", "theta")
 SHORT = 1e-5  # [s], a step that shows the rates
+STRAIGHT = 1e-3  # of velocities near 1: what a short step leaves
 SPEEDS = ("v", "speed", "velocity", "vx", "u")
 
 
@@ -76,6 +77,23 @@ def steering(model: Model) -> list[str]:
     size |= {n: float(np.abs(f_u[:, i, j]).max()) for j, n in enumerate(model.input_names)}
     no = {*position(model), turned, speed(model), speed_input(model), *role(model, "heading_rate")}
     return [n for n, by in size.items() if n not in no and by > 1e-3 * dt]
+
+
+def body_velocity(model: Model) -> tuple[str, ...]:
+    """The velocities ahead and to the side, (u, v), where a model has both in the plane.
+
+    x' = u cos psi - v sin psi,  y' = u sin psi + v cos psi,  at samples of its own rates.
+    """
+    where, turned = position(model), heading(model)
+    if len(where) < 2 or turned is None:
+        return ()
+    (x, u), dt, names = samples(model, 8), probe(model, SHORT), model.state_names
+    rates = (model.system.step(x, u, model.values, dt) - x) / dt
+    i, j, k = (names.index(name) for name in (*where, turned))
+    cos, sin = np.cos(x[:, k]), np.sin(x[:, k])
+    own = rates[:, i] * cos + rates[:, j] * sin, rates[:, j] * cos - rates[:, i] * sin
+    found = [[n for n in range(model.n) if np.abs(x[:, n] - one).max() < STRAIGHT] for one in own]
+    return tuple(names[one[0]] for one in found) if all(found) else ()
 
 
 def velocities(model: Model) -> list[str]:

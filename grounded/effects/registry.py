@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.effects import actuator, friction, geometry, joint, places, rate, sensor
+from grounded.effects import actuator, friction, geometry, joint, medium, places, rate, sensor
 from grounded.effects.correction import correction
 from grounded.effects.family import Effect, Family, ParamFamily, Quantity, RateFamily, Scales, Site
 from grounded.errors import GroundedError, nearest
@@ -56,6 +56,7 @@ BUILT_IN: tuple[Family, ...] = (
     *rate.FAMILIES,
     *friction.FAMILIES,
     *geometry.FAMILIES,
+    *medium.FAMILIES,
     *sensor.FAMILIES,
     parameter,
 )
@@ -120,7 +121,7 @@ class Library:
         idle, outright = derived_states(model), outright_states(model)
         integrals = places.integrated(model)
         geometric = set(integrals) - set(places.velocities(model))
-        same = aliases(model, idle | outright) | joint.renamed(model)
+        same = aliases(model, idle | outright) | joint.renamed(model) | medium.renamed(model)
         for family in self.families:
             for target in family.targets(model):
                 driven = target.partition("<-")

@@ -8,6 +8,7 @@ One control step of the wrapped model, for commands held over the step:
     s1     = f(s + dt/2 rate(s), u_eff)           half of an added rate before the step ...
     s+     = s1 + dt/2 rate(s1)                   ... and half after it (Strang): second order in dt
     s+     = s + h (own + rate(s))                families that limit a rate, h = dt / parts
+    s+     = V_c(f(V_-c(s))) + dt c               a medium that moves with c (`medium`)
     y+     = measure(s+),  s = recover(y)         sensor families
 
 Several rates are added up and all see the same `own`, whichever was wrapped first: `own` is never
@@ -26,11 +27,12 @@ from typing import Any
 
 import numpy as np
 
-from grounded.compile.names import Named, check_names
+from grounded.compile.names import Named
 from grounded.effects.family import (
     Effect,
     InputFamily,
     LossFamily,
+    MediumFamily,
     MemoryFamily,
     ParamFamily,
     RateFamily,
@@ -41,47 +43,12 @@ from grounded.effects.family import (
     braked,
 )
 from grounded.effects.joint import inputs_left
+from grounded.effects.medium import over_ground, through_it
+from grounded.effects.plain_step import Step, plain_step
 from grounded.effects.registry import partner
 from grounded.effects.sensor import lagging
 from grounded.errors import GroundedError
 from grounded.model import Model, Param
-
-Step = Callable[[Any, Any, Any, Any], dict[str, Any]]
-
-
-def plain_step(model: Model) -> Step:
-    """The model's step(s, a, p, dt) in the user's own words, integrating a derivative."""
-    stepped, derivative, names = model.step, model.derivative, model.state_names
-
-    def checked(function: Callable[..., Any], *at: Any) -> dict[str, Any]:
-        check_names(values := function(*at), names, function)
-        return dict(values)
-
-    if stepped is not None:
-        return lambda s, a, p, dt: checked(stepped, s, a, p, dt)
-    assert derivative is not None
-
-    def moved(s: Any, rates: Mapping[str, Any], by: Any) -> Named:
-        return Named("state", names, [s[n] + by * rates[n] for n in names])
-
-    def euler(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        return dict(moved(s, checked(derivative, s, a, p), dt))
-
-    def rk4(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        k1 = checked(derivative, s, a, p)
-        k2 = derivative(moved(s, k1, 0.5 * dt), a, p)
-        k3 = derivative(moved(s, k2, 0.5 * dt), a, p)
-        k4 = derivative(moved(s, k3, dt), a, p)
-        return {n: s[n] + dt / 6 * (k1[n] + 2 * k2[n] + 2 * k3[n] + k4[n]) for n in names}
-
-    once = rk4 if model.integrator == "rk4" else euler
-
-    def several(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        for _ in range(model.substeps):
-            s = Named("state", names, list(once(s, a, p, dt / model.substeps).values()))
-        return dict(s)
-
-    return once if model.substeps == 1 else several
 
 
 def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
@@ -106,6 +73,7 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
         LossFamily: _loss_step,
         MemoryFamily: _memory_step,
         RateFamily: _rate_step,
+        MediumFamily: _medium_step,
         SensorFamily: _sensor_step,
         SensorDelayFamily: _sensor_delay_step,
         SensorLagFamily: _sensor_lag_step,
@@ -339,6 +307,17 @@ def _kicked(s: Named, rate: Values, dt: Any) -> Named:
     """Half a step of an added rate alone."""
     moved = [s[n] + 0.5 * dt * rate[n] if n in rate else s[n] for n in s]
     return Named("state", tuple(s), moved)
+
+
+def _medium_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
+    base, model = plain_step(effect.site.model), effect.site.model
+
+    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        c = _quantities(effect, p)
+        after = base(through_it(effect, _own_state(model, s), c), a, p, dt)
+        return over_ground(effect, Named("state", tuple(after), list(after.values())), c, dt)
+
+    return step, {}
 
 
 def _sensor_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:

@@ -135,13 +135,14 @@ def planner_with(
         GroundedError: for an unknown effect, or a quantity that is missing or unknown.
     """
     from grounded.effects import Library, param_name, wrap
-    from grounded.effects.family import Effect, Scales, Site, wrapping_order
+    from grounded.effects.family import Effect, Scales, Site
+    from grounded.effects.order import wrapping_order
 
     library, checked = library or Library(), checked or Effect.complete
     assert task.latency is not None
     model, latency = task.model, np.array(task.latency)
     families = [library.family(name.partition(":")[0]) for name, _ in effects]
-    for i in wrapping_order(families):
+    for i in wrapping_order(families, together=False):
         name, values = effects[i]
         targets = tuple(name.partition(":")[2].split("+"))
         if families[i].name == "delay":

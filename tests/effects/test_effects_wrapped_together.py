@@ -11,7 +11,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, memory_start, wrap
-from grounded.effects.wrap import plain_step
+from grounded.effects.plain_step import plain_step
 from grounded.models.car import model as car
 from grounded_trials.workspace.adopted import planner_of
 

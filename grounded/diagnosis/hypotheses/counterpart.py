@@ -15,7 +15,7 @@ from grounded.diagnosis.hypotheses.explored import LEFT, sizes
 from grounded.diagnosis.likelihood.fitted import calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.effects import InputFamily, LossFamily, ParamFamily, RateFamily
+from grounded.effects import InputFamily, LossFamily, MediumFamily, ParamFamily, RateFamily
 from grounded.frozen import Array
 
 
@@ -24,7 +24,7 @@ def counterparts(predictor: Predictor, h: Hypothesis) -> list[str]:
 
     Both are seen beside all the rest: what they change of a step, each alone and together.
     """
-    kinds = RateFamily | InputFamily | LossFamily
+    kinds = RateFamily | InputFamily | LossFamily | MediumFamily
     effects = [e.name for e in h.effects if isinstance(e.family, kinds)]
     bare = list(_unshifted(predictor, h)) if effects else []
     if not bare:

@@ -28,7 +28,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.predictor import Predictor, rates_of
-from grounded.effects import Effect, InputFamily, ParamFamily, RateFamily
+from grounded.effects import Effect, InputFamily, MediumFamily, ParamFamily, RateFamily
 from grounded.filter.tempering import Tempering, tempering
 from grounded.frozen import Array
 
@@ -213,7 +213,8 @@ def _several_cancel(predictor: Predictor, h: Hypothesis, size: Array) -> bool:
     them that differ in kind, a dead zone and a gain, may well both be there.)
     """
     data, x = predictor.data, predictor.data.y[:-1]
-    known = [p for p in h.pairs if isinstance(p[0].family, RateFamily | InputFamily)]
+    kinds = RateFamily | InputFamily | MediumFamily
+    known = [p for p in h.pairs if isinstance(p[0].family, kinds)]
     names = [effect.name for effect, _ in known if not getattr(effect.family, "parts", 0)]
 
     def step(of: Hypothesis) -> Array:

@@ -26,12 +26,14 @@ from grounded.compile import Named
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.linearise import base_columns, filter_system, sensitivities_of
+from grounded.diagnosis.likelihood.moving import moving
 from grounded.diagnosis.likelihood.predictor import Predictor, sensor_offset
 from grounded.diagnosis.likelihood.tangent import tangent
 from grounded.effects import (
     Effect,
     InputFamily,
     LossFamily,
+    MediumFamily,
     MemoryFamily,
     ParamFamily,
     RateFamily,
@@ -124,7 +126,7 @@ class _Context(SentOnce):
         family = effect.family
         if isinstance(family, RateFamily) and not family.parts:
             return self._rate(i, point, effect, grid)
-        if isinstance(family, InputFamily | LossFamily | MemoryFamily | RateFamily):
+        if isinstance(family, InputFamily | LossFamily | MediumFamily | MemoryFamily | RateFamily):
             return self._step(i, point, effect, grid)
         if isinstance(family, SensorFamily | SensorDelayFamily | SensorLagFamily):
             return self._sensor(i, point, effect, grid)
@@ -180,6 +182,8 @@ class _Context(SentOnce):
         """The added rate at the start (0) or the end (1) of every step."""
         data = self.predictor.data
         x = self.x if when == 0 else self.after
+        if medium := moving(self.fit.hypothesis):
+            x = medium.through(x)
         t = data.time if when == 0 else data.time + data.dt
         own: Any = {}
         if effect.family.needs_own:  # type: ignore[attr-defined]

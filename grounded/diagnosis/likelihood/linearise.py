@@ -36,8 +36,10 @@ from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.moving import moving
 from grounded.diagnosis.likelihood.noise import NoiseModel
-from grounded.diagnosis.likelihood.predictor import Predictor, limits_of, losses_of, rates_of
+from grounded.diagnosis.likelihood.predictor import Predictor, losses_of
+from grounded.diagnosis.likelihood.rate_slopes import heading_slope, passed, with_effects
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.likelihood.tangent import tangent
 from grounded.effects import ParamFamily
@@ -118,6 +120,12 @@ def sensitivities_of(
 
     after: where they lead, if known.
     """
+    if medium := moving(h):
+        start = medium.through(x)
+        end = predictor.advance(medium.still, start, u, predictor.data.time)
+        F, f_p = sensitivities_of(predictor, medium.still, start, u, end)
+        before, later = medium.slopes(start, end)
+        return later @ F @ before, later @ f_p
     data = predictor.data
     flat, p = predictor.flat(x, predictor.left(h, x, u)), predictor.params(h)
 
@@ -139,6 +147,11 @@ def step_jacobian(
     """F of every step along a track (L or more, B, n), (L, B, n, n)."""
     data, u = predictor.data, predictor.inputs(h)
     x = track[: len(data.time)]
+    if medium := moving(h):
+        start = medium.through(x)
+        end = predictor.advance(medium.still, start, u, data.time)
+        before, later = medium.slopes(start, end)
+        return later @ step_jacobian(predictor, medium.still, start, end) @ before
     f_x, f_u = predictor.slopes(x, predictor.left(h, x, u), predictor.params(h))
     if losses_of(h):
         f_x = f_x - f_u @ predictor.loss_slopes(h, x, u, f_x)[0]
@@ -154,8 +167,13 @@ def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | No
     x, u, n = track[1:], predictor.inputs(h), data.model.n
     G = np.zeros((*x.shape, n))
     G[..., np.arange(n), np.arange(n)] = 1.0
+    turn: Array | None = None
+    if medium := moving(h):
+        h, x = medium.still, medium.through(x)
+        turn, _ = medium.slopes(x, x)
     for heading, rate in tied:
-        G[..., rate, :] += heading_slope(predictor, h, x, u, data.time + data.dt, heading, rate)
+        slope = heading_slope(predictor, h, x, u, data.time + data.dt, heading, rate)
+        G[..., rate, :] += slope if turn is None else (slope[..., None, :] @ turn)[..., 0, :]
     return G
 
 
@@ -229,119 +247,6 @@ def _nudged(h: Hypothesis, theta: Array, j: int, size: float) -> tuple[Hypothesi
         if moved := float(other.theta[j] - theta[j]):
             break
     return other, moved
-
-
-SMALL = 1e-4  # of a state's spread: the difference that a slope is taken over
-STEEPEST = 1.0  # of a rate's own state, per half step
-
-
-def with_effects(
-    predictor: Predictor, h: Hypothesis, x: Array, u: Array, F: Array, after: Array | None = None
-) -> Array:
-    """The Jacobian of a hypothesis' step from x (L, B, n); F (L, B, n, n) of the model alone."""
-    one, data = np.eye(x.shape[-1]), predictor.data
-    F = passed(predictor, h, x, u, F, one)
-    if not rates_of(h) and not (limits_of(h) and predictor.tied()):
-        return F
-    after = predictor.advance(h, x, u, data.time) if after is None else after
-    half, mean = 0.5 * data.dt, (F - one) / data.dt
-    first = rate_slopes(predictor, h, x, u, data.time, mean)
-    direct = rate_slopes(predictor, h, after, u, data.time + data.dt, None)
-    later = F + half * direct @ F
-    if any(e.family.needs_own for e, _ in rates_of(h)):
-        # at the end the model's own rate is still the mean of the step: a function of its start
-        later += half * (rate_slopes(predictor, h, after, u, data.time + data.dt, mean) - direct)
-    found = later @ (one + half * first)
-    for heading, rate in predictor.tied():
-        row = heading_slope(predictor, h, after, u, data.time + data.dt, heading, rate)
-        row = (row[..., None, :] @ found)[..., 0, :]
-        row -= heading_slope(predictor, h, x, u, data.time, heading, rate)
-        row[..., rate] += 1.0
-        found[..., rate, :] = row
-    return np.asarray(found)
-
-
-def passed(
-    predictor: Predictor,
-    h: Hypothesis,
-    x: Array,
-    u: Array,
-    slopes: Array,
-    still: Array | float = 0.0,
-) -> Array:
-    """What limits of rates leave of the model's slopes (L, B, n, k) from x (L, B, n).
-
-    A state that moves as fast as it can no longer depends on the model: its slope is that of
-    standing `still` (n, k), for the part of the step that it does.
-    """
-    limits = limits_of(h)
-    if not limits:
-        return slopes
-    data = predictor.data
-    parts = max(e.family.parts for e, _ in limits)
-    dt, held = data.dt / parts, np.zeros_like(x)
-    for k in range(parts):
-        t, own = data.time + k * dt, (predictor.moved(h, x, u, dt) - x) / dt
-        tiny = 1e-6 * np.abs(own).max(axis=(0, 1)) + 1e-12
-        added, more = (
-            predictor.added_rate(limits, x, u, t, predictor.named(rate))
-            for rate in (own, own + tiny)
-        )
-        held += (more - added) / tiny / parts  # 0: free, -1: held back
-        x = x + dt * (own + added)
-    return np.asarray(slopes + held[..., None] * (slopes - still))
-
-
-def rate_slopes(
-    predictor: Predictor,
-    h: Hypothesis,
-    x: Array,
-    u: Array,
-    t: Array,
-    of_own: Array | None,
-    *,
-    now: bool = False,
-) -> Array:
-    """Slope of the added rates (L, B, n, n) [1/s] at x (L, B, n).
-
-    of_own: slope of the model's own rates, (L, B, n, n) or broadcastable; None: they stay.
-    now: of this very moment, limits too, not the mean over the step.
-    """
-    rates, data = [*rates_of(h), *(limits_of(h) if now else [])], predictor.data
-    n, half, names = x.shape[-1], 0.5 * data.dt, data.model.state_names
-    if not rates:
-        return np.zeros((*x.shape, n))
-    own = x
-    if any(e.family.needs_own for e, _ in rates):
-        own = predictor.instant(h, x, u) if now else (predictor.moved(h, x, u) - x) / data.dt
-    base = predictor.added_rate(rates, x, u, t, predictor.named(own))
-    found = np.empty((*x.shape, n))
-    for j, name in enumerate(names):
-        size = SMALL * data.scales.spread(name)
-        other = x.copy()
-        other[..., j] += size
-        moved = own if of_own is None else own + size * of_own[..., j]
-        rate = predictor.added_rate(rates, other, u, t, predictor.named(moved))
-        found[..., j] = (rate - base) / size
-    i = np.arange(n)
-    found[..., i, i] = np.maximum(found[..., i, i], -STEEPEST / half)
-    return found
-
-
-def heading_slope(
-    predictor: Predictor, h: Hypothesis, x: Array, u: Array, t: Array, heading: int, rate: int
-) -> Array:
-    """Slope of the heading's rate of this very moment, effects and all, (L, B, n) [1/s]."""
-    data, short = predictor.data, 1e-3 * predictor.data.dt
-    f_x, _ = predictor.slopes(x, u, predictor.params(h), short)
-    one, name = np.eye(x.shape[-1]), data.model.state_names[heading]
-    slope = (f_x[..., heading, :] - one[heading]) / short
-    acting = [*rates_of(h), *limits_of(h)]
-    if any(name in e.site.targets or f"{name}<-" in e.name for e, _ in acting):
-        own = (f_x - one) / short
-        slope += rate_slopes(predictor, h, x, u, t, own, now=True)[..., heading, :]
-    slope[..., [heading, rate]] = 0.0
-    return np.asarray(slope)
 
 
 PART = 0.05  # of a parameter's size, to each side

@@ -23,6 +23,7 @@ from grounded.diagnosis.likelihood.arriving import arriving, memories_moved
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import behind
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.moving import moving
 from grounded.diagnosis.likelihood.simulated import Slopes, simulated
 from grounded.effects import (
     Effect,
@@ -161,6 +162,9 @@ class Predictor(SentOnce):
 
     def advance(self, h: Hypothesis, x: Array, u: Array, t: Array) -> Array:
         """One step of a hypothesis from x (..., n) with received inputs u (..., m) at times t."""
+        if medium := moving(h):
+            after = self.advance(medium.still, medium.through(x), u, t)
+            return medium.over(after, self.data.dt)
         dt, rates, limits = self.data.dt, rates_of(h), limits_of(h)
         if not rates and not limits:
             return self.moved(h, x, u)
@@ -184,7 +188,7 @@ class Predictor(SentOnce):
     def stepper(self, h: Hypothesis) -> Callable[[Array, Array, Array], Array]:
         """`advance` of many steps one after the other: from x (M, n) with u (M, m) at t (M,)."""
         step, p, dt = self.data.model.system.step, self.params(h), self.data.dt
-        if p.ndim > 1 or rates_of(h) or limits_of(h) or losses_of(h):
+        if p.ndim > 1 or _more_than_steps(h):
             return lambda x, u, t: self.advance(h, x, u, t)
         return lambda x, u, t: step(x, u, p, dt)
 
@@ -194,12 +198,15 @@ class Predictor(SentOnce):
         None where a hypothesis adds to them, or the model is not compiled.
         """
         march = getattr(self.data.model.system, "march", None)
-        if march is None or rates_of(h) or limits_of(h) or losses_of(h):
+        if march is None or _more_than_steps(h):
             return None
         return np.asarray(march(x, u, self.params(h), self.data.dt))
 
     def moved(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
         """The model's step with what its motion takes off the inputs, without further rates."""
+        if medium := moving(h):
+            after = self.moved(medium.still, medium.through(x), u, dt)
+            return medium.over(after, dt or self.data.dt)
         return self.step(x, self.left(h, x, u, dt), self.params(h), dt)
 
     def left(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
@@ -351,6 +358,11 @@ def limits_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
 def losses_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
     """What the motion takes off the inputs that drive it."""
     return [(e, v) for e, v in h.pairs if isinstance(e.family, LossFamily)]
+
+
+def _more_than_steps(h: Hypothesis) -> bool:
+    """Whether a hypothesis adds more to the model's steps than what arrives of the inputs."""
+    return bool(rates_of(h) or limits_of(h) or losses_of(h) or moving(h))
 
 
 def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt: float) -> Array:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.moving import moving
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.frozen import Array
@@ -35,6 +36,8 @@ def tangent(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Predicto
     """Predicts from near x (L, B, n) with inputs near u (L, B, m); a compiled model as ever."""
     if not simulated(predictor.data.model):
         return predictor
+    if medium := moving(h):
+        return tangent(predictor, medium.still, medium.through(x), u)
     left, p, kept = predictor.left(h, x, u), predictor.params(h), predictor._inputs
     after, slopes = predictor.step(x, left, p), predictor.slopes(x, left, p)
     return Tangent(predictor.data, kept, x=x, u=left, p=p, after=after, slopes_there=slopes)

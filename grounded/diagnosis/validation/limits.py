@@ -21,6 +21,7 @@ from grounded.effects import (
     Effect,
     InputFamily,
     LossFamily,
+    MediumFamily,
     MemoryFamily,
     RateFamily,
     SensorDelayFamily,
@@ -155,10 +156,10 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
             continue
         if targets & on_off and (isinstance(family, InputFamily) or family is backlash):
             continue
-        if isinstance(family, RateFamily | LossFamily) and targets & unmoved:
+        if isinstance(family, RateFamily | LossFamily | MediumFamily) and targets & unmoved:
             continue
         driven = {t.partition("<-")[0] for t in effect.site.targets}
-        if isinstance(family, RateFamily) and driven & logs:
+        if isinstance(family, RateFamily | MediumFamily) and driven & logs:
             continue  # an old log moves nothing: what is added to it is a sensor's error
         sensors = SensorFamily | SensorDelayFamily | SensorLagFamily
         if isinstance(family, sensors) and targets & (dead | unmoved):

@@ -20,8 +20,8 @@ from grounded.effects.family import (
     SensorDelayFamily,
     SensorLagFamily,
     Site,
-    joining_order,
 )
+from grounded.effects.order import joining_order
 from grounded.effects.registry import Library
 from grounded.errors import GroundedError
 from grounded.search.planner import Planner, planner_with

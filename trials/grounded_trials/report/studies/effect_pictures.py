@@ -2,10 +2,11 @@
 
 Made by `python -m grounded_trials.report.studies.effect_pictures docs`.
 
-A car (for a joint's effects a pendulum) is driven by the same commands in the model (grey) and in
-the model with one effect (orange); shown is the state that the effect changes most, in units of its
-own range: one that moves fast (speed, steering angle, heading rate) where it changes those, else a
-position. Strengths are chosen so that the change is seen: about a quarter of the range.
+A car (for a joint's effects a pendulum, for a medium's a boat) is driven by the same commands in
+the model (grey) and in the model with one effect (orange); shown is the state that the effect
+changes most, in units of its own range: one that moves fast (speed, steering angle, heading rate)
+where it changes those, else a position. Strengths are chosen so that the change is seen: about a
+quarter of the range.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +23,7 @@ from grounded.effects import (
     InputFamily,
     Library,
     LossFamily,
+    MediumFamily,
     MemoryFamily,
     ParamFamily,
     RateFamily,
@@ -30,6 +33,7 @@ from grounded.effects import (
     scales_of,
     wrap,
 )
+from grounded.effects.medium import FAMILIES as MEDIUM
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.models.car import model as car
@@ -42,6 +46,27 @@ ROW = 4  # panels side by side
 SEEN = 0.25  # of a state's range
 
 Drawn = tuple[str, Array, Array]  # a state's name, and it without and with an effect (T + 1,)
+
+
+def _sailing(s: Any, a: Any, p: Any) -> dict[str, Any]:
+    cos, sin = np.cos(s.psi), np.sin(s.psi)
+    return {
+        "u": 0.7 * (a.thrust - s.u) + s.v * s.r,
+        "v": -2.0 * s.v - s.u * s.r,
+        "r": a.rudder - 1.5 * s.r,
+        "x": s.u * cos - s.v * sin,
+        "y": s.u * sin + s.v * cos,
+        "psi": s.r,
+    }
+
+
+boat = Model(
+    name="boat",
+    states={"u": "m/s", "v": "m/s", "r": "rad/s", "x": "m", "y": "m", "psi": "rad"},
+    inputs={"rudder": "1", "thrust": "1"},
+    angles=("psi",),
+    derivative=_sailing,
+)
 
 
 def commands() -> Array:
@@ -115,18 +140,19 @@ def strip(named: Mapping[str, Drawn]) -> str:
 def kind_of(effect: Effect) -> str:
     """The section of docs/effects.md."""
     kinds = {InputFamily: "input", MemoryFamily: "memory", LossFamily: "joint", RateFamily: "rate"}
-    kinds[ParamFamily] = "param"
+    kinds |= {MediumFamily: "rate", ParamFamily: "param"}
     name = next((k for cls, k in kinds.items() if isinstance(effect.family, cls)), "sensor")
     return "sensor" if effect.family.name == "odometry_scale" else name
 
 
 def drawn_of(model: Model, scales: Scales) -> list[Effect]:
-    """All that applies to the car; of the pendulum what acts on its joint."""
+    """All that applies to the car; of the pendulum what acts on its joint, of the boat a medium."""
     if model is car:
         return list(Library().candidates(model, scales))
     library = Library()
     joints = [family for family in library.families if isinstance(family, LossFamily)]
-    names = [f"{family.name}:{target}" for family in joints for target in family.targets(model)]
+    drawn = MEDIUM if model is boat else joints
+    names = [f"{family.name}:{target}" for family in drawn for target in family.targets(model)]
     return [library.effect(name, model, scales) for name in names]
 
 
@@ -134,7 +160,7 @@ def draw_all(folder: Path) -> list[Path]:
     """Writes effects-KIND.svg for every kind; returns their paths."""
     inputs, swings = commands(), 2.0 * commands()[:, :1]
     strips: dict[str, dict[str, Drawn]] = {}
-    for model, u in ((car, inputs), (pendulum, swings)):
+    for model, u in ((car, inputs), (pendulum, swings), (boat, inputs)):
         plain = run(model, model, u)
         scales = scales_of(model, plain, u, DT, STEPS * DT)
         for effect in drawn_of(model, scales):

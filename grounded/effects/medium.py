@@ -1,0 +1,142 @@
+"""What a vehicle floats or flies in moves itself, or pushes it: a current, a wind.
+
+With the heading psi and velocities u ahead, v to the side of a plane (x' = u cos psi - v sin psi,
+y' = u sin psi + v cos psi; `places.body_velocity`), all over ground:
+
+    current      the medium moves by (a, b) over ground, and what the model says of u, v holds of
+                 the velocity through it: with V_c adding (a, b), turned into the vehicle's axes,
+
+                     s+ = V_c(f(V_-c(s))),     x+ = ... + dt a,    y+ = ... + dt b
+
+    push_world   u' += a cos psi + b sin psi,   v' += -a sin psi + b cos psi
+
+The first is Galileo's change of axes and exact for any model of forces that depend on velocities,
+linear drag or quadratic, more of it sideways than ahead: one (a, b) in m/s, where a push would need
+another size for each. What turns with the axes (v r, -u r) comes out as it was. A model without a
+drag of its own does not feel a current; what pushes it all the same (a wind on a hull, a floor that
+tilts) is the second.
+
+T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2011, section 8.3:
+equations of motion with ocean currents, in terms of the relative velocity.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from grounded.compile.names import Named
+from grounded.effects import places
+from grounded.effects.family import (
+    Effect,
+    MediumFamily,
+    Quantity,
+    RateFamily,
+    Scales,
+    Site,
+    Values,
+    per,
+)
+from grounded.frozen import Array
+from grounded.model import Model
+
+SAME = 1e-6  # of the squared length: what may differ
+FELT = 1e-4  # [1/s^2]: what a medium that moves by 0.2 changes of a velocity's rate at least
+
+
+def through_it(effect: Effect, s: Any, c: Any) -> Named:
+    """States s over ground as the medium sees them."""
+    return _moved(s, effect.family.shift(s, c, effect.site), -1.0)  # type: ignore[attr-defined]
+
+
+def over_ground(effect: Effect, s: Any, c: Any, dt: Any) -> dict[str, Any]:
+    """The inverse, dt after: the medium has moved on."""
+    family, site = effect.family, effect.site
+    assert isinstance(family, MediumFamily)
+    after = _moved(_moved(s, family.shift(s, c, site), 1.0), family.drift(c, site), dt)
+    return dict(after)
+
+
+def _moved(s: Any, by: Values, times: Any) -> Named:
+    return Named("state", tuple(s), [s[n] + times * by[n] if n in by else s[n] for n in s])
+
+
+def _in_its_axes(s: Any, c: Any, site: Site) -> Values:
+    """(a, b) of the ground in the axes of the vehicle."""
+    heading = places.heading(site.model)
+    assert heading is not None
+    cos, sin = np.cos(s[heading]), np.sin(s[heading])
+    ahead, aside = site.targets
+    return {ahead: c["a"] * cos + c["b"] * sin, aside: c["b"] * cos - c["a"] * sin}
+
+
+def _over_ground(c: Any, site: Site) -> Values:
+    return dict(zip(places.position(site.model), (c["a"], c["b"]), strict=True))
+
+
+def _pushed(model: Model) -> list[str]:
+    found = places.body_velocity(model)
+    return ["+".join(found)] if found else []
+
+
+def _carried(model: Model) -> list[str]:
+    """Velocities of a model to which it is not the same whether the medium moves."""
+    felt, _ = _felt(model)
+    return _pushed(model) if np.abs(felt).max(initial=0.0) > FELT else []
+
+
+def renamed(model: Model) -> dict[str, str]:
+    """{dropped: kept}: a push is a current where the drag is linear and alike both ways."""
+    felt, axes = _felt(model)
+    lengths = float(np.sum(felt * felt)) * float(np.sum(axes * axes))
+    same = lengths > 0 and float(np.sum(felt * axes)) ** 2 > (1 - SAME) * lengths
+    return {f"push_world:{n}": f"current:{n}" for n in _carried(model)} if same else {}
+
+
+def _felt(model: Model) -> tuple[Array, Array]:
+    """What a medium that moves adds to the rates of (u, v), and its velocity in their axes.
+
+    (S, 2) each, at S samples; (0, 2) of a model that has no such velocities.
+    """
+    if not (found := places.body_velocity(model)):
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    effect = current.at(Site(model, found, Scales()))
+    (x, u), dt = places.samples(model, 8), places.probe(model, places.SHORT)
+    names, c = model.state_names, {"a": 0.1, "b": 0.2}
+    plain = model.system.step(x, u, model.values, dt)
+    start = Named("state", names, list(x.T))
+    seen = np.stack(list(through_it(effect, start, c).values()), axis=-1)
+    after = model.system.step(seen, u, model.values, dt)
+    moved = over_ground(effect, Named("state", names, list(after.T)), c, dt)
+    axes = _in_its_axes(start, c, effect.site)
+    felt = [(moved[n] - plain[:, names.index(n)]) / dt for n in found]
+    return np.stack(felt, axis=-1), np.stack([axes[n] for n in found], axis=-1)
+
+
+def _two(unit: str) -> tuple[Quantity, ...]:
+    return (Quantity("a", unit), Quantity("b", unit))
+
+
+current = MediumFamily(
+    name="current",
+    equation="model of (u, v) through a medium that moves by (a, b) over ground",
+    sentence="the water or air moves, by {a} along the first axis and {b} along the second",
+    targets=_carried,
+    quantities=lambda site: _two(site.unit(site.target)),
+    lookalikes=("push_world", "offset", "slope", "drift_world", "drift_body"),
+    shift=_in_its_axes,
+    drift=_over_ground,
+)
+
+push_world = RateFamily(
+    name="push_world",
+    equation="u' = model + a cos(psi) + b sin(psi), v' = model - a sin(psi) + b cos(psi)",
+    sentence="something pushes it, by {a} along the first axis and {b} along the second",
+    targets=_pushed,
+    quantities=lambda site: _two(per(site.unit(site.target))),
+    lookalikes=("current", "offset", "slope", "patch"),
+    rate=lambda s, a, own, t, c, site: _in_its_axes(s, c, site),
+)
+
+FAMILIES = (current, push_world)

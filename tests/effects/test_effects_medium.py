@@ -1,0 +1,282 @@
+"""What moves or pushes a vehicle over ground: a current and a push, in the axes of the ground."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import grounded as gr
+from grounded import Model, Param, Trial
+from grounded.challenge.truth import Truth, _Run
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.linearise import linearise, sensitivities_of, step_jacobian
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.effects import Effect, Library, scales_of, wrapping_order
+from grounded.effects.places import body_velocity
+from grounded.models.aircraft import model as aircraft
+from grounded.models.car import model as car
+from grounded.search.planner import planner_with
+from grounded.task import Task
+from grounded.utility import Reward
+
+DT, FINE = 0.1, 20
+CURRENT = ("current:u+v", {"a": 0.15, "b": -0.08})
+PUSH = ("push_world:u+v", {"a": 0.15, "b": -0.08})
+DRAG = ("quadratic_drag:u", {"k": 0.3})
+
+
+def rates(s: Any, a: Any, p: Any, water=(0.0, 0.0), push=(0.0, 0.0)) -> dict[str, Any]:
+    """A boat over ground; of its drag only the velocity through the water makes one."""
+    cos, sin = np.cos(s["psi"]), np.sin(s["psi"])
+    ahead = s["u"] - water[0] * cos - water[1] * sin
+    aside = s["v"] + water[0] * sin - water[1] * cos
+    X = push[0] * cos + push[1] * sin
+    Y = push[1] * cos - push[0] * sin
+    drag = p["X"] * ahead + p["XX"] * ahead * np.abs(ahead)
+    return {
+        "u": a["thrust"] - drag + X + s["v"] * s["r"],
+        "v": -p["Y"] * aside + Y - s["u"] * s["r"],
+        "r": a["rudder"] - 1.8 * s["r"],
+        "x": s["u"] * cos - s["v"] * sin,
+        "y": s["u"] * sin + s["v"] * cos,
+        "psi": s["r"],
+    }
+
+
+STATES = {"u": "m/s", "v": "m/s", "r": "rad/s", "x": "m", "y": "m", "psi": "rad"}
+INPUTS = {"thrust": "m/s^2", "rudder": "rad/s^2"}
+SIZES = {"X": 0.4, "XX": 0.3, "Y": 2.0}
+
+
+def boat_of(*, states=STATES, uncertain=True, **sizes: float) -> Model:
+    params = {n: Param(v, "1/s", 0.0, 5.0) if uncertain else Param(v) for n, v in sizes.items()}
+    return Model(
+        name="boat",
+        states=states,
+        inputs=INPUTS,
+        params=params,
+        angles=("psi",),
+        derivative=rates,
+    )
+
+
+boat = boat_of(**SIZES)
+
+
+def driven(water=(0.0, 0.0), push=(0.0, 0.0), count=3, steps=150) -> list[Trial]:
+    """Trials of the real boat, in fine steps of other code, with noise."""
+    rng, found, h = np.random.default_rng(5), [], DT / FINE
+    for _ in range(count):
+        w, t = rng.uniform(0.3, 1.2, 3), DT * np.arange(steps)
+        thrust = 0.5 + 0.3 * np.sign(np.sin(w[0] * t + 1))
+        u = np.stack([thrust, 0.8 * np.sign(np.sin(w[1] * t)) * np.abs(np.sin(w[2] * t))], axis=1)
+        x = np.zeros(6)
+        states = [x]
+        for row in u:
+            a = dict(zip(INPUTS, row, strict=True))
+            for _ in range(FINE):
+
+                def f(z: Any, a: Mapping[str, Any] = a) -> Any:
+                    s = dict(zip(STATES, z, strict=True))
+                    return np.array(list(rates(s, a, SIZES, water, push).values()))
+
+                x = x + h * f(x + 0.5 * h * f(x))
+            x = x + np.array([4e-3, 4e-3, 4e-3, 0, 0, 0]) * rng.standard_normal(6)
+            states.append(x)
+        noise = np.array([0.01, 0.01, 6e-3, 0.01, 0.01, 4e-3]) * rng.standard_normal((steps + 1, 6))
+        y = np.array(states) + noise
+        found.append(Trial(y, u, DT, tuple(STATES), tuple(INPUTS), start_inputs=np.zeros(2)))
+    return found
+
+
+TRIALS = driven()
+
+
+def effect(name: str, model: Model = boat) -> Effect:
+    one = TRIALS[0]
+    scales = scales_of(model, one.states, one.inputs, DT, one.steps * DT)
+    return Library().effect(name, model, scales)
+
+
+def hypothesis(*parts: tuple[str, dict[str, float]], model: Model = boat) -> Hypothesis:
+    h = Hypothesis()
+    for name, values in parts:
+        h = h.plus(effect(name, model), values)
+    return h
+
+
+def adopted(*parts: tuple[str, dict[str, float]], model: Model = boat) -> Model:
+    """The model that plans with these effects."""
+    one, two = np.ones(model.n), np.ones(model.m)
+    task = Task(
+        model=model,
+        dt=DT,
+        target=np.zeros((11, model.n)),
+        reward=Reward(one, one, two, two),
+        start=np.zeros(model.n),
+        past=np.zeros(2),
+        low=-two,
+        high=two,
+    )
+    return planner_with(task, parts).plan.model
+
+
+def offered(model: Model) -> set[str]:
+    names = {e.name for e in Library().candidates(model)}
+    return {n for n in names if n.startswith(("current:", "push_world:"))}
+
+
+def test_the_body_velocities_are_found_from_the_models_rates_not_their_names():
+    def other(s: Any, a: Any, p: Any) -> dict[str, Any]:
+        named = {"u": s.fwd, "v": s.side, "r": s.r, "x": s.x, "y": s.y, "psi": s.psi}
+        found = rates(named, a, SIZES)
+        return {"side": found.pop("v"), "fwd": found.pop("u"), **found}
+
+    states = {"side": "m/s", "fwd": "m/s", **{n: STATES[n] for n in ("r", "x", "y", "psi")}}
+    model = Model(states=states, inputs=INPUTS, angles=("psi",), derivative=other)
+    assert body_velocity(model) == ("fwd", "side")
+    assert offered(model) == {"current:fwd+side", "push_world:fwd+side"}
+
+
+def test_they_are_not_offered_where_one_speed_or_no_plane_is():
+    assert not offered(car) and not offered(aircraft)
+
+
+def test_what_has_no_drag_feels_no_current():
+    """Galileo: it is the same in any medium."""
+    assert offered(boat_of(X=0.0, XX=0.0, Y=0.0)) == {"push_world:u+v"}
+
+
+def test_a_linear_drag_that_is_alike_both_ways_leaves_one_name():
+    """A current is then a push: the data could never tell them apart."""
+    assert offered(boat_of(X=0.7, XX=0.0, Y=0.7)) == {"current:u+v"}
+    assert len(offered(boat)) == len(offered(boat_of(X=0.7, XX=0.0, Y=0.8))) == 2
+
+
+@pytest.mark.parametrize(
+    ("parts", "truth"),
+    [
+        ((CURRENT,), {"water": (0.15, -0.08)}),
+        ((PUSH,), {"push": (0.15, -0.08)}),
+    ],
+    ids=["current", "push_world"],
+)
+def test_the_adopted_model_is_the_boat_in_the_water(parts, truth):
+    """Linear and quadratic drag, ahead and aside: one current, exactly."""
+    model = adopted(*parts)
+    assert model.system.how == "compiled", model.system.note
+
+    def real(s: Any, a: Any, p: Any) -> dict[str, Any]:
+        return rates(s, a, p, **truth)
+
+    want = Model(states=STATES, inputs=INPUTS, params=boat.params, angles=("psi",), derivative=real)
+    x, u = TRIALS[0].states[:-1], TRIALS[0].inputs
+    found = model.system.step(x, u, model.values, 0.02)
+    np.testing.assert_allclose(found, want.system.step(x, u, want.values, 0.02), atol=3e-6)
+
+
+TOGETHER = [(CURRENT,), (PUSH,), (CURRENT, DRAG), (DRAG, CURRENT), (PUSH, CURRENT, DRAG)]
+
+
+@pytest.mark.parametrize("parts", TOGETHER, ids=lambda p: "+".join(n.split(":")[0] for n, _ in p))
+def test_an_adopted_medium_is_the_one_that_was_diagnosed(parts):
+    data, h = prepare(boat, TRIALS[:1]), hypothesis(*parts)
+    want = Predictor(data).next(h, data.y[:-1])
+    order = wrapping_order([e.family for e in h.effects])
+    model = adopted(*(parts[i] for i in order))  # as `adopt` writes them
+    x, u = data.y[:-1].reshape(-1, 6), Predictor(data).inputs(h).reshape(-1, 2)
+    found = model.system.step(x, u, model.values, DT)
+    np.testing.assert_allclose(found.reshape(want.shape), want, atol=1e-9)
+
+
+def test_a_drag_that_joins_a_model_with_a_current_acts_as_it_was_diagnosed():
+    """Over ground: the model that it was found on has the current already."""
+    model = adopted(CURRENT)
+    data, h = prepare(model, TRIALS[:1]), hypothesis(DRAG, model=model)
+    want = Predictor(data).next(h, data.y[:-1])
+    both = adopted(CURRENT, DRAG)
+    x, u = data.y[:-1].reshape(-1, 6), Predictor(data).inputs(h).reshape(-1, 2)
+    found = both.system.step(x, u, both.values, DT)
+    np.testing.assert_allclose(found.reshape(want.shape), want, atol=1e-9)
+
+
+@pytest.mark.parametrize("parts", TOGETHER, ids=lambda p: "+".join(n.split(":")[0] for n, _ in p))
+def test_its_slopes_are_those_of_its_steps(parts):
+    """A current's exactly; where a rate's kick moves the model, to two per cent, as of any rate."""
+    data = prepare(boat, TRIALS[:1])
+    predictor, h, size = Predictor(data), hypothesis(*parts), 1e-6
+    x, u = data.y[:-1], predictor.inputs(h)
+    F = step_jacobian(predictor, h, data.y)
+    both, by_param = sensitivities_of(predictor, h, x, u)
+    np.testing.assert_allclose(both, F, atol=1e-12)
+
+    def near(found, ends):
+        error = np.abs(found - (ends[0] - ends[1]) / (2 * size)).max(axis=-1)
+        assert np.quantile(error, 0.9) < (1e-6 if parts == (CURRENT,) else 0.02)
+
+    for j in range(boat.n):
+        nudge = size * np.eye(boat.n)[j]
+        near(F[..., j], [predictor.advance(h, x + s * nudge, u, data.time) for s in (1, -1)])
+    for k in range(len(boat.params)):
+        shifts = [s * size * np.eye(len(boat.params))[k] for s in (1, -1)]
+        moved = [replace(h, shift=shift) for shift in shifts]
+        near(by_param[..., k], [predictor.advance(one, x, u, data.time) for one in moved])
+
+
+def test_a_black_box_is_linearised_about_what_the_medium_sees():
+    """Its steps are not asked again for each nudged value: slopes stand for them."""
+
+    def step(s: Any, a: Any, p: Any, dt: float) -> dict[str, Any]:
+        if s["u"] > 1e9:  # can't be traced
+            return dict(s)
+        moved = dict(s)
+        for _ in range(10):
+            half = {n: moved[n] + 0.05 * dt * v for n, v in rates(moved, a, p).items()}
+            moved = {n: moved[n] + 0.1 * dt * v for n, v in rates(half, a, p).items()}
+        return moved
+
+    box = Model(states=STATES, inputs=INPUTS, params=boat.params, angles=("psi",), step=step)
+    columns = []
+    for model in (box, boat):
+        data, h = prepare(model, TRIALS[:1]), hypothesis(CURRENT, model=model)
+        columns.append(linearise(Predictor(data), h, data.y))
+    for one, other in zip(*columns, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-3)
+    assert np.abs(columns[0][1][..., 1:]).max() > 0.01
+
+
+def test_the_challenges_truth_has_the_same_current():
+    """Integrated inside the derivative by other code."""
+    truth = Truth(boat, ((effect(CURRENT[0]), CURRENT[1]),))
+    run = _Run(truth, np.random.default_rng(0), np.zeros(6), np.zeros(2), DT)
+    for x, u in zip(TRIALS[0].states[10::30], TRIALS[0].inputs[10::30], strict=False):
+        s, a = dict(zip(STATES, x, strict=True)), dict(zip(INPUTS, u, strict=True))
+        want = rates(s, a, SIZES, water=(0.15, -0.08))
+        np.testing.assert_allclose(run.rates(x, u, 0.0), list(want.values()), atol=1e-5)
+
+
+SEA = [
+    ({"water": (0.15, -0.08)}, "current:u+v"),
+    ({"push": (0.12, 0.2)}, "push_world:u+v"),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("truth", "name"), SEA, ids=lambda v: v if isinstance(v, str) else "")
+def test_the_cause_is_found_with_its_size(truth, name):
+    """Of a boat whose drag is not known either."""
+    found = gr.diagnose(boat_of(X=0.5, XX=0.3, Y=1.6), driven(**truth))
+    first = found.ranking[0]
+    assert found.verdict.effects == (name,) and first.effect == name and first.claimed
+    (size,) = truth.values()
+    for q, value in zip("ab", size, strict=True):
+        assert first.params[q].value == pytest.approx(value, abs=0.012)
+
+
+@pytest.mark.slow
+def test_none_is_claimed_in_still_water():
+    found = gr.diagnose(boat_of(X=0.5, XX=0.3, Y=1.6), driven())
+    assert not {n for n in found.verdict.effects if n.startswith(("current", "push_world"))}
