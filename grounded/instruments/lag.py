@@ -230,7 +230,11 @@ def _mean(pieces: _Pieces, a: Array, b: Array, d: float) -> float:
     scale, part = _dot(a, b) / max(_dot(b, b), 1e-300), _dot(a, bent) / size
     s = scale - part * _dot(curve, b) / max(_dot(b, b), 1e-300)
     rest = a - s * b - part * curve
-    std = max(_scatter(rest * bent, group) for group in pieces.groups) / size
+    blocks = len(a) // (2 * pieces.half + 3)  # what a window joins is one
+    if blocks < BLOCKS // 2:
+        return 0.0  # so few that their scatter says little
+    apart = np.arange(len(a)) * min(blocks, BLOCKS) // len(a)
+    std = max(_scatter(rest * bent, group) for group in (*pieces.groups, apart)) / size
     sure = -np.sign(s) * part > SURE * std and _dot(rest, rest) < TOLD**2 * _dot(a, a)
     return float(np.sqrt(24 * -part / s)) if sure else 0.0
 

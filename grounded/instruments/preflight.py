@@ -65,6 +65,13 @@ from grounded.instruments.rows import kinematic_rows, tied
 from grounded.instruments.single import Signal, judge_signal
 from grounded.instruments.slow_clock import told_by_the_clock
 from grounded.instruments.swapped import judge_columns
+from grounded.instruments.way import (
+    plane_of,
+    rate_agrees,
+    stop_at_axes,
+    stop_at_units,
+    turned_compass,
+)
 from grounded.model import Model
 from grounded.task import Task
 from grounded.trial import Trial
@@ -128,7 +135,7 @@ def preflight(
         judge_stamps(model, bench.trials, ratios)
         judge_units(model, bench.trials, ratios, bench.shown)
         judge_columns(model, bench.trials, bench.shown)
-        mended = list(bench.mismatched())
+        mended = [*bench.ways(), *bench.mismatched()]
         found = [
             *bench.dead(),
             *mended,
@@ -167,6 +174,14 @@ class _Bench:
             states = np.array(trial.states)
             states[:, i] = x
             self.trials[k] = replace(trial, states=states)
+
+    def ways(self) -> Iterator[Finding]:
+        """Of a compass's heading; stops at speeds in the axes of positions, and in knots."""
+        plane = plane_of(self.model, self.rows)
+        if plane is not None:
+            stop_at_axes(plane, self.trials)
+            yield from turned_compass(plane, self.trials)
+            stop_at_units(plane, self.trials)
 
     def mismatched(self) -> Iterator[Finding]:
         """Of signs and degrees by rows of several sensors; stops at other units and exchanges."""
@@ -263,7 +278,10 @@ class _Bench:
     def unit(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """Sign and unit, which are put right; a scale, which may be either sensor's."""
         q, w = (self.model.state_names[k] for k in (relation.i, relation.j))
-        if lag.sign < 0:
+        if lag.sign < 0 and self.turns_away(relation.i):
+            text = f"turns the other way than {w} says and than the course that is travelled"
+            yield self.turned_round(relation.i, text)
+        elif lag.sign < 0:
             yield self.turned_round(relation.j, f"has the opposite sign of the rate of {q}")
         size = float(np.sqrt(lag.low * lag.high))
         for i, factor in ((relation.j, size), (relation.i, 1 / size)):
@@ -275,6 +293,14 @@ class _Bench:
             yield Finding(w, text, "scale", scale=size)
         elif relation.exact and lag.one_size:
             self.refuted |= {f"sensor_scale:{w}", f"sensor_scale:{q}", f"rate_gain:{q}"}
+
+    def turns_away(self, i: int) -> bool:
+        """Whether the course that is travelled agrees with a heading of the other sign."""
+        relation = turned(self.model)
+        if relation is None or relation.k != i:
+            return False
+        found = course(self.model, relation, self.trials)
+        return found is not None and found.agrees < AGREE < found.mirrored
 
     def turned_round(self, i: int, text: str) -> Finding:
         """With the sign of state i changed."""
@@ -369,7 +395,8 @@ class _Bench:
         if found.agrees < AGREE < found.mirrored:
             yield self.turned_round(relation.k, f"turns the other way than {way}")
         elif found.agrees < AGREE < found.degrees:
-            yield self.from_degrees(relation.k)
+            if not rate_agrees(self.model, relation.k, self.trials):
+                yield self.from_degrees(relation.k)
         elif found.agrees > AGREE and abs(found.offset) > TURNED_AWAY:
             text = f"is {np.rad2deg(-found.offset):.0f} degrees off {way}"
             yield Finding(self.model.state_names[relation.k], text, "offset")
