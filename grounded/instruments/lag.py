@@ -51,7 +51,8 @@ class Lag:
         high: upper bracket of the scale.
         coherence: 0 to 1, how much of both is the same.
         scale_std: standard deviation of the scale.
-        mean: b is the mean of a over so long [s], its middle `delay` ago; 0 where none is sure.
+        mean: b is the mean of a over so long [s], its middle `delay` ago; 0 where none is sure,
+            NaN where too little is seen to say.
     """
 
     delay: float
@@ -90,7 +91,9 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
         return max(lags, key=lambda lag: lag.coherence, default=None)
     best = min(clear, key=lambda lag: lag.std)
     apart = float(np.median([abs(one.delay - best.delay) for one in clear]))
-    return replace(best, std=float(np.hypot(best.std, apart)))
+    told = [one for one in clear if not np.isnan(one.mean)]
+    mean = 0.0 if best.filtered or not told else min(told, key=lambda lag: lag.std).mean
+    return replace(best, std=float(np.hypot(best.std, apart)), mean=mean)
 
 
 def reach_of(steps: int, dt: float) -> int:
@@ -223,16 +226,19 @@ def _filter(pieces: _Pieces, a: Array, misfit: float, scale: float) -> tuple[flo
 
 
 def _mean(pieces: _Pieces, a: Array, b: Array, d: float) -> float:
-    """The length [samples] of the mean that b is of a, d samples ago; 0 where none is sure."""
+    """The length [samples] of the mean that b is of a, d samples ago; 0 where none is sure.
+
+    NaN where a wide window leaves so few independent samples that their scatter says little.
+    """
+    blocks = len(a) // (2 * pieces.half + 3)
+    if blocks < BLOCKS // 2:
+        return np.nan
     curve = pieces.moved(d + 1) - 2 * b + pieces.moved(d - 1)
     bent = curve - _dot(curve, b) / max(_dot(b, b), 1e-300) * b
     size = max(_dot(bent, bent), 1e-300)
     scale, part = _dot(a, b) / max(_dot(b, b), 1e-300), _dot(a, bent) / size
     s = scale - part * _dot(curve, b) / max(_dot(b, b), 1e-300)
     rest = a - s * b - part * curve
-    blocks = len(a) // (2 * pieces.half + 3)  # what a window joins is one
-    if blocks < BLOCKS // 2:
-        return 0.0  # so few that their scatter says little
     apart = np.arange(len(a)) * min(blocks, BLOCKS) // len(a)
     std = max(_scatter(rest * bent, group) for group in (*pieces.groups, apart)) / size
     sure = -np.sign(s) * part > SURE * std and _dot(rest, rest) < TOLD**2 * _dot(a, a)

@@ -83,14 +83,32 @@ class Plane:
         """Both positions."""
         return (self.relation.i, self.relation.j)
 
-    def way(self, trial: Trial, factors: Sequence[float] = (), *, mirrored: bool = False) -> Way:
+    def way(self, trial: Trial, factors: Array | None = None, *, mirrored: bool = False) -> Way:
         """How well a trial's way is explained with its states times factors (n,)."""
-        some = replace(trial, states=trial.states * factors) if len(factors) else trial
+        some = trial if factors is None else replace(trial, states=trial.states * factors)
         return _fitted(per_step(self.model, some, self.rows), self.xy, trial.dt, mirrored)
 
     def times(self, states: Sequence[int], factor: float) -> Array:
         """Factors of all states (n,)."""
         return np.where(np.isin(np.arange(self.model.n), states), factor, 1.0)
+
+
+def judge_way(model: Model, trials: list[Trial], rows: Sequence[Row]) -> Iterator[Finding]:
+    """Puts a compass's heading right, in the list; stops at other axes and units of speeds.
+
+    Args:
+        model: however crude.
+        trials: any; those that are put right are replaced.
+        rows: kinematic ones, see `rows.kinematic_rows`.
+
+    Raises:
+        GroundedError: with what to turn, or the scales for [log].
+    """
+    plane = plane_of(model, rows)
+    if plane is not None:
+        stop_at_axes(plane, trials)
+        yield from turned_compass(plane, trials)
+        stop_at_units(plane, trials)
 
 
 def plane_of(model: Model, rows: Sequence[Row]) -> Plane | None:
@@ -234,10 +252,8 @@ def turned_compass(plane: Plane, trials: list[Trial]) -> Iterator[Finding]:
     log = f"scale = -1, offset = {offset:.8g}" * whole
     yield put_right(psi, text, "sign", log, scale=-1.0)
     if sign > 0 and plane.rate is not None:
-        text = f"has the opposite sign{where * (not whole)}, as {psi} that it is the rate of"
-        yield put_right(
-            plane.names((plane.rate,)), text, "sign", "scale = -1" * whole, scale=-1.0
-        )
+        text, r = "has the opposite sign as well", plane.names((plane.rate,))
+        yield put_right(r, text + where * (not whole), "sign", "scale = -1" * whole, scale=-1.0)
 
 
 def _compass(plane: Plane, trial: Trial) -> float | None:
