@@ -51,8 +51,7 @@ class Lag:
         high: upper bracket of the scale.
         coherence: 0 to 1, how much of both is the same.
         scale_std: standard deviation of the scale.
-        mean: b is the mean of a over so long [s], its middle `delay` ago; 0 where none is sure,
-            NaN where too little is seen to say.
+        mean: b is the mean of a over so long [s], its middle `delay` ago; 0 where none is sure.
     """
 
     delay: float
@@ -85,15 +84,15 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
     longest = max((len(a) for a, _ in pairs), default=0)
     reach = reach_of(longest, dt)
     found = [_smoothed(pairs, h, reach) for h in WINDOWS if 2 * h + 2 * reach < longest / 2]
-    lags = [one for p in found if (one := _measured(p, reach, dt)) is not None]
-    clear = [one for one in lags if one.coherence > CLEAR]
+    every = [(p, one) for p in found if (one := _measured(p, reach, dt)) is not None]
+    clear = [(p, one) for p, one in every if one.coherence > CLEAR]
     if not clear:
-        return max(lags, key=lambda lag: lag.coherence, default=None)
-    best = min(clear, key=lambda lag: lag.std)
-    apart = float(np.median([abs(one.delay - best.delay) for one in clear]))
-    told = [one for one in clear if not np.isnan(one.mean)]
-    mean = 0.0 if best.filtered or not told else min(told, key=lambda lag: lag.std).mean
-    return replace(best, std=float(np.hypot(best.std, apart)), mean=mean)
+        return max((one for _, one in every), key=lambda lag: lag.coherence, default=None)
+    best = min((one for _, one in clear), key=lambda lag: lag.std)
+    apart = float(np.median([abs(one.delay - best.delay) for _, one in clear]))
+    told = [one for p, one in clear if p.windows >= BLOCKS // 2]  # wider ones sway by chance
+    sure = bool(told) and min(told, key=lambda lag: lag.std).mean > 0
+    return replace(best, std=float(np.hypot(best.std, apart)), mean=best.mean * sure)
 
 
 def reach_of(steps: int, dt: float) -> int:
@@ -144,6 +143,11 @@ class _Pieces:
         lengths = [len(a) for a in self.a]
         total = np.arange(sum(lengths)) * max(BLOCKS, 2 * len(lengths)) // sum(lengths)
         return total, np.concatenate([np.arange(n) * BLOCKS // (2 * n) for n in lengths])
+
+    @property
+    def windows(self) -> int:
+        """Samples that no window joins."""
+        return sum(len(a) for a in self.a) // (2 * self.half + 3)
 
     @property
     def sides(self) -> list[tuple[Array, Array]]:
@@ -226,21 +230,14 @@ def _filter(pieces: _Pieces, a: Array, misfit: float, scale: float) -> tuple[flo
 
 
 def _mean(pieces: _Pieces, a: Array, b: Array, d: float) -> float:
-    """The length [samples] of the mean that b is of a, d samples ago; 0 where none is sure.
-
-    NaN where a wide window leaves so few independent samples that their scatter says little.
-    """
-    blocks = len(a) // (2 * pieces.half + 3)
-    if blocks < BLOCKS // 2:
-        return np.nan
+    """The length [samples] of the mean that b is of a, d samples ago; 0 where none is sure."""
     curve = pieces.moved(d + 1) - 2 * b + pieces.moved(d - 1)
     bent = curve - _dot(curve, b) / max(_dot(b, b), 1e-300) * b
     size = max(_dot(bent, bent), 1e-300)
     scale, part = _dot(a, b) / max(_dot(b, b), 1e-300), _dot(a, bent) / size
     s = scale - part * _dot(curve, b) / max(_dot(b, b), 1e-300)
     rest = a - s * b - part * curve
-    apart = np.arange(len(a)) * min(blocks, BLOCKS) // len(a)
-    std = max(_scatter(rest * bent, group) for group in (*pieces.groups, apart)) / size
+    std = max(_scatter(rest * bent, group) for group in pieces.groups) / size
     sure = -np.sign(s) * part > SURE * std and _dot(rest, rest) < TOLD**2 * _dot(a, a)
     return float(np.sqrt(24 * -part / s)) if sure else 0.0
 
