@@ -180,15 +180,15 @@ def stop_at_axes(plane: Plane, trials: Sequence[Trial]) -> None:
     told = [_axes(plane, trial) for trial in trials]
     if "world" not in told:
         return
-    speeds, xy, psi = plane.names(plane.speeds), plane.names(plane.xy), plane.names(plane.angles)
+    speeds, xy = plane.names(plane.speeds), plane.names(plane.xy)
+    psi = plane.names((plane.relation.k,))
     said = (
         f"{speeds} are in the axes of {xy}, not in the body's: they are the rates of {xy} as they "
         f"stand, and the model turns them by {psi}"
     )
     mend = (
-        f"Turn {speeds} by minus {psi} where they are logged and in the robot's program "
-        "(u = x' cos psi + y' sin psi, v = y' cos psi - x' sin psi), or write the model in these "
-        "axes"
+        f"Turn {speeds} back by {psi}, into the body's axes, where they are logged and in the "
+        "robot's program, or write the model in theirs"
     )
     raise unusable(trials, _concerned(told, "world"), said, mend)
 
