@@ -315,6 +315,7 @@ def _unit(plane: Plane, trial: Trial) -> tuple[tuple[int, ...], str] | None:
             if near and one.left < FITS:
                 found[states, unit] = one.left * (CLOSE if len(states) == 1 else 1.0)
     if not found:
-        return OTHER if plain.left < FITS else None
+        sure = plain.left < FITS and SURELY * plain.std < OF_ONE_UNIT
+        return OTHER if sure else None
     best = min(found, key=lambda one: found[one])
     return (best[0], best[1])
