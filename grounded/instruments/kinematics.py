@@ -19,7 +19,8 @@ from grounded.effects import places
 from grounded.effects.memory import true_values
 from grounded.effects.registry import partner
 from grounded.frozen import Array, wrapped
-from grounded.instruments.lag import Lag, lag_between
+from grounded.instruments.finding import Finding
+from grounded.instruments.lag import SURE, Lag, lag_between
 from grounded.model import Model
 from grounded.trial import Trial, stretches
 
@@ -28,6 +29,8 @@ FAST = 0.2  # of the largest speed: below it a course means little
 OWN = 200  # logged samples that show how a model's own position follows its velocity
 AGREE = 0.9  # length of the mean of unit vectors that point the same way
 TURNED_AWAY = np.deg2rad(20)  # what no side slip makes
+OFF = 0.03  # of a scale, beyond both of its brackets
+SAME_WAY = 0.95  # of a speed and the way: below it something drifts or slips
 
 
 @dataclass(frozen=True)
@@ -205,3 +208,36 @@ def course(model: Model, relation: Turned, trials: Sequence[Trial]) -> Course | 
         abs(mean(np.pi / 180)),
         lag_between(pairs, dt) if abs(plain) > AGREE else None,
     )
+
+
+def travelled(
+    model: Model, trials: Sequence[Trial], shown: Sequence[int]
+) -> tuple[Turned, Course] | None:
+    """The plane in which a model moves, and the course there; None without sensors for it."""
+    relation = turned(model)
+    if relation is None or not {relation.i, relation.j, relation.k} <= set(shown):
+        return None
+    found = course(model, relation, trials)
+    return None if found is None else (relation, found)
+
+
+def judge_speed(model: Model, relation: Turned, lag: Lag | None, dt: float) -> Iterator[Finding]:
+    """A late or wrong speed: slipping wheels and drifts do it too, so physics has to judge.
+
+    Args:
+        model: whose plane it is.
+        relation: of a body that also moves sideways nothing is said: its noises don't add to zero.
+        lag: of the speed behind the way, see `Course.speed`.
+        dt: [s].
+    """
+    if lag is None or lag.coherence < SAME_WAY or lag.sign < 0 or len(relation.speed) != 1:
+        return
+    where = "+".join(model.state_names[i] for i in (relation.i, relation.j))
+    d, name = float(abs(lag.delay)), model.state_names[relation.speed[0]]
+    if d > max(SURE * lag.std, 0.5 * dt):
+        text = f"{d:.3g} s {'later' if lag.delay > 0 else 'earlier'} than {where} move"
+        yield Finding(name, text, "delay", float(lag.delay), lag.std)
+    if lag.low > 1 + OFF or lag.high < 1 - OFF:
+        size = float(np.sqrt(lag.low * lag.high))
+        text = f"shows {100 * size:.3g} % of the speed of {where}: a sensor, or slip"
+        yield Finding(name, text, "scale", scale=size)

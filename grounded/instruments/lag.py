@@ -84,13 +84,15 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
     longest = max((len(a) for a, _ in pairs), default=0)
     reach = reach_of(longest, dt)
     found = [_smoothed(pairs, h, reach) for h in WINDOWS if 2 * h + 2 * reach < longest / 2]
-    lags = [one for p in found if (one := _measured(p, reach, dt)) is not None]
-    clear = [one for one in lags if one.coherence > CLEAR]
+    every = [(p, one) for p in found if (one := _measured(p, reach, dt)) is not None]
+    clear = [(p, one) for p, one in every if one.coherence > CLEAR]
     if not clear:
-        return max(lags, key=lambda lag: lag.coherence, default=None)
-    best = min(clear, key=lambda lag: lag.std)
-    apart = float(np.median([abs(one.delay - best.delay) for one in clear]))
-    return replace(best, std=float(np.hypot(best.std, apart)))
+        return max((one for _, one in every), key=lambda lag: lag.coherence, default=None)
+    best = min((one for _, one in clear), key=lambda lag: lag.std)
+    apart = float(np.median([abs(one.delay - best.delay) for _, one in clear]))
+    told = [one for p, one in clear if p.windows >= BLOCKS // 2]  # wider ones sway by chance
+    sure = bool(told) and min(told, key=lambda lag: lag.std).mean > 0
+    return replace(best, std=float(np.hypot(best.std, apart)), mean=best.mean * sure)
 
 
 def reach_of(steps: int, dt: float) -> int:
@@ -141,6 +143,11 @@ class _Pieces:
         lengths = [len(a) for a in self.a]
         total = np.arange(sum(lengths)) * max(BLOCKS, 2 * len(lengths)) // sum(lengths)
         return total, np.concatenate([np.arange(n) * BLOCKS // (2 * n) for n in lengths])
+
+    @property
+    def windows(self) -> int:
+        """Samples that no window joins."""
+        return sum(len(a) for a in self.a) // (2 * self.half + 3)
 
     @property
     def sides(self) -> list[tuple[Array, Array]]:

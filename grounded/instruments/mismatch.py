@@ -20,9 +20,8 @@ from grounded.instruments.kinematics import (
     AGREE,
     TURNED_AWAY,
     Turned,
-    course,
     integrals,
-    turned,
+    travelled,
 )
 from grounded.instruments.odd_trial import Odd, missed, spread
 from grounded.instruments.other_units import FACTORS, described, unusable
@@ -136,11 +135,10 @@ def _away(
     model: Model, trials: Sequence[Trial], shown: Sequence[int]
 ) -> tuple[Turned, float] | None:
     """A constant angle [rad] between a heading and the course that was travelled."""
-    relation = turned(model)
-    if relation is None or not {relation.i, relation.j, relation.k} <= set(shown):
+    if (away := travelled(model, trials, shown)) is None:
         return None
-    found = course(model, relation, trials)
-    if found is None or found.agrees <= AGREE or abs(found.offset) <= TURNED_AWAY:
+    relation, found = away
+    if found.agrees <= AGREE or abs(found.offset) <= TURNED_AWAY:
         return None
     return relation, found.offset
 

@@ -4,6 +4,7 @@ odd_trial     a whole trial in other units than the rest
 slow_clock    one pace of the stamps behind several rates that are off
 other_units   a position in mm beside a velocity in m/s
 swapped       two columns of a trial in each other's place
+way           speeds in the axes of positions or in knots, a compass's heading
 mismatch      a position that doesn't move as velocities and angles say
 single        each state by itself
 dead          a velocity that stays at one value while its position moves
@@ -33,15 +34,15 @@ from grounded.instruments.finding import DEGREES, Finding, in_degrees, put_right
 from grounded.instruments.inputs import judge_inputs
 from grounded.instruments.kinematics import (
     AGREE,
+    OFF,
     TURNED_AWAY,
     Integral,
-    Turned,
-    course,
     integrals,
+    judge_speed,
     lag_of,
     logged_behind,
     own_lag,
-    turned,
+    travelled,
 )
 from grounded.instruments.lag import LEAST_S, SURE, Lag, earlier
 from grounded.instruments.late_position import late_positions
@@ -66,16 +67,15 @@ from grounded.instruments.rows import kinematic_rows, tied
 from grounded.instruments.single import Signal, judge_signal
 from grounded.instruments.slow_clock import told_by_the_clock
 from grounded.instruments.swapped import judge_columns
+from grounded.instruments.way import judge_way, rate_agrees
 from grounded.model import Model
 from grounded.task import Task
 from grounded.trial import Trial
 
 LEAST_STEPS = 0.1  # of a time step: less is a matter of time stamps
 ALIKE = 0.9  # coherence from which two sensors are compared at all
-OFF = 0.03  # of a scale, beyond both of its brackets
 UNIT = 0.1  # relative, from which a scale is taken for one of degrees
 SMOOTH = 2.0  # time steps: a velocity that is a mean over less still tells when something happens
-SAME_WAY = 0.95  # of a speed and the way: below it something drifts or slips
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ def preflight(
         judge_stamps(model, bench.trials, ratios)
         judge_units(model, bench.trials, ratios, bench.shown)
         judge_columns(model, bench.trials, bench.shown)
-        mended = list(bench.mismatched())
+        mended = [*judge_way(model, bench.trials, bench.rows), *bench.mismatched()]
         found = [
             *bench.dead(),
             *mended,
@@ -270,7 +270,10 @@ class _Bench:
     def unit(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """Sign and unit, which are put right; a scale, which may be either sensor's."""
         q, w = (self.model.state_names[k] for k in (relation.i, relation.j))
-        if lag.sign < 0:
+        if lag.sign < 0 and self.turns_away(relation.i):
+            text = f"turns the other way than {w} says and than the course that is travelled"
+            yield self.turned_round(relation.i, text)
+        elif lag.sign < 0:
             yield self.turned_round(relation.j, f"has the opposite sign of the rate of {q}")
         size = float(np.sqrt(lag.low * lag.high))
         for i, factor in ((relation.j, size), (relation.i, 1 / size)):
@@ -282,6 +285,11 @@ class _Bench:
             yield Finding(w, text, "scale", scale=size)
         elif relation.exact and lag.one_size:
             self.refuted |= {f"sensor_scale:{w}", f"sensor_scale:{q}", f"rate_gain:{q}"}
+
+    def turns_away(self, i: int) -> bool:
+        """Whether the course that is travelled agrees with a heading of the other sign."""
+        plane = travelled(self.model, self.trials, self.shown)
+        return plane is not None and plane[0].k == i and plane[1].agrees < AGREE < plane[1].mirrored
 
     def turned_round(self, i: int, text: str) -> Finding:
         """With the sign of state i changed."""
@@ -365,35 +373,18 @@ class _Bench:
 
     def plane(self) -> Iterator[Finding]:
         """Of a heading and a speed with the way that was travelled."""
-        relation = turned(self.model)
-        if relation is None or not {relation.i, relation.j, relation.k} <= set(self.shown):
+        plane = travelled(self.model, self.trials, self.shown)
+        if plane is None:
             return
-        found = course(self.model, relation, self.trials)
-        if found is None:
-            return
+        relation, found = plane
+        of = (self.model, relation.k, self.trials)
         where = "+".join(self.model.state_names[i] for i in (relation.i, relation.j))
         way = f"the course that {where} travel"
         if found.agrees < AGREE < found.mirrored:
             yield self.turned_round(relation.k, f"turns the other way than {way}")
-        elif found.agrees < AGREE < found.degrees:
+        elif found.agrees < AGREE < found.degrees and not rate_agrees(*of):
             yield self.from_degrees(relation.k)
         elif found.agrees > AGREE and abs(found.offset) > TURNED_AWAY:
             text = f"is {np.rad2deg(-found.offset):.0f} degrees off {way}"
             yield Finding(self.model.state_names[relation.k], text, "offset")
-        lag = found.speed
-        if lag is None or lag.coherence < SAME_WAY or lag.sign < 0:
-            return
-        yield from self.speed(relation, lag, where)
-
-    def speed(self, relation: Turned, lag: Lag, where: str) -> Iterator[Finding]:
-        """A late or wrong speed: slipping wheels and drifts do it too, so physics has to judge."""
-        if len(relation.speed) != 1:
-            return  # of a body that also moves sideways, whose noises don't add to zero
-        d, name = float(abs(lag.delay)), self.model.state_names[relation.speed[0]]
-        if d > max(SURE * lag.std, 0.5 * self.dt):
-            text = f"{d:.3g} s {'later' if lag.delay > 0 else 'earlier'} than {where} move"
-            yield Finding(name, text, "delay", float(lag.delay), lag.std)
-        if lag.low > 1 + OFF or lag.high < 1 - OFF:
-            size = float(np.sqrt(lag.low * lag.high))
-            text = f"shows {100 * size:.3g} % of the speed of {where}: a sensor, or slip"
-            yield Finding(name, text, "scale", scale=size)
+        yield from judge_speed(self.model, relation, found.speed, self.dt)

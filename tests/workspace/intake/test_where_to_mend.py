@@ -8,6 +8,7 @@ import pytest
 from cli import grounded
 from facts import holding, holds
 from grounded.errors import GroundedError
+from grounded.instruments.finding import Finding
 from grounded.trial import Trial
 from grounded_trials.report.diagnosis_words import instrument_lines
 from grounded_trials.store.trial_file import write_trial
@@ -15,6 +16,7 @@ from grounded_trials.workspace.config import read_config
 from grounded_trials.workspace.diagnosing import instruments_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.ingest import ingest_log
+from grounded_trials.workspace.intake.where_to_mend import where_to_mend
 from workspaces import make
 
 LOG = """
@@ -107,6 +109,30 @@ def test_what_log_has_already_is_counted(tmp_path, kind, has, logged, mended):
     said = ", ".join(f"{key} = {value}" for key, value in keys.items())
     toml.write_text(toml.read_text().replace(has, said))  # read as it was: the same is said
     assert keys_of(found_in(w, kind).log) == keys
+
+
+@pytest.mark.parametrize(
+    ("has", "mended"),
+    [
+        ("", {"scale": -1, "offset": 1.5}),
+        (", offset = 0.25", {"scale": -1, "offset": 1.25}),
+        (", scale = 2, offset = 0.25", {"scale": -2, "offset": 1.25}),
+        (", scale = -1", {"scale": 1, "offset": 1.5}),
+    ],
+)
+def test_an_offset_that_is_found_adds_to_that_of_log(tmp_path, has, mended):
+    w, trial = make(tmp_path / "w"), late()
+    table = LOG.replace('v = { path = "/csv.v" }', f'v = {{ path = "/csv.v"{has} }}')
+    (w.folder / "grounded.toml").write_text((w.folder / "grounded.toml").read_text() + table)
+    t = 0.05 * np.arange(trial.steps)
+    rows = np.column_stack([t, trial.states[:-1], trial.inputs])
+    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header="t,x,v,force", comments="")
+    ingest_log(w, tmp_path / "log.csv", data=True)
+    w = Folder(w.folder)
+    (used,) = (replace(trial, id=one.stored.id) for one in w.trials())
+    compass = Finding("v", "turns the other way", "sign", log="scale = -1, offset = 1.5")
+    (one,) = where_to_mend(w, [used], [compass])
+    assert keys_of(one.log) == mended
 
 
 @pytest.mark.parametrize("entry", ["[log.state.v]\ndelay_s = 0.02", "[log.input.force]\nscale = 2"])

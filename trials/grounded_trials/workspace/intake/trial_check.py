@@ -6,7 +6,6 @@ Whether it ran its candidate at all is asked in `who_drove.py`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 
 import numpy as np
 
@@ -213,9 +212,12 @@ def _mistaken(model: Model, trial: Trial) -> tuple[list[str], tuple[str, ...]]:
 
     known = trial.until(trial.known_steps)
     told = mistaken(model, [known], range(model.n))
-    with suppress(GroundedError):  # of other instruments: the diagnosis tells
-        if told is not None:
+    if told is not None:
+        try:
             mended = preflight(model, [known]).trials
+        except GroundedError:  # of other instruments: the diagnosis tells what looks turned so
+            told = None if told.mistake.turned else told
+        else:
             told = mistaken(model, mended, range(model.n))
     if told is None:
         return [], ()

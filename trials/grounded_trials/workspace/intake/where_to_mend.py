@@ -99,7 +99,8 @@ def _whole(finding: Finding, meta: Mapping[str, str]) -> str:
     if "scale" in keys:
         by = float(keys["scale"])
         keys["scale"] = f"{by * now['scale']:.8g}"
-        keys |= {"offset": f"{by * now['offset']:.8g}"} if now["offset"] else {}
+        offset = by * now["offset"] + float(keys.get("offset", 0.0))
+        keys |= {"offset": f"{offset:.8g}"} if offset else {}
     if "delay_s" in keys:
         keys["delay_s"] = f"{float(keys['delay_s']) + now['delay_s']:.3g}"
     return ", ".join(f"{key} = {value}" for key, value in keys.items())

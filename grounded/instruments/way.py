@@ -1,0 +1,321 @@
+"""The way that was travelled against what speeds and a heading say of it, by one complex factor.
+
+Over stretches of a log what moved is m = x + iy, what the rows of x and y say is w, and
+m = k w + c T with a constant drift c (a current): |k| is a unit, arg k a heading that is off. The
+same is done with the heading turned the other way (a compass), with none (the speeds are in the
+axes of x and y already) and with the way mirrored (x and y exchanged, or one of the other sign).
+Only one of these leaves little of m, however large the factor is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.instruments.finding import Finding, put_right
+from grounded.instruments.kinematics import TURNED_AWAY, Turned, integrals, lag_of, turned
+from grounded.instruments.other_units import unusable
+from grounded.instruments.rows import LEAST, STRETCH, Row, per_step
+from grounded.model import Model
+from grounded.result import listed
+from grounded.trial import Trial
+
+FITS = 0.25  # of what moved: less is left of it by what is right
+BETTER = 3.0  # times less than by anything else
+CLOSE = 2.0  # times: another explains it nearly as well
+BLOCKS = 16  # their scatter is the uncertainty
+UNITS = {"knots": 1.943844, "mph": 2.236936, "ft/s": 3.28084, "km/h": 3.6}  # in a m/s
+FEET = UNITS["ft/s"]  # in a m
+OF_ONE_UNIT, SURELY = 0.015, 3.0  # relative, of a factor; standard deviations within that
+SOUND = 0.1  # of a factor: no unit's
+SAME_SIZE = 1.5  # times, of a heading's rate and the logged one: both in radians
+SNAPPED = np.deg2rad(3)  # an offset is that of a compass: a multiple of a right angle
+TOLD = 0.9  # coherence of a heading with its rate
+SAME, OTHER = ((), "same"), ((), "other")  # units: none of UNITS makes the latter
+
+
+@dataclass(frozen=True)
+class Way:
+    """What of the way is left, and the factor of what is said of it.
+
+    Args:
+        left: rms that is unexplained, over the rms of what moved.
+        size: what moved over what was said.
+        angle: by which the way is turned against what was said [rad].
+        std: relative standard deviation of the size.
+    """
+
+    left: float
+    size: float
+    angle: float
+    std: float
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Rows of two positions that turn with a heading, all of known sensors.
+
+    Args:
+        model: whose rows they are.
+        relation: the positions and the heading.
+        rows: of both positions.
+        speeds: in m/s, of which they are made.
+        angles: with which they turn, the heading among them.
+        rate: the sensor of the heading's rate, None where there is none.
+    """
+
+    model: Model
+    relation: Turned
+    rows: tuple[Row, ...]
+    speeds: tuple[int, ...]
+    angles: tuple[int, ...]
+    rate: int | None
+
+    def names(self, states: Sequence[int]) -> str:
+        """Of some states, in words."""
+        return listed(self.model.state_names[i] for i in states)
+
+    @property
+    def xy(self) -> tuple[int, int]:
+        """Both positions."""
+        return (self.relation.i, self.relation.j)
+
+    def way(self, trial: Trial, factors: Array | None = None, *, mirrored: bool = False) -> Way:
+        """How well a trial's way is explained with its states times factors (n,)."""
+        some = trial if factors is None else replace(trial, states=trial.states * factors)
+        return _fitted(per_step(self.model, some, self.rows), self.xy, trial.dt, mirrored)
+
+    def times(self, states: Sequence[int], factor: float) -> Array:
+        """Factors of all states (n,)."""
+        return np.where(np.isin(np.arange(self.model.n), states), factor, 1.0)
+
+
+def judge_way(model: Model, trials: list[Trial], rows: Sequence[Row]) -> Iterator[Finding]:
+    """Puts a compass's heading right, in the list; stops at other axes and units of speeds.
+
+    Args:
+        model: however crude.
+        trials: any; those that are put right are replaced.
+        rows: kinematic ones, see `rows.kinematic_rows`.
+
+    Raises:
+        GroundedError: with what to turn, or the scales for [log].
+    """
+    plane = plane_of(model, rows)
+    if plane is not None:
+        stop_at_axes(plane, trials)
+        yield from turned_compass(plane, trials)
+        stop_at_units(plane, trials)
+
+
+def plane_of(model: Model, rows: Sequence[Row]) -> Plane | None:
+    """The plane in which a model moves; None where it has none, or no sensors for its rows.
+
+    Args:
+        model: any.
+        rows: kinematic ones, see `rows.kinematic_rows`.
+    """
+    relation = turned(model) if rows else None
+    if relation is None:
+        return None
+    both = tuple(row for row in rows if row.i in (relation.i, relation.j))
+    units, by = list(model.states.values()), sorted({j for row in both for j in row.by})
+    speeds = tuple(j for j in by if units[j] == "m/s")
+    lengths = units[relation.i] == units[relation.j] == "m"
+    if len(both) < 2 or relation.k not in by or not speeds or not lengths:
+        return None
+    rates = [row.by[0] for row in rows if row.i == relation.k and len(row.by) == 1]
+    angles = tuple(j for j in by if units[j] == "rad")
+    return Plane(model, relation, both, speeds, angles, rates[0] if rates else None)
+
+
+def _fitted(
+    steps: Sequence[tuple[Array, Array]], xy: tuple[int, int], dt: float, mirrored: bool
+) -> Way:
+    """The factor of what is said, over the stretches that it explains best."""
+    sums = [
+        (np.cumsum(x[:, xy[0]] + 1j * x[:, xy[1]]), np.cumsum(w[:, xy[0]] + 1j * w[:, xy[1]]))
+        for x, w in steps
+    ]
+    best, far = Way(1.0, 0.0, 0.0, np.inf), max(1, round(STRETCH / dt))
+    while usable := [pair for pair in sums if len(pair[0]) > LEAST * far]:
+        m, w = (
+            np.concatenate([(d := z[k][far:] - z[k][:-far]) - d.mean() for z in usable])
+            for k in (0, 1)
+        )
+        m = m.conj() if mirrored else m
+        moved, said = float((abs(m) ** 2).sum()), float((abs(w) ** 2).sum())
+        if moved > 0 and said > 0:
+            k = complex((w.conj() * m).sum()) / said
+            rest = m - k * w
+            left = float(np.sqrt((abs(rest) ** 2).sum() / moved))
+            if left < best.left:
+                at = np.arange(len(m)) * BLOCKS // len(m)
+                pull = ((w.conj() * rest) / k).real
+                std = float(np.sqrt((np.bincount(at, pull) ** 2).sum())) / said
+                best = Way(left, abs(k), float(np.angle(k)), std)
+        far *= 2
+    return best
+
+
+def _concerned(told: Sequence[object], what: object) -> list[int]:
+    """The trials that tell something, and those that tell nothing where none tells otherwise."""
+    some = {k for k, one in enumerate(told) if one == what}
+    return sorted(some if set(told) - {what, None} else range(len(told)))
+
+
+def stop_at_axes(plane: Plane, trials: Sequence[Trial]) -> None:
+    """Stops at speeds that are the derivatives of x and y: those of a body are meant.
+
+    Only where the heading's own rate agrees with it: one in degrees hardly turns, either.
+
+    Raises:
+        GroundedError: with what to turn.
+    """
+    if len(plane.speeds) < 2 or not rate_agrees(plane.model, plane.relation.k, trials):
+        return
+    told = [_axes(plane, trial) for trial in trials]
+    if "world" not in told:
+        return
+    speeds, xy = plane.names(plane.speeds), plane.names(plane.xy)
+    psi = plane.names((plane.relation.k,))
+    said = (
+        f"{speeds} are in the axes of {xy}, not in the body's: they are the rates of {xy} as they "
+        f"stand, and the model turns them by {psi}"
+    )
+    mend = (
+        f"Turn {speeds} back by {psi}, into the body's axes, where they are logged and in the "
+        "robot's program, or write the model in theirs"
+    )
+    raise unusable(trials, _concerned(told, "world"), said, mend)
+
+
+def _axes(plane: Plane, trial: Trial) -> str | None:
+    """Whether a trial's speeds are in the body's axes or the world's; None where it doesn't say."""
+    plain, world = plane.way(trial), plane.way(trial, plane.times(plane.angles, 0.0))
+    other = plane.way(trial, plane.times(plane.angles, -1.0))
+    if plain.left < FITS and plain.left * BETTER < world.left:
+        return "body"
+    clear = world.left < FITS and world.left * BETTER < min(plain.left, other.left)
+    return "world" if clear and abs(world.angle) < TURNED_AWAY else None
+
+
+def rate_agrees(model: Model, heading: int, trials: Sequence[Trial]) -> int:
+    """The sign with which a heading's rate is the logged one, of its size; 0 where it isn't.
+
+    Args:
+        model: with an exact relation between the two, psi' = r.
+        heading: the state.
+        trials: any; 0 where they have no sensor of the rate.
+    """
+    for relation in integrals(model):
+        if relation.i == heading and relation.exact:
+            lag = lag_of(model, relation, trials)
+            if lag is not None and lag.coherence > TOLD:
+                size = float(np.sqrt(lag.low * lag.high))
+                return lag.sign * (1 / SAME_SIZE < size < SAME_SIZE)
+    return 0
+
+
+def turned_compass(plane: Plane, trials: list[Trial]) -> Iterator[Finding]:
+    """With a heading that turns the other way, from another axis, put right (in the list).
+
+    What its rate says tells whether that is turned as well, or x and y are mirrored.
+    """
+    told = [_compass(plane, trial) for trial in trials]
+    angles = [angle for angle in told if angle is not None and angle]
+    if not angles:
+        return
+    sign = rate_agrees(plane.model, plane.relation.k, trials)
+    angle = float(np.angle(np.exp(1j * np.array(angles)).mean()))
+    right = np.rint(angle / (np.pi / 2)) * np.pi / 2
+    offset = float(right if abs(angle - right) < SNAPPED else angle)
+    some = _concerned([None if angle is None else bool(angle) for angle in told], True)
+    psi, i = plane.names((plane.relation.k,)), plane.relation.k
+    signs, plus = plane.times((i,), -1.0), plane.times((i,), offset) - plane.times((i,), 0.0)
+    if sign > 0 and plane.rate is not None:
+        if not all(_not_mirrored(plane, trials[k]) for k in some if told[k] is not None):
+            return
+        signs = signs * plane.times((plane.rate,), -1.0)
+    for k in some:
+        trials[k] = replace(trials[k], states=trials[k].states * signs + plus)
+    whole = len(some) == len(trials)
+    where = f" in trial{'s' * (len(some) > 1)} {', '.join(trials[k].id for k in some)}"
+    text = (
+        f"turns the other way than the course that {plane.names(plane.xy)} travel"
+        f"{where * (not whole)}: it is {np.rad2deg(offset):.0f} degrees less what is logged "
+        "(a compass counts from north, clockwise)"
+    )
+    log = f"scale = -1, offset = {offset:.8g}" * whole
+    yield put_right(psi, text, "sign", log, scale=-1.0)
+    if sign > 0 and plane.rate is not None:
+        text, r = "has the opposite sign as well", plane.names((plane.rate,))
+        yield put_right(r, text + where * (not whole), "sign", "scale = -1" * whole, scale=-1.0)
+
+
+def _compass(plane: Plane, trial: Trial) -> float | None:
+    """The offset of a heading that turns the other way, 0 of one that doesn't; None: not told."""
+    plain, other = plane.way(trial), plane.way(trial, plane.times(plane.angles, -1.0))
+    if plain.left < FITS and plain.left * BETTER < other.left:
+        return 0.0
+    reflected = plane.way(trial, mirrored=True)
+    clear = other.left < FITS and other.left * BETTER < plain.left
+    if not clear or reflected.left * BETTER < other.left or abs(other.angle) < TURNED_AWAY:
+        return None
+    return other.angle
+
+
+def _not_mirrored(plane: Plane, trial: Trial) -> bool:
+    """Whether x and y exchanged, or one of them of the other sign, explain a way much worse."""
+    other = plane.way(trial, plane.times(plane.angles, -1.0))
+    return plane.way(trial, mirrored=True).left > CLOSE * other.left
+
+
+def stop_at_units(plane: Plane, trials: Sequence[Trial]) -> None:
+    """Stops at speeds in knots, km/h, mph or feet per second, and at positions in feet.
+
+    Raises:
+        GroundedError: with the scales for [log].
+    """
+    told = [_unit(plane, trial) for trial in trials]
+    found = {one for one in told if one is not None and one != SAME}
+    if len(found) != 1 or OTHER in found:
+        return
+    ((states, unit),) = found
+    factor = FEET if unit == "feet" else UNITS[unit]
+    some = "; ".join(f"[log.state.{plane.names((i,))}] scale = {1 / factor:.6g}" for i in states)
+    verb = "looks" if len(states) == 1 else "look"
+    said = (
+        f"{plane.names(states)} {verb} {factor:.4g} times too large (in {unit}): divided by that, "
+        f"positions move as speeds and {plane.names((plane.relation.k,))} say: {some}"
+    )
+    mend = (
+        "Put these scales into [log] (multiply a scale, 1 where none is given) and into the "
+        "robot's program"
+    )
+    raise unusable(trials, _concerned(told, (states, unit)), said, mend)
+
+
+def _unit(plane: Plane, trial: Trial) -> tuple[tuple[int, ...], str] | None:
+    """The states of a trial in another unit, SAME or OTHER; None where it doesn't say."""
+    plain = plane.way(trial)
+    if plain.left < FITS and abs(plain.size - 1) < SOUND:
+        return SAME
+    groups = {plane.speeds: UNITS, plane.xy: {"feet": FEET}}
+    if len(plane.speeds) > 1:
+        groups |= {(i,): UNITS for i in plane.speeds}
+    found = {}
+    for states, units in groups.items():
+        for unit, factor in units.items():
+            one = plane.way(trial, plane.times(states, 1 / factor))
+            near = max(abs(one.size - 1), SURELY * one.std) < OF_ONE_UNIT
+            if near and one.left < FITS:
+                found[states, unit] = one.left * (CLOSE if len(states) == 1 else 1.0)
+    if not found:
+        sure = plain.left < FITS and SURELY * plain.std < OF_ONE_UNIT
+        return OTHER if sure else None
+    best = min(found, key=lambda one: found[one])
+    return (best[0], best[1])
