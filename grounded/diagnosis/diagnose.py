@@ -130,7 +130,7 @@ def diagnose(
     looked = preflight(subject, [*trials, *compare], options.hidden)
     trials = looked.trials
     data = prepare(model, trials, latency, past, options.hidden)
-    judge_commands(model, trials, options.hidden)
+    judge_commands(model, trials, options.hidden, looked.findings)
     filters = {model.state_names.index(name): tau for name, tau in looked.filters.items()}
     data = replace(data, filters=filters)
     known = limits(data, looked.left_out)

@@ -19,7 +19,7 @@ import numpy as np
 
 from grounded.effects import places
 from grounded.frozen import Array
-from grounded.instruments.finding import DEGREES
+from grounded.instruments.finding import DEGREES, Finding
 from grounded.instruments.inputs import OVER
 from grounded.instruments.kinematics import integrals
 from grounded.instruments.other_units import unusable
@@ -126,13 +126,30 @@ def mistaken(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Tol
     return _best(whole) if whole else None
 
 
-def judge_commands(model: Model, trials: Sequence[Trial], hidden: Sequence[str] = ()) -> None:
+def as_logged(model: Model, told: Told, findings: Sequence[Finding]) -> Told:
+    """The same without states that other instruments had turned: as they are logged they are right.
+
+    Of a position and a velocity that disagree in sign one is turned to agree; that it was the other
+    one only the model tells.
+    """
+    done = {f.signal for f in findings if f.kind == "sign" and f.corrected}
+    left = tuple(i for i in told.mistake.turned if model.state_names[i] not in done)
+    return replace(told, mistake=replace(told.mistake, turned=left)) if left else told
+
+
+def judge_commands(
+    model: Model,
+    trials: Sequence[Trial],
+    hidden: Sequence[str] = (),
+    findings: Sequence[Finding] = (),
+) -> None:
     """Stops at trials with commands, or joints, that the model says are mistaken.
 
     Args:
         model: however crude.
         trials: with what other instruments do put right, see `preflight`.
         hidden: states that no sensor has.
+        findings: of the other instruments.
 
     Raises:
         GroundedError: with the signals and what mends them.
@@ -140,6 +157,7 @@ def judge_commands(model: Model, trials: Sequence[Trial], hidden: Sequence[str] 
     shown = [i for i, name in enumerate(model.state_names) if name not in hidden]
     told = mistaken(model, trials, shown)
     if told is not None:
+        told = as_logged(model, told, findings)
         mend = mended_by(model, told)
         raise unusable(trials, range(len(trials)), described(model, told), mend)
 

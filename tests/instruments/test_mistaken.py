@@ -169,6 +169,15 @@ def test_a_sensor_that_counts_the_other_way_is_named_with_its_velocity(turned):
     assert all(f"[log.state.{name}]" in mended_by(ball(), told) for name in names)
 
 
+def test_a_position_that_counts_the_other_way_beside_a_right_velocity_is_named_alone():
+    """The distance from the top as the height: both were to be turned, then one back again."""
+    trials = [Mistake(turned=(0,)).mended(driven(ROLLED, k)) for k in range(2)]
+    with pytest.raises(GroundedError) as refused:
+        gr.diagnose(ball(), trials)
+    said = str(refused.value)
+    assert "x looks turned" in said and "[log.state.x]" in said and "[log.state.v]" not in said
+
+
 @pytest.mark.parametrize("gain", [-1.0, 0.0, 0.3])
 def test_a_turned_dead_or_weak_input_is_no_turned_sensor(gain):
     trials = [driven(ROLLED, k, gains=np.array([gain])) for k in range(2)]

@@ -176,7 +176,7 @@ def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Findi
     memory = planner.plan.model.state_names[planner.task.model.n :]
     used = _chosen(workspace, trials)
     found = preflight(planner.plan, [planner.lift(trial) for trial in used], memory)
-    judge_commands(planner.plan.model, found.trials, memory)
+    judge_commands(planner.plan.model, found.trials, memory, found.findings)
     return where_to_mend(workspace, used, found.findings)
 
 

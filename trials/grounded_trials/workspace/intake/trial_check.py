@@ -207,18 +207,19 @@ def _in_degrees(task: Task, trial: Trial) -> list[str]:
 
 def _mistaken(model: Model, trial: Trial) -> tuple[list[str], tuple[str, ...]]:
     """What the model says of exchanged commands or other units, and the inputs in other units."""
-    from grounded.instruments.mistaken import described, mended_by, mistaken
+    from grounded.instruments.mistaken import as_logged, described, mended_by, mistaken
     from grounded.instruments.preflight import preflight
 
     known = trial.until(trial.known_steps)
     told = mistaken(model, [known], range(model.n))
     if told is not None:
         try:
-            mended = preflight(model, [known]).trials
+            looked = preflight(model, [known])
         except GroundedError:  # of other instruments: the diagnosis tells what looks turned so
             told = None if told.mistake.turned else told
         else:
-            told = mistaken(model, mended, range(model.n))
+            told = mistaken(model, looked.trials, range(model.n))
+            told = told and as_logged(model, told, looked.findings)
     if told is None:
         return [], ()
     again = f"{mended_by(model, told)}, and ingest it again, without {trial.id or 'this one'}"
