@@ -436,3 +436,20 @@ def test_logs_are_data_without_a_target_whatever_errors_would_weigh(tmp_path):
     other = Workspace(w.folder)
     taken = other.ingest(log, data=True)
     assert other.trials()[0].stored.id == taken.trial and not other.task.reward.state.any()
+
+
+def test_a_hole_in_a_log_is_told_where_it_is_not_taken_for_the_run(tmp_path):
+    """Of a run that lacked a second somebody else was said to have driven, and no more."""
+    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
+    policy = w.propose().candidate.policy
+    log = record(w, tmp_path / "run.csv", policy, 0.5)
+    table = np.loadtxt(log, delimiter=",", skiprows=1)
+    table[:, 3] *= -0.4  # nobody's
+    table = np.delete(table, slice(120, 160), axis=0)
+    np.savetxt(log, table, "%.5f", ",", header="t,x,v,force", comments="")
+    config = w.folder / "grounded.toml"
+    text = config.read_text().replace('path = "/csv.x"', 'path = "/csv.x"\nmax_age_s = 2')
+    text = text.replace('path = "/csv.v"', 'path = "/csv.v"\nmax_age_s = 2')
+    config.write_text(text)
+    with pytest.raises(GroundedError, match=holding("did not run", "no sample of", "0.41")):
+        Workspace(w.folder).ingest(log)

@@ -63,6 +63,7 @@ from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of
 from grounded_trials.workspace.proposing import candidate_named, latest_candidates, standing_in
 
+HOLE = 10.0  # usual intervals without a sample
 EXACT = 0.1  # of how finely commands are known: a log of what the program saw and sent
 
 
@@ -219,6 +220,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             f" Or {listed(guessed)}, which [estimate] finds here, {_is(guessed)} not what "
             "its program steered by: have it log its own, and map that in [log] too."
         )
+    said += _hole(read)
     if other:
         raise GroundedError(
             f"{said} Take it in with --candidate {other}, with --candidate {ran} all the same, or "
@@ -230,6 +232,17 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         f"{said} Take it in with --data for fitting and diagnosis, or with --candidate {ran} all "
         f"the same{begins}",
         NextCommand("ingest", (str(path), "--data")),
+    )
+
+
+def _hole(read: Read) -> str:
+    """The longest time of which a log tells nothing; "" where its samples never stop for long."""
+    longest = max(read.signals, key=lambda one: one.largest_gap_s, default=None)
+    if longest is None or not longest.largest_gap_s * longest.rate_hz > HOLE:
+        return ""
+    return (
+        f" It has no sample of {longest.name} for {longest.largest_gap_s:.2g} s, from "
+        f"{longest.largest_gap_at_s:.2f} s on: that may be why."
     )
 
 
