@@ -105,7 +105,7 @@ def command(
         text = with_unit(f"{number(low)} to {number(high)}", model.states[name])
         show(field(name, text, "  "))
     for kind, by in (
-        ("state", "1 for an error as large as a range here"),
+        ("state", "1 for an error as large as a range here, a position's smaller one"),
         ("input_change", "0.04 / (range of [limits])^2"),
     ):
         if (weights := reward.get(kind, {})) != before.get(kind, {}):

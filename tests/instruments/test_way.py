@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from facts import holding
+from facts import holding, holds
 from grounded import Model
 from grounded.errors import GroundedError
 from grounded.frozen import Array
@@ -15,6 +15,7 @@ from grounded.instruments.preflight import preflight
 from grounded.instruments.rows import kinematic_rows, tied
 from grounded.instruments.way import plane_of, stop_at_axes
 from grounded.trial import Trial
+from grounded_trials.workspace.intake.trial_check import travelled
 
 DT = 0.1
 STATES = {"u": "m/s", "v": "m/s", "r": "rad/s", "x": "m", "y": "m", "psi": "rad"}
@@ -204,3 +205,18 @@ def test_a_gyro_that_is_no_difference_of_the_heading_stays():
             trial = sailed(seed + 10, steps)
             lag = lag_of(BOAT, heading, [trial])
             assert lag is not None and lag.mean == 0
+
+
+@pytest.mark.parametrize(
+    "fault, words",
+    [
+        (in_the_world, ("u and v", "axes of x and y")),
+        (times(1.944, "u", "v"), ("u and v", "knots")),
+        (compass, ("psi", "scale = -1", "[log.state.psi]")),
+        (lambda x: x, ()),
+    ],
+)
+def test_it_is_told_when_a_log_is_taken_in(fault, words):
+    """Runs with a twist in the world's axes were taken in without a word, and planned from."""
+    told = travelled(BOAT, logged(fault)[0])
+    assert len(told) == bool(words) and all(holds(one, *words) for one in told)

@@ -500,8 +500,9 @@ def test_a_column_that_stays_has_the_range_of_its_unit():
     columns = {"x": 2 * t, "y": 0 * t, "psi": 0 * t, "v": 0.01 * t}
     weights = equal_weights(columns, units)
     assert weights == pytest.approx({"x": 0.25, "y": 0.25, "psi": 1.0, "v": 100.0})
-    both = equal_weights({"x": 9 * t, "y": 3 * t, "v": t}, units, ("x", "y"))
-    assert both["x"] == both["y"] == equal_weights({"x": 9 * t}, units)["x"]  # of one position
+    for y, as_much in ((3 * t, 3.0), (0.5 * t, 1.8), (0 * t, 9.0)):  # axes of one position
+        both = equal_weights({"x": 9 * t, "y": y, "v": t}, units, ("x", "y"))
+        assert both["x"] == both["y"] == pytest.approx(as_much**-2)
     assert equal_weights({"x": 5 + 0 * t}, units) == pytest.approx({"x": 0.04})  # a step
 
 

@@ -211,7 +211,7 @@ def test_a_start_that_another_state_would_hold_is_told_with_it(tmp_path):
     limits = "[safety]\nh = [0.15, 0.9]\n[limits]\npwm = [0, 100]"
     file.write_text(file.read_text().replace("[limits]", limits))
     proposed = Workspace(w.folder).propose()
-    assert proposed.standing.ending == "not allowed"
+    assert proposed.standing.ending == "not allowed" and proposed.then.verb == "propose"
     (note,) = (n for n in proposed.proposal.notes if "counts as held" in n)
     assert "fan = 2700, pwm = 48.21" in note and "v changes" in note
     assert not any("widen" in n for n in proposed.proposal.notes)
@@ -220,6 +220,11 @@ def test_a_start_that_another_state_would_hold_is_told_with_it(tmp_path):
     )
     file.write_text(text)
     assert Workspace(w.folder).propose().candidate is not None
+    heavier = 'effects = [{name = "offset:v", c = -0.981}]\n[task]'  # a tenth more to carry
+    given = "start = { h = 0.2 }"
+    file.write_text(re.sub(r"(?m)^start = .*$", given, text.replace("[task]", heavier)))
+    (note,) = (n for n in Workspace(w.folder).propose().proposal.notes if "counts as held" in n)
+    assert "fan = 2970, pwm = 53.04" in note
 
 
 def test_a_model_that_stands_without_input_needs_none(blank):

@@ -73,7 +73,7 @@ def left_open(workspace: Folder, first: Candidate | None, ending: str) -> list[s
     if first is not None:
         found += _held_back(task, first) or _falls_short(task, first)
         found += _shaken(workspace, first)
-    held = _held_before(workspace)
+    held = held_before(workspace)
     found += held
     if ending == "not allowed" and not held:
         found.append(
@@ -188,33 +188,37 @@ def _most_missed(task: Task, plan: Trial) -> str:
     return text if share > MISSED else ""
 
 
-def _held_before(workspace: Folder) -> list[str]:
+def held_before(workspace: Folder) -> list[str]:
     """That the robot does not stand at its start, but would under another input held before.
 
     Or with other values of states that nobody gave, a fan's speed say. Nothing is said of an input
     whose value somebody gave, nor where it makes no difference: without a price on changes and
     without latency the first command is as if nothing had been held.
     """
-    task, config = workspace.task, workspace.config.task
-    assert task.latency is not None
-    names, states = task.model.input_names, task.model.state_names
-    free = np.array(
-        [s not in config.start and np.isnan(x) for s, x in zip(states, task.target[0], strict=True)]
-    )
+    base, task, config = workspace.task, workspace.planner.plan, workspace.config.task
+    assert base.latency is not None
+    names, states, n = task.model.input_names, task.model.state_names, base.model.n
+    memory = np.arange(task.model.n) >= n  # of adopted effects: it settles
+    free = memory.copy()
+    free[:n] = [
+        s not in config.start and np.isnan(x) for s, x in zip(states, base.target[0], strict=False)
+    ]
     chosen = any(name in config.start for name in names)
-    priced = bool(task.reward.input_change.any() or task.latency.any())
-    stands = None if chosen or not priced else standing(task, np.zeros(len(states), np.bool_))
-    if stands is None and free.any():
+    priced = bool(base.reward.input_change.any() or base.latency.any())
+    stands = None if chosen or not priced else standing(task, memory)
+    if stands is None and free[:n].any():
         stands = standing(task, free)
     if stands is None:
         return []
-    units, given = {**task.model.states, **task.model.inputs}, np.append(task.start, task.past)
+    units = {**base.model.states, **task.model.inputs}
+    given = np.concatenate([task.start[:n], task.past])
+    stands = np.concatenate([stands[:n], stands[len(states) :]])
     rate = moved_at_start(task, task.past) / task.dt
-    k = int(np.argmax(np.abs(rate)))
+    k = int(np.argmax(np.abs(rate[:n])))
     other = [
-        (n, at, to)
-        for n, at, to in zip(units, given, stands, strict=True)
-        if n in names or abs(to - at) > STILL * (1 + abs(to))
+        (name, at, to)
+        for name, at, to in zip(units, given, stands, strict=True)
+        if name in names or abs(to - at) > STILL * (1 + abs(to))
     ]
     held = ", ".join(with_unit(f"{name} = {at:.4g}", units[name]) for name, at, _ in other)
     told = ", ".join(f"{name} = {to:.4g}" for name, _, to in other)

@@ -105,7 +105,7 @@ def propose_in(workspace: Folder) -> Proposed:
         notes = notes or _void(workspace, before)
         notes = [f"{note}; run {candidate.id} in its place" for note in notes]
     if not proposal.standing.history:
-        from grounded_trials.workspace.first_plan import left_open
+        from grounded_trials.workspace.first_plan import held_before, left_open
 
         notes += left_open(workspace, candidate, proposal.standing.ending)
     if doubt := proposal.standing.doubt:
@@ -116,7 +116,10 @@ def propose_in(workspace: Folder) -> Proposed:
             notes.append(f"{doubt}: `{rendered(NextCommand('diagnose'), workspace.address)}`")
     proposal = replace(proposal, notes=(*proposal.notes, *notes))
     if candidate is None:
-        return Proposed(proposal, None, status_of(workspace, proposal.standing).then)
+        then = status_of(workspace, proposal.standing).then
+        if not proposal.standing.history and held_before(workspace):
+            then = NextCommand("propose")  # once [task] start is as the note says
+        return Proposed(proposal, None, then)
     path = workspace.candidate_path(candidate.id)
     return Proposed(proposal, path, to_run(workspace, candidate.id))
 

@@ -117,6 +117,7 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
 
 ROW_LIMIT = 200_002
 LEAST = 0.1  # range of a column of the target that weights go by
+NARROW = 0.2  # of a position's largest range: the least that its smallest one counts for
 UNKNOWN = 1.0  # in its own unit: that of a column that is constant, as all of its unit
 FULL = {"%": (-100.0, 100.0)}  # what an input may be, by its unit, where nothing says it
 CHANGE = 0.01  # the weight on the changes of an input from -1 to 1
@@ -280,13 +281,15 @@ def equal_weights(
     Args:
         columns: of the target, by state.
         units: of the model's states.
-        together: axes of one position: a metre costs the same along each, by the largest range.
+        together: axes of one position: a metre costs the same along each, by the smallest range,
+            but of one that is hardly any.
     """
     ranges = {
         name: float(np.ptp(values) or np.abs(values).max()) for name, values in columns.items()
     }
-    widest = max((own for name, own in ranges.items() if name in together), default=0.0)
-    ranges |= {name: widest for name in ranges if name in together}
+    if axes := [own for name, own in ranges.items() if name in together and own > 0]:
+        narrow = max(min(axes), NARROW * max(axes))
+        ranges |= {name: narrow for name in ranges if name in together}
     size: dict[str, float] = {}
     for name, own in ranges.items():
         unit = units.get(name, "")

@@ -57,7 +57,7 @@ from grounded_trials.workspace.intake.stored_before import (
     same_recording,
     what_repeats,
 )
-from grounded_trials.workspace.intake.trial_check import warnings_about
+from grounded_trials.workspace.intake.trial_check import mistaken_in, warnings_about
 from grounded_trials.workspace.intake.who_drove import OTHERS, Following, suspicion
 from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of
@@ -212,7 +212,8 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             f"diagnosis, or with --candidate {ran} all the same",
             NextCommand("ingest", (str(path), "--data")),
         )
-    if read.log and (named := crossed_in(read.log)):
+    sent, _ = mistaken_in(workspace.base_model, replace(read.trial, id=""))
+    if named := [*(crossed_in(read.log) if read.log else ()), *sent]:
         raise GroundedError(f"{path} is not read as a run of {ran}: {'; '.join(named)}")
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
     if log and (guessed := [n for n in log.names[0] if n not in log.logged]):

@@ -6,6 +6,7 @@ Whether it ran its candidate at all is asked in `who_drove.py`.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -66,7 +67,8 @@ def warnings_about(
         for one in dead_rates(model, whole, relations)
     ]
     found += _in_degrees(task, whole)
-    sent, scaled = _mistaken(model, whole)
+    found += travelled(model, whole)
+    sent, scaled = mistaken_in(model, whole)
     found += sent
     if not trial.candidate:
         return (*found, *_beyond(task, whole, scaled))
@@ -205,7 +207,22 @@ def _in_degrees(task: Task, trial: Trial) -> list[str]:
     return found
 
 
-def _mistaken(model: Model, trial: Trial) -> tuple[list[str], tuple[str, ...]]:
+def travelled(model: Model, trial: Trial) -> list[str]:
+    """What the way that was travelled says of heading and speeds: other axes, a compass, knots."""
+    from grounded.instruments.rows import kinematic_rows, tied
+    from grounded.instruments.way import judge_way
+
+    rows = tied(kinematic_rows(model, range(model.n)))
+    known = replace(trial.until(trial.known_steps), id="")
+    try:
+        with np.errstate(all="ignore"):
+            odd = list(judge_way(model, [known], rows))
+    except GroundedError as error:
+        return [str(error).replace("in trial number 1 ", "")]
+    return [f"{one.signal} {one.finding}: {one.log} in [log.state.{one.signal}]" for one in odd]
+
+
+def mistaken_in(model: Model, trial: Trial) -> tuple[list[str], tuple[str, ...]]:
     """What the model says of exchanged commands or other units, and the inputs in other units."""
     from grounded.instruments.mistaken import as_logged, described, mended_by, mistaken
     from grounded.instruments.preflight import preflight
@@ -222,7 +239,8 @@ def _mistaken(model: Model, trial: Trial) -> tuple[list[str], tuple[str, ...]]:
             told = told and as_logged(model, told, looked.findings)
     if told is None:
         return [], ()
-    again = f"{mended_by(model, told)}, and ingest it again, without {trial.id or 'this one'}"
+    stored = f", without {trial.id}" if trial.id else ""
+    again = f"{mended_by(model, told)}, and ingest it again{stored}"
     scaled = () if told.mistake.swap else told.mistake.inputs
     return [f"{described(model, told)}. {again}"], tuple(model.input_names[j] for j in scaled)
 
