@@ -227,6 +227,21 @@ def test_a_start_that_another_state_would_hold_is_told_with_it(tmp_path):
     assert "fan = 2970, pwm = 53.04" in note
 
 
+def test_a_friction_too_steep_for_a_step_is_followed_by_a_plan(blank):
+    """A width of 0.06 % of the fastest speed: a ball was planned to 4 m instead of 0.6, or not."""
+    file, way = blank.folder / "grounded.toml", np.linspace(0, 1, 41)
+    blank.target({"x": 0.2 * way**2 * (3 - 2 * way)})
+    steep = 'effects = [{name = "coulomb_friction:v", c = 0.25, width = 1e-5}]\n[task]'
+    plain = steep.replace("1e-5", "0.01")
+    text, found = file.read_text(), []
+    for effects in (plain, steep):
+        file.write_text(text.replace("[task]", effects, 1))
+        candidate = Workspace(blank.folder).propose().candidate
+        found.append(candidate.predicted_utility)
+        assert candidate.predicted_states[-1, 0] == pytest.approx(0.2, abs=0.05)
+    assert found[1] == pytest.approx(found[0], rel=0.1, abs=0.01)
+
+
 def test_a_model_that_stands_without_input_needs_none(blank):
     assert not blank.config.task.start and not blank.task.past.any()
 
