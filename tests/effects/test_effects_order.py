@@ -155,6 +155,19 @@ def test_what_is_found_on_an_adopted_model_acts_before_what_it_has(new):
     np.testing.assert_allclose(adopted(parts), want, atol=1e-9)
 
 
+def test_a_gain_of_a_rate_takes_along_what_was_adopted_on_that_rate():
+    """Found on the whole rate, it was written beside it: predictions were five times worse."""
+    old = [{"name": PULL[0], **PULL[1]}, {"name": "viscous_friction:v", "k": 0.1}]
+    model = planner_of(task(), old).plan.model
+    want = predicted((("rate_gain:delta", {"g": 0.3}),), model)
+    found = in_order(old, [{"name": "rate_gain:delta", "g": 0.3}])
+    parts = [(e["name"], {k: v for k, v in e.items() if k != "name"}) for e in found]
+    np.testing.assert_allclose(adopted(parts), want, atol=1e-4)
+    by_name = dict(parts)
+    assert by_name[PULL[0]] == {"c": pytest.approx(0.13)}
+    assert by_name["viscous_friction:v"] == {"k": 0.1}  # of another rate
+
+
 def test_effects_are_adopted_in_the_order_in_which_they_were_fitted():
     """By credit the gain comes first, as `next:` prints it; the dead zone acts first."""
     fitted = (ZONE, WEAKER, DELAY)

@@ -17,6 +17,7 @@ from typing import Any
 from grounded.effects.family import (
     Effect,
     Family,
+    RateFamily,
     Scales,
     SensorDelayFamily,
     SensorLagFamily,
@@ -28,6 +29,7 @@ from grounded.errors import GroundedError
 from grounded.search.planner import Planner, planner_with
 from grounded.task import Task
 
+LINEAR = ("c", "k", "A", "B", "a", "b")  # the numbers of an added rate that it grows with
 STEEP = 3.0  # times its width: what a dry friction takes off a speed in a step, at most
 
 
@@ -63,13 +65,30 @@ def in_order(
 ) -> list[dict[str, Any]]:
     """Effects that a model has and those that were diagnosed on it, in the order in which they act.
 
+    A gain of a rate was found on the rate that the model had by then, adopted effects and all; here
+    it acts on the model's own, so that those grow with it.
+
     Args:
         old: of the model, as [model] effects has them.
         new: in the order of the diagnosis (`Diagnosis.joining`).
     """
-    library, both = installed_effects(), (old, new)
+    library = installed_effects()
+    both = ([_grown(library, effect, new) for effect in old], new)
     families = [[library.family(str(e["name"]).partition(":")[0]) for e in some] for some in both]
     return [dict(both[late][i]) for late, i in joining_order(*families)]
+
+
+def _grown(
+    library: Library, effect: Mapping[str, Any], new: Sequence[Mapping[str, Any]]
+) -> Mapping[str, Any]:
+    """An adopted effect on a rate, as much larger as a gain of that rate that joins the model."""
+    name, _, target = str(effect["name"]).partition(":")
+    family, driven = library.family(name), target.partition("<-")[0]
+    gains = [1 + e["g"] for e in new if e["name"] == f"rate_gain:{driven}"]
+    if not gains or not isinstance(family, RateFamily) or family.needs_own:
+        return effect
+    grown = {k: float(f"{v * gains[0]:.8g}") for k, v in effect.items() if k in LINEAR}
+    return {**effect, **grown}
 
 
 def planner_of(task: Task, effects: Sequence[Mapping[str, Any]]) -> Planner:
