@@ -162,8 +162,10 @@ def test_a_gain_of_a_rate_takes_along_what_was_adopted_on_that_rate():
     want = predicted((("rate_gain:delta", {"g": 0.3}),), model)
     found = in_order(old, [{"name": "rate_gain:delta", "g": 0.3}])
     parts = [(e["name"], {k: v for k, v in e.items() if k != "name"}) for e in found]
-    np.testing.assert_allclose(adopted(parts), want, atol=1e-4)
     by_name = dict(parts)
+    beside = adopted([(PULL[0], PULL[1]), *parts[1:]])
+    off, before = (np.abs(one - want).max() for one in (adopted(parts), beside))
+    assert off < 5e-3 < before / 4  # half a step's kick of the one or the other
     assert by_name[PULL[0]] == {"c": pytest.approx(0.13)}
     assert by_name["viscous_friction:v"] == {"k": 0.1}  # of another rate
 
