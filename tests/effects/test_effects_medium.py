@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import linearise, sensitivities_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.report import Diagnosis, Verdict
 from grounded.effects import Effect, Library, scales_of, wrapping_order
 from grounded.effects.places import body_velocity
 from grounded.models.aircraft import model as aircraft
@@ -21,6 +23,7 @@ from grounded.models.car import model as car
 from grounded.search.planner import planner_with
 from grounded.task import Task
 from grounded.utility import Reward
+from grounded_trials.workspace.diagnosing import _over_ground
 
 DT, FINE = 0.1, 20
 CURRENT = ("current:u+v", {"a": 0.15, "b": -0.08})
@@ -280,3 +283,21 @@ def test_the_cause_is_found_with_its_size(truth, name):
 def test_none_is_claimed_in_still_water():
     found = gr.diagnose(boat_of(X=0.5, XX=0.3, Y=1.6), driven())
     assert not {n for n in found.verdict.effects if n.startswith(("current", "push_world"))}
+
+
+@pytest.mark.parametrize(
+    "adopted, claimed, told",
+    [
+        (("current:u+v",), ("offset:u",), True),
+        (("current:u+v",), (), False),
+        (("delay:port",), ("offset:u",), False),
+    ],
+)
+def test_what_is_found_beside_an_adopted_current_is_told_to_act_over_the_ground(
+    adopted, claimed, told
+):
+    """A hull's drag was found as an offset, a friction and other parameters, and advised."""
+    table = SimpleNamespace(effects=tuple({"name": name} for name in adopted))
+    workspace = SimpleNamespace(config=SimpleNamespace(model=table), address=None)
+    found = Diagnosis(Verdict("effect" if claimed else "none", effects=claimed))
+    assert ("adopt --undo" in _over_ground(workspace, found)) is told
