@@ -33,6 +33,8 @@ SHORT = 0.25  # of the way to where a target ends: the plan does not get there
 MISSED = 0.1  # of the way that a target asks for: the plan falls short
 SHAKEN = 0.05  # of what [limits] allow an input, else of what a plan uses of it
 MEDIAN = 0.6745  # standard deviations that half of all normal numbers lie within
+FARTHEST = 1e4  # in its unit: how far a state that nobody gave may be from where it starts
+UNGIVEN = 3  # states, whose values at the start are asked for: of more nobody has thought
 STILL = 1e-3  # of the rates under the held input: under another one the robot stands
 BEGUN = (0.0, 1.0, -1.0)  # beside the held input: a thrust by its square has no slope at 0
 
@@ -206,7 +208,7 @@ def held_before(workspace: Folder) -> list[str]:
     chosen = any(name in config.start for name in names)
     priced = bool(base.reward.input_change.any() or base.latency.any())
     stands = None if chosen or not priced else standing(task, memory)
-    if stands is None and free[:n].any():
+    if stands is None and 0 < free[:n].sum() <= UNGIVEN:
         stands = standing(task, free)
     if stands is None:
         return []
@@ -242,7 +244,7 @@ def standing(task: Task, free: NDArray[np.bool_]) -> Array | None:
     from grounded.search.first_guess import trim
 
     away = np.abs(moved_at_start(task, task.past)).max()
-    if not away > 1e-9:
+    if not away > 1e-9 or _out_of_reach(task, free):
         return None
     still = np.tile(task.start, (2, 1))
     middle, inside = task.past.copy(), np.isfinite(task.high - task.low)
@@ -255,6 +257,19 @@ def standing(task: Task, free: NDArray[np.bool_]) -> Array | None:
         if (moved <= STILL * away).all():
             return np.append(x, u)
     return None
+
+
+def _out_of_reach(task: Task, free: NDArray[np.bool_]) -> bool:
+    """Whether nothing inside the limits stops the start, as of what flies: asked in one step."""
+    if not np.isfinite(task.high - task.low).all():
+        return False
+    problem = task.problem(exact=True)
+    u = np.array([task.past, task.low, 0.5 * (task.low + task.high), task.high])
+    with np.errstate(all="ignore"):
+        f_x, f_u = problem.system.linearise(np.tile(task.start, (4, 1)), u, problem.p, problem.dt)
+    others = np.abs(f_x - np.eye(len(free))).max(axis=0)[:, free]
+    reach = 2 * np.abs(f_u).max(axis=0) @ (task.high - task.low) + FARTHEST * others.sum(axis=1)
+    return bool((np.abs(moved_at_start(task, task.past)) > reach).any())
 
 
 def moved_at_start(task: Task, inputs: Array) -> Array:
