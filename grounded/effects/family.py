@@ -150,6 +150,11 @@ def width(site: Site, speed: str) -> Quantity:
     )
 
 
+def two_axes(unit: str) -> tuple[Quantity, ...]:
+    """What acts along both axes of a plane."""
+    return (Quantity("a", unit), Quantity("b", unit))
+
+
 def speed_limit(site: Site, unit: str) -> tuple[Quantity, ...]:
     """A speed r that is not exceeded: scanned from half the fastest that a step could show."""
     spread = site.scales.spread(site.target)

@@ -21,13 +21,12 @@ from typing import Any
 import numpy as np
 
 from grounded.effects import places
-from grounded.effects.family import Quantity, RateFamily, Site, Values, coupled, per
+from grounded.effects.family import Quantity, RateFamily, Site, Values, coupled, per, two_axes
 from grounded.model import Model
 
 
 def _two_drifts(site: Site) -> tuple[Quantity, ...]:
-    unit = per(site.unit(site.target))
-    return (Quantity("a", unit), Quantity("b", unit))
+    return two_axes(per(site.unit(site.target)))
 
 
 def _heading(site: Site) -> str:

@@ -31,12 +31,12 @@ from grounded.effects import places
 from grounded.effects.family import (
     Effect,
     MediumFamily,
-    Quantity,
     RateFamily,
     Scales,
     Site,
     Values,
     per,
+    two_axes,
 )
 from grounded.frozen import Array
 from grounded.model import Model
@@ -114,16 +114,12 @@ def _felt(model: Model) -> tuple[Array, Array]:
     return np.stack(felt, axis=-1), np.stack([axes[n] for n in found], axis=-1)
 
 
-def _two(unit: str) -> tuple[Quantity, ...]:
-    return (Quantity("a", unit), Quantity("b", unit))
-
-
 current = MediumFamily(
     name="current",
     equation="model of (u, v) through a medium that moves by (a, b) over ground",
     sentence="the water or air moves, by {a} along the first axis and {b} along the second",
     targets=_carried,
-    quantities=lambda site: _two(site.unit(site.target)),
+    quantities=lambda site: two_axes(site.unit(site.target)),
     lookalikes=("push_world", "offset", "slope", "drift_world", "drift_body"),
     shift=_in_its_axes,
     drift=_over_ground,
@@ -134,7 +130,7 @@ push_world = RateFamily(
     equation="u' = model + a cos(psi) + b sin(psi), v' = model - a sin(psi) + b cos(psi)",
     sentence="something pushes it, by {a} along the first axis and {b} along the second",
     targets=_pushed,
-    quantities=lambda site: _two(per(site.unit(site.target))),
+    quantities=lambda site: two_axes(per(site.unit(site.target))),
     lookalikes=("current", "offset", "slope", "patch"),
     rate=lambda s, a, own, t, c, site: _in_its_axes(s, c, site),
 )

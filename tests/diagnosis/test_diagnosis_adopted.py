@@ -58,9 +58,9 @@ def lagging(friction, trials=4):
     return model, runs
 
 
-def adopted(model, runs):
-    """The model with the lag, trials with its memory beside, the memory's name."""
-    better = wrap(Library().effect("first_order_lag:u", model), {"tau": LAG}, DT)
+def adopted(model, runs, name="first_order_lag:u", **values):
+    """The model with an effect, trials with its memory beside, the memory's name."""
+    better = wrap(Library().effect(name, model), values or {"tau": LAG}, DT)
     lifted = [
         replace(
             run,
@@ -375,16 +375,7 @@ def test_an_adopted_delay_predicts_as_diagnosed_and_the_filter_behind_it_is_stil
     (told,) = (f for f in first.preflight if f.kind == "lag")
     d = first.ranking[0].params["d"].value
     assert d == pytest.approx(LATE, abs=0.01) and told.signal == "v"
-    better = wrap(Library().effect("sensor_delay:x+v", model), {"d": d}, DT)
-    lifted = [
-        replace(
-            run,
-            states=np.hstack([run.states, memory_of(better, model, run)]),
-            state_names=better.state_names,
-        )
-        for run in runs
-    ]
-    hidden = better.state_names[model.n :]
+    better, lifted, hidden = adopted(model, runs, "sensor_delay:x+v", d=d)
     again = diagnose(better, lifted, DiagnosisOptions(hidden=hidden, but=("sensor_delay:x+v",)))
     (same,) = (f for f in again.preflight if f.kind == "lag")
     assert same.signal == "v" and same.delay_s == pytest.approx(told.delay_s, rel=0.1)

@@ -22,7 +22,7 @@ from grounded.utility import Reward
 from grounded_trials.starting.examples import fresh_folder, toml_of
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
-from grounded_trials.workspace.first_plan import standing
+from grounded_trials.workspace.first_plan import resting
 from grounded_trials.workspace.model_file import load_module, model_in
 from grounded_trials.workspace.task_file import change_weight, write_target
 
@@ -143,6 +143,6 @@ def _task(model: Model, dt: float) -> Task:
         high=free,
     )
     with suppress(GroundedError):  # a model that does not work says so when it is planned with
-        if (still := standing(task, np.zeros(n, np.bool_))) is not None:
+        if (still := resting(task, np.zeros(n, np.bool_))) is not None:
             return replace(task, past=np.array([float(f"{u:.6g}") for u in still[n:]]))
     return task

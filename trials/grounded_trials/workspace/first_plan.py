@@ -7,6 +7,7 @@ does not stay where it starts.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -39,13 +40,16 @@ STILL = 1e-3  # of the rates under the held input: under another one the robot s
 BEGUN = (0.0, 1.0, -1.0)  # beside the held input: a thrust by its square has no slope at 0
 
 
-def left_open(workspace: Folder, first: Candidate | None, ending: str) -> list[str]:
+def left_open(
+    workspace: Folder, first: Candidate | None, ending: str, held: Sequence[str]
+) -> list[str]:
     """What a task leaves open, or out, that whoever runs its first plan should know.
 
     Args:
         workspace: where nothing was run yet.
         first: its plan; None where there is none.
         ending: why, see `standing.Ending`.
+        held: what `held_before` says.
     """
     task, found = workspace.task, []
     free = [
@@ -75,7 +79,6 @@ def left_open(workspace: Folder, first: Candidate | None, ending: str) -> list[s
     if first is not None:
         found += _held_back(task, first) or _falls_short(task, first)
         found += _shaken(workspace, first)
-    held = held_before(workspace)
     found += held
     if ending == "not allowed" and not held:
         found.append(
@@ -207,9 +210,9 @@ def held_before(workspace: Folder) -> list[str]:
     ]
     chosen = any(name in config.start for name in names)
     priced = bool(base.reward.input_change.any() or base.latency.any())
-    stands = None if chosen or not priced else standing(task, memory)
+    stands = None if chosen or not priced else resting(task, memory)
     if stands is None and 0 < free[:n].sum() <= UNGIVEN:
-        stands = standing(task, free)
+        stands = resting(task, free)
     if stands is None:
         return []
     units = {**base.model.states, **task.model.inputs}
@@ -232,7 +235,7 @@ def held_before(workspace: Folder) -> list[str]:
     ]
 
 
-def standing(task: Task, free: NDArray[np.bool_]) -> Array | None:
+def resting(task: Task, free: NDArray[np.bool_]) -> Array | None:
     """States and inputs (n + m,) inside the limits that stay as they are, from where a run starts.
 
     None where it stands under the input held before, or nothing holds it: the start is in motion.

@@ -104,10 +104,12 @@ def propose_in(workspace: Folder) -> Proposed:
     if candidate is not None and proposal.is_new:
         notes = notes or _void(workspace, before)
         notes = [f"{note}; run {candidate.id} in its place" for note in notes]
+    held: list[str] = []
     if not proposal.standing.history:
         from grounded_trials.workspace.first_plan import held_before, left_open
 
-        notes += left_open(workspace, candidate, proposal.standing.ending)
+        held = held_before(workspace)
+        notes += left_open(workspace, candidate, proposal.standing.ending, held)
     if doubt := proposal.standing.doubt:
         from grounded.search.standing import LOST
 
@@ -117,7 +119,7 @@ def propose_in(workspace: Folder) -> Proposed:
     proposal = replace(proposal, notes=(*proposal.notes, *notes))
     if candidate is None:
         then = status_of(workspace, proposal.standing).then
-        if not proposal.standing.history and held_before(workspace):
+        if held:
             then = NextCommand("propose")  # once [task] start is as the note says
         return Proposed(proposal, None, then)
     path = workspace.candidate_path(candidate.id)

@@ -67,7 +67,7 @@ def warnings_about(
         for one in dead_rates(model, whole, relations)
     ]
     found += _in_degrees(task, whole)
-    found += travelled(model, whole)
+    found += way_warnings(model, whole)
     sent, scaled = mistaken_in(model, whole)
     found += sent
     if not trial.candidate:
@@ -207,7 +207,7 @@ def _in_degrees(task: Task, trial: Trial) -> list[str]:
     return found
 
 
-def travelled(model: Model, trial: Trial) -> list[str]:
+def way_warnings(model: Model, trial: Trial) -> list[str]:
     """What the way that was travelled says of heading and speeds: other axes, a compass, knots."""
     from grounded.instruments.rows import kinematic_rows, tied
     from grounded.instruments.way import judge_way
