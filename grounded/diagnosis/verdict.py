@@ -253,7 +253,7 @@ HINTS = {
     "first_order_lag": "step the input sharply, by different amounts",
     "rate_limit": "step the input by small and large amounts",
     "slew_limit": "step the input by small and large amounts",
-    "input_bias": "use commands of both signs and of different size",
+    "input_bias": "use small and large commands, of both signs where it takes them",
     "input_gain": "use small and large commands",
     "input_fade": "repeat the same manoeuvre early and late in one trial",
     "understeer": "drive the same curve slowly and fast",

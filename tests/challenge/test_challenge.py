@@ -43,6 +43,7 @@ def test_no_file_of_a_case_holds_the_answer(made):
                 assert family.encode() not in path.read_bytes(), path
 
 
+@pytest.mark.slow
 def test_the_same_seed_makes_the_same_bytes(made, tmp_path):
     folder, _, _ = made
     words = ["--kind", "single", "--cases", "2", "--seed", "3"]
@@ -72,6 +73,7 @@ def test_a_case_without_a_diagnosis_says_what_to_run(made):
         score_case(folder, labels, name, read_manifest(folder)[name])
 
 
+@pytest.mark.slow
 def test_cases_are_run_and_scored_as_jobs_and_a_run_goes_on(tmp_path):
     folder = tmp_path / "cases"
 
@@ -152,6 +154,7 @@ def answered(folder):
         write_document(folder / name / "reports" / "diagnosis.json", done)
 
 
+@pytest.mark.slow
 def test_the_next_command_says_where_the_labels_are_to_be_looked_for(tmp_path):
     folder, labels = tmp_path / "cases", tmp_path / "sealed"
     words = ["make", folder, "--kind", "none", "--cases", "1", "--seed", "5"]
@@ -185,6 +188,7 @@ def test_an_impossible_error_of_parameters_is_refused(tmp_path):
         assert "0.0<=x<=0.5" in said(*words, "--param-error", error, code=2).err
 
 
+@pytest.mark.slow
 def test_families_may_be_named_in_a_list_or_one_by_one(tmp_path, monkeypatch):
     folder, seen = tmp_path / "cases", []
     said("make", folder, "--kind", "none", "--cases", "1", "--seed", "5")

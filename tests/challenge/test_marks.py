@@ -98,6 +98,7 @@ def test_the_simulator_is_the_crude_model_but_for_what_is_withheld(system, built
     np.testing.assert_allclose(after(true=heavier), ours, atol=5e-4)
 
 
+@pytest.mark.slow
 def test_without_mujoco_its_systems_are_left_out_with_a_word(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
     words = ["challenge", "make", tmp_path / "c", "--kind", "none", "--cases", "1", "--seed", "5"]

@@ -326,6 +326,7 @@ def test_fit_without_trials_says_so(w):
     assert done.code == 1 and holds(done.err, "ingest", "--data")
 
 
+@pytest.mark.slow
 def test_narration_is_not_data(w):
     """stdout of every --json command is one document and nothing else."""
     for args in (["propose"], ["run"], ["status"], ["verify"], ["learn", "--trials", "1"]):

@@ -297,6 +297,7 @@ def test_a_model_that_is_wrong_is_one_sentence_with_its_line(tmp_path, name):
     assert not list((folder / "candidates").iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rate", "why"), [("1 / 0", "model.py:7: ZeroDivisionError"), ("s.v * np.nan", "finite")]
 )
@@ -386,6 +387,7 @@ def with_command(tmp_path, command, drive=DRIVE):
     return folder
 
 
+@pytest.mark.slow
 def test_the_users_own_command_end_to_end(tmp_path):
     folder = with_command(tmp_path, f"{sys.executable} drive.py {{candidate}} {{trial}}")
     done = process("-C", folder, "learn", "--trials", "3", "--json")
@@ -420,6 +422,7 @@ with TrialWriter(sys.argv[2], policy.dt, {"x": "m", "v": "m/s"}, {"force": "N"},
 '''
 
 
+@pytest.mark.slow
 def test_an_exported_policy_drives_and_its_trial_is_the_outstanding_ones(tmp_path):
     command = f"{sys.executable} drive.py {{candidate}} {{trial}}"
     folder = with_command(tmp_path, command, EXPORTED)

@@ -143,6 +143,7 @@ def wide(n, m, dense, make=system_of, limits=0.3):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "m", "dense"),
     [(1, 1, True), (3, 5, True), (7, 8, False), (16, 4, True), (26, 3, False), (6, 9, True)],

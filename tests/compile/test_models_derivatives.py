@@ -37,6 +37,7 @@ def differenced(f, v, h):
     return np.stack(columns, axis=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [car.model, pendulum.model, aircraft.model], ids=lambda m: m.name)
 def test_derivatives_agree_with_central_differences(model):
     x, u = samples(model, np.random.default_rng(0))
@@ -75,6 +76,7 @@ def endless(s, a, p):
     return {"x": total}
 
 
+@pytest.mark.slow
 def test_a_loop_that_unrolls_too_far_names_file_and_line():
     model = Model(states={"x": "m"}, inputs={"u": "1"}, derivative=endless)
     with pytest.raises(GroundedError, match=r"test_models_derivatives\.py:\d+: .*\bunrolls\b"):

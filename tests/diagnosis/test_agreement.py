@@ -19,6 +19,7 @@ FEW = (
 OPTIONS = DiagnosisOptions(library=Library(tuple(map(Library().family, FEW))))
 
 
+@pytest.mark.slow
 def test_trials_of_one_system_agree():
     model, trials = cart(friction=0.3, trials=5)
     found = diagnose(model, trials, OPTIONS)
@@ -29,6 +30,7 @@ def test_trials_of_one_system_agree():
     assert np.abs(off).max() < 5 and not agreement_lines(found)
 
 
+@pytest.mark.slow
 def test_a_value_that_differs_by_trial_is_told_with_what_it_goes_with():
     trials = [cart(friction=0.25 + 0.05 * k, trials=1, seed=k)[1][0] for k in range(6)]
     found = diagnose(cart()[0], trials, OPTIONS)
@@ -39,6 +41,7 @@ def test_a_value_that_differs_by_trial_is_told_with_what_it_goes_with():
     assert [title for title, _ in agreement_lines(found)] == ["agreement"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("first", "second", "effect", "values"),
     [

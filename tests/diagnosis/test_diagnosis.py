@@ -149,6 +149,7 @@ def test_whiteness_is_the_chance_that_white_noise_is_as_correlated():
     assert 0.01 < found["0"] <= 1 and found["1"] < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("truth", "name", "quantity", "value"),
     [
@@ -167,6 +168,7 @@ def test_one_effect_is_named_with_its_size(truth, name, quantity, value):
     assert found.where.channels[0].name == "v"
 
 
+@pytest.mark.slow
 def test_no_effect_is_claimed_where_there_is_none():
     for seed in range(3):
         model, trials = cart(seed=seed)
@@ -176,6 +178,7 @@ def test_no_effect_is_claimed_where_there_is_none():
         assert found.gap.before == pytest.approx(1.0, abs=0.25)
 
 
+@pytest.mark.slow
 def test_a_parameter_that_is_off_is_blamed_as_a_parameter():
     model, trials = cart()
     found = diagnose(model.with_values({"tau": 1.2}), trials)
@@ -183,6 +186,7 @@ def test_a_parameter_that_is_off_is_blamed_as_a_parameter():
     assert found.gap.after < 1.2
 
 
+@pytest.mark.slow
 def test_parameters_that_are_off_are_named_most_important_first():
     model, trials = cart(trials=6)
     found = diagnose(model.with_values({"k": 1.9, "tau": 0.88}), trials)
@@ -373,6 +377,7 @@ def test_a_threshold_that_is_zero_but_for_rounding_reads_zero(scale):
     )  # others are told as they are
 
 
+@pytest.mark.slow
 def test_without_the_family_a_look_alike_is_marked_by_what_it_leaves():
     model, trials = cart(dead=0.25, trials=6)
     library = Library().without(["dead_zone", "stall", "backlash", "stiction", "coulomb_friction"])
@@ -380,6 +385,7 @@ def test_without_the_family_a_look_alike_is_marked_by_what_it_leaves():
     assert found.kind == "unknown" or found.leftover or found.gap.after < 1.3
 
 
+@pytest.mark.slow
 def test_one_trial_names_no_cause():
     model, trials = cart(friction=0.5, trials=1)
     found = diagnose(model, trials)
@@ -423,6 +429,7 @@ def test_gaps_in_the_log_are_bridged_by_the_filter():
     assert found.ranking[0].effect == "coulomb_friction:v"
 
 
+@pytest.mark.slow
 def test_the_document_is_plain_json():
     model, trials = cart(friction=0.4, trials=2, steps=80)
     document = diagnose(model, trials).to_json()
@@ -434,6 +441,7 @@ def test_the_document_is_plain_json():
     assert {"value", "std", "unit"} <= set(next(iter(again["ranking"][0]["params"].values())))
 
 
+@pytest.mark.slow
 def test_a_probe_tells_two_explanations_apart():
     model, trials = cart(dead=0.1, steps=60, trials=3)
     H = 100

@@ -112,6 +112,7 @@ def test_an_effect_on_an_input_moves_what_an_adopted_lag_begins_with():
     assert not np.delete(begun, i, axis=1).any()
 
 
+@pytest.mark.slow
 def test_nothing_is_left_beside_what_is_all():
     model, runs = lagging(0.0)
     better, lifted, memory = adopted(model, runs)

@@ -28,6 +28,7 @@ def again(found: Document) -> Any:
     return type(found).from_json(json.loads(json.dumps(found.to_json(), allow_nan=False)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "trials", "changes"),
     [("effect", 4, {"friction": 0.4}), ("none", 4, {}), ("unknown", 1, {"friction": 0.4})],

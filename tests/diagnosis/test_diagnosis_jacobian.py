@@ -57,6 +57,7 @@ def test_the_jacobian_is_that_of_the_hypothesis(cars, name, values):
         assert np.quantile(error.max(axis=-1), 0.9) < 0.02 * max(1.0, np.abs(slope).max())
 
 
+@pytest.mark.slow
 def test_a_carried_heading_rate_is_limited_with_the_heading(cars):
     """A gyro shows what the tyres let the heading do; adopted, the model says the same."""
     _, data = cars

@@ -253,6 +253,7 @@ def test_two_states_of_one_sensor_are_late_together_where_a_third_is_seen():
     assert "sensor_delay:theta" in offered and pair not in offered
 
 
+@pytest.mark.slow
 def test_sensors_that_filter_count_among_the_late_ones_of_a_fit():
     """Hypotheses are filtered side by side by how many sensors are late, the instruments' too."""
     data = prepare(cart_pole, hanging(1.8, trials=2, steps=60))

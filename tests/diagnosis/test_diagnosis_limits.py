@@ -23,6 +23,7 @@ def stuck(trials, *states):
         yield replace(trial, states=y)
 
 
+@pytest.mark.slow
 def test_states_that_never_moved_give_no_cause():
     found = diagnose(pendulum, list(stuck(swings(), 0, 1)))
     assert found.kind == "unknown" and not found.effects

@@ -48,6 +48,7 @@ def repeats_of(trial, count):
     return same
 
 
+@pytest.mark.slow
 def test_an_effect_that_is_found_explains_the_error():
     model, trials = cart(friction=0.4)
     document = diagnose(task_of(model), trials).to_json()
@@ -133,6 +134,7 @@ def test_a_trial_beside_itself_confirms_nothing():
     assert found.no_cause and not found.effects and found.trials == 1
 
 
+@pytest.mark.slow
 def test_without_repeats_noise_is_a_bound_unless_what_is_left_is_white():
     model, trials = cart(asymmetric=0.8, trials=4)
     poor = DiagnosisOptions(library=Library((Library().family("trend"),)))

@@ -91,6 +91,7 @@ def carts(width, trials=3, steps=150):
     return crude, found
 
 
+@pytest.mark.slow
 def test_a_constant_that_the_data_set_pays_as_a_number():
     model, trials = pushed(FRICTION)
     data = prepare(model, trials, np.zeros(1))

@@ -62,6 +62,7 @@ EFFECTS = Library().candidates(car, sizes(TRIAL))
 ONE_EACH = list({e.family.name: e for e in reversed(EFFECTS)}.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", ONE_EACH, ids=lambda e: e.name)
 def test_an_adopted_effect_is_the_one_that_was_diagnosed(effect):
     values = typical(effect)

@@ -18,12 +18,15 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Diagnosis, Verdict
 from grounded.effects import Effect, Library, scales_of, wrapping_order
 from grounded.effects.places import body_velocity
+from grounded.errors import NextCommand
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
 from grounded.search.planner import planner_with
 from grounded.task import Task
 from grounded.utility import Reward
+from grounded_trials.store.documents import write_document
 from grounded_trials.workspace.diagnosing import _over_ground
+from grounded_trials.workspace.next_step import to_adopt
 
 DT, FINE = 0.1, 20
 CURRENT = ("current:u+v", {"a": 0.15, "b": -0.08})
@@ -294,10 +297,16 @@ def test_none_is_claimed_in_still_water():
     ],
 )
 def test_what_is_found_beside_an_adopted_current_is_told_to_act_over_the_ground(
-    adopted, claimed, told
+    adopted, claimed, told, tmp_path
 ):
     """A hull's drag was found as an offset, a friction and other parameters, and advised."""
-    table = SimpleNamespace(effects=tuple({"name": name} for name in adopted))
-    workspace = SimpleNamespace(config=SimpleNamespace(model=table), address=None)
+    kept = {"adoptions": [{"names": list(adopted)}], "undone": []}
+    write_document(tmp_path / "adoptions.json", kept)
+    table = SimpleNamespace(effects=tuple({"name": name} for name in adopted), params={})
+    config = SimpleNamespace(model=table)
+    workspace = SimpleNamespace(config=config, address=None, reports=tmp_path, base_model=boat)
     found = Diagnosis(Verdict("effect" if claimed else "none", effects=claimed))
     assert ("adopt --undo" in _over_ground(workspace, found)) is told
+    then = to_adopt(workspace, found)
+    assert (then == NextCommand("adopt", ("--undo",))) is told
+    assert (then is None) is (not claimed)

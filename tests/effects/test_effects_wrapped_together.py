@@ -62,6 +62,7 @@ def drive(model, one):
     return np.array(z)[:, : car.n]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", BOTH_ORDERS, ids=names)
 def test_a_pair_steps_as_it_was_diagnosed(parts):
     one = trial()

@@ -55,6 +55,7 @@ def test_from_manual_driving_to_trials_of_a_policy(robot, tmp_path, monkeypatch)
     assert "its commands are not" not in done.err + done.out  # though packets were lost
 
 
+@pytest.mark.slow
 def test_the_kill_switch_holds_until_a_reset(robot):
     line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     line.bind(("127.0.0.1", PORT + 1))

@@ -75,6 +75,7 @@ def test_a_lost_worker_costs_its_job_only(tmp_path):
     assert Path(marker).exists()
 
 
+@pytest.mark.slow
 def test_workers_that_keep_dying_end_the_study_with_what_is_done():
     kept = {}
     jobs = [*draws(2), Job(experiment_jobs.dies_always, {"seed": 9})]
@@ -151,6 +152,7 @@ def test_a_cluster_that_loses_a_worker_half_way_gives_the_same_bits(cluster):
     assert found == run_jobs(jobs)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_no_cluster_is_said_so(monkeypatch):
     pytest.importorskip("distributed", reason="dask is not installed")

@@ -61,6 +61,7 @@ def test_flight_speaks_the_contract(flown):
     assert error[2] < 1.0  # altitude [m], what the model-based controller can't hold
 
 
+@pytest.mark.slow
 def test_flights_can_be_continued(flown, jobs):
     kept = dict(list(jobs.items())[:1])
     plain(flight.run(1, finished=kept))  # one run has no standard error: null, not NaN
@@ -85,6 +86,7 @@ def test_footnote9_is_solved_in_one_iteration():
     assert document["rows"][2]["model_based"] == 0.0
 
 
+@pytest.mark.slow
 def test_theorem1_has_its_slopes_and_keeps_its_bound():
     result = theorem1.run(range(2), epsilons=(0.003, 0.03, 0.1))
     document = plain(result)
@@ -115,6 +117,7 @@ def test_end_points_spread_as_the_paper_says():
     assert min(by_level[1.0]) > 0.01 and max(by_level[3.0]) < 0.5
 
 
+@pytest.mark.slow
 def test_the_quiet_car_reaches_the_papers_improvement():
     result = car.run([], manoeuvres=("turn",))  # the others: tests/search/test_improve.py
     (quiet,) = result.of("turn", False)
@@ -124,6 +127,7 @@ def test_the_quiet_car_reaches_the_papers_improvement():
     plain(result)
 
 
+@pytest.mark.slow
 def test_baselines_count_trials():
     result = baselines.run(
         [0], manoeuvres=("turn",), kinds=("parametric",), methods=("grounded", "ilc", "differences")
@@ -137,6 +141,7 @@ def test_baselines_count_trials():
     assert baselines.median_trials([2, None, None]) == "-"
 
 
+@pytest.mark.slow
 def test_noise_judges_by_fresh_runs():
     rules = (repeats.RULES[0], repeats.RULES[5])
     result = repeats.run([0], manoeuvres=("turn",), levels=(1.0,), rules=rules)

@@ -85,6 +85,7 @@ def test_every_study_has_its_picture():
     assert set(PICTURES) == set(STUDIES) == set(results())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(STUDIES))
 @pytest.mark.extra("png")
 def test_the_picture_holds_its_figure(name, tmp_path):

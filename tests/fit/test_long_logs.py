@@ -100,6 +100,7 @@ def test_ctrl_c_in_a_fit_says_the_values_so_far(trials):
         fit(MODEL, trials, progress=stop)
 
 
+@pytest.mark.slow
 def test_a_diagnosis_is_the_same_on_one_thread_and_on_two(trials):
     one, two = (diagnose(MODEL, trials, engine=Engine(n)).to_json() for n in (1, 2))
     assert one == two

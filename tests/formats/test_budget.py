@@ -25,6 +25,7 @@ from grounded_trials.store.trial_file import read_trial, trial_bytes
 QUICK = ("JSON, nested lists",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", QUICK)
 def test_a_bomb_ends_at_once(name: str, tmp_path: Path) -> None:
     """Fails on 0.1: 12 kB of JSON took 3.1 GB, a packed list 1.7 GB (FACTS 9)."""

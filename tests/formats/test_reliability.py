@@ -23,6 +23,7 @@ def test_every_truncation_is_refused() -> None:
     fine(reliability.read_damaged(flips=False))
 
 
+@pytest.mark.slow
 def test_every_flipped_bit_is_refused() -> None:
     fine(reliability.read_damaged(flips=True, stride=1 if FULL else 7))
 
@@ -40,6 +41,7 @@ def test_verify_finds_every_flipped_bit() -> None:
     fine(reliability.verify_flips(stride=1 if FULL else 5))
 
 
+@pytest.mark.slow
 def test_kill_at_any_moment() -> None:
     fine(reliability.kills(300 if FULL else 8))
 

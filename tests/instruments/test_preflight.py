@@ -95,6 +95,7 @@ def differenced(x, steps):
     return (x - before[:-steps]) / (steps * DT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved_back", [0, 1.5])
 def test_a_velocity_that_is_a_difference_of_its_position_says_no_more_than_that(moved_back):
     """Taken for a sensor, it made 0.41 rad/s^2 of a friction of 0.5: it goes on where q stops."""
@@ -365,6 +366,7 @@ def test_what_a_filter_takes_from_fast_swings_is_no_scale(filtered):
     assert size == pytest.approx(1.0 if filtered else 0.96, abs=0.012)
 
 
+@pytest.mark.slow
 def test_a_late_sensor_is_not_counted_against_the_effects():
     trials = arm(columns(w=lambda x: late(x, 1.0)), friction=0.5, steps=120)
     found = diagnose(ARM, trials)

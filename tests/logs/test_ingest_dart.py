@@ -122,6 +122,7 @@ def fitted(dart):
     return done.json
 
 
+@pytest.mark.slow
 def test_the_log_is_stored_as_data_on_the_control_grid(dart):
     folder, log, told = dart
     assert (told["trial"], told["candidate"], told["utility"]) == ("t0001", None, None)
@@ -187,6 +188,7 @@ def test_without_estimates_what_is_missing_is_named(dart, tmp_path):
     assert done.code == 1 and holds(done.err, "[log]", "'v'", "[estimate]")
 
 
+@pytest.mark.slow
 def test_a_wrong_path_names_what_the_message_has(dart, tmp_path):
     folder, log, _ = dart
     for name in ("model.py", "target.csv"):

@@ -23,6 +23,7 @@ from grounded_trials.logs.twins import find_twins
 from shared_data import data, files, needs_data
 
 
+@pytest.mark.slow
 @needs_data
 def test_every_shared_log_can_be_inspected() -> None:
     paths = files("*/*.mcap") + files("mcap_format_fixtures/*/*.mcap")

@@ -239,6 +239,7 @@ def test_wrong_encodings_and_damage_in_real_files() -> None:
             read_signals(path, {"u": SignalSpec("/vicon/jetracer1.pose.pose.position.x")})
 
 
+@pytest.mark.slow
 @needs_data
 def test_every_number_of_every_ros2_fixture_against_the_other_decoder() -> None:
     support = pytest.importorskip("mcap_ros2.decoder")

@@ -39,6 +39,7 @@ def flights():
     return many_flights(2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.extra("view", "png")
 def test_a_report_is_made_of_any_numbers(flights, tmp_path, case):

@@ -117,6 +117,7 @@ def test_a_damaged_recording_is_noticed(cart, tmp_path):
     assert _rerun("rrd", "verify", path).returncode != 0
 
 
+@pytest.mark.slow
 def test_fifty_trials_of_3000_steps_stay_small_and_quick(tmp_path):
     findings = many_flights(50)
     path = tmp_path / "many.rrd"

@@ -108,6 +108,7 @@ def test_json_holds_what_the_contract_says(cart):
     assert document["best"]["tracking_error"]["v"] is None  # no target: not a number
 
 
+@pytest.mark.slow
 @pytest.mark.extra("view", "png")
 def test_json_names_the_files_that_were_written(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
@@ -198,6 +199,7 @@ def test_a_damaged_diagnosis_is_named(cart, tmp_path, text):
     assert lost["file"] == "diagnosis.json" and lost["reason"]
 
 
+@pytest.mark.slow
 @pytest.mark.extra("view", "png")
 def test_the_first_trial_may_be_lost_and_a_short_one_is_shown_as_failed(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
@@ -265,6 +267,7 @@ def test_nothing_heavy_is_imported_for_text(cart):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.extra("view", "png")
 def test_a_workspace_of_data_only_shows_the_model_against_the_data(cart, tmp_path):
     folder = tmp_path / "data"

@@ -28,6 +28,7 @@ def test_without_a_screen_the_recording_is_written_and_named(cart, tmp_path, mon
     assert (folder / "reports" / "recording.rrd").stat().st_size > 1000
 
 
+@pytest.mark.slow
 @needs_posix
 @pytest.mark.parametrize(("ending", "code"), [("exit 3", 1), ("exit 0", 0), ("sleep 3", 0)])
 @pytest.mark.extra("view")

@@ -56,6 +56,7 @@ def test_a_search_goes_on_from_its_candidates_and_trials(search):
     assert numbers([half.ask()]) == numbers([search.candidates[2]])
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_with_effects_that_have_a_memory():
     """A wrapped delay made states that no target had: "task: target must have shape"."""
     begun = gr.Search(TASK, OPTIONS)

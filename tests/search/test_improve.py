@@ -34,6 +34,7 @@ from small_tasks import black_box, cart_task, drive, other, rover, rover_task
 PAPER = {"turn": 0.97, "circle": 0.88, "figure8": 0.63}  # section 5.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_papers_improvement_on_the_car(name):
     task, plant = car_task(name, car.model), real_plant()
@@ -102,6 +103,7 @@ def digest(task, candidates, trials):
     return sha.hexdigest()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "processes"), [("rover", [("1", "cache"), ("2", "cache")]), ("car", [("3", "")])]
 )

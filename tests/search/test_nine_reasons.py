@@ -43,6 +43,7 @@ def late_arm(mechanisms):
     return SimpleNamespace(task=task, run=lambda candidate: drive(task, plant, candidate))
 
 
+@pytest.mark.slow
 def test_the_first_plan_is_finished_and_the_best_of_many_starts(mechanisms):
     """Reason 2: 0.1 stopped this swing-up after 100 iterations, unconverged, at -431."""
     task = mechanisms.cart_task("smooth")
@@ -152,6 +153,7 @@ def test_smaller_steps_hold_a_stiff_friction():
     assert abs(x[16][0, 0]) < 1e-3 < 0.1 < abs(x[1][0, 0])
 
 
+@pytest.mark.slow
 def test_exact_repeats_end_all_reruns(mechanisms):
     """Reason 9: 0.1 went on running incumbents again after repeats had agreed to the last bit."""
     task = mechanisms.cart_task("gentle")

@@ -481,6 +481,7 @@ EVENTS = {
 }
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.sampled_from([*EVENTS, "model", "again", "data"]), max_size=9),
     st.sampled_from([1, 2]),

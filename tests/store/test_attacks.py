@@ -9,6 +9,7 @@ import pytest
 from attacks import ATTACKS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "seconds"), [("mutants", 0.7), ("configurations", 0.7), ("flips", 0.5)]
 )

@@ -54,6 +54,7 @@ def plainly(made, monkeypatch):
     return Workspace(made.folder)
 
 
+@pytest.mark.slow
 def test_the_index_changes_no_answer(indexed, monkeypatch):
     w, file = indexed
     first = Workspace(w.folder).status().to_json()
@@ -98,6 +99,7 @@ def test_an_index_that_is_damaged_is_made_again(indexed, how):
         file.rmdir()
 
 
+@pytest.mark.slow
 def test_flipped_bytes_of_the_index_never_change_an_answer(indexed):
     w, file = indexed
     answer = Workspace(w.folder).status().to_json()

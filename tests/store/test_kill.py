@@ -43,6 +43,7 @@ def undisturbed(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_learn_killed_again_and_again_ends_where_it_would_have(tmp_path, undisturbed, seed):
     folder = make(tmp_path / "w", config=NOISY).folder
@@ -55,6 +56,7 @@ def test_learn_killed_again_and_again_ends_where_it_would_have(tmp_path, undistu
     assert not list(folder.glob("trials/.*.tmp"))  # swept by the next that takes the lock
 
 
+@pytest.mark.slow
 def test_propose_killed_writes_a_whole_candidate_or_none(tmp_path, undisturbed):
     folder = make(tmp_path / "w", config=NOISY).folder
     seen = kept(undisturbed)[1]
@@ -64,6 +66,7 @@ def test_propose_killed_writes_a_whole_candidate_or_none(tmp_path, undisturbed):
         assert grounded("-C", folder, "learn", "--trials", "1").code == 0
 
 
+@pytest.mark.slow
 def test_ingest_killed_stores_a_whole_trial_or_none(tmp_path):
     folder = make(tmp_path / "w", config=NOISY).folder
     grounded("-C", folder, "propose")
@@ -76,6 +79,7 @@ def test_ingest_killed_stores_a_whole_trial_or_none(tmp_path):
     assert again["known"] and again["trial"] == "t0001"
 
 
+@pytest.mark.slow
 def test_run_killed_leaves_nothing_that_is_taken_for_a_trial(tmp_path):
     folder = make(tmp_path / "w", config=NOISY).folder
     grounded("-C", folder, "propose")
@@ -107,6 +111,7 @@ def test_caches_reports_and_the_place_do_not_matter(tmp_path, undisturbed):
     assert expected == (undisturbed / "candidates" / "c0003.mcap").read_bytes()
 
 
+@pytest.mark.slow
 def test_two_processes_at_once_store_each_trial_once(tmp_path):
     folder = make(tmp_path / "w", config=NOISY).folder
     grounded("-C", folder, "propose")

@@ -167,6 +167,7 @@ model = Model(states={"z": "m", "v": "m/s", "w": "rad/s"}, inputs={"left": "1", 
 """
 
 
+@pytest.mark.slow
 def test_what_holds_the_start_is_held_before_it_or_asked_for(tmp_path):
     """A quadrotor was planned from a thrust of 0, and dipped; after its end 0 was sent again."""
     (tmp_path / "quad.py").write_text(HOVER)

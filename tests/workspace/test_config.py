@@ -329,6 +329,7 @@ def changed(table, at, value):
 GOOD = tomllib.loads(CONFIG + LOG)
 
 
+@pytest.mark.slow
 @given(st.sampled_from(sorted(keys_of(GOOD))), VALUES)
 @settings(max_examples=300, deadline=None)
 def test_any_value_at_any_key_is_valid_or_one_sentence(tmp_path_factory, at, value):

@@ -140,6 +140,7 @@ def test_fit_says_how_its_values_are_written(tmp_path):
     assert w.base_model.params["mass"].value == pytest.approx(again.fit.params["mass"].value)
 
 
+@pytest.mark.slow
 def test_fit_knows_the_effects_that_were_adopted(tmp_path):
     """The robot has a delay, a lag and a dead zone, the model too: only mass and drag are off."""
     listed = """file = "model.py"

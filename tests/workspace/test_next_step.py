@@ -191,6 +191,7 @@ def told(done):
     return shlex.split(done.out.rstrip().replace("\\\n", " ").splitlines()[-1])
 
 
+@pytest.mark.slow
 def test_printed_commands_work_from_where_the_user_is(tmp_path):
     make(tmp_path / "my cart")
     for at in (("-C", "my cart", "propose"), ("propose", "-C", "my cart")):
@@ -295,6 +296,7 @@ def test_nothing_is_said_of_what_one_trial_can_not_know(cart, tmp_path):
     assert last(grounded("-C", folder, "status")) == "grounded run best"
 
 
+@pytest.mark.slow
 def test_diagnose_of_one_trial_asks_for_another(tmp_path):
     folder = make(tmp_path / "w").folder
     assert grounded("-C", folder, "learn", "--trials", 1).code == 0

@@ -37,6 +37,7 @@ def bounded(w, low, high):
     w.forget()
 
 
+@pytest.mark.slow
 def test_every_probe_that_is_offered_is_handed_over(diagnosed):
     """The last bounds are kept by the predicted run, but not where it strays as others did."""
     w, found = diagnosed
@@ -135,6 +136,7 @@ def test_without_safety_a_probe_stays_near_where_trials_have_been(diagnosed):
     assert (made > been.min(axis=0) - room).all() and (made < been.max(axis=0) + room).all()
 
 
+@pytest.mark.slow
 def test_a_probe_that_fails_costs_no_diagnosis(diagnosed, monkeypatch, caplog):
     """Seen on a crane: diagnosis.json was written, the terminal showed a traceback alone."""
     w, before = diagnosed

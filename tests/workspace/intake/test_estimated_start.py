@@ -35,6 +35,7 @@ def test_a_run_is_found_where_speeds_are_estimated(blind, tmp_path, before):
     assert {one.name for one in found.signals} == {"x", "force"}  # what was logged
 
 
+@pytest.mark.slow
 def test_what_nobody_sent_is_refused_where_speeds_are_estimated(blind, tmp_path):
     policy = blind.candidate("c0002")[0].policy
     other = replace(policy, feedforward=np.roll(policy.feedforward, 12, axis=0))
@@ -86,6 +87,7 @@ def test_a_run_is_known_by_the_speeds_that_its_program_made_itself(tmp_path, bef
     assert any("an estimate in its place" in one for one in found.warnings)
 
 
+@pytest.mark.slow
 def test_who_is_refused_where_speeds_are_estimated_is_told_to_log_them(tmp_path):
     w = waiting(tmp_path, ONLY_POSITIONS)
     path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.8, noise=ROUGH)

@@ -67,6 +67,7 @@ def driven(tmp_path_factory):
     return w, *read_trial(next((w.folder / "runs").iterdir()))[:2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names, factor",
     [
@@ -121,6 +122,7 @@ def test_other_driving_is_no_factor(driven, seed):
     assert other_units(w.task, odd, own, plain) == ((), 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("before", [0.0, 0.7])
 def test_a_log_whose_scale_is_wrong_is_told_so(tmp_path, before):
     w = waiting(tmp_path)

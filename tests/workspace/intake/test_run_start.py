@@ -222,6 +222,7 @@ def test_the_log_of_a_probe_is_not_credited_and_its_export_says_how_it_is_taken_
     assert waiting.out.split()[-1] == "LOG"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("by", "told"), [(1e3, "1000 times too large"), (-1.0, "other sign")])
 def test_a_log_that_begins_before_a_run_with_commands_of_another_unit_is_told_so(
     w, tmp_path, by, told
@@ -239,6 +240,7 @@ def test_a_log_that_begins_before_a_run_with_commands_of_another_unit_is_told_so
     assert any("force" in warning and f"{1 / by:g}" in warning for warning in named.warnings)
 
 
+@pytest.mark.slow
 def test_a_strange_log_has_no_start_and_is_taken_with_a_warning_where_it_is_named(w, tmp_path):
     """A named one was refused too, and told to name the candidate."""
     policy = w.candidate("c0002")[0].policy

@@ -335,6 +335,7 @@ def test_a_recording_may_begin_before_the_run(tmp_path, before):
     assert [f"{before:.2f}" in one for one in taken.notes] == [True] * (before > 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", ["start = 0.0", 'start = "first-input"'])
 def test_a_span_that_was_given_is_kept_to_and_a_strange_run_has_no_start(tmp_path, given):
     config = LOGGED + f"[log.span]\n{given}\n"

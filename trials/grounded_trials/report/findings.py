@@ -23,13 +23,13 @@ from grounded.search.standing import Standing
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.wording import figure, rendered, shown
-from grounded_trials.workspace.adopting import Better
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.next_step import Since
 from grounded_trials.workspace.off_target import reaches, tracking_error, weighed_groups
 
 if TYPE_CHECKING:
     from grounded_trials.report.settled import Settled
+    from grounded_trials.workspace.adopted import Better
 
 One = TypeVar("One")
 SHOWN = 4  # numbers of what improved

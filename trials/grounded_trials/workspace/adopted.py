@@ -1,5 +1,9 @@
 """Effects that grounded.toml says were adopted, as part of the model that plans.
 
+`better_model` has those that were diagnosed in it before anybody adopts them, for reports to draw
+beside the crude one; once effects are adopted and nothing newer was diagnosed, it is the model that
+plans.
+
     [model]
     effects = [ { name = "dead_zone:throttle", c = 0.146 } ]
 
@@ -11,8 +15,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from grounded.effects.family import (
     Effect,
@@ -28,6 +33,10 @@ from grounded.effects.registry import Library
 from grounded.errors import GroundedError
 from grounded.search.planner import Planner, planner_with
 from grounded.task import Task
+
+if TYPE_CHECKING:
+    from grounded.diagnosis.report import Diagnosis
+    from grounded_trials.workspace.folder import Folder
 
 LINEAR = ("c", "k", "A", "B", "a", "b")  # the numbers of an added rate that it grows with
 STEEP = 3.0  # times its width: what a dry friction takes off a speed in a step, at most
@@ -168,3 +177,45 @@ def _bounds(effect: Effect) -> dict[str, tuple[float, float]]:
         for q, p in zip(small.quantities, large.quantities, strict=True)
         if not q.fixed
     }
+
+
+@dataclass(frozen=True, eq=False)
+class Better:
+    """A model to compare the crude one with, and its name in a legend."""
+
+    planner: Planner
+    name: str
+
+
+def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | None:
+    """The diagnosed model, or else the one with adopted effects; None where there is neither.
+
+    Raises:
+        GroundedError: if the diagnosis names an effect or a quantity that is not known.
+    """
+    adopted = workspace.config.model.effects
+    new = _new(diagnosis, {str(effect["name"]) for effect in adopted})
+    values = _parameters(workspace, diagnosis)
+    if not (values or new):
+        return Better(workspace.planner, "with adopted effects") if adopted else None
+    task = workspace.task
+    estimated = task.with_model(task.model.with_values(values))
+    return Better(planner_of(estimated, in_order(adopted, new)), "as diagnosed")
+
+
+def _new(diagnosis: Diagnosis | None, adopted: set[str]) -> list[dict[str, Any]]:
+    """The effects that the verdict names and the model lacks, with their quantities."""
+    if diagnosis is None:
+        return []
+    return [
+        {"name": name, **diagnosis.values(name)}
+        for name in diagnosis.joining
+        if name not in adopted and diagnosis.ranked(name) is not None
+    ]
+
+
+def _parameters(workspace: Folder, diagnosis: Diagnosis | None) -> dict[str, float]:
+    """The model's parameters as the diagnosis estimated them; its own names only."""
+    known = workspace.task.model.params
+    found = diagnosis.known_parameters if diagnosis is not None else {}
+    return {n: e.value for n, e in found.items() if n in known and e.value == e.value}

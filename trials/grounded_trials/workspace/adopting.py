@@ -1,9 +1,8 @@
 """adopt in a workspace: diagnosed effects join the model of grounded.toml, with their values.
 
 A diagnosis estimates the model's parameters beside the effects, so both belong to what it claims
-and are adopted together. `better_model` is that model before anybody adopts it, for reports to draw
-beside the crude one; once effects are adopted and nothing newer was diagnosed, it is the model that
-plans. reports/adoptions.json keeps what [model] was before each, so that the last can be undone.
+and are adopted together. reports/adoptions.json keeps what [model] was before each, so that the
+last can be undone.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from typing import Any
 from grounded.diagnosis.report import Diagnosis, Estimate, Made
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.result import Result, listed, percent
-from grounded.search.planner import Planner
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.workspace.config import ModelTable, as_toml, set_in_model
 from grounded_trials.workspace.diagnosing import read_diagnosis
@@ -175,6 +173,12 @@ def undo_adoption(workspace: Folder) -> Undone:
     set_in_model(file, params=before["params"], effects=before["effects"])
     write_document(workspace.reports / KEPT, {"adoptions": earlier, "undone": [*undone, *names]})
     return Undone(tuple(names), tuple(before["effects"]), before["params"])
+
+
+def undoable(workspace: Folder) -> tuple[str, ...]:
+    """The effects that `undo_adoption` can take back, one adoption after another."""
+    kept, _ = _kept(workspace)
+    return tuple(str(name) for step in kept for name in step["names"])
 
 
 def declined(workspace: Folder) -> tuple[str, ...]:
@@ -353,47 +357,3 @@ def _rounded(value: float) -> float:
     if not math.isfinite(value):
         raise GroundedError("the last diagnosis lacks a value: diagnose again", then=AGAIN)
     return float(f"{float(value):.8g}")
-
-
-@dataclass(frozen=True, eq=False)
-class Better:
-    """A model to compare the crude one with, and its name in a legend."""
-
-    planner: Planner
-    name: str
-
-
-def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | None:
-    """The diagnosed model, or else the one with adopted effects; None where there is neither.
-
-    Raises:
-        GroundedError: if the diagnosis names an effect or a quantity that is not known.
-    """
-    adopted = workspace.config.model.effects
-    new = _new(diagnosis, {str(effect["name"]) for effect in adopted})
-    values = _parameters(workspace, diagnosis)
-    if not (values or new):
-        return Better(workspace.planner, "with adopted effects") if adopted else None
-    from grounded_trials.workspace.adopted import in_order, planner_of
-
-    task = workspace.task
-    estimated = task.with_model(task.model.with_values(values))
-    return Better(planner_of(estimated, in_order(adopted, new)), "as diagnosed")
-
-
-def _new(diagnosis: Diagnosis | None, adopted: set[str]) -> list[Effect]:
-    """The effects that the verdict names and the model lacks, with their quantities."""
-    if diagnosis is None:
-        return []
-    return [
-        {"name": name, **diagnosis.values(name)}
-        for name in diagnosis.joining
-        if name not in adopted and diagnosis.ranked(name) is not None
-    ]
-
-
-def _parameters(workspace: Folder, diagnosis: Diagnosis | None) -> dict[str, float]:
-    """The model's parameters as the diagnosis estimated them; its own names only."""
-    known = workspace.task.model.params
-    found = diagnosis.known_parameters if diagnosis is not None else {}
-    return {n: e.value for n, e in found.items() if n in known and e.value == e.value}

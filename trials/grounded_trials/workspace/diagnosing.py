@@ -140,9 +140,10 @@ def _over_ground(workspace: Folder, found: Diagnosis) -> str:
     A hull's drag acts through the water: beside a current that is part of the model already it is
     found as something else.
     """
-    adopted = [str(e["name"]) for e in workspace.config.model.effects]
-    current = next((name for name in adopted if name.startswith("current:")), "")
-    if not current or not found.effects:
+    from grounded_trials.workspace.next_step import beside_current
+
+    current = beside_current(workspace, found)
+    if not current:
         return ""
     undo, again = (
         rendered(NextCommand(*words), workspace.address)
