@@ -35,6 +35,7 @@ from grounded.effects.family import (
     MediumFamily,
     MemoryFamily,
     ParamFamily,
+    Quantity,
     RateFamily,
     SensorDelayFamily,
     SensorFamily,
@@ -67,7 +68,10 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
     if isinstance(family, ParamFamily):
         name = effect.site.target
         return model.with_values({name: model.params[name].value + whole["d"]})
-    added = {param_name(effect.name, q.name): _param(q, whole[q.name]) for q in effect.quantities}
+    sized = any(whole[q.name] for q in effect.quantities if not q.fixed)
+    added = {
+        param_name(effect.name, q.name): _param(q, whole[q.name], sized) for q in effect.quantities
+    }
     make = {
         InputFamily: _input_step,
         LossFamily: _loss_step,
@@ -106,13 +110,18 @@ def param_name(effect: str, quantity: str) -> str:
 SURE = 0.5  # of its value: prior standard deviation of an adopted effect's quantity
 
 
-def _param(quantity: Any, value: float) -> Param:
+def _param(quantity: Quantity, value: float, constant_at_zero: bool) -> Param:
+    """A quantity as a parameter.
+
+    One at 0 beside others of its effect is a part that no data showed, and stays so: what an input
+    from 0 up does on its other side.
+    """
+    fixed = quantity.fixed or (value == 0 and constant_at_zero)
+    if fixed:
+        return Param(value, quantity.unit, value, value)
     low = None if not np.isfinite(quantity.low) else min(float(quantity.low), value)
     high = None if not np.isfinite(quantity.high) else max(float(quantity.high), value)
-    if quantity.fixed:
-        low = high = value
-    sure = None if quantity.fixed else SURE * abs(value) or None
-    return Param(value, quantity.unit, low, high, sure)
+    return Param(value, quantity.unit, low, high, SURE * abs(value) or None)
 
 
 def _quantities(effect: Effect, p: Any) -> dict[str, Any]:

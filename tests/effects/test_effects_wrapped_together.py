@@ -106,6 +106,23 @@ def test_pairs_wrapped_in_any_order_are_one_model():
     np.testing.assert_allclose(first, second, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    "name, values, uncertain",
+    [
+        ("input_curve:throttle", {"a": 0.0, "b": -0.13, "U": 1.0}, {"b"}),
+        ("input_curve:throttle", {"a": 0.2, "b": -0.13, "U": 1.0}, {"a", "b"}),
+        ("input_gain:throttle", {"g": 0.0}, {"g"}),
+        ("coulomb_friction:v", {"c": 0.0}, {"c"}),
+    ],
+)
+def test_the_side_of_an_input_that_was_never_seen_stays_unknown(name, values, uncertain):
+    """The fan of a tube acted `0.4 % more to its positive side`: a fit had moved what was 0."""
+    model = wrap(Library().effect(name, car), values, DT)
+    stem = name.replace(":", "_") + "_"
+    free = {n.removeprefix(stem) for n, p in model.params.items() if p.uncertain}
+    assert free & set(values) == uncertain
+
+
 def test_a_heading_rate_carried_by_the_users_own_step_follows_too():
     rk4 = plain_step(car)
     own = Model(
