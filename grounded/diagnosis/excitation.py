@@ -32,7 +32,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import TIE
-from grounded.diagnosis.likelihood.data import Data, prepare, shifted
+from grounded.diagnosis.likelihood.data import Data, prepare
 from grounded.diagnosis.likelihood.fitted import calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.intervals import foretold
@@ -42,6 +42,7 @@ from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.patterns import BASE, probes
 from grounded.diagnosis.report import Diagnosis, Estimate
 from grounded.effects import Library, Scales, memory_start, scales_of, wrap, wrapping_order
+from grounded.effects.memory import shifted
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.onboard import Runner

@@ -30,8 +30,9 @@ from grounded.effects.family import (
 from grounded.effects.joint import like_a_load, one_friction
 from grounded.effects.memory import memory_of, memory_start
 from grounded.effects.order import acting_order, wrapping_order
+from grounded.effects.plain_step import param_name
 from grounded.effects.registry import Library
-from grounded.effects.wrap import param_name, wrap
+from grounded.effects.wrap import wrap
 
 __all__ = [
     "Effect",

@@ -21,7 +21,15 @@ from typing import Any
 import numpy as np
 
 from grounded.effects import places
-from grounded.effects.family import InputFamily, MemoryFamily, Quantity, Site, speed_limit
+from grounded.effects.family import (
+    LEAST_LIMIT,
+    InputFamily,
+    MemoryFamily,
+    Quantity,
+    Site,
+    beyond,
+    speed_limit,
+)
 from grounded.model import Model
 
 LONGEST_DELAY = 0.5  # [s] that a scan considers, where steps are not longer than usual
@@ -78,6 +86,7 @@ input_bias = InputFamily(
     lookalikes=("offset", "input_fade", "dead_zone"),
     vague=0.7,  # ln 2: it may have either sign
     effect=lambda u, t, c: u + c["b"],
+    linear=True,
 )
 
 input_gain = InputFamily(
@@ -89,6 +98,7 @@ input_gain = InputFamily(
     quantities=lambda site: (Quantity("g", "1", low=-3.0, high=5.0, absurd=4.0),),
     lookalikes=("viscous_friction", "rate_gain", "parameter", "input_fade"),
     effect=lambda u, t, c: (1 + c["g"]) * u,
+    linear=True,
 )
 
 dead_zone = InputFamily(
@@ -98,7 +108,7 @@ dead_zone = InputFamily(
     targets=_one_or_alike,
     quantities=_threshold,
     lookalikes=("stall", "stiction", "coulomb_friction", "backlash", "input_bias"),
-    effect=lambda u, t, c: np.maximum(u - c["c"], 0.0) - np.maximum(-u - c["c"], 0.0),
+    effect=lambda u, t, c: beyond(u, c["c"]),
 )
 
 stall = InputFamily(
@@ -108,7 +118,7 @@ stall = InputFamily(
     targets=places.inputs,
     quantities=_threshold,
     lookalikes=("dead_zone", "stiction"),
-    effect=lambda u, t, c: np.where(np.abs(u) > c["c"], u, 0.0),
+    effect=lambda u, t, c: np.where(np.abs(u) / np.maximum(c["c"], LEAST_LIMIT) > 1.0, u, 0.0),
 )
 
 saturation = InputFamily(
@@ -118,7 +128,7 @@ saturation = InputFamily(
     targets=places.inputs,
     quantities=_limit,
     lookalikes=("rate_limit", "slew_limit", "input_gain", "quadratic_drag"),
-    effect=lambda u, t, c: np.minimum(np.maximum(u, -c["c"]), c["c"]),
+    effect=lambda u, t, c: u - beyond(u, c["c"]),
 )
 
 input_curve = InputFamily(
@@ -130,7 +140,9 @@ input_curve = InputFamily(
     quantities=_curve,
     lookalikes=("input_gain", "input_bias", "saturation", "dead_zone"),
     vague=0.5,
-    effect=lambda u, t, c: (1 + c["b"] * (np.abs(u) / c["U"] - 0.5)) * u + c["a"] * np.abs(u),
+    effect=lambda u, t, c: (
+        (1 + c["b"] * (np.abs(u / c["U"]) - 0.5)) * u + c["a"] * c["U"] * np.abs(u / c["U"])
+    ),
 )
 
 
@@ -149,6 +161,7 @@ input_fade = InputFamily(
     lookalikes=("input_gain", "trend", "input_bias"),
     effect=lambda u, t, c: (1 - c["k"] * t) * u,
     timed=True,
+    linear=True,
 )
 
 
@@ -202,11 +215,9 @@ def _along_lag(u: Any, z: Any, c: Any, dt: float) -> Any:
 
 
 def _advance_rate(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tuple[Any, ...]]:
-    most = np.maximum(c["r"] * dt, 1e-12)
-    missing = u - z[0]
-    moved = np.minimum(np.maximum(missing, -most), most)
-    reached = np.minimum(np.abs(missing) / most, 1.0)  # the part of the step spent on the ramp
-    return z[0] + moved * (1 - 0.5 * reached), (z[0] + moved,)
+    most = np.maximum(c["r"] * dt, LEAST_LIMIT)
+    part = np.minimum(np.maximum((u - z[0]) / most, -1.0), 1.0)  # of the step, on the ramp
+    return z[0] + most * part * (1 - 0.5 * np.abs(part)), (z[0] + most * part,)
 
 
 def _along_rate(u: Any, z: Any, c: Any, dt: float) -> Any:
@@ -222,8 +233,7 @@ def _along_rate(u: Any, z: Any, c: Any, dt: float) -> Any:
 
 
 def _advance_backlash(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tuple[Any, ...]]:
-    half = 0.5 * c["b"]
-    held = np.minimum(np.maximum(z[0], u - half), u + half)
+    held = z[0] - beyond(z[0] - u, 0.5 * c["b"])
     return held, (held,)
 
 
@@ -262,6 +272,7 @@ first_order_lag = MemoryFamily(
     lookalikes=("delay", "rate_limit", "slew_limit", "parameter"),
     advance=_advance_lag,
     along=_along_lag,
+    linear=True,
 )
 
 rate_limit = MemoryFamily(

@@ -200,10 +200,14 @@ class Family:
 
 @dataclass(frozen=True)
 class InputFamily(Family):
-    """effect(u, t, c) -> what the actuator receives of a command u at time t."""
+    """effect(u, t, c) -> what the actuator receives of a command u at time t.
+
+    `linear`: a command that is delayed by a part of a step, its mean over each, may come first.
+    """
 
     effect: Callable[[Any, Any, Any], Any] = lambda u, t, c: u
     timed: bool = False
+    linear: bool = False
 
 
 @dataclass(frozen=True)
@@ -213,6 +217,7 @@ class MemoryFamily(Family):
     `depth(values, dt)`: how many memory states the effect needs, all starting at the input that
     was held before t = 0. `transport`: a pure delay, which acts after all others. `along(u, z, c,
     dt)`: where `depth` is one, z before each step of the commands u (S, T) that begin at z (S,).
+    `linear`: as of an `InputFamily`.
     """
 
     advance: Callable[[Any, tuple[Any, ...], Any, Any], tuple[Any, tuple[Any, ...]]] = (
@@ -220,6 +225,7 @@ class MemoryFamily(Family):
     )
     depth: Callable[[Mapping[str, float], float], int] = lambda values, dt: 1
     transport: bool = False
+    linear: bool = False
     along: Callable[[Any, Any, Mapping[str, float], float], Any] = lambda u, z, c, dt: z[:, None]
 
 
@@ -342,6 +348,21 @@ class Effect:
         if missing:
             raise GroundedError(f"effect '{self.name}' needs a value for '{missing[0]}'")
         return MappingProxyType({name: whole[name] for name in names})
+
+
+def beyond(value: Any, most: Any) -> Any:
+    """How far a value lies outside of -most to most, exactly 0 within: what a limit takes off it.
+
+    It is compared as a part of the limit, since planning rounds corners off (`Task.smoothing`): in
+    the limit's own unit that width may be more than the whole of it, and a plan through such a
+    corner has nothing to do with the limit.
+    """
+    most = np.maximum(most, LEAST_LIMIT)
+    part = value / most
+    return most * (np.maximum(part - 1.0, 0.0) - np.maximum(-part - 1.0, 0.0))
+
+
+LEAST_LIMIT = 1e-12
 
 
 def braked(effect: Effect, s: Any, added: Values, half: Any) -> Values:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from grounded.effects import places
-from grounded.effects.family import Quantity, RateFamily, Site, Values, per, width
+from grounded.effects.family import Quantity, RateFamily, Site, Values, beyond, per, width
 
 HALTS = 2.0  # times the fastest motion, a control step: what opposes it by more is no friction
 
@@ -76,8 +76,7 @@ def _stiction_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Valu
     v = s[site.target]
     slow = v / c["v_s"]
     drive = own[site.target] + 2.0 * v
-    held = np.minimum(np.maximum(drive, -c["c"]), c["c"])
-    return {site.target: -np.exp(-slow * slow) * held}
+    return {site.target: -np.exp(-slow * slow) * (drive - beyond(drive, c["c"]))}
 
 
 viscous_friction = RateFamily(

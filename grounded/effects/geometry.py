@@ -21,7 +21,16 @@ from typing import Any
 import numpy as np
 
 from grounded.effects import places
-from grounded.effects.family import Quantity, RateFamily, Site, Values, coupled, per, two_axes
+from grounded.effects.family import (
+    Quantity,
+    RateFamily,
+    Site,
+    Values,
+    beyond,
+    coupled,
+    per,
+    two_axes,
+)
 from grounded.model import Model
 
 
@@ -110,7 +119,7 @@ def _grip(site: Site) -> tuple[Quantity, ...]:
 def _grip_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
     rate = own[site.target]
     most = c["a"] / np.maximum(np.abs(_velocity(s, a, site)), 1e-3)
-    return {site.target: np.minimum(np.maximum(rate, -most), most) - rate}
+    return {site.target: -beyond(rate, most)}
 
 
 def _drag_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:

@@ -45,6 +45,12 @@ SAME = 1e-6  # of the squared length: what may differ
 FELT = 1e-4  # [1/s^2]: what a medium that moves by 0.2 changes of a velocity's rate at least
 
 
+def medium_of(model: Model) -> Effect | None:
+    """The medium that moves in a model, as it joined it."""
+    found = getattr(model.step, "medium", None)
+    return found if isinstance(found, Effect) else None
+
+
 def through_it(effect: Effect, s: Any, c: Any) -> Named:
     """States s over ground as the medium sees them."""
     return _moved(s, effect.family.shift(s, c, effect.site), -1.0)  # type: ignore[attr-defined]

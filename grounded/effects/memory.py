@@ -38,16 +38,39 @@ def true_values(names: Sequence[str], memory: Collection[str]) -> dict[int, int]
     }
 
 
-def memory_of(wrapped: Model, base: Model, trial: Trial) -> Array:
+def shifted(signal: Array, held: Array, steps: float) -> Array:
+    """A held signal (S, T) delayed by any fraction of steps: its mean over each step."""
+    whole = int(np.floor(steps + 1e-9))
+    part = max(0.0, steps - whole)
+    T = signal.shape[1]
+    line = np.concatenate([np.repeat(held[:, None], whole + 1, axis=1), signal], axis=1)
+    return (1 - part) * line[:, 1 : T + 1] + part * line[:, :T]
+
+
+def memory_of(wrapped: Model, base: Model, trial: Trial, latency: Array | None = None) -> Array:
     """The memory states along a recorded trial, (T + 1, wrapped.n - base.n).
 
-    They start at what held before t = 0 (`memory_start`), and follow the commands and the logged
-    states.
+    They start at what held before t = 0 (`memory_start`), and follow the logged states and what
+    arrives of the commands.
+
+    Args:
+        wrapped: the model with memory.
+        base: whose states the trial has.
+        trial: with `start_inputs`, or 0 was held before it.
+        latency: transport delay of the inputs (m,) [s], which acts before the memory; None: none.
     """
+    inputs = trial.inputs
+    if latency is not None and latency.any() and trial.steps:
+        held = np.zeros(base.m) if trial.start_inputs is None else trial.start_inputs
+        late = [
+            shifted(inputs[None, :, j], held[[j]], float(d) / trial.dt)[0]
+            for j, d in enumerate(latency)
+        ]
+        inputs = np.stack(late, axis=1)
     found = [now := memory_start(wrapped, base, trial)]
     for t in range(trial.steps):
         x = np.concatenate([trial.states[t], now])[None]
-        after = wrapped.system.step(x, trial.inputs[t][None], wrapped.values, trial.dt)
+        after = wrapped.system.step(x, inputs[t][None], wrapped.values, trial.dt)
         now = after[0, base.n :]
         found.append(now)
     return np.array(found).reshape(trial.steps + 1, wrapped.n - base.n)

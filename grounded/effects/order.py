@@ -38,24 +38,18 @@ def joining_order(old: Sequence[Family], new: Sequence[Family]) -> list[tuple[bo
     ]
 
 
-def wrapping_order(families: Sequence[Family], *, together: bool = True) -> list[int]:
-    """Indices of all effects, the one that is wrapped first (the innermost) first.
-
-    Args:
-        families: of the effects.
-        together: they were fitted together, so that a medium carries the rates among them; else
-            what is listed after a medium joined the model that has it, and acts over ground.
-    """
+def wrapping_order(families: Sequence[Family]) -> list[int]:
+    """Indices of all effects, the one that is wrapped first (the innermost) first."""
     inputs = acting_order(families)
     rest = [i for i in range(len(families)) if i not in inputs]
-    return [*sorted(rest, key=lambda i: _depth(families[i], together)), *reversed(inputs)]
+    return [*sorted(rest, key=lambda i: _depth(families[i])), *reversed(inputs)]
 
 
-def _depth(family: Family, together: bool) -> float:
+def _depth(family: Family) -> float:
     if isinstance(family, ParamFamily | LossFamily):
         return 0 if isinstance(family, ParamFamily) else 1
     if isinstance(family, MediumFamily):
-        return 3.5 if together else 3
+        return 3.5
     if isinstance(family, RateFamily):
         return 2 if family.parts else 3
     if isinstance(family, SensorDelayFamily | SensorLagFamily):  # their memories begin at the log

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from grounded.compile.names import Named, check_names
+from grounded.effects.family import Effect
 from grounded.model import Model
 
 Step = Callable[[Any, Any, Any, Any], dict[str, Any]]
@@ -44,3 +45,20 @@ def plain_step(model: Model) -> Step:
         return dict(s)
 
     return once if model.substeps == 1 else several
+
+
+def param_name(effect: str, quantity: str) -> str:
+    """`dead_zone_throttle_c`: the wrapped model's name of a quantity of `dead_zone:throttle`."""
+    family, _, targets = effect.partition(":")
+    return f"{family}_{targets.replace('+', '_').replace('<-', '_from_')}_{quantity}"
+
+
+def quantities_of(effect: Effect, p: Any) -> dict[str, Any]:
+    """An effect's numbers among the parameters of the model that it joined."""
+    return {q.name: p[param_name(effect.name, q.name)] for q in effect.quantities}
+
+
+def own_state(model: Model, s: Any, true: Mapping[str, str] | None = None) -> Named:
+    """The model's states; `true`: the memory that stands for one that is only logged."""
+    values = [s[(true or {}).get(n, n)] for n in model.state_names]
+    return Named("state", model.state_names, values)

@@ -21,7 +21,16 @@ from typing import Any
 import numpy as np
 
 from grounded.effects import places
-from grounded.effects.family import Quantity, RateFamily, Site, Values, coupled, per, speed_limit
+from grounded.effects.family import (
+    Quantity,
+    RateFamily,
+    Site,
+    Values,
+    beyond,
+    coupled,
+    per,
+    speed_limit,
+)
 
 
 def _coupling(site: Site) -> tuple[Quantity, ...]:
@@ -60,7 +69,7 @@ def _periodic_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Valu
 
 def _slew_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
     rate = own[site.target]
-    return {site.target: np.minimum(np.maximum(rate, -c["r"]), c["r"]) - rate}
+    return {site.target: -beyond(rate, c["r"])}
 
 
 offset = RateFamily(

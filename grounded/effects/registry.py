@@ -24,7 +24,18 @@ import numpy as np
 
 from grounded.effects import actuator, friction, geometry, joint, medium, places, rate, sensor
 from grounded.effects.correction import correction
-from grounded.effects.family import Effect, Family, ParamFamily, Quantity, RateFamily, Scales, Site
+from grounded.effects.family import (
+    Effect,
+    Family,
+    LossFamily,
+    MediumFamily,
+    ParamFamily,
+    Quantity,
+    RateFamily,
+    Scales,
+    Site,
+)
+from grounded.effects.sensed import moved_model
 from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
 from grounded.model import Model, Param
@@ -118,12 +129,15 @@ class Library:
     def candidates(self, model: Model, scales: Scales | None = None) -> tuple[Effect, ...]:
         """Every effect that can apply to a model, in the library's order."""
         found, offered = [], [family.name for family in self.families]
+        whole, model = model, moved_model(model)
         idle, outright = derived_states(model), outright_states(model)
         integrals = places.integrated(model)
         geometric = set(integrals) - set(places.velocities(model))
         same = aliases(model, idle | outright) | joint.renamed(model) | medium.renamed(model)
         for family in self.families:
-            for target in family.targets(model):
+            moves = isinstance(family, LossFamily | MediumFamily | RateFamily)
+            site = model if moves else whole
+            for target in family.targets(site):
                 driven = target.partition("<-")
                 if isinstance(family, RateFamily) and {driven[0], driven[2]} & idle:
                     continue
@@ -135,7 +149,7 @@ class Library:
                     continue
                 if same.get(f"{family.name}:{target}", "").partition(":")[0] in offered:
                     continue
-                found.append(_build(family, target, model, scales or Scales()))
+                found.append(_build(family, target, site, scales or Scales()))
         return tuple(found)
 
     def joints(self, model: Model, scales: Scales | None = None) -> tuple[Effect, ...]:
@@ -143,6 +157,7 @@ class Library:
         family = joint.joint_friction
         if family not in self.families:
             return ()
+        model = moved_model(model)
         targets = family.targets(model)
         return tuple(_build(family, target, model, scales or Scales()) for target in targets)
 

@@ -23,6 +23,7 @@ commands and the measured states (`memory`). In which order several effects are 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -44,10 +45,10 @@ from grounded.effects.family import (
     braked,
 )
 from grounded.effects.joint import inputs_left
-from grounded.effects.medium import over_ground, through_it
-from grounded.effects.plain_step import Step, plain_step
+from grounded.effects.medium import medium_of, over_ground, through_it
+from grounded.effects.plain_step import Step, own_state, param_name, plain_step, quantities_of
 from grounded.effects.registry import partner
-from grounded.effects.sensor import lagging
+from grounded.effects.sensed import behind_logs, late_step, sensor_step
 from grounded.errors import GroundedError
 from grounded.model import Model, Param
 
@@ -68,6 +69,9 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
     if isinstance(family, ParamFamily):
         name = effect.site.target
         return model.with_values({name: model.params[name].value + whole["d"]})
+    around = _shell(model)
+    if around and isinstance(family, LossFamily | MediumFamily | RateFamily):
+        return _inside(around, effect, values, dt)
     sized = any(whole[q.name] for q in effect.quantities if not q.fixed)
     added = {
         param_name(effect.name, q.name): _param(q, whole[q.name], sized) for q in effect.quantities
@@ -78,9 +82,9 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
         MemoryFamily: _memory_step,
         RateFamily: _rate_step,
         MediumFamily: _medium_step,
-        SensorFamily: _sensor_step,
-        SensorDelayFamily: _sensor_delay_step,
-        SensorLagFamily: _sensor_lag_step,
+        SensorFamily: sensor_step,
+        SensorDelayFamily: late_step,
+        SensorLagFamily: late_step,
     }
     build = next((build for kind, build in make.items() if isinstance(family, kind)), None)
     if build is None:
@@ -88,6 +92,11 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
     step, memory = build(effect, whole, dt)
     vars(step)["timestep"] = getattr(model.step, "timestep", 0.0)
     vars(step)["settled"] = _settled(effect)
+    if not isinstance(family, LossFamily | RateFamily):
+        vars(step)["shell"] = _Shell(effect, whole, dt)
+    if isinstance(family, InputFamily | MemoryFamily) and (late := behind_logs(model)):
+        vars(step)["behind"] = late.lifted(model)
+    vars(step)["medium"] = effect if isinstance(family, MediumFamily) else medium_of(model)
     written = model.step or model.derivative
     vars(step)["__wrapped__"] = getattr(written, "__wrapped__", written)  # `where`: the user's
     return Model(
@@ -101,10 +110,34 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
     )
 
 
-def param_name(effect: str, quantity: str) -> str:
-    """`dead_zone_throttle_c`: the wrapped model's name of a quantity of `dead_zone:throttle`."""
-    family, _, targets = effect.partition(":")
-    return f"{family}_{targets.replace('+', '_').replace('<-', '_from_')}_{quantity}"
+@dataclass(frozen=True)
+class _Shell:
+    """The outermost effect of a model, what moves things excepted."""
+
+    effect: Effect
+    whole: Values
+    dt: float
+
+
+def _shell(model: Model) -> _Shell | None:
+    found = getattr(model.step, "shell", None)
+    return found if isinstance(found, _Shell) else None
+
+
+def _inside(around: _Shell, effect: Effect, values: Mapping[str, float], dt: float) -> Model:
+    """A model that gets an effect inside its outermost one: what moves things acts there.
+
+    A friction brakes what moves, not the late log of it; a hull's drag acts through the water.
+    """
+    model, outer = effect.site.model, around.effect
+    inner = outer.site.model
+    inner = replace(inner, params={name: model.params[name] for name in inner.params})
+    grown = wrap(replace(effect, site=replace(effect.site, model=inner)), values, dt)
+    again = replace(outer, site=replace(outer.site, model=grown))
+    whole = wrap(again, around.whole, around.dt)
+    params = {name: model.params.get(name, param) for name, param in whole.params.items()}
+    name = f"{model.name} with {effect.name}"
+    return replace(whole, params=params, name=name)
 
 
 SURE = 0.5  # of its value: prior standard deviation of an adopted effect's quantity
@@ -124,16 +157,6 @@ def _param(quantity: Quantity, value: float, constant_at_zero: bool) -> Param:
     return Param(value, quantity.unit, low, high, SURE * abs(value) or None)
 
 
-def _quantities(effect: Effect, p: Any) -> dict[str, Any]:
-    return {q.name: p[param_name(effect.name, q.name)] for q in effect.quantities}
-
-
-def _own_state(model: Model, s: Any, true: Mapping[str, str] | None = None) -> Named:
-    """The model's states; `true`: the memory that stands for one that is only logged."""
-    values = [s[(true or {}).get(n, n)] for n in model.state_names]
-    return Named("state", model.state_names, values)
-
-
 def _replaced(model: Model, a: Any, target: Mapping[str, Any]) -> Named:
     return Named("input", model.input_names, [target.get(n, a[n]) for n in model.input_names])
 
@@ -149,10 +172,10 @@ def _input_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[st
     timed = family.timed
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        c = _quantities(effect, p)
+        c = quantities_of(effect, p)
         t = s[clock] if timed else 0.0
         u = {n: family.effect(a[n], t, c) for n in effect.site.targets}
-        after = base(_own_state(model, s), _replaced(model, a, u), p, dt)
+        after = base(own_state(model, s), _replaced(model, a, u), p, dt)
         return {**after, clock: s[clock] + dt} if timed else after
 
     return step, {clock: "s"} if timed else {}
@@ -165,12 +188,12 @@ def _memory_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[s
     names = {n: [f"{n}_{family.name}_{i + 1}" for i in range(depth)] for n in effect.site.targets}
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        c, u = _quantities(effect, p), dict[str, Any]()
+        c, u = quantities_of(effect, p), dict[str, Any]()
         kept: dict[str, Any] = {}
         for n, memory in names.items():
             u[n], later = family.advance(a[n], tuple(s[z] for z in memory), c, dt)
             kept.update(zip(memory, later, strict=True))
-        return {**base(_own_state(model, s), _replaced(model, a, u), p, dt), **kept}
+        return {**base(own_state(model, s), _replaced(model, a, u), p, dt), **kept}
 
     return step, {z: model.inputs[n] for n, memory in names.items() for z in memory}
 
@@ -188,7 +211,7 @@ def _settled(effect: Effect) -> Callable[[Any, Any], dict[str, Any]]:
         if isinstance(family, MemoryFamily):
             own = {f"{n}_{family.name}": a[n] for n in effect.site.targets}
         elif isinstance(family, InputFamily):
-            c = _quantities(effect, p)
+            c = quantities_of(effect, p)
             u = {n: family.effect(a[n], 0.0, c) for n in effect.site.targets}
             a = _replaced(model, a, u)
         return own if inner is None else {**inner(a, p), **own}
@@ -203,8 +226,8 @@ def _loss_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str
     base, effects = plain_step(inner), (*others, effect)
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        start, given = _own_state(inner, s), _replaced(inner, a, {})
-        pairs = [(e, _quantities(e, p)) for e in effects]
+        start, given = own_state(inner, s), _replaced(inner, a, {})
+        pairs = [(e, quantities_of(e, p)) for e in effects]
         left = inputs_left(pairs, start, given, dt, lambda u: base(start, u, p, dt))
         return base(start, left, p, dt)
 
@@ -235,7 +258,7 @@ def _joint_step(model: Model, effects: tuple[Effect, ...]) -> Step:
     tied = {n: k for n in model.state_names if (k := partner(model, n))}
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        start, now = _own_state(model, s), {z: s[z] for z in clocks}
+        start, now = own_state(model, s), {z: s[z] for z in clocks}
         then = {z: s[z] + dt for z in clocks}
         own = _mean_rate(start, base(start, a, p, dt), dt) if needs_own else {}
         state = _kicked(start, _added(rates, start, a, own, now, p, dt), dt)
@@ -283,7 +306,7 @@ def _added(
     total: dict[str, Any] = {}
     for e in effects:
         t = clock.get(_clock(e), 0.0)
-        added = _family(e).rate(s, a, own, t, _quantities(e, p), e.site)
+        added = _family(e).rate(s, a, own, t, quantities_of(e, p), e.site)
         for n, rate in braked(e, s, added, 0.5 * dt).items():
             total[n] = total[n] + rate if n in total else rate
     return total
@@ -322,64 +345,8 @@ def _medium_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[s
     base, model = plain_step(effect.site.model), effect.site.model
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        c = _quantities(effect, p)
-        after = base(through_it(effect, _own_state(model, s), c), a, p, dt)
+        c = quantities_of(effect, p)
+        after = base(through_it(effect, own_state(model, s), c), a, p, dt)
         return over_ground(effect, Named("state", tuple(after), list(after.values())), c, dt)
 
     return step, {}
-
-
-def _sensor_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
-    model, family = effect.site.model, effect.family
-    assert isinstance(family, SensorFamily)
-    base, seen = plain_step(model), effect.site.targets
-
-    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        c = _quantities(effect, p)
-        true = [family.recover(s[n], c) if n in seen else s[n] for n in model.state_names]
-        after = base(Named("state", model.state_names, true), a, p, dt)
-        return {n: family.measure(v, c) if n in seen else v for n, v in after.items()}
-
-    return step, {}
-
-
-def _sensor_delay_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
-    """True values and their past become memory; the states themselves are the logged, old ones."""
-    model, targets = effect.site.model, effect.site.targets
-    depth = max(1, int(np.ceil(whole["d"] / dt - 1e-9)))
-    true = {n: _true_name(model, n) for n in targets}
-    memory = {n: [z, *[f"{z}_{i + 1}" for i in range(depth)]] for n, z in true.items()}
-    base = plain_step(model)
-
-    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        behind = _quantities(effect, p)["d"] / dt
-        after = base(_own_state(model, s, true), a, p, dt)
-        found = dict(after)
-        for n, past in memory.items():
-            line = [after[n], *[s[z] for z in past]]
-            part = [np.maximum(1 - np.abs(behind - i), 0.0) for i in range(len(line))]
-            found[n] = sum(part[i] * value for i, value in enumerate(line))
-            found |= dict(zip(past, line, strict=False))
-        return found
-
-    return step, {z: model.states[n] for n, past in memory.items() for z in past}
-
-
-def _true_name(model: Model, target: str) -> str:
-    """What the state is called that the log of `target` shows late; its log may be late twice."""
-    name = f"{target}_true"
-    return _true_name(model, name) if name in model.states else name
-
-
-def _sensor_lag_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
-    """The true value becomes memory; the state itself is the logged, filtered one."""
-    model, target = effect.site.model, effect.site.target
-    base, memory = plain_step(model), _true_name(model, target)
-
-    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        after = base(_own_state(model, s, {target: memory}), a, p, dt)
-        behind, moved = s[target] - s[memory], after[target] - s[memory]
-        off = lagging(behind, moved, _quantities(effect, p)["tau"], dt)
-        return {**after, target: after[target] + off, memory: after[target]}
-
-    return step, {memory: model.states[target]}

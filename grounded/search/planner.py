@@ -20,6 +20,7 @@ import numpy as np
 
 from grounded.compile import Problem
 from grounded.errors import GroundedError
+from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.rollout import Rollout, simulate
@@ -56,7 +57,7 @@ class Planner:
 
         if trial.start_inputs is None:
             trial = dataclasses.replace(trial, start_inputs=self.task.past)
-        states = np.hstack([trial.states, memory_of(plan, base, trial)])
+        states = np.hstack([trial.states, memory_of(plan, base, trial, self.plan.latency)])
         return dataclasses.replace(trial, states=states, state_names=plan.state_names)
 
     def widened(self, policy: Policy) -> Policy:
@@ -123,7 +124,9 @@ def planner_with(
     """The planner of a task whose model got these effects, in the order in which they act.
 
     A pure delay becomes latency of the task, a queue that the robot's runner knows; everything else
-    wraps the model, with memory states where the effect has a memory.
+    wraps the model, with memory states where the effect has a memory. Of an input that is bent on
+    its way (a dead zone, a limit of its rate) the latency has whole steps alone: what is left of a
+    step acts behind the bend, since the mean of two commands, bent, is not the mean of both bent.
 
     Args:
         task: what is to be done, with the model as it was.
@@ -135,25 +138,57 @@ def planner_with(
         GroundedError: for an unknown effect, or a quantity that is missing or unknown.
     """
     from grounded.effects import Library, param_name, wrap
-    from grounded.effects.family import Effect, Scales, Site
+    from grounded.effects.family import Effect, InputFamily, MemoryFamily, Scales, Site
     from grounded.effects.order import wrapping_order
 
     library, checked = library or Library(), checked or Effect.complete
     assert task.latency is not None
-    model, latency = task.model, np.array(task.latency)
+    model, latency, bent = task.model, np.array(task.latency), np.zeros(task.model.m, bool)
     families = [library.family(name.partition(":")[0]) for name, _ in effects]
-    for i in wrapping_order(families, together=False):
-        name, values = effects[i]
-        targets = tuple(name.partition(":")[2].split("+"))
-        if families[i].name == "delay":
-            reached = [_input(task, name, one) for one in targets]
-            site = Site(task.model, targets, Scales())
-            latency[reached] += checked(families[i].at(site), values)["d"]
+    for (name, values), family in zip(effects, families, strict=True):
+        if not isinstance(family, InputFamily | MemoryFamily):
             continue
+        targets = tuple(name.partition(":")[2].split("+"))
+        reached = [_input(task, name, one) for one in targets]
+        if family.name == "delay":
+            site = Site(task.model, targets, Scales())
+            latency[reached] += checked(family.at(site), values)["d"]
+        else:
+            bent[reached] |= not family.linear
+    part = np.where(bent, latency - task.dt * np.floor(latency / task.dt + WHOLE), 0.0)
+    part[part < WHOLE * task.dt] = 0.0
+    order = wrapping_order(families)
+    inputs = [i for i in order if isinstance(families[i], InputFamily | MemoryFamily)]
+    for i in order:
+        if i in inputs[:1]:
+            model = _late_by(model, part, task.dt)
+        if families[i].name == "delay":
+            continue
+        name, values = effects[i]
         effect = library.effect(name, model)
         model = wrap(effect, checked(effect, values), task.dt)
+    latency -= part
     widths = tuple(param_name(name, "width") for name, values in effects if "width" in values)
     return dataclasses.replace(planner_for(task, model, latency), widths=widths)
+
+
+WHOLE = 1e-6  # of a step: closer to whole steps is whole
+
+
+def _late_by(model: Model, late: Array, dt: float) -> Model:
+    """The model whose inputs arrive parts of a step late, (m,) [s]: constants, not estimated."""
+    from grounded.effects import Library, wrap
+    from grounded.effects.family import MemoryFamily
+
+    for name, by in zip(model.input_names, late.tolist(), strict=True):
+        if by > 0:
+            effect = Library().effect(f"delay:{name}", model)
+            assert isinstance(effect.family, MemoryFamily)
+            once = dataclasses.replace(effect.family, depth=lambda values, dt: 1)
+            fixed = tuple(dataclasses.replace(q, fixed=True, start=by) for q in effect.quantities)
+            effect = dataclasses.replace(effect, family=once, quantities=fixed)
+            model = wrap(effect, {"d": by}, dt)
+    return model
 
 
 def _input(task: Task, name: str, target: str) -> int:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,18 +14,13 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import linearise, sensitivities_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.report import Diagnosis, Verdict
-from grounded.effects import Effect, Library, scales_of, wrapping_order
+from grounded.effects import Effect, Library, scales_of, wrap, wrapping_order
 from grounded.effects.places import body_velocity
-from grounded.errors import NextCommand
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
 from grounded.search.planner import planner_with
 from grounded.task import Task
 from grounded.utility import Reward
-from grounded_trials.store.documents import write_document
-from grounded_trials.workspace.diagnosing import _over_ground
-from grounded_trials.workspace.next_step import to_adopt
 
 DT, FINE = 0.1, 20
 CURRENT = ("current:u+v", {"a": 0.15, "b": -0.08})
@@ -198,15 +192,21 @@ def test_an_adopted_medium_is_the_one_that_was_diagnosed(parts):
     np.testing.assert_allclose(found.reshape(want.shape), want, atol=1e-9)
 
 
-def test_a_drag_that_joins_a_model_with_a_current_acts_as_it_was_diagnosed():
-    """Over ground: the model that it was found on has the current already."""
+def test_a_drag_that_joins_a_model_with_a_current_acts_through_the_water():
+    """However they join: a hull's drag that was found later was taken for an offset over ground."""
     model = adopted(CURRENT)
     data, h = prepare(model, TRIALS[:1]), hypothesis(DRAG, model=model)
-    want = Predictor(data).next(h, data.y[:-1])
-    both = adopted(CURRENT, DRAG)
+    found = Predictor(data).next(h, data.y[:-1])
     x, u = data.y[:-1].reshape(-1, 6), Predictor(data).inputs(h).reshape(-1, 2)
-    found = both.system.step(x, u, both.values, DT)
-    np.testing.assert_allclose(found.reshape(want.shape), want, atol=1e-9)
+    for both in (adopted(CURRENT, DRAG), adopted(DRAG, CURRENT), joined(DRAG, model)):
+        want = both.system.step(x, u, both.values, DT)
+        np.testing.assert_allclose(found.reshape(want.shape), want, atol=1e-9)
+
+
+def joined(part: tuple[str, dict[str, float]], model: Model) -> Model:
+    """The model with one more effect."""
+    name, values = part
+    return wrap(Library().effect(name, model), values, DT)
 
 
 @pytest.mark.parametrize("parts", TOGETHER, ids=lambda p: "+".join(n.split(":")[0] for n, _ in p))
@@ -286,27 +286,3 @@ def test_the_cause_is_found_with_its_size(truth, name):
 def test_none_is_claimed_in_still_water():
     found = gr.diagnose(boat_of(X=0.5, XX=0.3, Y=1.6), driven())
     assert not {n for n in found.verdict.effects if n.startswith(("current", "push_world"))}
-
-
-@pytest.mark.parametrize(
-    "adopted, claimed, told",
-    [
-        (("current:u+v",), ("offset:u",), True),
-        (("current:u+v",), (), False),
-        (("delay:port",), ("offset:u",), False),
-    ],
-)
-def test_what_is_found_beside_an_adopted_current_is_told_to_act_over_the_ground(
-    adopted, claimed, told, tmp_path
-):
-    """A hull's drag was found as an offset, a friction and other parameters, and advised."""
-    kept = {"adoptions": [{"names": list(adopted)}], "undone": []}
-    write_document(tmp_path / "adoptions.json", kept)
-    table = SimpleNamespace(effects=tuple({"name": name} for name in adopted), params={})
-    config = SimpleNamespace(model=table)
-    workspace = SimpleNamespace(config=config, address=None, reports=tmp_path, base_model=boat)
-    found = Diagnosis(Verdict("effect" if claimed else "none", effects=claimed))
-    assert ("adopt --undo" in _over_ground(workspace, found)) is told
-    then = to_adopt(workspace, found)
-    assert (then == NextCommand("adopt", ("--undo",))) is told
-    assert (then is None) is (not claimed)

@@ -153,6 +153,7 @@ class _Context(SentOnce):
             before = self._rates_at(effect, values, 0)
             later = self._rates_at(effect, values, 1)
             d = 0.5 * dt * (self._passed(before) + later)
+            d = predictor.logged(self.fit.hypothesis, np.zeros_like(d), d)
             for a, b in predictor.tied():
                 assert self.G is not None
                 slope = self.G[..., b, :].copy()
@@ -182,7 +183,7 @@ class _Context(SentOnce):
         """The added rate at the start (0) or the end (1) of every step."""
         data = self.predictor.data
         x = self.x if when == 0 else self.after
-        if medium := moving(self.fit.hypothesis):
+        if medium := moving(self.fit.hypothesis, self.predictor.seen):
             x = medium.through(x)
         t = data.time if when == 0 else data.time + data.dt
         own: Any = {}

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from grounded.compile import Named
-from grounded.diagnosis.likelihood.data import Data, shifted
+from grounded.diagnosis.likelihood.data import Data
 from grounded.effects import Effect, InputFamily, MemoryFamily
-from grounded.effects.memory import settled
+from grounded.effects.memory import settled, shifted
 from grounded.frozen import Array
 
 Acting = Sequence[tuple[Effect, Mapping[str, float]]]

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from grounded.effects import Scales, scales_of
-from grounded.effects.memory import true_values
+from grounded.effects.memory import shifted, true_values
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
@@ -136,15 +136,6 @@ class Data:
         for j, latency in enumerate(self.latency):
             out[:, :, j] = shifted(inputs[:, :, j], held[:, j], latency / self.dt)
         return out
-
-
-def shifted(signal: Array, held: Array, steps: float) -> Array:
-    """A held signal (S, T) delayed by any fraction of steps: its mean over each step."""
-    whole = int(np.floor(steps + 1e-9))
-    part = max(0.0, steps - whole)
-    T = signal.shape[1]
-    line = np.concatenate([np.repeat(held[:, None], whole + 1, axis=1), signal], axis=1)
-    return (1 - part) * line[:, 1 : T + 1] + part * line[:, :T]
 
 
 def prepare(

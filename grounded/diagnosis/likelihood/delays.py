@@ -82,7 +82,7 @@ class Delays:
             before = np.concatenate([2 * own[:1] - own[1:2], own[:-1]])  # as if it came so
             found[..., i] = a * now[..., i] + b * before
             if c > 0:
-                shown = own + behind(own, tau, self.first)
+                shown = own + filter_lag(own, tau, self.first)
                 found[0, :, i] = shown[0]
                 found[1:, :, i] += c * shown[:-1]
         return found
@@ -234,7 +234,7 @@ def _named(h: Hypothesis, data: Data) -> dict[int, list[float]]:
     return found
 
 
-def behind(track: Array, tau: float, settled: Any = ()) -> Array:
+def filter_lag(track: Array, tau: float, settled: Any = ()) -> Array:
     """How far a filtered sensor is off along a track (L + 1, B), tau in steps.
 
     A run that goes on moved before as it does in its first two time constants; in those that begin

@@ -39,7 +39,12 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.moving import moving
 from grounded.diagnosis.likelihood.noise import NoiseModel
 from grounded.diagnosis.likelihood.predictor import Predictor, losses_of
-from grounded.diagnosis.likelihood.rate_slopes import heading_slope, passed, with_effects
+from grounded.diagnosis.likelihood.rate_slopes import (
+    heading_slope,
+    logged_slopes,
+    passed,
+    with_effects,
+)
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.likelihood.tangent import tangent
 from grounded.effects import ParamFamily
@@ -120,12 +125,12 @@ def sensitivities_of(
 
     after: where they lead, if known.
     """
-    if medium := moving(h):
+    if medium := moving(h, predictor.seen):
         start = medium.through(x)
         end = predictor.advance(medium.still, start, u, predictor.data.time)
         F, f_p = sensitivities_of(predictor, medium.still, start, u, end)
         before, later = medium.slopes(start, end)
-        return later @ F @ before, later @ f_p
+        return logged_slopes(predictor, h, later @ F @ before), later @ f_p
     data = predictor.data
     flat, p = predictor.flat(x, predictor.left(h, x, u)), predictor.params(h)
 
@@ -147,11 +152,12 @@ def step_jacobian(
     """F of every step along a track (L or more, B, n), (L, B, n, n)."""
     data, u = predictor.data, predictor.inputs(h)
     x = track[: len(data.time)]
-    if medium := moving(h):
+    if medium := moving(h, predictor.seen):
         start = medium.through(x)
         end = predictor.advance(medium.still, start, u, data.time)
         before, later = medium.slopes(start, end)
-        return later @ step_jacobian(predictor, medium.still, start, end) @ before
+        F = step_jacobian(predictor, medium.still, start, end)
+        return logged_slopes(predictor, h, later @ F @ before)
     f_x, f_u = predictor.slopes(x, predictor.left(h, x, u), predictor.params(h))
     if losses_of(h):
         f_x = f_x - f_u @ predictor.loss_slopes(h, x, u, f_x)[0]
@@ -168,7 +174,7 @@ def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | No
     G = np.zeros((*x.shape, n))
     G[..., np.arange(n), np.arange(n)] = 1.0
     turn: Array | None = None
-    if medium := moving(h):
+    if medium := moving(h, predictor.seen):
         h, x = medium.still, medium.through(x)
         turn, _ = medium.slopes(x, x)
     for heading, rate in tied:

@@ -26,6 +26,7 @@ class Moving:
     """One medium's change of axes, of states (..., n); `still`: the hypothesis without it."""
 
     still: Hypothesis
+    names: tuple[str, ...]  # of the states, as physics sees them
     effect: Effect
     values: Mapping[str, float]
 
@@ -53,16 +54,16 @@ class Moving:
         return found
 
     def _named(self, x: Array) -> Named:
-        return Named("state", self.effect.site.model.state_names, list(np.moveaxis(x, -1, 0)))
+        return Named("state", self.names, list(np.moveaxis(x, -1, 0)))
 
 
 def _array(values: Mapping[str, Array]) -> Array:
     return np.stack(list(values.values()), axis=-1)
 
 
-def moving(h: Hypothesis) -> Moving | None:
-    """The medium that moves under a hypothesis, if one does."""
+def moving(h: Hypothesis, names: tuple[str, ...]) -> Moving | None:
+    """The medium that moves under a hypothesis, if one does; `names` as physics sees the states."""
     for effect, values in h.pairs:
         if isinstance(effect.family, MediumFamily):
-            return Moving(h.minus(effect.name), effect, values)
+            return Moving(h.minus(effect.name), names, effect, values)
     return None

@@ -21,13 +21,14 @@ import numpy as np
 from grounded.compile import Named
 from grounded.diagnosis.likelihood.arriving import arriving, memories_moved
 from grounded.diagnosis.likelihood.data import Data
-from grounded.diagnosis.likelihood.delays import behind
+from grounded.diagnosis.likelihood.delays import filter_lag
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.moving import moving
 from grounded.diagnosis.likelihood.simulated import Slopes, simulated
 from grounded.effects import (
     Effect,
     LossFamily,
+    MediumFamily,
     ParamFamily,
     RateFamily,
     SensorDelayFamily,
@@ -37,7 +38,10 @@ from grounded.effects import (
 )
 from grounded.effects.family import braked, coupled
 from grounded.effects.joint import Loads, loads, solved
+from grounded.effects.medium import medium_of, through_it
+from grounded.effects.plain_step import quantities_of
 from grounded.effects.registry import partner
+from grounded.effects.sensed import behind_logs, logged, moved_model, seen_names
 from grounded.engine import SentOnce
 from grounded.frozen import Array
 
@@ -162,9 +166,9 @@ class Predictor(SentOnce):
 
     def advance(self, h: Hypothesis, x: Array, u: Array, t: Array) -> Array:
         """One step of a hypothesis from x (..., n) with received inputs u (..., m) at times t."""
-        if medium := moving(h):
+        if medium := moving(h, self.seen):
             after = self.advance(medium.still, medium.through(x), u, t)
-            return medium.over(after, self.data.dt)
+            return self.logged(h, x, medium.over(after, self.data.dt))
         dt, rates, limits = self.data.dt, rates_of(h), limits_of(h)
         if not rates and not limits:
             return self.moved(h, x, u)
@@ -183,7 +187,16 @@ class Predictor(SentOnce):
                 added = self.added_rate([*rates, *limits], s, u, when, own)
                 found.append(rate[..., i] + added[..., i])
             result[..., j] = x[..., j] + found[1] - found[0]
-        return result
+        return self.logged(h, x, result)
+
+    def logged(self, h: Hypothesis, x: Array, after: Array) -> Array:
+        """States after a step from x, or slopes of them, with late logs of where they went."""
+        model = self.data.model
+        return (
+            after
+            if behind_logs(model) is None
+            else logged(model, x, after, self.params(h), self.data.dt)
+        )
 
     def stepper(self, h: Hypothesis) -> Callable[[Array, Array, Array], Array]:
         """`advance` of many steps one after the other: from x (M, n) with u (M, m) at t (M,)."""
@@ -204,7 +217,7 @@ class Predictor(SentOnce):
 
     def moved(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
         """The model's step with what its motion takes off the inputs, without further rates."""
-        if medium := moving(h):
+        if medium := moving(h, self.seen):
             after = self.moved(medium.still, medium.through(x), u, dt)
             return medium.over(after, dt or self.data.dt)
         return self.step(x, self.left(h, x, u, dt), self.params(h), dt)
@@ -247,7 +260,7 @@ class Predictor(SentOnce):
         base = solved(pairs, at, self.data.dt)
         drives = [coupled(effect.site) for effect, _ in pairs]
         for i, (_, source) in enumerate(drives):
-            k = self.data.model.state_names.index(source)
+            k = self.seen.index(source)
             size = 1e-6 * self.data.scales.peak(source)
             more = [value + size if j == i else value for j, value in enumerate(w)]
             ends = [value + size if j == i else value for j, value in enumerate(free)]
@@ -276,10 +289,14 @@ class Predictor(SentOnce):
             touched |= (added != 0).any(axis=-1, keepdims=True)
         return np.where(touched, x, after), np.where(touched, mean, free)
 
+    @cached_property
+    def seen(self) -> tuple[str, ...]:
+        """The states by the names under which physics sees their values (`seen_names`)."""
+        return seen_names(self.data.model)
+
     def named(self, x: Array) -> Named:
         """States, or their rates (..., n), by name."""
-        names = self.data.model.state_names
-        return Named("state", names, [x[..., i] for i in range(len(names))])
+        return Named("state", self.seen, [x[..., i] for i in range(len(self.seen))])
 
     def instant(self, h: Hypothesis, x: Array, u: Array) -> Array:
         """The model's own rates at x (..., n), by a very short step."""
@@ -288,19 +305,22 @@ class Predictor(SentOnce):
 
     def tied(self) -> list[tuple[int, int]]:
         """(heading, heading rate) where the rate is only carried along."""
-        names = self.data.model.state_names
+        names, model = self.seen, moved_model(self.data.model)
         key = ("tied",)
         if key not in self._inputs:
-            found = [(i, k) for i, n in enumerate(names) if (k := partner(self.data.model, n))]
+            found = [(names.index(n), k) for n in model.state_names if (k := partner(model, n))]
             self._inputs[key] = np.array([(i, names.index(k)) for i, k in found]).reshape(-1, 2)
         return [(int(i), int(j)) for i, j in self._inputs[key]]
 
     def added_rate(self, rates: Any, x: Array, u: Array, t: Array, own: Any) -> Array:
         """Sum of the rates of (effect, values) pairs at x (..., n), (..., n) per second.
 
-        `own` are the model's own rates by name, for families that need them.
+        `own` are the model's own rates by name, for families that need them. In a medium that the
+        model says moves, they act on velocities through it (at the model's own values of it).
         """
-        names, s = self.data.model.state_names, self.named(x)
+        names, s = self.seen, self.named(x)
+        if medium := medium_of(self.data.model):
+            s = through_it(medium, s, quantities_of(medium, self._nominal))
         inputs = self.data.model.input_names
         a = Named("input", inputs, [u[..., j] for j in range(len(inputs))])
         total = np.zeros_like(x)
@@ -311,12 +331,16 @@ class Predictor(SentOnce):
                 total[..., names.index(name)] += value
         return total
 
+    @cached_property
+    def _nominal(self) -> dict[str, float]:
+        return {name: float(param.value) for name, param in self.data.model.params.items()}
+
     def offset(self, h: Hypothesis, track: Array) -> Array | float:
         """The log minus the state along a track (L + 1, B, n); 0.0 where sensors are right."""
         names, dt, old = self.data.model.state_names, self.data.dt, track
         for i, tau in self.data.filters.items():
             old = old.copy()
-            old[..., i] += behind(old[..., i], tau / dt)
+            old[..., i] += filter_lag(old[..., i], tau / dt)
         for effect, values in h.pairs:
             if isinstance(effect.family, SensorDelayFamily | SensorLagFamily):
                 old = old.copy()
@@ -362,7 +386,8 @@ def losses_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
 
 def _more_than_steps(h: Hypothesis) -> bool:
     """Whether a hypothesis adds more to the model's steps than what arrives of the inputs."""
-    return bool(rates_of(h) or limits_of(h) or losses_of(h) or moving(h))
+    medium = any(isinstance(e.family, MediumFamily) for e in h.effects)
+    return bool(rates_of(h) or limits_of(h) or losses_of(h) or medium)
 
 
 def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt: float) -> Array:
@@ -370,7 +395,7 @@ def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt:
     if isinstance(effect.family, SensorFamily):
         return np.asarray(effect.family.measure(track, values) - track)
     if isinstance(effect.family, SensorLagFamily):
-        return behind(track, values["tau"] / dt)
+        return filter_lag(track, values["tau"] / dt)
     steps = values["d"] / dt
     slope = np.vstack([track[1:2] - track[:1], np.diff(track, axis=0)])
     whole, part = int(np.floor(steps)), steps - np.floor(steps)

@@ -6,6 +6,7 @@ import numpy as np
 
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor, limits_of, rates_of
+from grounded.effects.sensed import behind_logs
 from grounded.frozen import Array
 
 SMALL = 1e-4  # of a state's spread: the difference that a slope is taken over
@@ -19,7 +20,7 @@ def with_effects(
     one, data = np.eye(x.shape[-1]), predictor.data
     F = passed(predictor, h, x, u, F, one)
     if not rates_of(h) and not (limits_of(h) and predictor.tied()):
-        return F
+        return logged_slopes(predictor, h, F) if limits_of(h) else F
     after = predictor.advance(h, x, u, data.time) if after is None else after
     half, mean = 0.5 * data.dt, (F - one) / data.dt
     first = rate_slopes(predictor, h, x, u, data.time, mean)
@@ -35,7 +36,16 @@ def with_effects(
         row -= heading_slope(predictor, h, x, u, data.time, heading, rate)
         row[..., rate] += 1.0
         found[..., rate, :] = row
-    return np.asarray(found)
+    return logged_slopes(predictor, h, np.asarray(found))
+
+
+def logged_slopes(predictor: Predictor, h: Hypothesis, F: Array) -> Array:
+    """The Jacobian of a step (..., n, n) with the rows of late logs of those of true values."""
+    if behind_logs(predictor.data.model) is None:
+        return F
+    columns = np.swapaxes(F, -1, -2)
+    nudged = np.broadcast_to(np.eye(F.shape[-1]), columns.shape)
+    return np.swapaxes(predictor.logged(h, nudged, columns), -1, -2)
 
 
 def passed(
@@ -109,9 +119,9 @@ def heading_slope(
     predictor: Predictor, h: Hypothesis, x: Array, u: Array, t: Array, heading: int, rate: int
 ) -> Array:
     """Slope of the heading's rate of this very moment, effects and all, (L, B, n) [1/s]."""
-    data, short = predictor.data, 1e-3 * predictor.data.dt
+    short = 1e-3 * predictor.data.dt
     f_x, _ = predictor.slopes(x, u, predictor.params(h), short)
-    one, name = np.eye(x.shape[-1]), data.model.state_names[heading]
+    one, name = np.eye(x.shape[-1]), predictor.seen[heading]
     slope = (f_x[..., heading, :] - one[heading]) / short
     acting = [*rates_of(h), *limits_of(h)]
     if any(name in e.site.targets or f"{name}<-" in e.name for e, _ in acting):

@@ -36,7 +36,7 @@ def tangent(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Predicto
     """Predicts from near x (L, B, n) with inputs near u (L, B, m); a compiled model as ever."""
     if not simulated(predictor.data.model):
         return predictor
-    if medium := moving(h):
+    if medium := moving(h, predictor.seen):
         return tangent(predictor, medium.still, medium.through(x), u)
     left, p, kept = predictor.left(h, x, u), predictor.params(h), predictor._inputs
     after, slopes = predictor.step(x, left, p), predictor.slopes(x, left, p)

@@ -145,7 +145,6 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
     still, unmoved, on_off = set(constant_inputs(data)), set(still_states(data)), switches(data)
     dead = {n for i, n in enumerate(data.model.state_names) if not data.seen[..., i].any()}
     memory = {data.model.state_names[i] for i in data.hidden}
-    logs = {data.model.state_names[i] for i in data.behind.values()}
     kept = []
     for effect in effects:
         targets = {part for t in effect.site.targets for part in t.split("<-")}
@@ -158,9 +157,6 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
             continue
         if isinstance(family, RateFamily | LossFamily | MediumFamily) and targets & unmoved:
             continue
-        driven = {t.partition("<-")[0] for t in effect.site.targets}
-        if isinstance(family, RateFamily | MediumFamily) and driven & logs:
-            continue  # an old log moves nothing: what is added to it is a sensor's error
         sensors = SensorFamily | SensorDelayFamily | SensorLagFamily
         if isinstance(family, sensors) and targets & (dead | unmoved):
             continue

@@ -130,7 +130,7 @@ def left_behind(found: Diagnosis) -> dict[str, Left]:
 
     The trials do not tell them apart from others; what the diagnosis measured had them all.
     """
-    from grounded.effects.wrap import param_name
+    from grounded.effects import param_name
 
     made = found.made or Made()
     called = {
@@ -173,12 +173,6 @@ def undo_adoption(workspace: Folder) -> Undone:
     set_in_model(file, params=before["params"], effects=before["effects"])
     write_document(workspace.reports / KEPT, {"adoptions": earlier, "undone": [*undone, *names]})
     return Undone(tuple(names), tuple(before["effects"]), before["params"])
-
-
-def undoable(workspace: Folder) -> tuple[str, ...]:
-    """The effects that `undo_adoption` can take back, one adoption after another."""
-    kept, _ = _kept(workspace)
-    return tuple(str(name) for step in kept for name in step["names"])
 
 
 def declined(workspace: Folder) -> tuple[str, ...]:
@@ -288,7 +282,7 @@ def settled(
     params: Mapping[str, float], effects: Sequence[Mapping[str, Any]]
 ) -> tuple[dict[str, float], list[Effect]]:
     """The model's own parameters, and the effects with the values of theirs."""
-    from grounded.effects.wrap import param_name
+    from grounded.effects import param_name
 
     own, changed = dict(params), []
     for effect in effects:

@@ -109,8 +109,6 @@ def diagnose_in(
         found = replace(found, next_trial=f"{words}{run}", probe=identity)
     if undo := _in_vain(workspace, found):
         found = replace(found, next_trial=f"{undo} {found.next_trial}")
-    if again := _over_ground(workspace, found):
-        found = replace(found, next_trial=f"{again} {found.next_trial}")
     _keep(workspace, found)  # with what is said of the next trial
     return replace(found, then=after_diagnosis(workspace, found))
 
@@ -131,27 +129,6 @@ def _as_known(workspace: Folder, ranking: Sequence[Ranked], made: Made) -> tuple
         if row and one.effect.startswith("delay:")
         else one
         for one in ranking
-    )
-
-
-def _over_ground(workspace: Folder, found: Diagnosis) -> str:
-    """That what is claimed beside an adopted current acts over the ground; "" where neither is.
-
-    A hull's drag acts through the water: beside a current that is part of the model already it is
-    found as something else.
-    """
-    from grounded_trials.workspace.next_step import beside_current
-
-    current = beside_current(workspace, found)
-    if not current:
-        return ""
-    undo, again = (
-        rendered(NextCommand(*words), workspace.address)
-        for words in (("adopt", ("--undo",)), ("diagnose",))
-    )
-    return (
-        f"What is found beside the adopted {current} acts over the ground, a drag too: "
-        f"`{undo}` until it is gone, then `{again}` looks for both at once."
     )
 
 

@@ -104,8 +104,6 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
 
     if set(new) <= set(declined(workspace)):
         return None  # adopted, and undone: whoever did that is not asked to do it again
-    if beside_current(workspace, diagnosis):
-        return NextCommand("adopt", ("--undo",))
     if most := diagnosis.verdict.look_for:
         return _with_more(most, diagnosis.made or Made())
     params = workspace.base_model.params
@@ -116,18 +114,6 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     if own.issuperset(new):
         return NextCommand("fit")  # the model's form is right: all of its numbers at once
     return NextCommand("adopt", new)
-
-
-def beside_current(workspace: Folder, diagnosis: Diagnosis) -> str:
-    """The adopted current beside which something is claimed, "" where none is.
-
-    It acts over the ground there, where a hull's drag acts through the water: before it is adopted
-    both are looked for at once. A current that was written by hand is not ours to undo.
-    """
-    from grounded_trials.workspace.adopting import undoable
-
-    current = next((name for name in undoable(workspace) if name.startswith("current:")), "")
-    return current if diagnosis.effects else ""
 
 
 def _with_more(effects: int, made: Made) -> NextCommand:
