@@ -20,6 +20,7 @@ from grounded_trials.workspace.adopting import joined
 DT, STEPS = 0.05, 60
 LIMIT = ("rate_limit:steering", {"r": 2.0})
 DELAY = ("delay:steering", {"d": 2 * DT})
+PART = ("delay:steering", {"d": 2.6 * DT})
 LAG = ("first_order_lag:steering", {"tau": 0.1})
 ZONE = ("dead_zone:steering", {"c": 0.1})
 WEAKER = ("input_gain:steering", {"g": -0.2})
@@ -108,6 +109,9 @@ def adopted(parts):
         (WEAK, THROTTLE),
         (THROTTLE, WEAK),
         (BIAS, LIMIT, DELAY),
+        (LIMIT, PART),
+        (PART, ZONE, LAG),
+        (BIAS, LAG, PART),
         (BIAS, ("backlash:steering", {"b": 0.1})),
     ],
     ids=lambda parts: " ".join(name.partition(":")[0] for name, _ in parts),
@@ -116,6 +120,37 @@ def test_one_order_everywhere(parts):
     want = predicted(parts)
     np.testing.assert_allclose(probed(parts), want, atol=1e-9)
     np.testing.assert_allclose(adopted(parts), want, atol=1e-9)
+
+
+def test_what_is_bent_is_late_by_whole_steps_before_it_and_by_the_rest_behind_it():
+    """A robot's rate limit and delay, adopted: 3.5 times the error that was diagnosed."""
+    plan = planner_of(task(), [{"name": name, **values} for name, values in (LIMIT, PART)]).plan
+    j = car.input_names.index(PART[0].partition(":")[2])
+    assert plan.latency[j] == pytest.approx(2 * DT)
+    plain = planner_of(task(), [{"name": PART[0], **PART[1]}]).plan
+    assert plain.latency[j] == pytest.approx(2.6 * DT) and plain.model.n == car.n
+    known = {n: p for n, p in plan.model.params.items() if n.startswith("delay")}
+    assert known and not any(p.uncertain for p in known.values())
+
+
+def test_the_memory_of_a_trial_follows_what_arrives():
+    """A limit's memory behind a delay began pieces of a log as if nothing were late."""
+    planner = planner_of(task(), [{"name": name, **values} for name, values in (LIMIT, PART)])
+    trial = Trial(
+        predicted((LIMIT, PART)),
+        commands(),
+        DT,
+        car.state_names,
+        car.input_names,
+        start_inputs=HELD,
+    )
+    states, plan = planner.lift(trial).states, planner.plan
+    received = np.stack(
+        [shifted(commands()[None, :, j], HELD[[j]], plan.latency[j] / DT)[0] for j in range(2)],
+        axis=1,
+    )
+    after = plan.model.system.step(states[:-1], received, plan.model.values, DT)
+    np.testing.assert_allclose(after, states[1:], atol=1e-9)
 
 
 @pytest.mark.parametrize("parts", [(WEAK, THROTTLE), (BIAS, LAG, DELAY), (BIAS, LIMIT)])

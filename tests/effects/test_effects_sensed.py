@@ -153,7 +153,9 @@ def test_a_friction_is_found_behind_a_late_log():
         for t in real
     ]
     hidden = model.state_names[cart.n :]
-    options = DiagnosisOptions(hidden=hidden, but={"sensor_delay:x", "sensor_delay:v"}, max_effects=1)
+    options = DiagnosisOptions(
+        hidden=hidden, but={"sensor_delay:x", "sensor_delay:v"}, max_effects=1
+    )
     found = gr.diagnose(model, lifted, options)
     assert found.verdict.effects == ("coulomb_friction:v",)
     assert found.ranking[0].params["c"].value == pytest.approx(0.4, abs=0.03)
