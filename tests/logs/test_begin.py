@@ -20,7 +20,7 @@ from grounded_trials.starting.begin import begin
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, path_target
 from grounded_trials.workspace.task_file import equal_weights, read_target
-from ros_bags import arm_bag, car_bag, commanded_arm_bag
+from ros_bags import arm_bag, car_bag, commanded_arm_bag, rover_bag
 from shared_data import data
 
 
@@ -44,6 +44,27 @@ def test_from_a_bag_to_the_first_candidate_in_four_commands(tmp_path, storage):
     assert fitted["L"]["value"] == pytest.approx(0.32, abs=0.01)
     proposed = grounded("-C", w, "propose", "--json").json
     assert proposed["candidate"] == "c0001"
+
+
+@pytest.mark.parametrize("names", ["speed turn", "linear angular"])
+def test_a_robot_on_wheels_that_lists_its_joints_drives(tmp_path, names):
+    """It was an arm of two wheels, and nothing was mapped to what it is commanded."""
+    log, w, model = rover_bag(tmp_path / "bag"), tmp_path / "w", None
+    if names != "speed turn":
+        begin(tmp_path / "first", log)
+        text = (tmp_path / "first/model.py").read_text()
+        model = tmp_path / "model.py"
+        for old, new in zip(("speed", "turn"), names.split(), strict=True):
+            text = text.replace(f"a.{old}", f"a.{new}").replace(f'"{old}": "', f'"{new}": "')
+        model.write_text(text)
+    found = begin(w, log, model=model)
+    assert (found.kind == "rover") is (model is None)
+    paths = {guess.name: guess.path for guess in found.inputs}
+    assert paths == dict(
+        zip(names.split(), ("/cmd_vel.linear.x", "/cmd_vel.angular.z"), strict=True)
+    )
+    assert not found.unsure and found.dt == 0.05
+    assert grounded("-C", w, "ingest", "--data", log).code == 0
 
 
 def test_the_joints_of_an_arm_by_name(tmp_path):

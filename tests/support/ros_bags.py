@@ -31,16 +31,21 @@ def vector(kind, x, y, z):
     return T[f"geometry_msgs/msg/{kind}"](x=x, y=y, z=z)
 
 
+def twist(ahead, turn):
+    linear, angular = vector("Vector3", ahead, 0.0, 0.0), vector("Vector3", 0.0, 0.0, turn)
+    return T["geometry_msgs/msg/Twist"](linear=linear, angular=angular)
+
+
 def odometry(t, x, y, psi, v, rate):
     turn = T["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=np.sin(psi / 2), w=np.cos(psi / 2))
     pose = T["geometry_msgs/msg/Pose"](position=vector("Point", x, y, 0.0), orientation=turn)
-    linear, angular = vector("Vector3", v, 0.0, 0.0), vector("Vector3", 0.0, 0.0, rate)
-    twist = T["geometry_msgs/msg/Twist"](linear=linear, angular=angular)
     return T["nav_msgs/msg/Odometry"](
         header=header(t),
         child_frame_id="base",
         pose=T["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
-        twist=T["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
+        twist=T["geometry_msgs/msg/TwistWithCovariance"](
+            twist=twist(v, rate), covariance=np.zeros(36)
+        ),
     )
 
 
@@ -85,6 +90,30 @@ def car_bag(folder, storage=StoragePlugin.SQLITE3):
         v, psi = v + DT * (0.9 * speed - v) / 0.35, psi + DT * rate
         x, y = x + DT * v * np.cos(psi), y + DT * v * np.sin(psi)
     return bag(folder, topics, messages, storage)
+
+
+def rover_bag(folder):
+    """A robot on two wheels in a warehouse; its commands begin a little before its odometry."""
+    topics = {
+        "/cmd_vel": "geometry_msgs/msg/Twist",
+        "/odom": "nav_msgs/msg/Odometry",
+        "/joint_states": "sensor_msgs/msg/JointState",
+    }
+    messages, v, w, x, y, psi = [], 0.0, 0.0, 0.0, 0.0, 0.0
+    names = ["wheel_left_joint", "wheel_right_joint"]
+    for k in range(1000):
+        t, ahead, turn = START + k * 10**7, 0.6 * np.sin(0.01 * k) ** 2, 0.8 * np.sin(0.013 * k)
+        if k % 5 == 0:
+            messages.append(("/cmd_vel", t, twist(float(ahead), float(turn))))
+        if k > 0:
+            messages.append(("/odom", t, odometry(t, x, y, psi, v, w)))
+            sides = np.array([v - 0.26 * w, v + 0.26 * w]) / 0.1
+            turned = np.array([x, x]) / 0.1
+            messages.append(("/joint_states", t, joints(t, names, turned, sides, 0 * sides)))
+        v, w = v + DT * (ahead - v) / 0.2, w + DT * (turn - w) / 0.15
+        psi += DT * w
+        x, y = x + DT * v * np.cos(psi), y + DT * v * np.sin(psi)
+    return bag(folder, topics, messages)
 
 
 def arm_bag(folder, scale=1.0):

@@ -455,3 +455,54 @@ def test_a_hole_in_a_log_is_told_where_it_is_not_taken_for_the_run(tmp_path):
     config.write_text(text)
     with pytest.raises(GroundedError, match=holding("did not run", "no sample of", "0.41")):
         Workspace(w.folder).ingest(log)
+
+
+def edited(path, change):
+    """The log with its rows changed: t, x, v, force."""
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    change(table)
+    np.savetxt(path, table, "%.5f", ",", header="t,x,v,force", comments="")
+    return path
+
+
+def test_a_gap_within_the_run_is_the_reason_that_is_given(w, tmp_path):
+    """Behind a lead-in no start was found for it: `somebody, or another controller, drove`."""
+
+    def hole(table):
+        table[450:470, 1:3] = np.nan
+
+    log = edited(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 4.0), hole)
+    with pytest.raises(GroundedError, match=r"has a gap of 0\.2.* s .*max_age_s"):
+        w.ingest(log)
+
+
+def test_commands_that_were_logged_before_the_states_are_a_lead_in(w, tmp_path):
+    """A robot that sends zeros all the time: `start recording before the run`, which it did."""
+
+    def blind(table):
+        table[:8, 1:3] = np.nan
+
+    log = edited(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 1.0), blind)
+    found = w.ingest(log)
+    assert found.candidate == "c0002" and any("begins 1.0" in one for one in found.notes)
+    late = edited(record(w, tmp_path / "b.csv", w.candidate("c0002")[0].policy, 0.0), blind)
+    w.discard(found.trial)
+    with pytest.raises(GroundedError, match="before every state is known"):
+        w.ingest(late)
+
+
+@pytest.mark.parametrize("before", [0.91, 0.92, 0.93, 0.94])
+def test_a_run_whose_commands_are_logged_as_they_are_sent_begins_with_its_own(w, tmp_path, before):
+    """A step too early, and the log was blamed for it."""
+    step = round(w.task.dt * RATE)
+
+    def sent(table):
+        kept = (np.arange(len(table)) - round(before * RATE)) % step == 0
+        kept[0] = True  # a zero, while it waits
+        table[~kept, 3] = np.nan
+
+    log = edited(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, before), sent)
+    found = w.ingest(log)
+    (note,) = [one for one in found.notes if "begins" in one]
+    assert abs(float(re.search(r"begins ([0-9.]+) s", note)[1]) - before) < 1.5 / RATE
+    assert not any("seem to be" in one for one in found.warnings)

@@ -68,6 +68,7 @@ def weigh(
     guesses = {name: of_joint(guess, units[name], joints, log) for name, guess in guesses.items()}
     guesses |= in_order(guesses, units, joints, log)
     guesses = {name: _unit(guess, units[name]) for name, guess in guesses.items()}
+    guesses |= _by_unit(guesses, model)
     guesses |= _speed_asked(guesses, model, log)
     turning = [guesses[name] for name in model.state_names if units[name] in ("rad", "deg")]
     stated = Stated.by(log.files)
@@ -145,6 +146,27 @@ def _unit(guess: Guess, unit: str) -> Guess:
         return replace(guess, path=fits[0], others=(guess.path, *rest), reasons=(why,), field=None)
     why = f"its unit should be {unit}, the log's is {known}"
     return replace(guess, sure=False, reasons=(*guess.reasons, why))
+
+
+def _by_unit(guesses: Mapping[str, Guess], model: Model) -> dict[str, Guess]:
+    """Inputs that no name gives, each at the only command left that is in its unit.
+
+    A Twist of a robot on wheels has one number in m/s that moves and one in rad/s.
+    """
+    taken = {guesses[name].path for name in model.input_names if guesses[name].path}
+    found = {}
+    for name in (n for n in model.input_names if not guesses[n].path):
+        left, unit = tuple(p for p in guesses[name].others if p not in taken), model.inputs[name]
+        fits = [path for path in left if unit and unit_of(path) == unit]
+        rivals = [n for n in model.input_names if n != name and not guesses[n].path]
+        alone = len(fits) == 1 and all(model.inputs[n] != unit for n in rivals)
+        why = f"no name says it; the only command in {unit}"
+        found[name] = (
+            replace(guesses[name], path=fits[0], others=(), sure=True, reasons=(why,))
+            if alone
+            else replace(guesses[name], others=left)
+        )
+    return found
 
 
 def _speed_asked(guesses: Mapping[str, Guess], model: Model, log: LogReport) -> dict[str, Guess]:

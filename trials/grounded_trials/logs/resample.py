@@ -177,7 +177,7 @@ def _extent(
     for name in states:
         s = samples[name]
         held = s.spec.resample == "hold"
-        slack = 0 if held else round(s.slack(dt) * 1e9)
+        slack = 0 if held else int(s.slack(dt) * 1e9)  # rounded up, it would be refused there
         first.append(int(s.t[0]) - slack)
         last.append(int(s.t[-1]) + (round(s.max_gap(dt) * 1e9) if held else slack))
     for name in inputs:

@@ -138,7 +138,7 @@ def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
     steered = next((t.topic for t in log.topics if "Ackermann" in t.type), None)
     if steered is not None:
         return "car", f"{steered} holds Ackermann commands"
-    if joints:
+    if joints := of_arms(joints):
         where, names = next(iter(joints.items()))
         kind = "arm" if len(names) > 1 else "pendulum"
         return kind, f"{where} has {len(names)} joints: {', '.join(names[:6])}"
@@ -163,6 +163,15 @@ def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
     if flat := next((t.topic for t in log.topics if _in_the_plane(t)), None):
         return "rover", f"{flat} moves in the plane and no steering is named"
     return "generic", "nothing tells what kind of robot it is, --kind does: the names are the log's"
+
+
+def of_arms(joints: Joints) -> Joints:
+    """Topics of joints that are not all wheels, as those of a robot that drives are."""
+    return {
+        topic: names
+        for topic, names in joints.items()
+        if not all("wheel" in name.lower() for name in names)
+    }
 
 
 def _both_sides(log: LogReport) -> tuple[str, ...]:
@@ -239,6 +248,7 @@ def skeleton(
 ) -> Skeleton:
     """The skeleton of a kind, named after what is in the log; for the rest see `generic`."""
     if kind == "arm":
+        joints = of_arms(joints) or joints
         return arm(from_base(next(iter(joints.values()))) if joints else ("joint1", "joint2"))
     ackermann = any("Ackermann" in topic.type for topic in log.topics)
     if kind == "car" and not ackermann:

@@ -77,12 +77,6 @@ class ForeignLog:
         )
         logged = tuple(one for one in found.reports if one.name in self.series)
         found = replace(found, reports=logged)
-        if candidate and found.late_s > task.dt / 2:
-            raise GroundedError(
-                f"{self.path}: the run starts {found.late_s:.2f} s before every state is known: "
-                "the trial's time would not be the candidate's. Start recording before the run, "
-                "or take it in with --data"
-            )
         trial = Trial(
             states=found.states,
             inputs=found.inputs,
@@ -93,6 +87,19 @@ class ForeignLog:
             start_inputs=found.start_inputs,
         )
         return trial, found
+
+    def refuse_late(self, found: Gridded) -> None:
+        """Refuses a candidate's run of which the beginning was not seen.
+
+        Raises:
+            GroundedError: if a state is first known after it began.
+        """
+        if found.late_s > self.workspace.config.task.dt / 2:
+            raise GroundedError(
+                f"{self.path}: the run starts {found.late_s:.2f} s before every state is known: "
+                "the trial's time would not be the candidate's. Start recording before the run, "
+                "or take it in with --data"
+            )
 
     @property
     def unlike_units(self) -> tuple[str, ...]:

@@ -173,6 +173,8 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         logs.append(late)
     looks = [_Look(read, one, own, candidates, workspace.task) for one in logs]
     look = min(looks, key=lambda one: one.doubt)
+    if look.read.log and look.read.cut:  # a command may have come before the states, and the run
+        look.read.log.refuse_late(look.read.cut)
     read, log, found, whole, seen = look.read, look.log, look.found, look.whole, look.suspicion
     if found and found.alike and found.loose_s > LOOSE * workspace.task.dt:
         read = replace(read, warnings=(*read.warnings, loosely(found.loose_s, ran)))

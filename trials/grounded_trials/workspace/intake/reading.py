@@ -16,6 +16,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.trial import Trial
 from grounded_trials.formats.text_tables import cut_off
 from grounded_trials.logs.log_files import log_files
+from grounded_trials.logs.resample import Gridded
 from grounded_trials.logs.samples import SignalReport
 from grounded_trials.logs.stated_units import same_unit
 from grounded_trials.plain_file import read_file
@@ -42,6 +43,7 @@ class Read:
     bare: bool = False  # it ran a candidate, and carries no copy of it
     doubted: bool = False  # taken in as a candidate's run, though its commands say otherwise
     log: ForeignLog | None = None
+    cut: Gridded | None = None  # of a foreign log: how it was sampled
     last_s: float = math.nan  # its last sample of every state, since the start; of a foreign log
 
 
@@ -167,6 +169,7 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
         found.reports,
         notes=() if candidate else tuple(begun(found, trial.dt, trial.input_names)),
         log=log,
+        cut=found,
         last_s=(found.last_ns - found.start_ns) * 1e-9,
     )
 

@@ -154,10 +154,20 @@ class Recording:
         if (found := phase_of(self.changes[inside] - start, dt, late)) is None:
             return start, float(np.median(late)) if len(late) else 0.0
         phase, room = found
-        if abs(phase) < self.dt / self.parts:
+        if abs(phase) < dt / 4:
             return start + phase, room
         tried = [start + phase + move * dt for move in (-1, 0, 1)]
-        return min(tried, key=lambda one: self.apart_at(policy, one)), room
+        return min(tried, key=lambda one: self._misfit(policy, one)), room
+
+    def _misfit(self, policy: Policy, start: float) -> float:
+        """The mean difference of the commands of the trial from there, in units of their size."""
+        trial = self.trial_from(start)
+        T = 0 if trial is None else min(trial.finite_steps, policy.horizon)
+        if trial is None or T < LEAST:
+            return np.inf
+        sent = np.clip(trial.inputs[:T], policy.low, policy.high)
+        asked = policy.commands(trial.states[None, :T], policy.past)[0]
+        return float((np.abs(asked - sent) / (np.abs(sent).max(axis=0) + 1e-12)).mean())
 
     def _between_rows(self, policy: Policy, start: float, row: float) -> tuple[float, float]:
         """A start moved back by less than a row, to where the feedback says that it was [s].
@@ -276,7 +286,11 @@ def recording(
     try:
         whole = to_grid(series, dt / parts, *names, angles=model.angles)
     except GroundedError:
-        return None
+        series = {n: _bridged(one) if n in names[0] else one for n, one in series.items()}
+        try:
+            whole = to_grid(series, dt / parts, *names, angles=model.angles)
+        except GroundedError:
+            return None
     sent = [series[name] for name in model.input_names]
     seen = [changes_of(s.t, s.values) for s in sent]
     at, late = (np.concatenate(x) for x in zip(*seen, strict=True))
@@ -295,6 +309,12 @@ def recording(
         late,
         interval,
     )
+
+
+def _bridged(series: Series) -> Series:
+    """Samples whose gaps are no reason not to look: the run that is found is cut with them."""
+    longest = float(np.ptp(series.t)) * 1e-9 if len(series.t) else 0.0
+    return replace(series, spec=replace(series.spec, max_age_s=longest))
 
 
 def pace_of(log: Recording, task: Task, policy: Policy) -> float | None:
