@@ -30,6 +30,7 @@ from grounded_trials.workspace.diagnosing import _in_vain
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.next_step import DIAGNOSE, after_diagnosis, since_diagnosis
 from grounded_trials.workspace.proposing import standing_in
+from recorded import LOGGED, record
 from reported import DIAGNOSIS, cart, copied
 from workspaces import CONFIG, make
 
@@ -173,6 +174,18 @@ def test_what_a_fresh_diagnosis_claims_is_adopted_while_a_candidate_waits(tmp_pa
     assert found.next_command == "grounded adopt viscous_friction:v"
     assert grounded("-C", folder, "learn", "--trials", 1).code == 0  # a later trial outdates it
     assert "adopt" not in last(grounded("-C", folder, "status"))
+
+
+def test_after_a_crash_what_was_diagnosed_is_adopted_before_a_gentler_policy_runs(tmp_path):
+    """A quadrotor's crude policy fell, and its feedback was made gentler: it fell again."""
+    folder = make(tmp_path / "w", config=LOGGED).folder
+    (folder / "reports").mkdir(exist_ok=True)
+    diagnosed(folder, diagnosed={"trials": [], "adopted": [], "params": {}})
+    w = Workspace(folder)
+    log = record(w, tmp_path / "fell.csv", w.propose().candidate.policy, 0.0, until=1.0)
+    done = grounded("-C", folder, "ingest", log)
+    assert "crashed" in done.out and last(done) == "grounded adopt viscous_friction:v"
+    assert last(grounded("-C", folder, "status")) == "grounded adopt viscous_friction:v"
 
 
 def test_a_long_command_is_broken_where_a_shell_allows_it():

@@ -14,7 +14,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.model import all_at_bounds
 from grounded.search.standing import Standing
 from grounded_trials.wording import rendered
-from grounded_trials.workspace.diagnosing import diagnosable
+from grounded_trials.workspace.diagnosing import diagnosable, read_diagnosis
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.proposing import standing_in, status_of, to_run
 
@@ -37,8 +37,8 @@ def next_command(
     """
     since = since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since()
     follow = to_adopt(workspace, diagnosis) if diagnosis and not since.changed else None
-    if follow and not since.newer:  # wherever the search stands: a better model plans better
-        return follow
+    if follow and (not since.newer or _none_stood(now)):
+        return follow  # wherever the search stands: a better model plans better
     if now.phase == "await-trial":
         return another_trial(workspace, now)
     if now.ending == "not allowed" and not now.history:
@@ -74,7 +74,17 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
     """
     if now is None or verdict == "probe":
         return DIAGNOSE
+    if _none_stood(now) and (found := read_diagnosis(workspace.reports)) is not None:
+        usable = usable_ids(workspace)
+        changed = since_diagnosis(workspace, found, usable).changed
+        if not changed and (follow := to_adopt(workspace, found)) is not None:
+            return follow
     return PROPOSE if now.phase in ("propose", "await-trial") else status_of(workspace, now).then
+
+
+def _none_stood(now: Standing) -> bool:
+    """Whether every policy that was run crashed: a gentler one is the last resort."""
+    return bool(now.history) and now.incumbent is None
 
 
 def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
