@@ -109,5 +109,8 @@ def still_open(diagnosis: Diagnosis) -> str:
     rows = diagnosis.prediction_error
     if not found and (name := open_noise(rows)):
         found.append(f"only repeated trials tell how much of what is left in {name} is noise")
-    text = "; ".join(found) or rest(rows) or "nothing is left above the noise"
+    nothing = "nothing is left above the noise"
+    if worsened(rows):  # which is said elsewhere
+        nothing = "it is open why predictions get worse with it there"
+    text = "; ".join(found) or rest(rows) or nothing
     return f"{text[:1].upper()}{text[1:]}."
