@@ -59,6 +59,11 @@ class Candidate(Result):
         return bool(self.base) and self.way in ("", "recorded inputs")
 
     @property
+    def expected_gain(self) -> float:
+        """The promised gain less what the model is likely to miss of it."""
+        return self.predicted_gain - self.likely_off
+
+    @property
     def doubtful(self) -> bool:
         """Whether its model is likely to be off by more than it promises."""
         return 0 < self.likely_off >= self.predicted_gain

@@ -86,7 +86,8 @@ def propose(
     make = Maker(planner, now, identity or f"c{len(candidates) + 1:04d}", fingerprint)
     if now.incumbent is None:
         policy, plan = planner.first_policy(now.caution, tick)
-        made = make.checked(make.candidate(policy, planner.plan.problem(exact=True), Step()))
+        model = planner.plan.problem(exact=True)
+        made = make.checked(make.with_margin(make.candidate(policy, model, Step()), model))
         if plan.status == "converged":
             return made
         note = f"the plan is not at the model's optimum: {plan.sentence}"

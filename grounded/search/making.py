@@ -15,6 +15,7 @@ from grounded.rollout import Rollout, apart
 from grounded.search.candidate import LITTLE, Candidate, Slopes, Tried, Way
 from grounded.search.directions import base_columns, direction
 from grounded.search.limit_cycle import between_limits, limit_cycle
+from grounded.search.margin import steadied
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from grounded.search.feedback import Alternative
 
 GENTLER = 1e3  # factor on the price of inputs from which gentler gains are designed
-HALF, FINE = 0.5, 12  # of the mean gain is left where no limit is met; parts of a caution
+HALF, FINE = 0.5, 12  # of the mean gain is left where no limit is met; parts of caution
 NEAR = 0.2  # of the way that one that lost would go: a step that ends so near is the same one
 REFUTED = 2  # steps by corrected slopes that lost too much: then the model's own are believed
 FORETOLD = 0.2  # of the incumbent's cost: a plain model that is off by more there is no judge
@@ -66,10 +67,9 @@ class About:
             self.real, self.corrected, self.missed = found.problem, found.corrected, found.missed
         already = predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
-        began = self.real.start.copy()
-        began[: own.states.shape[1]] = own.states[0]
-        as_run = predicted(replace(self.real, start=began), incumbent.candidate.policy)
-        self.as_run = as_run.utility  # theta's from where its trial began
+        began = np.append(own.states[0], self.real.start[own.states.shape[1] :])
+        as_run = replace(self.real, start=began)  # theta's from where its trial began
+        self.as_run = predicted(as_run, incumbent.candidate.policy).utility
         self.least = options.tolerance * abs(self.already)
         self.plain = plan.problem(exact=True)  # no trial in it, hence no noise and no start
         self.plainly = predicted(self.plain, incumbent.candidate.policy).utility
@@ -96,7 +96,7 @@ class About:
         lost = losers_of(self.make.now.history, best.candidate.id, model)
         corrected = {candidate.id for candidate in lost if candidate.slopes}
         return sum(
-            tried.utility - best.utility < expected(tried.candidate)
+            tried.utility - best.utility < tried.candidate.expected_gain
             for tried in self.make.now.history
             if tried.candidate.id in corrected
         )
@@ -140,10 +140,9 @@ class About:
         history, model = make.now.history, make.fingerprint
         first = options.due(history, self.incumbent, model, self.way, self.slopes) or first
         lost = losers_of(history, self.incumbent.candidate.id, model)
-        foretold = [predicted(self.real, candidate.policy) for candidate in lost]
+        foretold = [predicted(self.real, one.policy) for one in lost]
         unsafe: Proposal | None = None
-        doubted: Proposal | None = None
-        ruinous: Candidate | None = None
+        doubted, ruinous = unsafe, self.ruinous
         directions: dict[float, Policy] = {}
         for step in options.steps_from(first):
             if step.damping not in directions:
@@ -161,7 +160,7 @@ class About:
             if any(self._near(made, run) for run in foretold):
                 continue
             if made.predicted_gain > self.least:
-                proposal = make.checked(made)
+                proposal = make.checked(make.with_margin(made, self.real))
                 if proposal.candidate is None:
                     unsafe = proposal
                     continue
@@ -169,7 +168,7 @@ class About:
                 proposal = replace(proposal, candidate=told)
                 if self._ruinous(told):
                     ruinous = ruinous or told
-                elif expected(made) > self.least:
+                elif made.expected_gain > self.least:
                     return proposal
                 else:
                     doubted = doubted or proposal
@@ -182,7 +181,7 @@ class About:
 
     def _ruinous(self, made: Candidate) -> bool:
         """Whether it is foretold to lose more than all that the incumbent costs there."""
-        return expected(made) < -max(self._disturbed, -self.incumbent.utility)
+        return made.expected_gain < -max(self._disturbed, -self.incumbent.utility)
 
     @cached_property
     def _disturbed(self) -> float:
@@ -233,10 +232,10 @@ class About:
             return None
         policy, _ = make.planner.first_policy()
         made = self._told(self.candidate(policy, Step(), "own plan"))
-        promise = expected(rival.candidate) if rival and rival.candidate else self.least
+        promise = rival.candidate.expected_gain if rival and rival.candidate else self.least
         swung = wild(self.incumbent) or limit_cycle(self.incumbent, make.planner.task)
         better = swung or self._worth(made) > max(promise, self.least)
-        proposal = make.checked(made) if better else None
+        proposal = make.checked(make.with_margin(made, self.real)) if better else None
         return proposal if proposal is not None and proposal.candidate is not None else None
 
     def _worth(self, made: Candidate) -> float:
@@ -250,12 +249,7 @@ class About:
         plainly = self._plain_gain(made) if made.predicted_gain > self.least else None
         sure = -np.inf if plainly is None else plainly - self._plain_off
         little = sure <= LITTLE * -self.incumbent.utility
-        return expected(made) if little else max(expected(made), sure)
-
-
-def expected(made: Candidate) -> float:
-    """The promised gain less what the model is likely to miss of it."""
-    return made.predicted_gain - made.likely_off
+        return made.expected_gain if little else max(made.expected_gain, sure)
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,6 +345,13 @@ class Maker:
         K = measured_gains(gentle, run.z, run.inputs, found.gains.K, self.planner.task.model.n)
         policy = plan.policy(run.inputs, K[:, :, columns], run.z[:-1, columns])
         return self.planner.narrowed(policy)
+
+    def with_margin(self, made: Candidate, problem: Problem) -> Candidate:
+        """The same run with gains that hold on old samples, where memory was adopted."""
+        if made.policy.gain is None or not self.planner.remembers:
+            return made
+        policy = steadied(problem, made.policy, lambda c: self._gently(made.policy, problem, c))
+        return self.foretold(made, policy, problem, made.expected_of_base)
 
     def checked(self, made: Candidate) -> Proposal:
         """A candidate that is finite, inside the limits and predicted to stay safe; or none."""

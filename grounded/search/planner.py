@@ -48,6 +48,11 @@ class Planner:
         """Of the model that plans, see `model_fingerprint`."""
         return model_fingerprint(self.plan)
 
+    @property
+    def remembers(self) -> bool:
+        """Whether the planning model has memory, which no sensor of the robot shows."""
+        return self.plan.model.n > self.task.model.n
+
     def lift(self, trial: Trial) -> Trial:
         """A trial with the planning model's memory states beside its own."""
         plan, base = self.plan.model, self.task.model

@@ -30,6 +30,7 @@ from grounded.frozen import Array, wrapped
 PASSES = 4
 SHARES = (0.5, 0.25, 0.0)  # of the gains on the known part: what is left where no pass is better
 SAME = 1e-9  # of what inputs do together: less, in difference, is rounding
+STILL = 1e-3  # of what a state or input does along the run
 RIDGE = 1e-6  # of a known quantity's own variance
 
 
@@ -50,14 +51,14 @@ def measured_gains(problem: Problem, z: Array, u: Array, K: Array, measured: int
         return dropped
     with np.errstate(all="ignore"):
         q = linearised(problem.system, problem, z, u)
-        noise = _disturbances(problem, z)
+        noise, still = _disturbances(problem, z), STILL * np.ptp(z, axis=0)
         best, least, gains = dropped, _cost(q, dropped, noise), K
         for less in (share * dropped for share in SHARES):
             cost = _cost(q, less, noise)
             if cost < least:
                 best, least = less, cost
         for _ in range(PASSES):
-            gains = _swept(q, K, _estimates(q, gains, noise, known), known)
+            gains = _swept(q, K, _estimates(q, gains, noise, known, still), known)
             cost = _cost(q, gains, noise)
             if cost < least:
                 best, least = gains, cost
@@ -72,18 +73,26 @@ def _disturbances(problem: Problem, z: Array) -> Array:
     return variance
 
 
-def _estimates(q: Quadratic, K: Array, noise: Array, known: NDArray[np.bool_]) -> Array:
-    """E[dz | dy] as matrices (H, nz, nz) that are zero on columns that are not known."""
+def _estimates(
+    q: Quadratic, K: Array, noise: Array, known: NDArray[np.bool_], still: Array
+) -> Array:
+    """E[dz | dy] as matrices (H, nz, nz) that are zero on columns that are not known.
+
+    What deviates by no more than `still` (nz,) tells nothing: of an input that was at its limit the
+    commands before have none but rounding, and a gain on that may have any size.
+    """
     found = np.zeros_like(q.A)
     found[:] = np.diag(known.astype(float))
     S = np.diag(noise)
     for t in range(len(K)):
-        size = np.sqrt(np.diag(S)[known]) + 1e-300
-        scaled = S[np.ix_(known, known)] / np.outer(size, size)
+        size = np.sqrt(np.diag(S))
+        telling = known & (size > still)
+        size = size[telling]
+        scaled = S[np.ix_(telling, telling)] / np.outer(size, size)
         if np.isfinite(scaled).all():
             solved = np.linalg.solve(scaled + RIDGE * np.eye(len(size)), np.diag(1.0 / size))
-            rows = (S[np.ix_(~known, known)] / size) @ solved
-            found[t][np.ix_(~known, known)] = rows
+            rows = (S[np.ix_(~known, telling)] / size) @ solved
+            found[t][np.ix_(~known, telling)] = rows
         loop = q.A[t] + q.B[t] @ K[t]
         S = loop @ S @ loop.T + np.diag(noise)
     return found

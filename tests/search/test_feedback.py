@@ -13,7 +13,7 @@ from grounded.plant import Noise, Plant
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
-from grounded.search.making import About, Maker, expected
+from grounded.search.making import About, Maker
 from grounded.search.planner import Planner, model_fingerprint, planner_for, predicted
 from grounded.search.standing import SearchOptions, standing
 from grounded.search.step_size import Step
@@ -99,7 +99,7 @@ def test_what_a_model_is_likely_to_miss_grows_with_the_step(noisy):
     far = replace(own, feedforward=own.feedforward + 1.0)
     near, moved = (about.candidate(policy, Step(), "") for policy in (own, far))
     assert moved.likely_off > near.likely_off and moved.doubtful
-    assert expected(moved) == pytest.approx(moved.predicted_gain - moved.likely_off)
+    assert moved.expected_gain == pytest.approx(moved.predicted_gain - moved.likely_off)
 
 
 def test_an_own_plan_must_promise_more_than_it_is_likely_off_by(noisy):
