@@ -130,6 +130,9 @@ def spread(trial: Trial, some: Sequence[int]) -> Array:
     return np.asarray(np.nanstd(trial.states[:, some], axis=0) + 1e-300)
 
 
+RUNS_AWAY = 1e3  # times what the signals do: how far a prediction is off that says nothing
+
+
 def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Odd]:
     """Of each trial the signals that are in degrees in all of them, by what the model makes of it.
 
@@ -144,19 +147,23 @@ def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) 
     moving = tuple(i for i in shown if units[i] in ("rad", "rad/s"))
     some = trials[:: max(1, len(trials) // MANY)]
 
-    def left(odd: Odd) -> float:
+    def left(odd: Odd) -> Array:
         turned = [odd.mended(trial) for trial in some]
         unit = np.median([spread(t, shown) for t in turned], axis=0)
-        return float(np.median([missed(model, t, shown, shown, unit) for t in turned]))
+        return np.array([missed(model, t, shown, shown, unit) for t in turned])
 
     groups = dict.fromkeys([*((i,) for i in angles), angles, moving, ()])
     choices = [Odd(0, DEGREES, g, u) for g in groups for u in ((), sent) if g or u]
-    errors = [left(odd) for odd in choices]
+    errors = [float(np.median(left(odd))) for odd in choices]
     if not np.isfinite(errors).any():
         return []
     best = choices[int(np.nanargmin(errors))]
+    mended, own = left(best), left(replace(best, factor=1.0))
+    judges = np.minimum(mended, own) < RUNS_AWAY  # of a trial that no model predicts none tells
     near = [left(replace(best, factor=f * DEGREES)) for f in (1 / LIKE, LIKE)]
-    told = np.nanmin(errors) < min(left(replace(best, factor=1.0)) / 2, *near)
+    told = judges.any() and all(
+        np.median(mended[judges] / other[judges]) < 1 for other in (own / 2, *near)
+    )
     return [replace(best, trial=k) for k in range(len(trials))] if told else []
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from grounded import Model
+from grounded.instruments.odd_trial import all_in_degrees
 from grounded.plant import Plant
 from grounded.search import first_policy as starts
 from grounded.search import making, mispredictions
@@ -100,6 +101,22 @@ def test_a_better_models_own_plan_is_a_rival(late_arm, trials):
             told.append(late_arm.run(made))
     assert trials > 1 or candidates[1].way == "own plan"
     assert max(map(task.utility, told)) > -0.125  # its optimum is -0.115
+
+
+def test_what_no_model_predicts_is_in_no_other_unit(late_arm):
+    """An arm that spun was taken for degrees: a dead zone was claimed in the place of its delay."""
+    task, rng = late_arm.task, np.random.default_rng(3)
+    search = Search(task)
+    for _ in range(2):
+        search.tell(late_arm.run(search.ask()))
+    calm = search.trials[1]
+    spun = np.cumsum(rng.normal(size=calm.states.shape), axis=0) * [0.3, 1.0, 10.0, 60.0]
+    wild = replace(calm, states=spun)
+    for trials in ([wild, calm], [wild], [wild, wild, calm]):
+        assert all_in_degrees(task.model, trials, range(4)) == []
+    turned = replace(calm, states=np.rad2deg(calm.states))
+    found = all_in_degrees(task.model, [turned], range(4))
+    assert [odd.states for odd in found] == [(0, 1, 2, 3)]
 
 
 def test_an_unstable_loop_gets_gentler_gains(late_arm):
