@@ -130,7 +130,7 @@ def spread(trial: Trial, some: Sequence[int]) -> Array:
     return np.asarray(np.nanstd(trial.states[:, some], axis=0) + 1e-300)
 
 
-RUNS_AWAY = 1e3  # times what the signals do: how far a prediction is off that says nothing
+PREDICTED = 1.0  # of what the signals do: an error below that predicts them
 
 
 def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Odd]:
@@ -159,7 +159,7 @@ def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) 
         return []
     best = choices[int(np.nanargmin(errors))]
     mended, own = left(best), left(replace(best, factor=1.0))
-    judges = np.minimum(mended, own) < RUNS_AWAY  # of a trial that no model predicts none tells
+    judges = mended < PREDICTED  # a trial that no model predicts tells nothing
     near = [left(replace(best, factor=f * DEGREES)) for f in (1 / LIKE, LIKE)]
     told = judges.any() and all(
         np.median(mended[judges] / other[judges]) < 1 for other in (own / 2, *near)
