@@ -219,7 +219,7 @@ def _named(model: Model, mistake: Mistake) -> str:
 
 
 def _exchanges(model: Model, shown: Sequence[int]) -> Iterator[Mistake]:
-    """Pairs of inputs, of whatever unit (of a Twist, say), and of positions with their velocities."""
+    """Pairs of inputs, in unlike units too (a Twist), and of positions with their velocities."""
     kinds = list(model.states.values())
     for pair in combinations(range(model.m), 2):
         yield Mistake(inputs=pair)

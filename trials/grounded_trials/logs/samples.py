@@ -307,10 +307,10 @@ def check_overlap(states: Sequence[Samples], inputs: Sequence[Samples]) -> None:
         for s in moved
     )
     raise GroundedError(
-        f"the log's signals are on clocks that differ, by about {abs(by) * 1e-9:.3f} s if they begin "
-        f"together: {', '.join(spans)} after its first sample. Log all by one clock, or bridge "
-        f"the two: {lines}. Find the difference to a few ms (by a knock that both show): what is "
-        "left of it is taken for a delay, or for a motion before its command"
+        f"the log's signals are on clocks that differ, by about {abs(by) * 1e-9:.3f} s if they "
+        f"begin together: {', '.join(spans)} after its first sample. Log all by one clock, or "
+        f"bridge the two: {lines}. Find the difference to a few ms (by a knock that both show): "
+        "what is left of it is taken for a delay, or for a motion before its command"
     )
 
 

@@ -76,7 +76,7 @@ def warnings_about(
         ends = f"after {whole.steps} of {task.horizon} steps ({whole.steps * trial.dt:.2f} s)"
         found.append(
             f"the run ended {ends}: a failed candidate; its data stay usable for fit and diagnose"
-            f"{_ran_before(workspace, trial)}"
+            f". {_if_stopped(workspace, trial)}"
             if whole.whole(task.horizon) is whole
             else f"the log ends {ends}{_lacking(task, last_s)}: the rest is judged as if the robot "
             "had gone on as it did last. Log at least one more row after the last command"
@@ -102,19 +102,20 @@ def warnings_about(
     return tuple(found)
 
 
-def _ran_before(workspace: Folder, trial: Trial) -> str:
-    """What to do about a short log of a candidate that once ran to the end; "" for others."""
+def _if_stopped(workspace: Folder, trial: Trial) -> str:
+    """When a run that ended early is no loss of its candidate, and what takes it out."""
     horizon = workspace.task.horizon
     ran = [
         one.id
         for one in workspace.task_trials()
         if one.candidate == trial.candidate and one.whole(horizon).finite_steps >= horizon
     ]
+    stopped = f"If you stopped it for a reason of your own, `discard {trial.id}`"
     if not ran:
-        return ""
+        return f"{stopped} takes it out"
     return (
-        f". {trial.candidate} ran to the end before ({', '.join(ran)}): if only the log was cut, "
-        f"`discard` {trial.id}"
+        f"{trial.candidate} ran to the end before ({', '.join(ran)}). {stopped} takes it out, as "
+        "where only the log was cut"
     )
 
 
