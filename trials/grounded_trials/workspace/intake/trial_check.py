@@ -66,8 +66,8 @@ def warnings_about(
         "sensor on?"
         for one in dead_rates(model, whole, relations)
     ]
-    found += _in_degrees(task, whole)
     found += way_warnings(model, whole)
+    found += told_in_degrees(model, whole, found) or _in_degrees(task, whole)
     sent, scaled = mistaken_in(model, whole)
     found += sent
     if not trial.candidate:
@@ -221,6 +221,24 @@ def way_warnings(model: Model, trial: Trial) -> list[str]:
     except GroundedError as error:
         return [str(error).replace("in trial number 1 ", "")]
     return [f"{one.signal} {one.finding}: {one.log} in [log.state.{one.signal}]" for one in odd]
+
+
+def told_in_degrees(model: Model, trial: Trial, told: Sequence[str]) -> list[str]:
+    """Degrees that a diagnosis would put right, but for those that are told already."""
+    from grounded.instruments.preflight import preflight
+
+    try:
+        findings = preflight(model, [replace(trial.until(trial.known_steps), id="")]).findings
+    except GroundedError:  # it stops the diagnosis, which tells it
+        return []
+    return [
+        f"{said}: multiply the scale in [log.state.{one.signal}] by {one.log.split(' = ')[1]} (1 "
+        "where none is given)"
+        for one in findings
+        if one.kind == "degrees" and one.log
+        for said in [f"{one.signal} {one.finding}"]
+        if not any(other.startswith(said) for other in told)
+    ]
 
 
 def mistaken_in(model: Model, trial: Trial) -> tuple[list[str], tuple[str, ...]]:
