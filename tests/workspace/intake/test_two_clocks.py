@@ -1,15 +1,18 @@
 """A motion capture and a robot's program, each with its own clock, in one log."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from recorded import LOGGED, record
 from workspaces import make
 
+SPLIT = LOGGED.replace("/csv.force", "/cmd.force").replace("/csv.", "/mocap.")
 APART = 8134.22  # [s] by which the cameras' clock is ahead
 
 
@@ -33,7 +36,7 @@ def two_tables(w, path, policy, apart):
 @pytest.mark.parametrize("apart", [APART, -APART])
 def test_two_clocks_are_told_with_the_lines_that_bridge_them(tmp_path, apart):
     """It was said that the trial had 0 steps, and [log.span] was named."""
-    config = LOGGED.replace("/csv.force", "/cmd.force").replace("/csv.", "/mocap.")
+    config = SPLIT
     w = Workspace(make(tmp_path / "w", config=config).folder)
     ran = w.propose().candidate
     log = two_tables(w, tmp_path / "run.npz", ran.policy, apart)
@@ -51,7 +54,22 @@ def test_two_clocks_are_told_with_the_lines_that_bridge_them(tmp_path, apart):
 
 
 def test_tables_of_one_clock_are_read_as_they_are(tmp_path):
-    config = LOGGED.replace("/csv.force", "/cmd.force").replace("/csv.", "/mocap.")
-    w = Workspace(make(tmp_path / "w", config=config).folder)
+    w = Workspace(make(tmp_path / "w", config=SPLIT).folder)
     ran = w.propose().candidate
     assert w.ingest(two_tables(w, tmp_path / "run.npz", ran.policy, 0.0)).candidate == ran.id
+
+
+def test_the_lines_of_the_docs_make_one_log_of_two_tables(tmp_path, monkeypatch):
+    w = Workspace(make(tmp_path / "w", config=SPLIT).folder)
+    ran = w.propose().candidate
+    rows = np.loadtxt(record(w, tmp_path / "a.csv", ran.policy, 0.0), delimiter=",", skiprows=1)
+    (tmp_path / "run").mkdir()
+    monkeypatch.chdir(tmp_path / "run")
+    for name, columns, head in (("mocap", (0, 1, 2), "time,x,v"), ("cmd", (0, 3), "t,force")):
+        np.savetxt(f"{name}.csv", rows[:, columns], "%.5f", ",", header=head, comments="")
+    with pytest.raises(GroundedError, match=holding("cmd.csv and mocap.csv", ".npz", "NAME_t")):
+        w.ingest(tmp_path / "run")
+    docs = Path(__file__).parents[3] / "docs/log-reference.md"
+    (lines,) = re.findall(r"```python\n(.*?np\.savez.*?)```", docs.read_text(), re.DOTALL)
+    exec(compile(lines, str(docs), "exec"), {})
+    assert w.ingest(tmp_path / "run/run.npz").candidate == ran.id
