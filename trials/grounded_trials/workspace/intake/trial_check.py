@@ -17,6 +17,7 @@ from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
 from grounded_trials.wording import count, with_unit
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.intake.estimating import read_estimate
 from grounded_trials.workspace.intake.who_drove import UNLIKE, follows, latest, second_differences
 
 FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth a warning,
@@ -68,6 +69,7 @@ def warnings_about(
     ]
     found += way_warnings(model, whole)
     found += told_in_degrees(model, whole, found) or _in_degrees(task, whole)
+    found += clocks_apart(workspace, whole)
     sent, scaled = mistaken_in(model, whole)
     found += sent
     if not trial.candidate:
@@ -239,6 +241,19 @@ def told_in_degrees(model: Model, trial: Trial, told: Sequence[str]) -> list[str
         for said in [f"{one.signal} {one.finding}"]
         if not any(other.startswith(said) for other in told)
     ]
+
+
+def clocks_apart(workspace: Folder, trial: Trial) -> list[str]:
+    """That measured states answer commands before they are sent."""
+    from grounded.instruments.early import answers_early, one_clock, too_soon
+
+    model, table = workspace.base_model, workspace.config.estimate
+    measured = read_estimate(table, model).measured if table.names() else model.state_names
+    shown = [i for i, name in enumerate(model.state_names) if name in measured]
+    if (early := answers_early(model, trial, shown)) is None:
+        return []
+    said = f"{too_soon(model, early)}. {one_clock(model, shown, early)}, and ingest it again"
+    return [f"{said}, without {trial.id}"]
 
 
 def mistaken_in(model: Model, trial: Trial) -> tuple[list[str], tuple[str, ...]]:
