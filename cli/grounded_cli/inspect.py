@@ -43,7 +43,7 @@ def command(log: str, json_: bool) -> None:
     )
     for topic in report.topics:
         _tell(topic)
-    for one in report.remarks:
+    for one in (*report.remarks, *found.odd):
         remark("note", one)
     if found.log_table:
         look = "; look at what is marked unsure" if "# unsure" in found.log_table else ""

@@ -46,6 +46,7 @@ from grounded.diagnosis.writer import Writer
 from grounded.effects import Library
 from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError
+from grounded.instruments.early import judge_clocks
 from grounded.instruments.mistaken import judge_commands
 from grounded.instruments.preflight import preflight
 from grounded.model import Model
@@ -130,6 +131,7 @@ def diagnose(
     looked = preflight(subject, [*trials, *compare], options.hidden)
     trials = looked.trials
     data = prepare(model, trials, latency, past, options.hidden)
+    judge_clocks(model, trials, options.hidden)
     judge_commands(model, trials, options.hidden, looked.findings)
     filters = {model.state_names.index(name): tau for name, tau in looked.filters.items()}
     data = replace(data, filters=filters)

@@ -219,11 +219,10 @@ def _named(model: Model, mistake: Mistake) -> str:
 
 
 def _exchanges(model: Model, shown: Sequence[int]) -> Iterator[Mistake]:
-    """Pairs of inputs of one unit, and of positions with their velocities."""
-    units, kinds = list(model.inputs.values()), list(model.states.values())
+    """Pairs of inputs, in unlike units too (a Twist), and of positions with their velocities."""
+    kinds = list(model.states.values())
     for pair in combinations(range(model.m), 2):
-        if units[pair[0]] == units[pair[1]]:
-            yield Mistake(inputs=pair)
+        yield Mistake(inputs=pair)
     exact = [r for r in integrals(model) if r.exact and {r.i, r.j} <= set(shown)]
     for a, b in combinations(exact, 2):
         like = kinds[a.i] == kinds[b.i] and kinds[a.j] == kinds[b.j]

@@ -11,6 +11,7 @@ dead          a velocity that stays at one value while its position moves
 constant      a velocity that is off by a constant, against the way of its position
 kinematics    velocities against the rates of their positions, courses against headings
 late_position both positions of a plane behind what velocities and a heading say
+early         states that answer commands before they are sent
 mistaken      commands in each other's place, or in percent, once the rest is put right
 inputs        copies of one another, at their limits or beyond, constant within each trial
 

@@ -49,12 +49,20 @@ class Ahead:
         trial: of its states and inputs.
         shown: states that a sensor has.
         starts: samples to predict from, at most.
+        delays: that all commands may have [s].
     """
 
-    def __init__(self, model: Model, trial: Trial, shown: Sequence[int], starts: int) -> None:
+    def __init__(
+        self,
+        model: Model,
+        trial: Trial,
+        shown: Sequence[int],
+        starts: int,
+        delays: Sequence[float] = DELAYS,
+    ) -> None:
         self.model, self.shown, self.sent, self.dt = model, list(shown), trial.inputs, trial.dt
         self.steps = max(1, round(AHEAD / trial.dt))
-        self.delays = tuple(dict.fromkeys(round(d / trial.dt) for d in DELAYS))
+        self.delays = tuple(dict.fromkeys(round(d / trial.dt) for d in delays))
         logged = np.array(trial.states)
         logged[:, [i for i in range(model.n) if i not in self.shown]] = 0.0  # nobody knows
         good = np.asarray(np.isfinite(logged).all(axis=1))

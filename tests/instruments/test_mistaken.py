@@ -93,6 +93,37 @@ def test_exchanged_commands_are_named_and_a_crude_model_is_no_exchange(crude, la
     assert holds(said, "port and starboard", "r, east and psi")  # the mirror image does it, too
 
 
+def rover(tau=0.3, k_w=1.0):
+    """A robot on two wheels that is told a speed and a rate of turn."""
+
+    def rates(s, a, p):
+        return {
+            "v": (a.linear - s.v) / p.tau,
+            "omega": (p.k_w * a.angular - s.omega) / p.tau,
+            "x": s.v * np.cos(s.psi),
+            "y": s.v * np.sin(s.psi),
+            "psi": s.omega,
+        }
+
+    return Model(
+        states={"v": "m/s", "omega": "rad/s", "x": "m", "y": "m", "psi": "rad"},
+        inputs={"linear": "m/s", "angular": "rad/s"},
+        params={"tau": Param(tau, "s", 0.05, 1.0), "k_w": Param(k_w, "1", 0.7, 1.3)},
+        angles=("psi",),
+        derivative=rates,
+    )
+
+
+@pytest.mark.parametrize("late", [0, 2])
+def test_exchanged_commands_of_two_units_are_named(late):
+    """A diagnosis said of a Twist read crosswise that the speed moves by at most 0 m/s^2."""
+    trials = [driven(rover(), k, late=late, gains=np.array([1.0, 0.9])) for k in range(2)]
+    crude = rover(tau=0.15, k_w=1.1)
+    assert mistaken(crude, trials, every(crude)) is None
+    told = mistaken(crude, [SWAPPED.mended(t) for t in trials], every(crude))
+    assert told is not None and told.mistake.inputs == (0, 1) and told.mistake.signs == (1, 1)
+
+
 def test_an_exchange_with_a_sign_says_whose():
     odd = SWAPPED.mended(driven(vessel(), gains=np.array([-1.0, 1.0])))
     told = mistaken(vessel(), [odd], every(vessel()))

@@ -252,3 +252,12 @@ def test_only_rows_of_states_show_a_command_late(topic: str, late: float) -> Non
     t = np.arange(0, 2, 0.02)
     sent = series(t, np.floor(t / 0.1 + 1e-6), SignalSpec(f"{topic}.force", "log"))
     assert grid(pose(np.sin), sent).row_s == pytest.approx(late)
+
+
+def test_what_is_held_or_sent_seldom_may_end_before_others_begin() -> None:
+    later = pose(np.sin)
+    later = replace(later, t=later.t + 20 * 10**9, log_times=later.log_times + 20 * 10**9)
+    seldom = command(0.0, 0.3)
+    assert set(grid(later, seldom).inputs[:, 0]) == {5.0}
+    with pytest.raises(GroundedError, match=holding("clocks", "[log.state.x] delay_s = 19.500")):
+        grid(later, command())

@@ -30,6 +30,13 @@ PLANE = Model(
 )
 
 
+ROVER = Model(
+    states={"v": "m/s", "psi": "rad"},
+    inputs={"linear": "m/s", "angular": "rad/s"},
+    derivative=lambda s, a, p: {"v": a.linear - s.v, "psi": a.angular},
+)
+
+
 def reading(model, *columns, form="/csv.{}"):
     paths = {
         name: SignalSpec(form.format(column))
@@ -67,6 +74,22 @@ def test_a_message_of_a_number_alone_is_named_by_its_topic(form):
     assert crossed(boat, reading(boat, "v", "port", "starboard", form=form)) == ()
     (told,) = crossed(boat, reading(boat, "v", "starboard", "port", form=form))
     assert holds(told, "port", "starboard", "exchanged")
+
+
+@pytest.mark.parametrize(
+    ("columns", "odd"),
+    [
+        (("odom.twist.twist.linear.x", "@rpy.yaw", "cmd.linear.x", "cmd.angular.z"), False),
+        (("odom.twist.twist.linear.x", "@rpy.yaw", "cmd.angular.z", "cmd.linear.x"), True),
+        (("odom.twist.twist.linear.x", "@rpy.yaw", "cmd.linear.x", "cmd.linear.y"), False),
+        (("odom.speed", "odom.yaw", "cmd.angular.z", "cmd.data[0]"), False),
+    ],
+)
+def test_two_numbers_of_a_twist_in_each_others_unit_are_exchanged(columns, odd):
+    """That somebody took over was said of a run, and of data that the robot moved by 0 m/s^2."""
+    found = crossed(ROVER, reading(ROVER, *columns, form="/{}"))
+    assert len(found) == odd
+    assert all(holds(text, "linear", "angular", "exchanged", "units") for text in found)
 
 
 def test_an_input_in_the_column_of_a_state_is_told_at_ingest(tmp_path):

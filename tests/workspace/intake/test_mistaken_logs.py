@@ -81,6 +81,16 @@ def test_exchanged_commands_are_told_at_once_and_stop_a_diagnosis(w, tmp_path):
         Workspace(w.folder).preflight()
 
 
+def test_a_yaw_in_degrees_beside_its_rate_is_told_at_once(w, tmp_path):
+    """Only the diagnosis told it, when the next logs were read so, too."""
+    path = log(w, tmp_path / "a.csv")
+    rows = np.loadtxt(path, delimiter=",", skiprows=1)
+    rows[:, 3] = np.rad2deg(rows[:, 3])
+    np.savetxt(path, rows, "%.6f", ",", header="t,v,r,psi,port,starboard", comments="")
+    (warning,) = w.ingest(path, data=True).warnings
+    assert holds(warning, "psi", "degrees", "[log.state.psi]", "0.017453293")
+
+
 def test_percent_is_told_with_the_scale_and_a_scale_mends_it(w, tmp_path):
     path = log(w, tmp_path / "a.csv", scale=100.0)
     (warning,) = w.ingest(path, data=True).warnings

@@ -13,8 +13,8 @@ from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.intake.other_scale import other_units, units_tried
 from grounded_trials.workspace.intake.who_drove import follows, latest
-from recorded import record, waiting
-from workspaces import make
+from recorded import LOGGED, record, waiting
+from workspaces import MODEL, make
 
 ROVER = """import numpy as np
 
@@ -134,3 +134,17 @@ def test_a_log_whose_scale_is_wrong_is_told_so(tmp_path, before):
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
     assert holds(str(refused.value), "ran c0002", "v 2 times", "small", "[log]", "program")
+
+
+@pytest.mark.parametrize("before", [0.0, 0.7])
+def test_a_rate_that_is_logged_in_radians_for_a_model_in_degrees_is_told(tmp_path, before):
+    """That another controller drove was said: only of a model's radians were degrees tried."""
+    model = MODEL.replace('"force": "N"', '"force": "deg/s"')
+    w = Workspace(make(tmp_path / "w", config=LOGGED, model=model).folder)
+    log = record(w, tmp_path / "a.csv", w.propose().candidate.policy, before)
+    rows = np.loadtxt(log, delimiter=",", skiprows=1)
+    rows[:, 3] = np.deg2rad(rows[:, 3])
+    np.savetxt(log, rows, "%.6f", ",", header="t,x,v,force", comments="")
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(log)
+    assert holds(str(refused.value), "ran c0001", "force", "57.2958", "radians for degrees")

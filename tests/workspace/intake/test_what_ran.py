@@ -177,13 +177,14 @@ def test_a_trial_that_names_its_candidate_is_not_given_to_another(waiting, tmp_p
     assert w.ingest(other, candidate="c0002").candidate == "c0002"
 
 
-def test_a_cut_log_of_a_candidate_that_ran_well_says_how_to_take_it_back(waiting, tmp_path):
+def test_a_run_that_ended_early_says_how_to_take_it_back(waiting, tmp_path):
     w, ran, _ = waiting
     for candidate in ("c0001", "c0002"):
         short = said_to_have_run("", ran, tmp_path / f"{candidate}.mcap", 20, nudge=1e-9)
         found = w.ingest(short, candidate=candidate)
         (said,) = [one for one in found.warnings if "ended after 20" in one]
-        assert (f"`discard` {found.trial}" in said) == (candidate == "c0001")
+        assert f"`discard {found.trial}`" in said
+        assert ("ran to the end before" in said) == (candidate == "c0001")
         assert found.verdict == "crashed" or candidate == "c0001"
 
 

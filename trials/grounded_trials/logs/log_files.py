@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from grounded.errors import GroundedError, nearest
+from grounded.result import listed
 from grounded_trials.formats.budget import budget
 from grounded_trials.formats.mcap_records import Messages, Metadata, Record
 from grounded_trials.formats.mcap_walk import MAGIC, read_records
@@ -89,6 +90,13 @@ def _nearby(path: Path) -> str:
 def _advice(folder: Path) -> str:
     if (folder / "grounded.toml").is_file():
         return "; it is a workspace: name the log, or its folder, inside"
+    tables = sorted(path.name for path in folder.iterdir() if path.name.endswith(".csv"))
+    if len(tables) > 1:
+        return (
+            f": name the log itself. If {listed(tables[:3])} are one run, put them into one .npz, "
+            "an array NAME of each beside its times NAME_t and its columns NAME_names: "
+            'docs/log-reference.md, "Two tables, two clocks", has the lines'
+        )
     return ": name the log itself"
 
 

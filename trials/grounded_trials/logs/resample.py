@@ -27,9 +27,11 @@ from grounded_trials.logs.command_steps import (
     stands_still,
 )
 from grounded_trials.logs.samples import (
+    REGULAR,
     Samples,
     SignalReport,
     check_clocks,
+    check_overlap,
     report_of,
     staircase,
     tidy,
@@ -40,7 +42,6 @@ from grounded_trials.logs.signals import Clock, Series, SignalSpec
 START, END = "[log.span] start", "[log.span] end"  # names of the series that a span watches
 ABSOLUTE_S = 1e8  # a time beyond this is a stamp, not one that counts from the log's beginning
 STEP_LIMIT = 2_000_000
-REGULAR = 10  # inputs sent more often than this are sent all the time; their end is the trial's
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,7 @@ def to_grid(
     names = [*states, *inputs]
     check_clocks({n: series[n] for n in (*names, *span.signals())})
     samples = {n: tidy(n, series[n], unwrap=n in angles) for n in names}
+    check_overlap([samples[n] for n in states], [samples[n] for n in inputs])
     how = {n: samples[n].spec.resample or ("linear" if n in states else "hold") for n in names}
     for name in names:
         if how[name] == "linear":

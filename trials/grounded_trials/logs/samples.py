@@ -8,13 +8,14 @@ and what had to be bridged.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from grounded.errors import GroundedError
+from grounded.result import listed
 from grounded_trials.formats.messages import Floats, Ints
 from grounded_trials.logs.signals import Series, SignalSpec
 
@@ -25,6 +26,7 @@ MIXED_S = 1.0  # signals on different clocks whose clocks differ by more don't f
 SKEW_S = 0.1  # and by more than this, they may be shifted
 SPARSE = 50.0  # steps between two samples: the log's time is in another unit
 BRIDGED = 1.9  # a value between samples this many intervals apart was bridged
+REGULAR = 10  # inputs sent more often than this are sent all the time; their end is the trial's
 LEAST_RUNS, REPEATED = 20, 0.8  # runs of equal samples, and those of two and more: it is held
 COARSE = 2.5  # times its least change is the median one of a signal that is not quantised
 
@@ -271,6 +273,45 @@ def check_clocks(series: Mapping[str, Series]) -> None:
             f"{apart:.3f} s (simulation time, or an unset clock?); read both "
             'by the same one, such as clock = "log"'
         )
+
+
+def check_overlap(states: Sequence[Samples], inputs: Sequence[Samples]) -> None:
+    """Refuses signals of which some end before others begin: their stamps are of two clocks.
+
+    What is held, or sent seldom, is in force after its last sample: its end says nothing.
+
+    Args:
+        states: the samples of each, on the clocks that [log] names.
+        inputs: likewise.
+
+    Raises:
+        GroundedError: with the signals of both clocks, and the delay_s that puts one on the other.
+    """
+    held = [s for s in states if s.spec.resample == "hold"]
+    held += [s for s in inputs if len(s.t) <= REGULAR or s.spec.max_age_s is not None]
+    end = min((int(s.t[-1]) for s in (*states, *inputs) if s not in held), default=2**62)
+    late = [s for s in (*states, *inputs) if (int(s.t[0]) - end) * 1e-9 > MIXED_S]
+    if not late:
+        return
+    early = [s for s in (*states, *inputs) if s not in late]
+    first, begin = (min(int(s.t[0]) for s in some) for some in (early, late))
+    moved, by = (late, begin - first) if any(s in inputs for s in early) else (early, first - begin)
+    spans = [
+        f"{listed(s.name for s in some)} from {(start - first) * 1e-9:.3f} "
+        f"to {(max(int(s.t[-1]) for s in some) - first) * 1e-9:.3f} s"
+        for some, start in ((early, first), (late, begin))
+    ]
+    lines = "; ".join(
+        f"[log.{'state' if s in states else 'input'}.{s.name}] delay_s = "
+        f"{s.spec.delay_s + by * 1e-9:.3f}"
+        for s in moved
+    )
+    raise GroundedError(
+        f"the log's signals are on clocks that differ, by about {abs(by) * 1e-9:.3f} s if they "
+        f"begin together: {', '.join(spans)} after its first sample. Log all by one clock, or "
+        f"bridge the two: {lines}. Find the difference to a few ms (by a knock that both show): "
+        "what is left of it is taken for a delay, or for a motion before its command"
+    )
 
 
 def _furthest(skews: Mapping[str, float | None]) -> tuple[str, str, float]:

@@ -169,6 +169,7 @@ def _paid(found: Diagnosis) -> bool:
 
 def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
     """What the stored trials say of the instruments, before any physics."""
+    from grounded.instruments.early import judge_clocks
     from grounded.instruments.mistaken import judge_commands
     from grounded.instruments.preflight import preflight
 
@@ -176,6 +177,7 @@ def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Findi
     memory = planner.plan.model.state_names[planner.task.model.n :]
     used = _chosen(workspace, trials)
     found = preflight(planner.plan, [planner.lift(trial) for trial in used], memory)
+    judge_clocks(planner.plan.model, found.trials, memory)
     judge_commands(planner.plan.model, found.trials, memory, found.findings)
     return where_to_mend(workspace, used, found.findings)
 

@@ -23,6 +23,7 @@ class Inspected(Result):
     log_table: str  # TOML; "" where none is guessed
     why_none: str = ""  # why no table is guessed for a log that needs one
     ran_nothing: bool = False  # no candidate was proposed yet that it could have run
+    odd: tuple[str, ...] = ()  # what the workspace's [log] reads as what it is not
 
     @property
     def format(self) -> str:
@@ -61,7 +62,7 @@ class Inspected(Result):
             "duration_s": report.duration_s,
             "messages": report.messages,
             "topics": [vars(t) | {"fields": [vars(f) for f in t.fields]} for t in report.topics],
-            "remarks": list(report.remarks),
+            "remarks": [*report.remarks, *self.odd],
             "damage": report.damage,
             "log_table": self.log_table,
         }
@@ -79,7 +80,9 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     """
     from grounded_trials.logs.inspect_evidence import weigh
     from grounded_trials.logs.inspect_guess import guess_mapping, is_simulated, mapping_toml
+    from grounded_trials.logs.log_table import log_mapping
     from grounded_trials.logs.unnamed import from_the_rest
+    from grounded_trials.workspace.intake.no_angle import no_angles
 
     report = inspect_log(log)
     if report.meta.get("format") or report.damage:
@@ -95,4 +98,6 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     both = from_the_rest((*states, *inputs), {**model.states, **model.inputs}, report)
     states, inputs = both[: model.n], both[model.n :]
     table = mapping_toml(states, inputs, simulated=is_simulated(report))
-    return Inspected(str(log), report, table, ran_nothing=not workspace.candidate_ids())
+    mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
+    odd = tuple(f"{name} {said}" for name, said in no_angles(model, mapping).items())
+    return Inspected(str(log), report, table, ran_nothing=not workspace.candidate_ids(), odd=odd)

@@ -1,7 +1,8 @@
 """Two signals that [log] reads from each other's column, by what the columns are called.
 
 A state and an input have no relation that data must keep: an angle of a beam that is read from the
-servo's column is as smooth as its own. The names tell, where each fits the other signal better.
+servo's column is as smooth as its own. The names tell, where each fits the other signal better, and
+the units that ROS's conventions give a path, where each is the other signal's.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Mapping
 from itertools import combinations
 
 from grounded.model import Model
+from grounded_trials.logs.inspect_evidence import unit_of
 from grounded_trials.logs.log_table import LogMapping
 from grounded_trials.logs.stated_units import bare_command
 from grounded_trials.workspace.config import FILE
@@ -26,13 +28,25 @@ def crossed(model: Model, mapping: LogMapping) -> tuple[str, ...]:
         mapping: which column each is read from.
     """
     paths = {name: one.path for name, one in {**mapping.states, **mapping.inputs}.items()}
+    units = {**model.states, **model.inputs}
     axes = model.roles.get("position", ())  # north may be the x of one and the y of another
-    return tuple(
-        f"{a} is read from {paths[a]} and {b} from {paths[b]}: by their names they are exchanged "
-        f"in {FILE}'s [log]"
+    by = {
+        (a, b): "units" if _of_the_other(a, b, paths, units) else "names"
         for a, b in combinations(paths, 2)
-        if not {a, b} <= set(axes) and _crossed(a, b, paths)
+        if _of_the_other(a, b, paths, units) or _crossed(a, b, paths)
+    }
+    return tuple(
+        f"{a} is read from {paths[a]} and {b} from {paths[b]}: by their {what} they are exchanged "
+        f"in {FILE}'s [log]"
+        for (a, b), what in by.items()
+        if not {a, b} <= set(axes)
     )
+
+
+def _of_the_other(a: str, b: str, paths: Mapping[str, str], units: Mapping[str, str]) -> bool:
+    """Whether each path's number is in the other signal's unit, and not in its own."""
+    found = unit_of(paths[a]), unit_of(paths[b])
+    return found == (units[b], units[a]) != (units[a], units[b])
 
 
 def _crossed(a: str, b: str, paths: Mapping[str, str]) -> bool:

@@ -25,7 +25,7 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task
 from grounded_trials.formats.messages import Ints
-from grounded_trials.logs.samples import Samples, tidy
+from grounded_trials.logs.samples import Samples, check_overlap, tidy
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.toml_table import Table
 
@@ -88,6 +88,7 @@ def with_estimates(
         return dict(series)
     samples = [tidy(n, series[n], unwrap=n in model.angles) for n in table.measured]
     sent = [tidy(name, series[name], unwrap=False) for name in model.input_names]
+    check_overlap(samples, sent)
     clock = _Clock.of(samples, min(int(s.t[0]) for s in (*samples, *sent)), task.dt)
     records = _records(samples, sent, clock, task.dt)
     if not records:

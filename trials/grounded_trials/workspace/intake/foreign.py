@@ -22,6 +22,7 @@ from grounded_trials.logs.inspect_log import inspect_log
 from grounded_trials.logs.log_files import log_files, log_records
 from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signals
 from grounded_trials.logs.resample import Gridded, Span, to_grid
+from grounded_trials.logs.samples import MIXED_S
 from grounded_trials.logs.signals import Series, read_signals
 from grounded_trials.store.store import hash_file
 from grounded_trials.workspace.adopted import but_late_sensors, planner_of
@@ -172,10 +173,15 @@ class ForeignLog:
         """The log as the robot's program had it, if it is not this; None: it is.
 
         Its late states are as late as they came, and speeds that the program made itself by
-        differences, a filter, an observer are its own, not the smoother's.
+        differences, a filter, an observer are its own, not the smoother's. A delay of more than
+        MIXED_S, or of less than nothing, is of another clock: as late as that no program is.
         """
         states = self.workspace.base_model.state_names
-        late = {n: s for n, s in self.series.items() if n in states and s.spec.delay_s}
+        late = {
+            name: one
+            for name, one in self.series.items()
+            if name in states and 0 < one.spec.delay_s <= MIXED_S
+        }
         seen = {n: replace(s, spec=replace(s.spec, delay_s=0.0)) for n, s in late.items()}
         own = dict[str, Series]()
         if specs := {n: self.mapping.states[n] for n in self._beside}:

@@ -34,8 +34,8 @@ from grounded_trials.workspace.intake.other_scale import other_units, units_told
 from grounded_trials.workspace.intake.reading import (
     NoneWaits,
     Read,
-    crossed_in,
     cut_log,
+    misread,
     read_log_file,
     read_own_trial,
 )
@@ -215,7 +215,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             NextCommand("ingest", (str(path), "--data")),
         )
     sent, _ = mistaken_in(workspace.base_model, replace(read.trial, id=""))
-    if named := [*(crossed_in(read.log) if read.log else ()), *sent]:
+    if named := [*(misread(read.log) if read.log else ()), *sent]:
         raise GroundedError(f"{path} is not read as a run of {ran}: {'; '.join(named)}")
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
     if log and (guessed := [n for n in log.names[0] if n not in log.logged]):

@@ -32,6 +32,7 @@ from grounded_trials.workspace.intake.who_drove import (
 
 THOUSAND, PERCENT = (1e-3, 1e3), (1e-2, 1e2)
 ANGULAR = (("rad", "rad/s"), ("rad",), ("rad/s",))  # groups of units that may be in degrees
+IN_DEGREES = ("deg", "deg/s")  # units that may be in radians
 LENGTHS = (("m", "m/s"), ("m",), ("m/s",))  # what one wheel measures
 NAMED = (  # by what a column is multiplied, and what that says of it
     (np.pi / 180, " (in degrees)"),
@@ -172,7 +173,9 @@ def _multiplied(trial: Trial, names: Sequence[str], factor: float) -> Trial:
 def units_tried(model: Model) -> Iterator[tuple[Sequence[str], float]]:
     """Signals that may be in another unit together, or of the other sign, and what mends it."""
     angular = [[n for n, u in model.states.items() if u in units] for units in ANGULAR]
-    angular += [[n] for n, u in (*model.states.items(), *model.inputs.items()) if u in ANGULAR[0]]
+    turns = (*ANGULAR[0], *IN_DEGREES)
+    angular += [[n] for n, u in model.states.items() if u in turns]
+    angular += [[n] for n, u in model.inputs.items() if u in turns]
     single = [[name] for name in (*model.state_names, *model.input_names)]
     pure = [name for name, unit in model.inputs.items() if unit == "1"]
     yield from ((names, f) for f in (np.pi / 180, 180 / np.pi) for names in angular if names)

@@ -26,6 +26,7 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, ROWS
 from grounded_trials.workspace.intake.crossed import crossed
 from grounded_trials.workspace.intake.foreign import ForeignLog, begun, mapping_of, read_foreign
+from grounded_trials.workspace.intake.no_angle import no_angles
 from grounded_trials.workspace.intake.stored_before import refuse_as_another
 from grounded_trials.workspace.proposing import standing_in
 
@@ -161,7 +162,7 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
         encoded,
         (
             *filter(None, map(cut_off, log_files(log.path))),
-            *crossed_in(log),
+            *misread(log),
             *log.unlike_units,
             *log.unread,
             *found.warnings,
@@ -174,9 +175,11 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
     )
 
 
-def crossed_in(log: ForeignLog) -> tuple[str, ...]:
-    """The signals of a log that [log] seems to read from each other's column."""
-    return crossed(log.workspace.base_model, log.mapping)
+def misread(log: ForeignLog) -> tuple[str, ...]:
+    """The signals that [log] seems to read from each other's column, or from what is no angle."""
+    model = log.workspace.base_model
+    odd = no_angles(model, log.mapping)
+    return (*crossed(model, log.mapping), *(f"{name} {said}" for name, said in odd.items()))
 
 
 class NoneWaits(GroundedError):

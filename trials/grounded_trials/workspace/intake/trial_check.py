@@ -17,6 +17,7 @@ from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
 from grounded_trials.wording import count, with_unit
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.intake.estimating import read_estimate
 from grounded_trials.workspace.intake.who_drove import UNLIKE, follows, latest, second_differences
 
 FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth a warning,
@@ -66,8 +67,9 @@ def warnings_about(
         "sensor on?"
         for one in dead_rates(model, whole, relations)
     ]
-    found += _in_degrees(task, whole)
     found += way_warnings(model, whole)
+    found += told_in_degrees(model, whole, found) or _in_degrees(task, whole)
+    found += clocks_apart(workspace, whole)
     sent, scaled = mistaken_in(model, whole)
     found += sent
     if not trial.candidate:
@@ -76,7 +78,7 @@ def warnings_about(
         ends = f"after {whole.steps} of {task.horizon} steps ({whole.steps * trial.dt:.2f} s)"
         found.append(
             f"the run ended {ends}: a failed candidate; its data stay usable for fit and diagnose"
-            f"{_ran_before(workspace, trial)}"
+            f". {_if_stopped(workspace, trial)}"
             if whole.whole(task.horizon) is whole
             else f"the log ends {ends}{_lacking(task, last_s)}: the rest is judged as if the robot "
             "had gone on as it did last. Log at least one more row after the last command"
@@ -102,19 +104,20 @@ def warnings_about(
     return tuple(found)
 
 
-def _ran_before(workspace: Folder, trial: Trial) -> str:
-    """What to do about a short log of a candidate that once ran to the end; "" for others."""
+def _if_stopped(workspace: Folder, trial: Trial) -> str:
+    """When a run that ended early is no loss of its candidate, and what takes it out."""
     horizon = workspace.task.horizon
     ran = [
         one.id
         for one in workspace.task_trials()
         if one.candidate == trial.candidate and one.whole(horizon).finite_steps >= horizon
     ]
+    stopped = f"If you stopped it for a reason of your own, `discard {trial.id}`"
     if not ran:
-        return ""
+        return f"{stopped} takes it out"
     return (
-        f". {trial.candidate} ran to the end before ({', '.join(ran)}): if only the log was cut, "
-        f"`discard` {trial.id}"
+        f"{trial.candidate} ran to the end before ({', '.join(ran)}). {stopped} takes it out, as "
+        "where only the log was cut"
     )
 
 
@@ -220,6 +223,37 @@ def way_warnings(model: Model, trial: Trial) -> list[str]:
     except GroundedError as error:
         return [str(error).replace("in trial number 1 ", "")]
     return [f"{one.signal} {one.finding}: {one.log} in [log.state.{one.signal}]" for one in odd]
+
+
+def told_in_degrees(model: Model, trial: Trial, told: Sequence[str]) -> list[str]:
+    """Degrees that a diagnosis would put right, but for those that are told already."""
+    from grounded.instruments.preflight import preflight
+
+    try:
+        findings = preflight(model, [replace(trial.until(trial.known_steps), id="")]).findings
+    except GroundedError:  # it stops the diagnosis, which tells it
+        return []
+    return [
+        f"{said}: multiply the scale in [log.state.{one.signal}] by {one.log.split(' = ')[1]} (1 "
+        "where none is given)"
+        for one in findings
+        if one.kind == "degrees" and one.log
+        for said in [f"{one.signal} {one.finding}"]
+        if not any(other.startswith(said) for other in told)
+    ]
+
+
+def clocks_apart(workspace: Folder, trial: Trial) -> list[str]:
+    """That measured states answer commands before they are sent."""
+    from grounded.instruments.early import answers_early, one_clock, too_soon
+
+    model, table = workspace.base_model, workspace.config.estimate
+    measured = read_estimate(table, model).measured if table.names() else model.state_names
+    shown = [i for i, name in enumerate(model.state_names) if name in measured]
+    if (early := answers_early(model, trial, shown)) is None:
+        return []
+    said = f"{too_soon(model, early)}. {one_clock(model, shown, early)}, and ingest it again"
+    return [f"{said}, without {trial.id}"]
 
 
 def mistaken_in(model: Model, trial: Trial) -> tuple[list[str], tuple[str, ...]]:

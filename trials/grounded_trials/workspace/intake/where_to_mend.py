@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded.instruments.finding import Finding
+from grounded_trials.logs.log_table import log_mapping
 from grounded_trials.workspace.identity import READ_BY
+from grounded_trials.workspace.intake.no_angle import no_angles
 from grounded_trials.workspace.task_file import seen_in
 
 if TYPE_CHECKING:
-    from grounded.instruments.finding import Finding
     from grounded.trial import Trial
     from grounded_trials.logs.log_table import LogMapping
     from grounded_trials.workspace.folder import Folder
@@ -44,6 +46,10 @@ def where_to_mend(
     findings = _at_limits(workspace, used, findings)
     read = [meta for trial in used if "source_sha256" in (meta := about[trial.id])]
     if read:
+        model, log = workspace.base_model, workspace.config.log
+        mapping = log_mapping(log, model.state_names, model.input_names)
+        odd = [Finding(n, said, "mismatch") for n, said in no_angles(model, mapping).items()]
+        findings = (*odd, *findings)
         driven = workspace.config.task.feedback and any(
             meta.get("kind") == "trial" for meta in read
         )

@@ -1,0 +1,178 @@
+"""States that answer commands before they are sent: two clocks that were put together wrongly.
+
+No physics does that. A run of a feedback controller looks like it, though: its commands follow the
+states, so what will be sent tells how a disturbance goes on. But it tells it with the wrong sign,
+and not as the model says. So the model predicts a quarter of a second ahead with the commands as
+they are logged and with commands of later, both times calibrated (`short_runs`), and the later ones
+are believed where they leave much less, do about what the model says, and no causal change of the
+model leaves as little: a delay, gains and parameters, a quicker actuator (commands ahead by their
+own slope). Less than EARLY_S is not looked for: that little an actuator's crude lag may make.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.instruments.kinematics import integrals
+from grounded.instruments.other_units import unusable
+from grounded.instruments.short_runs import Ahead, Fit
+from grounded.model import Model
+from grounded.result import listed
+from grounded.trial import Trial
+
+EARLY_S, REACH_S, GRID_S = 0.1, 1.0, 0.05  # [s] the least and the most that is looked for, and how
+PART = 0.25  # of a trial, at most
+HINT, CLEAR = 0.5, 2.0  # [nats] by which later commands must lower the errors: as it is, calibrated
+HALF = 0.5  # of the error of one state at least
+LIKE = 4.0  # times what the model says, or a part of it: what gain an input may have
+LEADS = (0.1, 0.3)  # [s] by which commands are ahead of themselves, by their slope
+DIFFERENCE_S = 0.04  # half of that over which a velocity without a sensor is a difference
+STARTS = 120  # samples that are predicted from
+
+
+@dataclass(frozen=True)
+class Early:
+    """What answers too early in a trial.
+
+    Args:
+        seconds: by how much, to a step or so.
+        state: the one that is then predicted better by most.
+        logged: its rms error a quarter of a second ahead, as it is logged, in its unit.
+        mended: the same with the commands of so much later.
+    """
+
+    seconds: float
+    state: int
+    logged: float
+    mended: float
+
+
+def judge_clocks(model: Model, trials: Sequence[Trial], hidden: Sequence[str] = ()) -> None:
+    """Stops at trials whose states answer commands before they are sent.
+
+    Args:
+        model: however crude.
+        trials: of its states and inputs.
+        hidden: states that no sensor has.
+
+    Raises:
+        GroundedError: with the state, the seconds and what mends them.
+    """
+    shown = [i for i, name in enumerate(model.state_names) if name not in hidden]
+    each = [answers_early(model, one, shown) for one in trials]
+    found = {k: early for k, early in enumerate(each) if early}
+    if not found:
+        return
+    early = found[first := min(found)]
+    mend = one_clock(model, _known(trials[first], shown), early)
+    raise unusable(trials, list(found), too_soon(model, early), mend)
+
+
+def one_clock(model: Model, shown: Sequence[int], early: Early) -> str:
+    """What to do about it."""
+    tables = listed(f"[log.state.{model.state_names[i]}]" for i in shown)
+    return (
+        f"Take {early.seconds:.3g} s off delay_s in {tables} (delay_s = -{early.seconds:.3g} where "
+        "none is given), or put the commands' stamps right"
+    )
+
+
+def too_soon(model: Model, early: Early) -> str:
+    """What is wrong and how it is known, one clause."""
+    name = model.state_names[early.state]
+    unit = model.states[name]
+    sent = list(model.input_names)
+    return (
+        f"{name} moves about {early.seconds:.3g} s before {listed(sent)} "
+        f"ask{'s' * (len(sent) == 1)} for it: the clocks of states and commands differ (with "
+        f"commands of so much later the model misses {name} by {early.mended:.2g} rather than "
+        f"{early.logged:.2g}{'' if unit == '1' else f' {unit}'} 0.25 s ahead)"
+    )
+
+
+def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | None:
+    """By how much the states of a trial are ahead of its commands; None where they are not.
+
+    Args:
+        model: however crude.
+        trial: of its states and inputs.
+        shown: states that a sensor has.
+    """
+    trial = trial.until(trial.known_steps)
+    reach = min(round(REACH_S / trial.dt), int(PART * trial.steps))
+    least, every = max(2, round(EARLY_S / trial.dt)), max(1, round(GRID_S / trial.dt))
+    if reach <= least or not np.isfinite(trial.inputs).all():
+        return None
+    seen = _known(trial, shown)
+    trial, known = _with_differences(model, trial, seen)
+
+    def later(k: int) -> Ahead:
+        return Ahead(model, _moved(trial, k, reach), known, STARTS, delays=(0.0,))
+
+    ones = np.ones(model.m)
+    with np.errstate(all="ignore"):
+        logged = Ahead(model, _moved(trial, 0, reach), known, STARTS)
+        if not logged.enough:
+            return None
+        moved = {k: later(k).plain(ones).score for k in range(least, reach + 1, every)}
+        about = min(moved, key=lambda k: moved[k])
+        if moved[about] > logged.plain(ones).score - HINT:
+            return None
+        near = range(max(least, about - every + 1), min(reach, about + every - 1) + 1)
+        fits = {k: _as_told(later(k), ones) for k in near}
+        k = min(fits, key=lambda k: fits[k].score)
+        if fits[k].score > logged.still().score - CLEAR:
+            return None  # commands tell nothing
+        before = min(
+            (logged.best([ones, np.zeros(model.m)]), *_quicker(model, trial, reach, known)),
+            key=lambda fit: fit.score,
+        )
+    parts = fits[k].rms / before.rms
+    if before.score - fits[k].score < CLEAR or parts.min() > HALF:
+        return None
+    state = min(seen, key=lambda i: float(parts[i]))
+    return Early(k * trial.dt, state, float(before.rms[state]), float(fits[k].rms[state]))
+
+
+def _known(trial: Trial, shown: Sequence[int]) -> list[int]:
+    return [i for i in shown if np.isfinite(trial.states[:, i]).any()]
+
+
+def _as_told(ahead: Ahead, ones: Array) -> Fit:
+    """The best fit in which commands do about what the model says, by gains or parameters."""
+    free = ahead.best([ones])
+    if ((free.gains > 1 / LIKE) & (free.gains < LIKE)).all():
+        return free
+    return ahead.best([ones], free=False)  # a mass may hide what a gain does
+
+
+def _moved(trial: Trial, k: int, reach: int) -> Trial:
+    """The trial with the commands of k steps later, always of the same states."""
+    steps = trial.steps - reach
+    return replace(trial, states=trial.states[: steps + 1], inputs=trial.inputs[k : k + steps])
+
+
+def _quicker(model: Model, trial: Trial, reach: int, known: Sequence[int]) -> list[Fit]:
+    """Fits with commands that are ahead by their own slope up to now: of a model that is slow."""
+    sent = trial.inputs
+    slope = np.diff(sent, axis=0, prepend=sent[:1]) / trial.dt
+    ahead = [replace(trial, inputs=sent + lead * slope) for lead in LEADS]
+    some = [Ahead(model, _moved(one, 0, reach), known, STARTS) for one in ahead]
+    return [one.best([np.ones(model.m)]) for one in some]
+
+
+def _with_differences(model: Model, trial: Trial, known: list[int]) -> tuple[Trial, list[int]]:
+    """With velocities that no sensor has as differences of their positions, over both sides."""
+    states, w = np.array(trial.states), max(1, round(DIFFERENCE_S / trial.dt))
+    found = list(known)
+    for one in integrals(model):
+        if one.exact and one.i in known and one.j not in found and trial.steps > 2 * w:
+            x = states[:, one.i]
+            states[:, one.j] = np.nan
+            states[w:-w, one.j] = (x[2 * w :] - x[: -2 * w]) / (2 * w * trial.dt * one.c)
+            found.append(one.j)
+    return replace(trial, states=states), sorted(found)
