@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 
 from grounded.compile import Named
-from grounded.diagnosis.likelihood.delays import delays_of
+from grounded.diagnosis.likelihood.delays import delays_of, sensor_offset
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.linearise import base_columns, filter_system, sensitivities_of
 from grounded.diagnosis.likelihood.moving import moving
-from grounded.diagnosis.likelihood.predictor import Predictor, sensor_offset
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.tangent import tangent
 from grounded.effects import (
     Effect,

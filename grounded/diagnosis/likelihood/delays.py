@@ -21,7 +21,7 @@ Noise (its weights) and adjoints belong to samples: outside the filter they stay
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -31,7 +31,7 @@ import numpy as np
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import NoiseModel
-from grounded.effects import Effect, SensorDelayFamily, SensorLagFamily
+from grounded.effects import Effect, SensorDelayFamily, SensorFamily, SensorLagFamily
 from grounded.effects.sensor import lagging
 from grounded.filter.augmented import Delayed
 from grounded.filter.kalman import Adjoint
@@ -246,3 +246,19 @@ def filter_lag(track: Array, tau: float, settled: Any = ()) -> Array:
     for step in np.diff(track, axis=0):
         off.append(lagging(off[-1], step, tau, 1.0))
     return np.array(off)
+
+
+def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt: float) -> Array:
+    """What a sensor effect adds to the log of its state along a track (L + 1, B)."""
+    if isinstance(effect.family, SensorFamily):
+        return np.asarray(effect.family.measure(track, values) - track)
+    if isinstance(effect.family, SensorLagFamily):
+        return filter_lag(track, values["tau"] / dt)
+    steps = values["d"] / dt
+    slope = np.vstack([track[1:2] - track[:1], np.diff(track, axis=0)])
+    whole, part = int(np.floor(steps)), steps - np.floor(steps)
+    first = track[:1] - slope[:1] * np.arange(whole + 1, 0, -1)[:, None]  # as if it came so
+    line = np.concatenate([first, track])
+    count = len(track)
+    old = (1 - part) * line[1 : count + 1] + part * line[:count]
+    return np.asarray(old - track)

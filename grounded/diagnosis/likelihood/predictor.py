@@ -21,7 +21,7 @@ import numpy as np
 from grounded.compile import Named
 from grounded.diagnosis.likelihood.arriving import arriving, memories_moved
 from grounded.diagnosis.likelihood.data import Data
-from grounded.diagnosis.likelihood.delays import filter_lag
+from grounded.diagnosis.likelihood.delays import filter_lag, sensor_offset
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.moving import moving
 from grounded.diagnosis.likelihood.simulated import Slopes, simulated
@@ -388,19 +388,3 @@ def _more_than_steps(h: Hypothesis) -> bool:
     """Whether a hypothesis adds more to the model's steps than what arrives of the inputs."""
     medium = any(isinstance(e.family, MediumFamily) for e in h.effects)
     return bool(rates_of(h) or limits_of(h) or losses_of(h) or medium)
-
-
-def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt: float) -> Array:
-    """What a sensor effect adds to the log of its state along a track (L + 1, B)."""
-    if isinstance(effect.family, SensorFamily):
-        return np.asarray(effect.family.measure(track, values) - track)
-    if isinstance(effect.family, SensorLagFamily):
-        return filter_lag(track, values["tau"] / dt)
-    steps = values["d"] / dt
-    slope = np.vstack([track[1:2] - track[:1], np.diff(track, axis=0)])
-    whole, part = int(np.floor(steps)), steps - np.floor(steps)
-    first = track[:1] - slope[:1] * np.arange(whole + 1, 0, -1)[:, None]  # as if it came so
-    line = np.concatenate([first, track])
-    count = len(track)
-    old = (1 - part) * line[1 : count + 1] + part * line[:count]
-    return np.asarray(old - track)

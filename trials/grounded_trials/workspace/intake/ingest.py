@@ -31,6 +31,7 @@ from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.intake.odd_run import odd_run
 from grounded_trials.workspace.intake.other_scale import other_units, units_told
+from grounded_trials.workspace.intake.read_otherwise import pace_of, unit_of
 from grounded_trials.workspace.intake.reading import (
     NoneWaits,
     Read,
@@ -45,9 +46,7 @@ from grounded_trials.workspace.intake.run_start import (
     Start,
     elsewhere,
     loosely,
-    pace_of,
     rival_in,
-    unit_of,
 )
 from grounded_trials.workspace.intake.stored_before import (
     as_stored,

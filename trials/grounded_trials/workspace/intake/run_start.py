@@ -29,7 +29,6 @@ from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.logs.command_steps import changes_of, phase_of
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
-from grounded_trials.workspace.intake.other_scale import NEARLY, any_factor, units_tried
 from grounded_trials.workspace.intake.who_drove import (
     FINE,
     LEAST,
@@ -48,7 +47,6 @@ CLEARLY = 0.7  # of the commands' difference at the first command: the start is 
 KNOWN = 0.25  # of a row: the standard deviation from which feedback tells when in it a run began
 EXACT = 0.1  # of what a row's lateness does to commands: with less, the states were the policy's
 LOOSE = 0.1  # of a step: a start that is known no better is told
-PACES = (2.0, 0.5)  # of a recording that was played twice as fast, or half
 EXACTLY = 0.02  # of an input's size: the mean difference of a run that is sought by how it begins
 BATCH = 256  # instants compared at once
 
@@ -315,66 +313,6 @@ def _bridged(series: Series) -> Series:
     """Samples whose gaps are no reason not to look: the run that is found is cut with them."""
     longest = float(np.ptp(series.t)) * 1e-9 if len(series.t) else 0.0
     return replace(series, spec=replace(series.spec, max_age_s=longest))
-
-
-def pace_of(log: Recording, task: Task, policy: Policy) -> float | None:
-    """How many seconds of a policy's run a second of the log's stamps is, where not one.
-
-    Args:
-        log: in which no run of the policy begins.
-        task: whose steps it is cut into.
-        policy: what is sought.
-    """
-    for pace in PACES:
-        paced = {name: _paced(one, pace) for name, one in log.logged.items()}
-        if _run_in(recording(paced, task, log.complete), policy):
-            return pace
-    return None
-
-
-def unit_of(log: Recording, task: Task, policy: Policy) -> tuple[tuple[str, ...], float]:
-    """Signals in another unit, times what a run of a policy begins in a log; (), 1 where none does.
-
-    Args:
-        log: in which none begins as it is.
-        task: whose steps it is cut into.
-        policy: what is sought.
-    """
-    tried = set[tuple[tuple[str, ...], float]]()
-    for group, by in units_tried(task.model):
-        names = tuple(name for name in group if name in log.logged)
-        if not names or (names, by) in tried:
-            continue
-        tried.add((names, by))
-        scaled = {n: replace(log.logged[n], values=log.logged[n].values * by) for n in names}
-        known = None  # what was estimated does not hang on the size of what was sent
-        if set(names) <= set(task.model.input_names):
-            known = {**log.series, **scaled}
-        run = _run_in(recording({**log.logged, **scaled}, task, log.complete, known), policy)
-        fit = run and follows(policy, run.until(policy.horizon), 0)
-        if fit and fit.error < NEARLY:
-            return names, by
-    for begins in log.openings[:TRIED]:
-        if trial := log.trial_from(begins):
-            names, by = any_factor(task, policy, trial)
-            if names:
-                return names, by
-    return (), 1.0
-
-
-def _run_in(log: Recording | None, policy: Policy) -> Trial | None:
-    """The run of a policy that begins in a log, wherever; None where none does."""
-    found = log.start_of(policy) if log else None
-    return log.trial_from(found.seconds) if log and found and found.alike else None
-
-
-def _paced(series: Series, pace: float) -> Series:
-    """The same samples, `pace` times as far apart."""
-    t, log = (
-        at[:1] + np.round((at - at[:1]) * pace).astype(at.dtype)
-        for at in (series.t, series.log_times)
-    )
-    return replace(series, t=t, log_times=log)
 
 
 def elsewhere(log: Recording, found: Start, policy: Policy, why: str) -> bool:
