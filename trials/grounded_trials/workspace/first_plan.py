@@ -37,6 +37,8 @@ MEDIAN = 0.6745  # standard deviations that half of all normal numbers lie withi
 FARTHEST = 1e4  # in its unit: how far a state that nobody gave may be from where it starts
 UNGIVEN = 3  # states, whose values at the start are asked for: of more nobody has thought
 STILL = 1e-3  # of the rates under the held input: under another one the robot stands
+NOTHING = 1e-6  # of an input's [limits], else of 1 in its unit: 0
+MOVED = 0.01  # of the same: a given input that no longer holds the start
 BEGUN = (0.0, 1.0, -1.0)  # beside the held input: a thrust by its square has no slope at 0
 
 
@@ -193,12 +195,16 @@ def _most_missed(task: Task, plan: Trial) -> str:
     return text if share > MISSED else ""
 
 
-def held_before(workspace: Folder) -> list[str]:
+def held_before(workspace: Folder, again: bool = False) -> list[str]:
     """That the robot does not stand at its start, but would under another input held before.
 
     Or with other values of states that nobody gave, a fan's speed say. Nothing is said of an input
     whose value somebody gave, nor where it makes no difference: without a price on changes and
     without latency the first command is as if nothing had been held.
+
+    Args:
+        workspace: whose first plan it is.
+        again: another model was planned with before: what somebody gave may have held that one.
     """
     base, task, config = workspace.task, workspace.planner.plan, workspace.config.task
     assert base.latency is not None
@@ -210,7 +216,7 @@ def held_before(workspace: Folder) -> list[str]:
     ]
     chosen = any(name in config.start for name in names)
     priced = bool(base.reward.input_change.any() or base.latency.any())
-    stands = None if chosen or not priced else resting(task, memory)
+    stands = None if (chosen and not again) or not priced else resting(task, memory)
     if stands is None and 0 < free[:n].sum() <= UNGIVEN:
         stands = resting(task, free)
     if stands is None:
@@ -218,15 +224,23 @@ def held_before(workspace: Folder) -> list[str]:
     units = {**base.model.states, **task.model.inputs}
     given = np.concatenate([task.start[:n], task.past])
     stands = np.concatenate([stands[:n], stands[len(states) :]])
+    span = np.append(np.ones(n), task.high - task.low)
+    span = np.where(np.isfinite(span), span, np.maximum(1.0, np.abs(given)))
+    stands[np.abs(stands) < NOTHING * span] = 0.0
+    if chosen and not (np.abs(stands - given) > MOVED * span).any():
+        return []
     rate = moved_at_start(task, task.past) / task.dt
     k = int(np.argmax(np.abs(rate[:n])))
-    other = [
-        (name, at, to)
+    other = {
+        name: to
         for name, at, to in zip(units, given, stands, strict=True)
         if name in names or abs(to - at) > STILL * (1 + abs(to))
-    ]
-    held = ", ".join(with_unit(f"{name} = {at:.4g}", units[name]) for name, at, _ in other)
-    told = ", ".join(f"{name} = {to:.4g}" for name, _, to in other)
+    }
+    before = dict(zip(units, given, strict=True))
+    held = ", ".join(with_unit(f"{name} = {before[name]:.4g}", units[name]) for name in other)
+    whole = {name: f"{value:.10g}" for name, value in config.start.items() if name in units}
+    whole |= {name: f"{to:.4g}" for name, to in other.items()}
+    told = ", ".join(f"{name} = {whole[name]}" for name in units if name in whole)
     return [
         f"at the start {held} counts as held, under which {states[k]} changes at once, by "
         f"{with_unit(f'{rate[k]:.3g}', units[states[k]])} a second; the plan begins from there, "
@@ -239,30 +253,35 @@ def resting(task: Task, free: NDArray[np.bool_]) -> Array | None:
     """States and inputs (n + m,) inside the limits that stay as they are, from where a run starts.
 
     None where it stands under the input held before, or nothing holds it: the start is in motion.
+    The clock of an effect that grows with time goes on: what holds the start, holds it then.
 
     Args:
         task: whose start it is.
         free: (n,), states that may be others than those of the start.
     """
+    from grounded.effects import is_clock
     from grounded.search.first_guess import trim
 
-    away = np.abs(moved_at_start(task, task.past)).max()
-    if not away > 1e-9 or _out_of_reach(task, free):
+    clocks = free & [is_clock(name) for name in task.model.state_names]
+    free = free & ~clocks
+    away = np.abs(moved_at_start(task, task.past))[~clocks].max()
+    if not away > 1e-9 or _out_of_reach(task, free, clocks):
         return None
     still = np.tile(task.start, (2, 1))
+    still[1, clocks] += task.dt
     middle, inside = task.past.copy(), np.isfinite(task.high - task.low)
     middle[inside] = 0.5 * (task.low[inside] + task.high[inside])
     for first in [*(task.past + move for move in BEGUN), middle]:
         begun = np.clip(first, task.low, task.high)
         one = replace(task, target=still, input_target=None, past=begun)
         x, u = (found[0] for found in trim(one, still, ~free))
-        moved = np.abs(moved_at_start(replace(task, start=x), u))
+        moved = np.abs(moved_at_start(replace(task, start=x), u))[~clocks]
         if (moved <= STILL * away).all():
             return np.append(x, u)
     return None
 
 
-def _out_of_reach(task: Task, free: NDArray[np.bool_]) -> bool:
+def _out_of_reach(task: Task, free: NDArray[np.bool_], clocks: NDArray[np.bool_]) -> bool:
     """Whether nothing inside the limits stops the start, as of what flies: asked in one step."""
     if not np.isfinite(task.high - task.low).all():
         return False
@@ -272,7 +291,7 @@ def _out_of_reach(task: Task, free: NDArray[np.bool_]) -> bool:
         f_x, f_u = problem.system.linearise(np.tile(task.start, (4, 1)), u, problem.p, problem.dt)
     others = np.abs(f_x - np.eye(len(free))).max(axis=0)[:, free]
     reach = 2 * np.abs(f_u).max(axis=0) @ (task.high - task.low) + FARTHEST * others.sum(axis=1)
-    return bool((np.abs(moved_at_start(task, task.past)) > reach).any())
+    return bool((np.abs(moved_at_start(task, task.past)) > reach)[~clocks].any())
 
 
 def moved_at_start(task: Task, inputs: Array) -> Array:

@@ -255,7 +255,7 @@ class Check:
         elif self._changed:
             again = "predicted again" if self._predictable else "its prediction is the old one"
             yield f"the model was changed since {name} was made; {again}"
-        if self.same_task and not any(tried.trials for tried in self.standing.history):
+        if self.same_task and not self.standing.trials:
             yield from self._untried()
 
     def _became(self) -> Iterator[str]:

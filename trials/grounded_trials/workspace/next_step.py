@@ -41,7 +41,7 @@ def next_command(
         return follow
     if now.phase == "await-trial":
         return another_trial(workspace, now)
-    if now.ending == "not allowed" and not now.history:
+    if now.ending == "not allowed" and not now.trials:
         return TARGET  # what was asked of the model leaves [safety]; to propose it again helps none
     if diagnosis is None:
         logs = usable and not now.history  # what they show comes before the first candidate

@@ -105,10 +105,10 @@ def propose_in(workspace: Folder) -> Proposed:
         notes = notes or _void(workspace, before)
         notes = [f"{note}; run {candidate.id} in its place" for note in notes]
     held: list[str] = []
-    if not proposal.standing.history:
+    if not proposal.standing.trials and (candidate is None or proposal.is_new):
         from grounded_trials.workspace.first_plan import held_before, left_open
 
-        held = held_before(workspace)
+        held = held_before(workspace, _other_model(workspace, before))
         notes += left_open(workspace, candidate, proposal.standing.ending, held)
     if doubt := proposal.standing.doubt:
         from grounded.search.standing import LOST
@@ -182,13 +182,30 @@ def _proposal(workspace: Folder, without: Collection[str]) -> Proposal:
     )
 
 
+def _not_run(workspace: Folder, before: Sequence[str]) -> tuple[Candidate, dict[str, str]] | None:
+    """The search's last candidate of those, if no trial ran it, with what its file says of it."""
+    for name in reversed(before):
+        made, meta = workspace.candidate(name)
+        if meta.get("kind") == "search":
+            return (
+                None if any(t.trial.candidate == name for t in workspace.trials()) else (made, meta)
+            )
+    return None
+
+
+def _other_model(workspace: Folder, before: Sequence[str]) -> bool:
+    """Whether the search's last candidate was planned with another model, and never run."""
+    last = _not_run(workspace, before)
+    if last is None or last[1].get("task") != workspace.task.hash:
+        return False
+    return last[0].model != workspace.planner.fingerprint
+
+
 def _void(workspace: Folder, before: Sequence[str]) -> list[str]:
     """That the search's last candidate, which was never run, is replaced by a new one, and why."""
-    search = (c for c in reversed(before) if workspace.candidate(c)[1].get("kind") == "search")
-    last = next(search, "")
-    if not last or any(t.trial.candidate == last for t in workspace.trials()):
+    if (last := _not_run(workspace, before)) is None:
         return []
-    made, meta = workspace.candidate(last)
+    made, meta = last
     if meta.get("task") == workspace.task.hash:
         same = made.model == workspace.planner.fingerprint
         why = "the trial that it followed was set aside" if same else "the model was changed"
@@ -201,7 +218,7 @@ def _void(workspace: Folder, before: Sequence[str]) -> list[str]:
     else:
         wider = list(outside_limits(workspace.task, made.policy))
         why = "; ".join(wider) or "the task was changed since it was made"
-    return [f"{last} was not run and is void: {why}"]
+    return [f"{made.id} was not run and is void: {why}"]
 
 
 def standing_in(
