@@ -61,7 +61,8 @@ def another_trial(workspace: Folder, now: Standing) -> NextCommand:
         return PROPOSE
     if waiting and now.outstanding is not None:
         return to_run(workspace, now.outstanding.id)
-    return to_run(workspace, "best", "best")
+    assert now.incumbent is not None
+    return to_run(workspace, now.incumbent.candidate.id, "best")
 
 
 def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextCommand:

@@ -127,13 +127,20 @@ def propose_in(workspace: Folder) -> Proposed:
 
 
 def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
-    """How a candidate is run: `run` with its name as given; by people: its export, then its log."""
+    """How a candidate is run: `run` with its name as given; by people: its export, then its log.
+
+    Its export counts as made where its file lies in the workspace or the current folder; a file
+    of that name may as well be another workspace's, or a log.
+    """
+    from grounded_trials.workspace.exporting import is_export
+
     if workspace.config.system.reachable:
         return NextCommand("run", named)
-    folders = (workspace.folder, Path())
-    if any(any(folder.glob(f"{candidate}.*")) for folder in folders):
+    name = named[0] if named else candidate
+    files = (path for at in (workspace.folder, Path()) for path in at.glob(f"{name}.*"))
+    if any(is_export(workspace, candidate, path) for path in files):
         return NextCommand("next", ("LOG",))
-    return NextCommand("export", (candidate, "--runner"))
+    return NextCommand("export", (name, "--runner"))
 
 
 def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
