@@ -228,43 +228,6 @@ def test_a_start_that_another_state_would_hold_is_told_with_it(tmp_path):
     assert "fan = 2970, pwm = 53.04" in note
 
 
-LIFTED = """
-from grounded import Model, Param
-
-def rate(s, a, p):
-    return {"h": s.v, "v": p.k * a.thrust - 9.81, "q": a.turn - s.q}
-
-model = Model(states={"h": "m", "v": "m/s", "q": "deg/s"}, inputs={"thrust": "1", "turn": "deg/s"},
-              params={"k": Param(20.0, "m/s^2")}, derivative=rate)
-"""
-
-
-def test_what_holds_the_start_is_told_of_an_adopted_model_with_all_that_is_given(tmp_path):
-    """An effect that fades with time never rests; what was given is to stay in the line told."""
-    (tmp_path / "lifted.py").write_text(LIFTED)
-    w = Workspace.create(tmp_path / "w", model=tmp_path / "lifted.py")
-    w.target({"h": np.linspace(1.0, 1.5, 101)})
-    file = w.folder / "grounded.toml"
-    limits = "[limits]\nthrust = [0.1, 1]\nturn = [-200, 200]"
-    text = file.read_text().replace("[limits]", limits)
-
-    def told(effects: str, start: str) -> str:
-        changed = re.sub(r"(?m)^start = .*$", f"start = {{ {start} }}", text)
-        file.write_text(changed.replace("[task]", f"effects = [{effects}]\n[task]", 1))
-        notes = [n for n in Workspace(w.folder).propose().proposal.notes if "counts as held" in n]
-        return " ".join(notes).partition("start = ")[2]
-
-    fading = '{name = "input_fade:thrust", k = 0.001}'
-    dead = '{name = "dead_zone:thrust", c = 0.2}'
-    assert told(fading, "h = 1") == "{ h = 1, thrust = 0.4905, turn = 0 }"
-    assert told(dead, "h = 1") == "{ h = 1, thrust = 0.6905, turn = 0 }"
-    given = "h = 1, thrust = 0.4905, turn = 0"
-    assert told("", given) == ""
-    # the model that was planned with is another now, and what held it then holds no longer
-    assert told(dead, given) == "{ h = 1, thrust = 0.6905, turn = 0 }"
-    assert told(dead, given) == ""  # once
-
-
 def test_a_friction_too_steep_for_a_step_is_followed_by_a_plan(blank):
     """A width of 0.06 % of the fastest speed: a ball was planned to 4 m instead of 0.6, or not."""
     file, way = blank.folder / "grounded.toml", np.linspace(0, 1, 41)

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.result import percent
+from grounded.errors import NextCommand
+from grounded.result import listed, percent
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import step_rewards
-from grounded_trials.wording import with_unit
+from grounded_trials.wording import rendered, with_unit
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import tracking_error, weighed_groups
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
     from grounded.frozen import Array
     from grounded.search.candidate import Candidate
+    from grounded.search.making import Proposal
 
 MOSTLY = 0.9  # of a plan's cost
 HELD = 0.8  # of a plan's steps: an input is at a limit nearly all the time
@@ -42,18 +44,15 @@ MOVED = 0.01  # of the same: a given input that no longer holds the start
 BEGUN = (0.0, 1.0, -1.0)  # beside the held input: a thrust by its square has no slope at 0
 
 
-def left_open(
-    workspace: Folder, first: Candidate | None, ending: str, held: Sequence[str]
-) -> list[str]:
+def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> list[str]:
     """What a task leaves open, or out, that whoever runs its first plan should know.
 
     Args:
         workspace: where nothing was run yet.
-        first: its plan; None where there is none.
-        ending: why, see `standing.Ending`.
+        proposal: with its plan, or why there is none.
         held: what `held_before` says.
     """
-    task, found = workspace.task, []
+    task, first, found = workspace.task, proposal.candidate, list[str]()
     free = [
         name
         for name, *both in zip(task.model.input_names, task.low, task.high, strict=True)
@@ -82,7 +81,9 @@ def left_open(
         found += _held_back(task, first) or _falls_short(task, first)
         found += _shaken(workspace, first)
     found += held
-    if ending == "not allowed" and not held:
+    loose = _not_held(workspace, proposal.refused) if proposal.refused is not None else []
+    found += loose
+    if proposal.standing.ending == "not allowed" and not held and not loose:
         found.append(
             "nothing was run yet: widen [safety], or draw a target whose run stays inside "
             "(`target`), and propose again"
@@ -95,6 +96,60 @@ def left_open(
             f"{task.horizon + 1}: the plan ends after {task.horizon * task.dt:g} s"
         )
     return found
+
+
+def _not_held(workspace: Folder, refused: Candidate) -> list[str]:
+    """Which states leave [safety] that nothing keeps on a target, and what gives them one."""
+    task = workspace.task
+    assert task.safety_low is not None and task.safety_high is not None
+    states, weight = refused.predicted_states, task.reward.state + task.reward.terminal
+    out = np.any((states < task.safety_low) | (states > task.safety_high), axis=0)
+    given, names = np.isfinite(task.target).any(axis=0), task.model.state_names
+    bare = [names[i] for i in np.flatnonzero(out & ~given)]
+    free = [names[i] for i in np.flatnonzero(out & given & (weight == 0))]
+    found = []
+    if bare:
+        start = {name: float(task.start[names.index(name)]) for name in bare}
+        more = " ".join(f"--to {name}={value:g}" for name, value in start.items())
+        drawn = _drawn(task)
+        how = "with a column for each as well"
+        if drawn is not None:
+            again = NextCommand(drawn.verb, (*drawn.arguments, *more.split()))
+            command = rendered(again, workspace.address)
+            how = f"with {more} as well, so that it stays: `{command}`, and what else you gave"
+        found.append(
+            f"{listed(bare)} {'leave' if len(bare) > 1 else 'leaves'} [safety] and "
+            f"{'have' if len(bare) > 1 else 'has'} no column in the target: nothing in [reward] "
+            f"asks to stay inside. Draw the target again {how}"
+        )
+    if free:
+        found.append(
+            f"{listed(free)} {'leave' if len(free) > 1 else 'leaves'} [safety], and [reward] state "
+            "gives no weight to keeping the target there: give it one"
+        )
+    return found
+
+
+def _drawn(task: Task) -> NextCommand | None:
+    """The line or step that a target seems to be, to states' values; None for another one."""
+    from grounded_trials.logs.inspect_pairs import velocities
+
+    names, rates = task.model.state_names, set(velocities(task.model).values())
+    known = zip(names, np.isfinite(task.target).all(axis=0), strict=True)
+    given = np.array([bool(all_) and name not in rates for name, all_ in known])
+    way = task.model.difference(task.target, task.start)[:, given]
+    if not way.any():
+        return None
+    k = int(np.argmax(np.abs(way[-1])))
+    if not way[-1, k]:
+        return None
+    share = way[:, k] / way[-1, k]
+    if not np.allclose(way, share[:, None] * way[-1], atol=1e-6 * abs(way[-1, k])):
+        return None
+    shape = "step" if np.allclose(share[1:], 1.0) else "line"
+    ends = zip(np.flatnonzero(given), task.target[-1, given], strict=True)
+    to = (("--to", f"{names[i]}={value:g}") for i, value in ends)
+    return NextCommand("target", (shape, *(word for pair in to for word in pair)))
 
 
 def _held_back(task: Task, first: Candidate) -> list[str]:

@@ -109,7 +109,7 @@ def propose_in(workspace: Folder) -> Proposed:
         from grounded_trials.workspace.first_plan import held_before, left_open
 
         held = held_before(workspace, _other_model(workspace, before))
-        notes += left_open(workspace, candidate, proposal.standing.ending, held)
+        notes += left_open(workspace, proposal, held)
     if doubt := proposal.standing.doubt:
         from grounded.search.standing import LOST
 
