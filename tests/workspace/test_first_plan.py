@@ -1,12 +1,15 @@
 """What the first plan of a task tells: what holds its start, and what its target leaves free."""
 
 import re
+import tomllib
 
 import numpy as np
+import pytest
 
 from cli import grounded
 from facts import holds
 from grounded_trials import Workspace
+from grounded_trials.starting.begin import begin
 
 LIFTED = """
 from grounded import Model, Param
@@ -83,3 +86,48 @@ def test_a_position_that_a_target_leaves_free_is_named_with_the_target_that_hold
     file.write_text(weights)
     (note,) = asked()
     assert holds(note, "z leaves", "[reward] state") and "target line" not in note
+
+
+CART = """
+from grounded import Model, Param
+
+def rate(s, a, p):
+    return {"x": s.v, "v": (a.force - 0.3 * s.v) / p.M}
+
+model = Model(states={"x": "m", "v": "m/s"}, inputs={"force": "N"},
+              params={"M": Param(1.0, "kg", 0.5, 2.0)}, derivative=rate)
+"""
+
+
+def test_weights_that_were_made_of_the_limits_seen_follow_those_that_are_given(tmp_path):
+    """They stayed as the log's narrow range had made them: 700 times too heavy."""
+    (tmp_path / "cart.py").write_text(CART)
+    t = np.arange(400) * 0.05
+    rows = np.column_stack([t, np.sin(t), np.cos(t), np.sin(3 * t)])
+    np.savetxt(tmp_path / "r.csv", rows, "%.5f", ",", header="t,x,v,force", comments="")
+    folder = tmp_path / "w"
+    begin(folder, tmp_path / "r.csv", model=tmp_path / "cart.py")
+    file = folder / "grounded.toml"
+    step = ("-C", folder, "target", "step", "--seconds", "2", "--to")
+
+    def weight() -> float:
+        return tomllib.loads(file.read_text())["reward"]["input_change"]["force"]
+
+    def limited(low: float, high: float) -> list[str]:
+        given = f"[limits]\nforce = [{low}, {high}]\n"
+        file.write_text(re.sub(r"(?ms)^\[limits\].*?\n(?=\n)", given, file.read_text()))
+        notes = Workspace(folder).propose().proposal.notes
+        return [note for note in notes if "input_change" in note and "init" in note]
+
+    assert weight() == pytest.approx(0.01, rel=1e-3) and not limited(-1, 1)
+    (note,) = limited(-20, 20)
+    assert "force = 2.5e-05" in note
+    assert grounded(*step, "x=1").code == 0
+    assert weight() == 2.5e-05 and not limited(-20, 20)
+    assert limited(-2, 2) and grounded(*step, "x=2").code == 0
+    assert weight() == 0.0025
+    file.write_text(
+        re.sub(r"(?m)^input_change = .*$", "input_change = { force = 1 }", file.read_text())
+    )
+    assert not limited(-20, 20) and grounded(*step, "x=1").code == 0
+    assert weight() == 1

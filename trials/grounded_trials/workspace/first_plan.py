@@ -19,9 +19,10 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import step_rewards
 from grounded_trials.wording import rendered, with_unit
-from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.config import FILE, made_changes
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.off_target import tracking_error, weighed_groups
+from grounded_trials.workspace.off_target import tracked, tracking_error, weighed_groups
+from grounded_trials.workspace.task_file import limited_changes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -39,6 +40,7 @@ MEDIAN = 0.6745  # standard deviations that half of all normal numbers lie withi
 FARTHEST = 1e4  # in its unit: how far a state that nobody gave may be from where it starts
 UNGIVEN = 3  # states, whose values at the start are asked for: of more nobody has thought
 STILL = 1e-3  # of the rates under the held input: under another one the robot stands
+OTHER = 1.5  # times the weight that [limits] would give: it was made by others
 NOTHING = 1e-6  # of an input's [limits], else of 1 in its unit: 0
 MOVED = 0.01  # of the same: a given input that no longer holds the start
 BEGUN = (0.0, 1.0, -1.0)  # beside the held input: a thrust by its square has no slope at 0
@@ -77,6 +79,7 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
                 f"{percent(share)} of what the plan costs is [reward] input and input_change: with "
                 "less weight there, errors would count for more"
             )
+    found += _of_other_limits(workspace)
     if first is not None:
         found += _held_back(task, first) or _falls_short(task, first)
         found += _shaken(workspace, first)
@@ -96,6 +99,28 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
             f"{task.horizon + 1}: the plan ends after {task.horizon * task.dt:g} s"
         )
     return found
+
+
+def _of_other_limits(workspace: Folder) -> list[str]:
+    """Where weights on changes of inputs are still those that `init` made, by other [limits]."""
+    config, model = workspace.config, workspace.base_model
+    made = made_changes(config.file.read_text(encoding="utf-8"))
+    weights = dict(zip(model.input_names, workspace.task.reward.input_change, strict=True))
+    now = {name: by for name, (_, by) in limited_changes(config, model).items()}
+    off = [
+        name
+        for name, by in now.items()
+        if weights[name] == made.get(name) and not 1 / OTHER < weights[name] / by < OTHER
+    ]
+    if not off:
+        return []
+    was = ", ".join(f"{name} = {weights[name]:.4g}" for name in off)
+    new = ", ".join(f"{name} = {now.get(name, w):.4g}" for name, w in weights.items() if w)
+    return [
+        f"[reward] input_change has {was}, which `init` made of the range that it saw in the log. "
+        f"By [limits] as they are now it would be input_change = {{ {new} }}: write that, or draw "
+        "the target again (`target` does so where no weight in [reward] was changed)"
+    ]
 
 
 def _not_held(workspace: Folder, refused: Candidate) -> list[str]:
@@ -135,8 +160,7 @@ def _drawn(task: Task) -> NextCommand | None:
     from grounded_trials.logs.inspect_pairs import velocities
 
     names, rates = task.model.state_names, set(velocities(task.model).values())
-    known = zip(names, np.isfinite(task.target).all(axis=0), strict=True)
-    given = np.array([bool(all_) and name not in rates for name, all_ in known])
+    given = [i for i in tracked(task) if names[i] not in rates]
     way = task.model.difference(task.target, task.start)[:, given]
     if not way.any():
         return None
@@ -147,8 +171,7 @@ def _drawn(task: Task) -> NextCommand | None:
     if not np.allclose(way, share[:, None] * way[-1], atol=1e-6 * abs(way[-1, k])):
         return None
     shape = "step" if np.allclose(share[1:], 1.0) else "line"
-    ends = zip(np.flatnonzero(given), task.target[-1, given], strict=True)
-    to = (("--to", f"{names[i]}={value:g}") for i, value in ends)
+    to = (("--to", f"{names[i]}={task.target[-1, i]:g}") for i in given)
     return NextCommand("target", (shape, *(word for pair in to for word in pair)))
 
 
