@@ -72,6 +72,11 @@ class Policy:
                     f"gain and reference must have shapes {((H, m, nz), (H, nz))}, got {found}"
                 )
 
+    def __repr__(self) -> str:
+        names = f"states {', '.join(self.state_names)}; inputs {', '.join(self.input_names)}"
+        loop = "open loop" if self.gain is None else "with feedback"
+        return f"Policy({self.horizon} steps of {self.dt:.4g} s, {loop}; {names})"
+
     @property
     def horizon(self) -> int:
         """H, the number of control steps."""

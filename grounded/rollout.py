@@ -26,6 +26,9 @@ class Rollout:
         object.__setattr__(self, "z", readonly(self.z))
         object.__setattr__(self, "inputs", readonly(self.inputs))
 
+    def __repr__(self) -> str:
+        return f"Rollout({len(self.inputs)} steps; utility {self.utility:.4g})"
+
     @property
     def states(self) -> Array:
         """States s_0 .. s_H, (H + 1, n)."""

@@ -106,6 +106,12 @@ class Task:
                 )
         self._check_values()
 
+    def __repr__(self) -> str:
+        followed = np.flatnonzero(np.isfinite(self.target).any(axis=0))
+        names = ", ".join(self.model.state_names[i] for i in followed) or "nothing"
+        steps = f"{self.horizon} steps of {self.dt:.4g} s"
+        return f"Task({self.model.name}: {steps}, following {names}; {self.hash})"
+
     def _check_values(self) -> None:
         positive("task: dt", self.dt)
         if not (np.isfinite(self.smoothing) and self.smoothing >= 0):

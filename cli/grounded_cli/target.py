@@ -54,7 +54,7 @@ def command(
 
     The target there was is kept as target.csv.bak, and [task] horizon follows; so do the weights in
     [reward] state, unless you chose them, and with them input_change of inputs that have [limits],
-    where it is what `init --blank` wrote. Earlier trials stay, for fit and diagnose; the search
+    where it is what `init` wrote. Earlier trials stay, for fit and diagnose; the search
     begins anew.
     """
     from grounded_trials.starting.shapes import (

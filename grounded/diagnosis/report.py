@@ -362,11 +362,26 @@ class Diagnosis(Document):
             params: the model's parameters, as [model] params has them.
         """
         made = self.made or Made()
-        now: dict[str, Any] = {str(effect["name"]): dict(effect) for effect in adopted}
-        now |= {f"parameter:{name}": value for name, value in (params or {}).items()}
-        then: dict[str, Any] = dict(made.effects)
-        then |= {f"parameter:{name}": value for name, value in (made.params or {}).items()}
+        now, then = _numbers(adopted, params), _numbers(made.adopted, made.params)
         return tuple(name for name in self.effects if now.get(name) == then.get(name))
+
+
+def _numbers(
+    effects: Iterable[Mapping[str, Any]], params: Mapping[str, float] | None
+) -> dict[str, Any]:
+    """What a model has, by the names of effects: their own, and `parameter:NAME` of every number.
+
+    A number of an effect is a parameter too: that of `viscous_friction:vz` is called
+    `viscous_friction_vz_k`.
+    """
+    from grounded.effects import param_name
+
+    found: dict[str, Any] = {f"parameter:{name}": value for name, value in (params or {}).items()}
+    for effect in map(dict, effects):
+        name = str(effect["name"])
+        found[name] = effect
+        found |= {f"parameter:{param_name(name, key)}": value for key, value in effect.items()}
+    return found
 
 
 def quantity(estimate: Estimate) -> str:

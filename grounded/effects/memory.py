@@ -19,6 +19,11 @@ def settled(model: Model, a: Named, p: Named) -> dict[str, Any]:
     return {} if found is None else dict(found(a, p))
 
 
+def is_clock(memory: str) -> bool:
+    """Whether a memory state is the time since the start, which goes on where all else rests."""
+    return memory.endswith("_clock")
+
+
 def true_values(names: Sequence[str], memory: Collection[str]) -> dict[int, int]:
     """Which memory states hold true values behind a late log, each with the state that logs them.
 
@@ -34,7 +39,7 @@ def true_values(names: Sequence[str], memory: Collection[str]) -> dict[int, int]
         i: k
         for i, name in enumerate(names)
         for k, n in own
-        if name in memory and name.startswith(f"{n}_true") and not name.endswith("_clock")
+        if name in memory and name.startswith(f"{n}_true") and not is_clock(name)
     }
 
 

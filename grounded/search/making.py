@@ -360,7 +360,7 @@ class Maker:
         if not found:
             return Proposal(self.now, made, is_new=True)
         stopped = replace(self.now, phase="stopped", sentence=found[0], ending="not allowed")
-        return Proposal(stopped, None, is_new=False, notes=tuple(found))
+        return Proposal(stopped, None, is_new=False, notes=tuple(found), refused=made)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -371,6 +371,7 @@ class Proposal(Result):
     candidate: Candidate | None
     is_new: bool
     notes: tuple[str, ...] = ()
+    refused: Candidate | None = None  # what `notes` speak against
 
     def summary(self) -> str:
         """The candidate, or the end of the search."""

@@ -185,6 +185,26 @@ def refused(path: Any, spec: SignalSpec, says: str) -> None:
     assert says in str(caught.value), str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "asked, header, meant",
+    [
+        ("x", "t,x_mm,vx,theta", "x_mm"),
+        ("theta_deg", "t,x,theta,header", "theta"),
+        ("theta_deg", "t,theta2_deg,theta_rad", "theta_rad"),
+        ("speed_kmh", "t,speed_kmx,speed_mps", "speed_mps"),
+        ("thta", "t,x,theta_rad,theta", "theta"),  # no unit, and no such word
+    ],
+)
+def test_the_same_word_with_another_unit_is_what_was_meant(
+    tmp_path: Path, asked: str, header: str, meant: str
+) -> None:
+    """`x` beside `x_mm` was asked for as 'vx', `theta_deg` as 'header'."""
+    path = tmp_path / "a.csv"
+    row = ",".join(["0.1"] * (header.count(",") + 1))
+    path.write_text(f"{header}\n{row}\n{row.replace('0.1', '0.2')}\n")
+    refused(path, SignalSpec(f"/csv.{asked}"), f"did you mean '{meant}'?")
+
+
 def test_what_a_person_is_told(tmp_path: Path) -> None:
     path = floats(tmp_path / "a.mcap", 0, 10)
     refused(path, SignalSpec("/v.data"), "the log has no topic '/v'")

@@ -9,6 +9,7 @@ import pytest
 from facts import holding
 from grounded.errors import GroundedError
 from grounded.model import Model
+from grounded.rollout import simulate
 from grounded.utility import Reward
 from small_tasks import cart, cart_task, other, rover_task
 
@@ -119,3 +120,14 @@ def test_a_model_of_a_thousand_states_is_refused_at_once():
     with pytest.raises(GroundedError, match=holding(1000, 200)):
         Model(states, {"force": "N"}, step=lambda s, a, p, dt: states)
     assert time.process_time() - began < 1.0
+
+
+def test_nouns_with_arrays_are_shown_in_one_short_line():
+    """`print(task)` was 340 lines of arrays."""
+    found = cart_task()
+    policy = found.policy(np.zeros((found.horizon, found.model.m)), None, None)
+    run = simulate(found.problem(), policy)
+    for noun in (found, policy, run):
+        shown = repr(noun)
+        assert "\n" not in shown and len(shown) < 120, shown
+        assert shown.startswith(f"{type(noun).__name__}(") and str(found.horizon) in shown

@@ -16,7 +16,9 @@ from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.tables import candidate_table, parameter_table
 from grounded_trials.report.settled import told
 from grounded_trials.store.documents import write_document
-from grounded_trials.wording import changed, legend
+from grounded_trials.wording import changed, legend, told_apart
+from grounded_trials.workspace.adopted import better_model
+from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.folder import Folder
 from reported import DIAGNOSIS, cart, copied
 
@@ -92,6 +94,37 @@ def test_a_number_of_an_adopted_effect_that_stays_behind_is_told_by_its_effect(c
     assert again.code == 0 and again.json["left"] == {name: 0.5}
 
 
+@pytest.mark.parametrize("name", ["parameter:mass", "parameter:quadratic_drag_v_k"])
+def test_a_parameter_that_was_blamed_is_in_the_model_as_diagnosed_once(cart, tmp_path, name):
+    """The number of an adopted effect too; what was adopted since is not added a second time."""
+    folder = copied(cart, tmp_path / "w")
+    before = [{"name": "quadratic_drag:v", "k": 0.2}]
+    set_in_model(folder / "grounded.toml", effects=before)
+    blamed = {"effect": name, "claimed": True, "evidence": 9.0}
+    blamed["params"] = {"d": {"value": 0.1, "std": 0.02, "unit": "1/m"}}
+    names = ["viscous_friction:v", name]
+    written(
+        folder,
+        verdict={"kind": "several", "effects": names, "sentence": "Two."},
+        ranking=[DIAGNOSIS["ranking"][0], blamed],
+        parameters={},
+        diagnosed=MADE | {"adopted": before, "nominal": {"mass": 1.0, "quadratic_drag_v_k": 0.2}},
+    )
+
+    def as_diagnosed() -> str:
+        found = gather(Folder(folder))
+        assert not found.lost
+        better = better_model(Folder(folder), found.diagnosis)
+        assert better is not None
+        return better.planner.fingerprint
+
+    diagnosed = as_diagnosed()
+    assert grounded("-C", folder, "adopt", *names).code == 0
+    assert as_diagnosed() == Folder(folder).planner.fingerprint == diagnosed
+    found = gather(Folder(folder))
+    assert found.since.missing == () and set(found.since.adopted) == set(names)
+
+
 def test_a_gain_that_nobody_measured_is_not_claimed(cart, tmp_path):
     folder = written(copied(cart, tmp_path / "w"))
     assert grounded("-C", folder, "adopt", "viscous_friction:v", "--effect-only").code == 0
@@ -163,6 +196,7 @@ def test_the_order_of_candidates_is_explained(cart):
 
 def test_numbers_that_differ_are_told_apart():
     assert changed("l", 0.5, 0.4997, "m") == "l 0.5000 -> 0.4997 m"
+    assert told_apart(0.99973, 1.0) == ("0.9997", "1.000")  # not 1.000 and 1.00
     assert changed("g", 2.0, 2.0, "1") == "g 2.000 -> 2.000"
 
 

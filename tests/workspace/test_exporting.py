@@ -19,7 +19,7 @@ from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.exporting import RUNNER, export_candidate
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.proposing import propose_in
+from grounded_trials.workspace.proposing import propose_in, to_run
 from grounded_trials.workspace.running import run_candidate
 from workspaces import CONFIG, make
 
@@ -158,3 +158,27 @@ def test_what_became_of_a_candidate_is_said_with_its_export(tmp_path):
     assert grounded("-C", w.folder, "discard", lost.trial, "--why", "wheel off").code == 0
     (note,) = export_candidate(Folder(w.folder), second, path=tmp_path / "c.json").notes
     assert all(part in note for part in (lost.trial, "wheel off"))
+
+
+def test_only_the_candidates_own_export_counts_as_made(tmp_path, monkeypatch):
+    """`next:` was `next LOG` where another workspace's c0001.npz lay in the current folder."""
+    mine, other = (
+        make(tmp_path / name, config=CONFIG.partition("[system]")[0].replace("10.0", weight))
+        for name, weight in (("w", "10.0"), ("other", "11.0"))
+    )
+    made = [propose_in(w).candidate.id for w in (mine, other)]
+    assert made == ["c0001"] * 2
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    for form in ("npz", "json", "csv"):
+        path = here / f"c0001.{form}"
+        export_candidate(other, "c0001", form, path)
+        assert to_run(mine, "c0001").verb == "export" and to_run(other, "c0001").verb == "next"
+        export_candidate(mine, "c0001", form, path)
+        assert to_run(mine, "c0001").verb == "next"
+        path.unlink()
+    (here / "c0001.csv").write_text("t,x,force\n0,0,0\n")  # its log
+    assert to_run(mine, "c0001").verb == "export"
+    (here / "c0001.mcap").write_bytes(mine.candidate_bytes("c0001"))
+    assert to_run(mine, "c0001").verb == "next"

@@ -70,9 +70,15 @@ def with_unit(text: str, unit: str) -> str:
 
 def changed(name: str, old: float, new: float, unit: str) -> str:
     """`m 1.00 -> 1.30 kg`, in as many digits as tell the two apart."""
-    pairs = ((figure(old, digits), figure(new, digits)) for digits in range(3, 9))
-    a, b = next((pair for pair in pairs if pair[0] != pair[1]), (figure(old), figure(new)))
-    return with_unit(f"{name} {a} -> {b}", unit)
+    return with_unit(f"{name} {' -> '.join(told_apart(old, new))}", unit)
+
+
+def told_apart(one: float, other: float) -> tuple[str, str]:
+    """Two numbers in as many digits, three or more, as tell them apart."""
+    for digits in range(3, 9):
+        if float(f"{one:.{digits}g}") != float(f"{other:.{digits}g}"):
+            return figure(one, digits), figure(other, digits)
+    return figure(one), figure(other)
 
 
 def legend(text: str, iterations: Sequence[int]) -> str:

@@ -94,6 +94,25 @@ def test_a_start_within_the_noise_of_its_sensor_is_no_warning(w, tmp_path, sigma
     assert any("started with x = 0.2" in one for one in warnings) is told
 
 
+def test_a_start_is_far_off_by_what_it_costs(tmp_path):
+    """By the range in the run, a z off by 3 mm was told again and again, an x by 60 mm never."""
+    config = CONFIG.replace("{ x = 10.0 }", "{ x = 10.0, v = 1e-4 }")
+    rows = "\n".join(f"{0.05 * i:.2f},{i / 40},0.5" for i in range(41))
+    w = make(tmp_path / "w", config=config, target=f"t,x,v\n{rows}\n")
+    ran, *_ = read_trial(run(w))
+    a_step = -w.task.utility(ran) / len(ran.states)
+    off = np.array([0.7 * np.sqrt(a_step / 10), 0.5])
+    assert off[0] < 0.1 * np.ptp(ran.states[:, 0]) and off[1] > 0.1 * np.ptp(ran.states[:, 1])
+    for states in ([1, 0], [0, 1], [1, 1]):
+        moved = np.array(ran.states)
+        moved[0] += off * states
+        write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
+        warnings = ingest_log(w, tmp_path / "t.mcap", "c0001").warnings
+        told = [one for one in warnings if "the run started with" in one]
+        assert [one.split()[4] for one in told] == ["x"] * states[0]
+        assert all("%" in one for one in told)
+
+
 @pytest.mark.parametrize("data", [False, True])
 def test_units_that_a_trial_states_must_be_the_models(w, tmp_path, data):
     """A trial in cm was stored as if it were in m."""

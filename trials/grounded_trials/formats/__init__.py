@@ -8,5 +8,5 @@ path, and JSON) first. `schemas.py` and `idl_schema.py` turn definitions into ty
 `mcap_whole.py` a whole candidate at once.
 
 `bags.py` (.db3, .bag) and `tables.py` (.csv, .npz, .ulg) give the records of files that are not
-MCAP.
+MCAP. `name_endings.py` knows the units that names end with.
 """

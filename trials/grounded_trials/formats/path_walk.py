@@ -43,6 +43,7 @@ from grounded_trials.formats.messages import (
     Text,
     Type,
 )
+from grounded_trials.formats.name_endings import in_another_unit
 
 SECONDS, NANOSECONDS = ("sec", "secs", "seconds"), ("nanosec", "nsec", "nsecs", "nanos")
 CALENDAR_S = 9_200_000_000  # 2^63 ns: the years 1678 to 2261
@@ -111,7 +112,9 @@ def _field(type: Type, name: str) -> Type:
     if not isinstance(type, Struct):
         raise BadPath(f"'{name}' is asked of a {type}, which has no fields")
     if name not in type.by_name:
-        raise BadPath(f"{type} has no field '{name}': {nearest(name, type.by_name)}")
+        alike = in_another_unit(name, type.by_name)
+        hint = f"did you mean '{alike[0]}'?" if alike else nearest(name, type.by_name)
+        raise BadPath(f"{type} has no field '{name}': {hint}")
     return type.by_name[name].type
 
 

@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from grounded_trials.formats.name_endings import ENDINGS, unit_ending
 from grounded_trials.formats.text_tables import column_units
 
 _OF = {  # a multiple of another unit, itself a product
@@ -43,19 +44,6 @@ _OF = {  # a multiple of another unit, itself a product
     "%": ("1", 0.01),
 }
 
-_ENDINGS = {  # of a name, and the unit that they write
-    **dict.fromkeys(("deg_s", "degs", "deg_per_s", "dps"), "deg/s"),
-    **dict.fromkeys(("rad_s", "rads", "rad_per_s"), "rad/s"),
-    **dict.fromkeys(("m_s", "mps", "m_per_s"), "m/s"),
-    **dict.fromkeys(("km_h", "kmh", "kph"), "km/h"),
-    **{"mm_s": "mm/s", "cm_s": "cm/s", "m_s2": "m/s^2", "deg_s2": "deg/s^2", "RPM": "rpm"},
-    **dict.fromkeys(("pct", "percent", "perc"), "%"),
-    **dict.fromkeys(("degree", "degrees"), "deg"),
-    **dict.fromkeys(("radian", "radians"), "rad"),
-    **{unit: unit for unit in ("mm", "cm", "m", "km", "deg", "mrad", "rad", "rpm", "us", "ms")},
-    **{unit: unit for unit in ("mV", "mA", "Nm", "mNm", "mN", "kN")},
-    **{unit: unit for unit in ("s", "V", "A", "N")},
-}
 _ROLES = re.compile(  # what a command is to its robot: its unit may stand before that, or after
     r"_(?:cmd|command|commanded|ref|reference|target|setpoint|sp|desired|des|goal|request|req)$"
 )
@@ -90,7 +78,7 @@ class Stated:
 
 def unit_in_name(path: str) -> str:
     """The unit that the last name of a message path ends with, `/csv.x_mm`; "" for none."""
-    return _ENDINGS.get(_parts(path)[1] or _parts(without_role(path))[1], "")
+    return ENDINGS.get(_parts(path)[1] or _parts(without_role(path))[1], "")
 
 
 def without_unit(path: str) -> str:
@@ -114,11 +102,8 @@ def bare_command(path: str) -> str:
 def _parts(path: str) -> tuple[str, str]:
     """A path without the ending of its last name, and that ending."""
     whole = _NUMBER.sub("", path)
-    name = re.split(r"[./]", whole)[-1]
-    for ending in sorted(_ENDINGS, key=len, reverse=True):
-        if name.endswith("_" + ending) and len(name) > len(ending) + 1:
-            return whole[: -len(ending) - 1], ending
-    return path, ""
+    ending = unit_ending(re.split(r"[./]", whole)[-1])
+    return (whole[: -len(ending) - 1], ending) if ending else (path, "")
 
 
 def factor_between(said: str, wanted: str) -> float | None:

@@ -70,6 +70,8 @@ def write_first(
         "# (docking, parking) and overshoots, 10 to 100 times state, the speeds' too",
         f"# terminal = {_inline({name: OFFERED * weight for name, weight in weights.items()})}",
         "# of (a_t - a_{t-1})^2: 0.04 / (range of [limits])^2, 0.01 of an input from -1 to 1",
+        "# `target` sets it anew by [limits] until you change a weight; by those seen in the log:",
+        f"# input_change = {_inline(changes)}",
         f"input_change = {_inline(changes)}",
         "",
         "[limits]                      # SEEN in the log, and 0: put in what your robot may get",

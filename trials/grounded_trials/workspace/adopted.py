@@ -193,29 +193,29 @@ def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | Non
     Raises:
         GroundedError: if the diagnosis names an effect or a quantity that is not known.
     """
-    adopted = workspace.config.model.effects
-    new = _new(diagnosis, {str(effect["name"]) for effect in adopted})
-    values = _parameters(workspace, diagnosis)
-    if not (values or new):
+    own, effects = _as_diagnosed(workspace, diagnosis) if diagnosis is not None else ({}, [])
+    if not (own or effects):
+        adopted = workspace.config.model.effects
         return Better(workspace.planner, "with adopted effects") if adopted else None
     task = workspace.task
-    estimated = task.with_model(task.model.with_values(values))
-    return Better(planner_of(estimated, in_order(adopted, new)), "as diagnosed")
+    estimated = task.with_model(task.model.with_values(own))
+    return Better(planner_of(estimated, effects), "as diagnosed")
 
 
-def _new(diagnosis: Diagnosis | None, adopted: set[str]) -> list[dict[str, Any]]:
-    """The effects that the verdict names and the model lacks, with their quantities."""
-    if diagnosis is None:
-        return []
-    return [
-        {"name": name, **diagnosis.values(name)}
-        for name in diagnosis.joining
-        if name not in adopted and diagnosis.ranked(name) is not None
-    ]
+def _as_diagnosed(
+    workspace: Folder, diagnosis: Diagnosis
+) -> tuple[dict[str, float], list[dict[str, Any]]]:
+    """The parameters and effects with what is claimed and not adopted; empty for nothing new."""
+    from grounded_trials.workspace.adopting import joined, nominal_values
 
-
-def _parameters(workspace: Folder, diagnosis: Diagnosis | None) -> dict[str, float]:
-    """The model's parameters as the diagnosis estimated them; its own names only."""
-    known = workspace.task.model.params
-    found = diagnosis.known_parameters if diagnosis is not None else {}
-    return {n: e.value for n, e in found.items() if n in known and e.value == e.value}
+    table = workspace.config.model
+    new = diagnosis.open(table.effects, table.params)
+    names = [name for name in diagnosis.joining if name in new and diagnosis.ranked(name)]
+    known = {n: e for n, e in diagnosis.known_parameters.items() if math.isfinite(e.value)}
+    nominal = nominal_values(diagnosis, workspace, names)
+    params, both = joined(diagnosis, names, table.effects, nominal, known)
+    own = {name: value for name, value in params.items() if name in workspace.task.model.params}
+    if not (own or names):
+        return {}, []
+    old = len(table.effects)
+    return own, in_order(both[:old], both[old:])

@@ -8,7 +8,7 @@ last can be undone.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -99,11 +99,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     _check(names, found, workspace, before)
     claimed = _claimed(found, names)
     calibrated = found.known_parameters if parameters and claimed else {}
-    nominal = {
-        target: _nominal(found, workspace, target)
-        for family, _, target in (name.partition(":") for name in names)
-        if family == "parameter"
-    }
+    nominal = nominal_values(found, workspace, names)
     old = workspace.config.model.effects
     own, both = joined(found, names, old, nominal, calibrated)
     adopted = in_order(both[: len(old)], both[len(old) :])
@@ -265,17 +261,23 @@ def _corrections(found: Diagnosis, names: list[str]) -> list[str]:
     return [name for name in names if name not in asked] + curves
 
 
-def _nominal(found: Diagnosis, workspace: Folder, name: str) -> float:
-    """A parameter's value when the diagnosis was made."""
-    if found.made is not None and name in found.made.nominal:
-        return found.made.nominal[name]
-    if name not in workspace.base_model.params:
-        raise GroundedError(
-            f"the last diagnosis does not say from which value of '{name}' it counts: diagnose "
-            "again",
-            then=AGAIN,
-        )
-    return float(workspace.base_model.params[name].value)
+def nominal_values(found: Diagnosis, workspace: Folder, names: Iterable[str]) -> dict[str, float]:
+    """The values, when a diagnosis was made, of the parameters among its effects.
+
+    Raises:
+        GroundedError: if neither an older document nor the model has one.
+    """
+    made, base = found.made or Made(), workspace.base_model.params
+    nominal = {}
+    for name in (n.removeprefix("parameter:") for n in names if n.startswith("parameter:")):
+        if name not in made.nominal and name not in base:
+            raise GroundedError(
+                f"the last diagnosis does not say from which value of '{name}' it counts: diagnose "
+                "again",
+                then=AGAIN,
+            )
+        nominal[name] = made.nominal[name] if name in made.nominal else float(base[name].value)
+    return nominal
 
 
 def settled(

@@ -21,6 +21,7 @@ from grounded.search.standing import SearchOptions
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import Table, read_toml
 
+MADE = re.compile(r"(?m)^# input_change = \{.*\}$")
 FILE = "grounded.toml"
 OFFERED = 10  # times the weight of a state: what a comment of `init` offers for the run's end
 
@@ -242,12 +243,13 @@ def set_target(
     """Replaces [task] target and horizon, and the weights of [reward] that nobody chose.
 
     Of states those are none, `before`, which belonged to the last target, or 1 each, of `init
-    --blank`. Where they are, so are what that wrote for the `changes` of inputs, by name the weight
-    without [limits] and by them.
+    --blank`. Where they are, so is what `init` wrote for the `changes` of inputs, by name the
+    weight without [limits] and by them: the former, of `--blank`, or `made_changes`.
     """
     import tomlkit
 
-    document = tomlkit.parse(file.read_text(encoding="utf-8"))
+    old_text = file.read_text(encoding="utf-8")
+    document, made, blank = tomlkit.parse(old_text), made_changes(old_text), dict[str, float]()
     _put(document, "task", {"target": name, "horizon": steps})
     reward = document.get("reward", {})
     own = dict(reward.get("state", {}))
@@ -258,14 +260,33 @@ def set_target(
     if same or (not own and not reward.get("terminal")):
         renewed: dict[str, Any] = {"state": _inline(weights)}
         written = dict(reward.get("input_change", {}))
-        blank = {name: new for name, (old, new) in changes.items() if written.get(name) == old}
+        blank = {
+            name: new
+            for name, (old, new) in changes.items()
+            if name in written and written[name] in (old, made.get(name))
+        }
         if blank:
             renewed["input_change"] = _inline(written | blank)
         _put(document, "reward", renewed)
     text = tomlkit.dumps(document)
     if same and own:
         text = re.sub(r"(?m)^# terminal = .*$", partial(_offered, before=own, now=weights), text)
+    if made and blank:
+        text = MADE.sub(f"# input_change = {_inline(made | blank).as_string()}", text)
     write_atomically(file, text.encode())
+
+
+def made_changes(text: str) -> dict[str, float]:
+    """The weights on changes of inputs that `init --from` or `target` made, as a comment has them.
+
+    Args:
+        text: of grounded.toml.
+    """
+    found = MADE.search(text)
+    with suppress(tomllib.TOMLDecodeError):
+        weights = tomllib.loads(found[0].removeprefix("# "))["input_change"] if found else {}
+        return {name: w for name, w in weights.items() if isinstance(w, int | float)}
+    return {}
 
 
 def _offered(found: re.Match[str], before: Mapping[str, float], now: Mapping[str, float]) -> str:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,7 +64,7 @@ def export_candidate(
     anyway: bool = False,
 ) -> Exported:
     """Writes a candidate; without `form` as `path` is named, else as json: `Workspace.export`."""
-    encoders = {"csv": _csv, "json": _json, "npz": _npz}
+    encoders = _encoders()
     named = path.suffix.lstrip(".").lower() if path else ""
     form = form or (named if named in encoders else "npz" if runner else "json")
     path = path or Path(f"{identity}.{form}")
@@ -74,9 +75,7 @@ def export_candidate(
     now = standing_in(workspace) if identity == "best" else None
     identity = candidate_named(workspace, identity, now)
     handed = checked_candidate(workspace, identity, anyway=anyway, other_task=True, now=now)
-    meta = handed.meta
-    about = {"candidate": identity, "task": meta["task"], "model": meta["model"]}
-    about["created_by"] = "grounded"
+    about = _about(identity, handed.meta)
     write_atomically(path, encoders[form](handed.candidate.policy, _units(workspace), about))
     program = path.with_name(RUNNER) if runner else None
     if program is not None:
@@ -84,6 +83,31 @@ def export_candidate(
     waiting = handed.check.standing.outstanding
     how = () if waiting and waiting.id == identity else ("--candidate", identity)
     return Exported(identity, path, form, program, handed.notes, handed.overridden, how)
+
+
+def is_export(workspace: Folder, identity: str, path: Path) -> bool:
+    """Whether a file is a candidate as it is exported, or as it was proposed, byte for byte."""
+    form = path.suffix.lstrip(".").lower()
+    try:
+        if form == "mcap":
+            data = workspace.candidate_bytes(identity)
+        elif form in (encoders := _encoders()):
+            made, meta = workspace.candidate(identity)
+            data = encoders[form](made.policy, _units(workspace), _about(identity, meta))
+        else:
+            return False
+        return path.stat().st_size == len(data) and path.read_bytes() == data
+    except (OSError, GroundedError):
+        return False
+
+
+def _encoders() -> dict[str, Callable[[Policy, dict[str, str], dict[str, str]], bytes]]:
+    return {"csv": _csv, "json": _json, "npz": _npz}
+
+
+def _about(identity: str, meta: Mapping[str, str]) -> dict[str, str]:
+    about = {"candidate": identity, "task": meta["task"], "model": meta["model"]}
+    return about | {"created_by": "grounded"}
 
 
 def _units(workspace: Folder) -> dict[str, str]:

@@ -13,20 +13,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.result import percent
+from grounded.errors import NextCommand
+from grounded.result import listed, percent
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import step_rewards
-from grounded_trials.wording import with_unit
-from grounded_trials.workspace.config import FILE
+from grounded_trials.wording import rendered, with_unit
+from grounded_trials.workspace.config import FILE, made_changes
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.off_target import tracking_error, weighed_groups
+from grounded_trials.workspace.off_target import tracked, tracking_error, weighed_groups
+from grounded_trials.workspace.task_file import limited_changes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from grounded.frozen import Array
     from grounded.search.candidate import Candidate
+    from grounded.search.making import Proposal
 
 MOSTLY = 0.9  # of a plan's cost
 HELD = 0.8  # of a plan's steps: an input is at a limit nearly all the time
@@ -37,21 +40,21 @@ MEDIAN = 0.6745  # standard deviations that half of all normal numbers lie withi
 FARTHEST = 1e4  # in its unit: how far a state that nobody gave may be from where it starts
 UNGIVEN = 3  # states, whose values at the start are asked for: of more nobody has thought
 STILL = 1e-3  # of the rates under the held input: under another one the robot stands
+OTHER = 1.5  # times the weight that [limits] would give: it was made by others
+NOTHING = 1e-6  # of an input's [limits], else of 1 in its unit: 0
+MOVED = 0.01  # of the same: a given input that no longer holds the start
 BEGUN = (0.0, 1.0, -1.0)  # beside the held input: a thrust by its square has no slope at 0
 
 
-def left_open(
-    workspace: Folder, first: Candidate | None, ending: str, held: Sequence[str]
-) -> list[str]:
+def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> list[str]:
     """What a task leaves open, or out, that whoever runs its first plan should know.
 
     Args:
         workspace: where nothing was run yet.
-        first: its plan; None where there is none.
-        ending: why, see `standing.Ending`.
+        proposal: with its plan, or why there is none.
         held: what `held_before` says.
     """
-    task, found = workspace.task, []
+    task, first, found = workspace.task, proposal.candidate, list[str]()
     free = [
         name
         for name, *both in zip(task.model.input_names, task.low, task.high, strict=True)
@@ -76,11 +79,14 @@ def left_open(
                 f"{percent(share)} of what the plan costs is [reward] input and input_change: with "
                 "less weight there, errors would count for more"
             )
+    found += _of_other_limits(workspace)
     if first is not None:
         found += _held_back(task, first) or _falls_short(task, first)
         found += _shaken(workspace, first)
     found += held
-    if ending == "not allowed" and not held:
+    loose = _not_held(workspace, proposal.refused) if proposal.refused is not None else []
+    found += loose
+    if proposal.standing.ending == "not allowed" and not held and not loose:
         found.append(
             "nothing was run yet: widen [safety], or draw a target whose run stays inside "
             "(`target`), and propose again"
@@ -93,6 +99,80 @@ def left_open(
             f"{task.horizon + 1}: the plan ends after {task.horizon * task.dt:g} s"
         )
     return found
+
+
+def _of_other_limits(workspace: Folder) -> list[str]:
+    """Where weights on changes of inputs are still those that `init` made, by other [limits]."""
+    config, model = workspace.config, workspace.base_model
+    made = made_changes(config.file.read_text(encoding="utf-8"))
+    weights = dict(zip(model.input_names, workspace.task.reward.input_change, strict=True))
+    now = {name: by for name, (_, by) in limited_changes(config, model).items()}
+    off = [
+        name
+        for name, by in now.items()
+        if weights[name] == made.get(name) and not 1 / OTHER < weights[name] / by < OTHER
+    ]
+    if not off:
+        return []
+    was = ", ".join(f"{name} = {weights[name]:.4g}" for name in off)
+    new = ", ".join(f"{name} = {now.get(name, w):.4g}" for name, w in weights.items() if w)
+    return [
+        f"[reward] input_change has {was}, which `init` made of the range that it saw in the log. "
+        f"By [limits] as they are now it would be input_change = {{ {new} }}: write that, or draw "
+        "the target again (`target` does so where no weight in [reward] was changed)"
+    ]
+
+
+def _not_held(workspace: Folder, refused: Candidate) -> list[str]:
+    """Which states leave [safety] that nothing keeps on a target, and what gives them one."""
+    task = workspace.task
+    assert task.safety_low is not None and task.safety_high is not None
+    states, weight = refused.predicted_states, task.reward.state + task.reward.terminal
+    out = np.any((states < task.safety_low) | (states > task.safety_high), axis=0)
+    given, names = np.isfinite(task.target).any(axis=0), task.model.state_names
+    bare = [names[i] for i in np.flatnonzero(out & ~given)]
+    free = [names[i] for i in np.flatnonzero(out & given & (weight == 0))]
+    found = []
+    if bare:
+        start = {name: float(task.start[names.index(name)]) for name in bare}
+        more = " ".join(f"--to {name}={value:g}" for name, value in start.items())
+        drawn = _drawn(task)
+        how = "with a column for each as well"
+        if drawn is not None:
+            again = NextCommand(drawn.verb, (*drawn.arguments, *more.split()))
+            command = rendered(again, workspace.address)
+            how = f"with {more} as well, so that it stays: `{command}`, and what else you gave"
+        found.append(
+            f"{listed(bare)} {'leave' if len(bare) > 1 else 'leaves'} [safety] and "
+            f"{'have' if len(bare) > 1 else 'has'} no column in the target: nothing in [reward] "
+            f"asks to stay inside. Draw the target again {how}"
+        )
+    if free:
+        found.append(
+            f"{listed(free)} {'leave' if len(free) > 1 else 'leaves'} [safety], and [reward] state "
+            "gives no weight to keeping the target there: give it one"
+        )
+    return found
+
+
+def _drawn(task: Task) -> NextCommand | None:
+    """The line or step that a target seems to be, to states' values; None for another one."""
+    from grounded_trials.logs.inspect_pairs import velocities
+
+    names, rates = task.model.state_names, set(velocities(task.model).values())
+    given = [i for i in tracked(task) if names[i] not in rates]
+    way = task.model.difference(task.target, task.start)[:, given]
+    if not way.any():
+        return None
+    k = int(np.argmax(np.abs(way[-1])))
+    if not way[-1, k]:
+        return None
+    share = way[:, k] / way[-1, k]
+    if not np.allclose(way, share[:, None] * way[-1], atol=1e-6 * abs(way[-1, k])):
+        return None
+    shape = "step" if np.allclose(share[1:], 1.0) else "line"
+    to = (("--to", f"{names[i]}={task.target[-1, i]:g}") for i in given)
+    return NextCommand("target", (shape, *(word for pair in to for word in pair)))
 
 
 def _held_back(task: Task, first: Candidate) -> list[str]:
@@ -193,12 +273,16 @@ def _most_missed(task: Task, plan: Trial) -> str:
     return text if share > MISSED else ""
 
 
-def held_before(workspace: Folder) -> list[str]:
+def held_before(workspace: Folder, again: bool = False) -> list[str]:
     """That the robot does not stand at its start, but would under another input held before.
 
     Or with other values of states that nobody gave, a fan's speed say. Nothing is said of an input
     whose value somebody gave, nor where it makes no difference: without a price on changes and
     without latency the first command is as if nothing had been held.
+
+    Args:
+        workspace: whose first plan it is.
+        again: another model was planned with before: what somebody gave may have held that one.
     """
     base, task, config = workspace.task, workspace.planner.plan, workspace.config.task
     assert base.latency is not None
@@ -210,7 +294,7 @@ def held_before(workspace: Folder) -> list[str]:
     ]
     chosen = any(name in config.start for name in names)
     priced = bool(base.reward.input_change.any() or base.latency.any())
-    stands = None if chosen or not priced else resting(task, memory)
+    stands = None if (chosen and not again) or not priced else resting(task, memory)
     if stands is None and 0 < free[:n].sum() <= UNGIVEN:
         stands = resting(task, free)
     if stands is None:
@@ -218,15 +302,23 @@ def held_before(workspace: Folder) -> list[str]:
     units = {**base.model.states, **task.model.inputs}
     given = np.concatenate([task.start[:n], task.past])
     stands = np.concatenate([stands[:n], stands[len(states) :]])
+    span = np.append(np.ones(n), task.high - task.low)
+    span = np.where(np.isfinite(span), span, np.maximum(1.0, np.abs(given)))
+    stands[np.abs(stands) < NOTHING * span] = 0.0
+    if chosen and not (np.abs(stands - given) > MOVED * span).any():
+        return []
     rate = moved_at_start(task, task.past) / task.dt
     k = int(np.argmax(np.abs(rate[:n])))
-    other = [
-        (name, at, to)
+    other = {
+        name: to
         for name, at, to in zip(units, given, stands, strict=True)
         if name in names or abs(to - at) > STILL * (1 + abs(to))
-    ]
-    held = ", ".join(with_unit(f"{name} = {at:.4g}", units[name]) for name, at, _ in other)
-    told = ", ".join(f"{name} = {to:.4g}" for name, _, to in other)
+    }
+    before = dict(zip(units, given, strict=True))
+    held = ", ".join(with_unit(f"{name} = {before[name]:.4g}", units[name]) for name in other)
+    whole = {name: f"{value:.10g}" for name, value in config.start.items() if name in units}
+    whole |= {name: f"{to:.4g}" for name, to in other.items()}
+    told = ", ".join(f"{name} = {whole[name]}" for name in units if name in whole)
     return [
         f"at the start {held} counts as held, under which {states[k]} changes at once, by "
         f"{with_unit(f'{rate[k]:.3g}', units[states[k]])} a second; the plan begins from there, "
@@ -239,30 +331,35 @@ def resting(task: Task, free: NDArray[np.bool_]) -> Array | None:
     """States and inputs (n + m,) inside the limits that stay as they are, from where a run starts.
 
     None where it stands under the input held before, or nothing holds it: the start is in motion.
+    The clock of an effect that grows with time goes on: what holds the start, holds it then.
 
     Args:
         task: whose start it is.
         free: (n,), states that may be others than those of the start.
     """
+    from grounded.effects import is_clock
     from grounded.search.first_guess import trim
 
-    away = np.abs(moved_at_start(task, task.past)).max()
-    if not away > 1e-9 or _out_of_reach(task, free):
+    clocks = free & [is_clock(name) for name in task.model.state_names]
+    free = free & ~clocks
+    away = np.abs(moved_at_start(task, task.past))[~clocks].max()
+    if not away > 1e-9 or _out_of_reach(task, free, clocks):
         return None
     still = np.tile(task.start, (2, 1))
+    still[1, clocks] += task.dt
     middle, inside = task.past.copy(), np.isfinite(task.high - task.low)
     middle[inside] = 0.5 * (task.low[inside] + task.high[inside])
     for first in [*(task.past + move for move in BEGUN), middle]:
         begun = np.clip(first, task.low, task.high)
         one = replace(task, target=still, input_target=None, past=begun)
         x, u = (found[0] for found in trim(one, still, ~free))
-        moved = np.abs(moved_at_start(replace(task, start=x), u))
+        moved = np.abs(moved_at_start(replace(task, start=x), u))[~clocks]
         if (moved <= STILL * away).all():
             return np.append(x, u)
     return None
 
 
-def _out_of_reach(task: Task, free: NDArray[np.bool_]) -> bool:
+def _out_of_reach(task: Task, free: NDArray[np.bool_], clocks: NDArray[np.bool_]) -> bool:
     """Whether nothing inside the limits stops the start, as of what flies: asked in one step."""
     if not np.isfinite(task.high - task.low).all():
         return False
@@ -272,7 +369,7 @@ def _out_of_reach(task: Task, free: NDArray[np.bool_]) -> bool:
         f_x, f_u = problem.system.linearise(np.tile(task.start, (4, 1)), u, problem.p, problem.dt)
     others = np.abs(f_x - np.eye(len(free))).max(axis=0)[:, free]
     reach = 2 * np.abs(f_u).max(axis=0) @ (task.high - task.low) + FARTHEST * others.sum(axis=1)
-    return bool((np.abs(moved_at_start(task, task.past)) > reach).any())
+    return bool((np.abs(moved_at_start(task, task.past)) > reach)[~clocks].any())
 
 
 def moved_at_start(task: Task, inputs: Array) -> Array:

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from grounded.search.standing import Standing
 
 NEAREST = 2  # bounds of [safety] that are told: those nearest beside how far the run goes
+NEARER = 0.01  # of how far a state goes: a run that comes nearer to a bound than where it starts
 AGREES = 1e-6  # of an input's size: how well a policy repeats its own predicted inputs
 
 
@@ -255,7 +256,7 @@ class Check:
         elif self._changed:
             again = "predicted again" if self._predictable else "its prediction is the old one"
             yield f"the model was changed since {name} was made; {again}"
-        if self.same_task and not any(tried.trials for tried in self.standing.history):
+        if self.same_task and not self.standing.trials:
             yield from self._untried()
 
     def _became(self) -> Iterator[str]:
@@ -277,18 +278,22 @@ class Check:
         return ""
 
     def _untried(self) -> Iterator[str]:
-        """How near the first run comes to [safety], which nothing but the bare model says."""
+        """How near the first run comes to [safety], which nothing but the bare model says.
+
+        A bound that it comes no nearer to than where it starts is left out.
+        """
         task, made = self.workspace.task, self.candidate
         assert task.safety_low is not None and task.safety_high is not None
         near = []
         for i, (name, unit) in enumerate(task.model.states.items()):
             low, high, values = task.safety_low[i], task.safety_high[i], made.predicted_states[:, i]
-            room = np.minimum(values - low, high - values)
-            t = int(np.argmin(room))
-            if np.isfinite(room[t]):
-                left = with_unit(f"{room[t]:.3g}", unit)
-                told = f"within {left} of the bound of {name} (at {t * task.dt:.4g} s)"
-                near.append((room[t] / max(np.ptp(values), 1e-12), told))
+            far = max(np.ptp(values), 1e-12)
+            for side, room in (("lower", values - low), ("upper", high - values)):
+                t = int(np.argmin(room))
+                if np.isfinite(room[t]) and room[0] - room[t] > NEARER * far:
+                    left = with_unit(f"{room[t]:.3g}", unit)
+                    told = f"within {left} of the {side} bound of {name} (at {t * task.dt:.4g} s)"
+                    near.append((room[t] / far, told))
         if near:
             told = " and ".join(text for _, text in sorted(near)[:NEAREST])
             yield (

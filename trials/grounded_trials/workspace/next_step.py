@@ -41,7 +41,7 @@ def next_command(
         return follow  # wherever the search stands: a better model plans better
     if now.phase == "await-trial":
         return another_trial(workspace, now)
-    if now.ending == "not allowed" and not now.history:
+    if now.ending == "not allowed" and not now.trials:
         return TARGET  # what was asked of the model leaves [safety]; to propose it again helps none
     if diagnosis is None:
         logs = usable and not now.history  # what they show comes before the first candidate
@@ -61,7 +61,8 @@ def another_trial(workspace: Folder, now: Standing) -> NextCommand:
         return PROPOSE
     if waiting and now.outstanding is not None:
         return to_run(workspace, now.outstanding.id)
-    return to_run(workspace, "best", "best")
+    assert now.incumbent is not None
+    return to_run(workspace, now.incumbent.candidate.id, "best")
 
 
 def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextCommand:

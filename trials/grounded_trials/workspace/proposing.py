@@ -105,11 +105,11 @@ def propose_in(workspace: Folder) -> Proposed:
         notes = notes or _void(workspace, before)
         notes = [f"{note}; run {candidate.id} in its place" for note in notes]
     held: list[str] = []
-    if not proposal.standing.history:
+    if not proposal.standing.trials and (candidate is None or proposal.is_new):
         from grounded_trials.workspace.first_plan import held_before, left_open
 
-        held = held_before(workspace)
-        notes += left_open(workspace, candidate, proposal.standing.ending, held)
+        held = held_before(workspace, _other_model(workspace, before))
+        notes += left_open(workspace, proposal, held)
     if doubt := proposal.standing.doubt:
         from grounded.search.standing import LOST
 
@@ -127,13 +127,20 @@ def propose_in(workspace: Folder) -> Proposed:
 
 
 def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
-    """How a candidate is run: `run` with its name as given; by people: its export, then its log."""
+    """How a candidate is run: `run` with its name as given; by people: its export, then its log.
+
+    Its export counts as made where its file lies in the workspace or the current folder; a file
+    of that name may as well be another workspace's, or a log.
+    """
+    from grounded_trials.workspace.exporting import is_export
+
     if workspace.config.system.reachable:
         return NextCommand("run", named)
-    folders = (workspace.folder, Path())
-    if any(any(folder.glob(f"{candidate}.*")) for folder in folders):
+    name = named[0] if named else candidate
+    files = (path for at in (workspace.folder, Path()) for path in at.glob(f"{name}.*"))
+    if any(is_export(workspace, candidate, path) for path in files):
         return NextCommand("next", ("LOG",))
-    return NextCommand("export", (candidate, "--runner"))
+    return NextCommand("export", (name, "--runner"))
 
 
 def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
@@ -182,13 +189,30 @@ def _proposal(workspace: Folder, without: Collection[str]) -> Proposal:
     )
 
 
+def _not_run(workspace: Folder, before: Sequence[str]) -> tuple[Candidate, dict[str, str]] | None:
+    """The search's last candidate of those, if no trial ran it, with what its file says of it."""
+    for name in reversed(before):
+        made, meta = workspace.candidate(name)
+        if meta.get("kind") == "search":
+            return (
+                None if any(t.trial.candidate == name for t in workspace.trials()) else (made, meta)
+            )
+    return None
+
+
+def _other_model(workspace: Folder, before: Sequence[str]) -> bool:
+    """Whether the search's last candidate was planned with another model, and never run."""
+    last = _not_run(workspace, before)
+    if last is None or last[1].get("task") != workspace.task.hash:
+        return False
+    return last[0].model != workspace.planner.fingerprint
+
+
 def _void(workspace: Folder, before: Sequence[str]) -> list[str]:
     """That the search's last candidate, which was never run, is replaced by a new one, and why."""
-    search = (c for c in reversed(before) if workspace.candidate(c)[1].get("kind") == "search")
-    last = next(search, "")
-    if not last or any(t.trial.candidate == last for t in workspace.trials()):
+    if (last := _not_run(workspace, before)) is None:
         return []
-    made, meta = workspace.candidate(last)
+    made, meta = last
     if meta.get("task") == workspace.task.hash:
         same = made.model == workspace.planner.fingerprint
         why = "the trial that it followed was set aside" if same else "the model was changed"
@@ -201,7 +225,7 @@ def _void(workspace: Folder, before: Sequence[str]) -> list[str]:
     else:
         wider = list(outside_limits(workspace.task, made.policy))
         why = "; ".join(wider) or "the task was changed since it was made"
-    return [f"{last} was not run and is void: {why}"]
+    return [f"{made.id} was not run and is void: {why}"]
 
 
 def standing_in(

@@ -255,11 +255,11 @@ def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -
     equal = equal_weights(columns, units, place)
     weights = {state: round(w, 6) for state, w in equal.items()}
     rows = len(next(iter(columns.values())))
-    set_target(config.file, name, rows - 1, weights, before, _changes(config, model))
+    set_target(config.file, name, rows - 1, weights, before, limited_changes(config, model))
     return path
 
 
-def _changes(config: Config, model: Model) -> dict[str, tuple[float, float]]:
+def limited_changes(config: Config, model: Model) -> dict[str, tuple[float, float]]:
     """The weights on changes of inputs that have [limits]: without them, and by them."""
     both = zip(*_limits(config, list(model.input_names)), model.inputs.items(), strict=True)
     return {

@@ -15,12 +15,13 @@ from grounded.model import Model
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
-from grounded_trials.wording import count, with_unit
+from grounded_trials.wording import count, percent, told_apart, with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.estimating import read_estimate
 from grounded_trials.workspace.intake.who_drove import UNLIKE, follows, latest, second_differences
 
-FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth a warning,
+FAR = 0.1  # of a run's mean cost a step: a start this far from s_0 is worth a warning (or of its
+# range in the run, of a state that [reward] does not weigh along the way),
 SURE = 3.0  # if it is so many standard deviations of the sensor's noise off, too
 LATEST = 3  # steps by which inputs may be logged late, and are told so
 WHITE = 0.6745 * 6**0.5  # the median of its second differences, in its standard deviations
@@ -142,7 +143,11 @@ def _lacking(task: Task, last_s: float) -> str:
 
 
 def _start(task: Task, trial: Trial) -> list[str]:
-    """Where a run did not start at s_0, by more than the noise that its sensor shows."""
+    """Where a run did not start at s_0, by more than the noise that its sensor shows.
+
+    What [reward] weighs along the way counts by what the first state costs beside a mean step of
+    the run, the dearest first; another state by how far the run takes it.
+    """
     if trial.finite_steps < 0:
         return []
     off = task.model.difference(trial.states[0], task.start)
@@ -150,13 +155,22 @@ def _start(task: Task, trial: Trial) -> list[str]:
     usual = np.ptp(states, axis=0)
     jumps = np.abs(second_differences(states, task.model.angle_mask))
     noise = np.median(jumps, axis=0) / WHITE if len(jumps) else np.zeros(len(usual))
+    known = -task.rewards(trial)[: len(states)]
+    known = known[np.isfinite(known)]
+    usually = known.sum() / max(len(known), 1)
+    weight = task.reward.state
+    with np.errstate(all="ignore"):
+        share = np.where(weight > 0, weight * off**2 / usually, np.abs(off) / usual)
+    told = (share > FAR) & (np.abs(off) > np.maximum(SURE * noise, 1e-9))
     found = []
-    for i, name in enumerate(trial.state_names):
-        if np.isfinite(off[i]) and abs(off[i]) > max(FAR * usual[i], SURE * noise[i], 1e-9):
-            found.append(
-                f"the run started with {name} = {trial.states[0, i]:.3g}, the task's start is "
-                f"{task.start[i]:.3g}: the search assumes one start state"
-            )
+    for i in sorted(np.flatnonzero(told), key=lambda i: (weight[i] == 0, -share[i])):
+        name, unit = list(task.model.states.items())[i]
+        began, start = told_apart(float(trial.states[0, i]), float(task.start[i]))
+        costs = f", which costs {percent(share[i])} of a mean step of the run" * bool(weight[i])
+        found.append(
+            f"the run started with {name} = {with_unit(began, unit)}, the task's start is "
+            f"{start}{costs}: the search assumes one start state"
+        )
     return found
 
 

@@ -1,0 +1,133 @@
+"""What the first plan of a task tells: what holds its start, and what its target leaves free."""
+
+import re
+import tomllib
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from facts import holds
+from grounded_trials import Workspace
+from grounded_trials.starting.begin import begin
+
+LIFTED = """
+from grounded import Model, Param
+
+def rate(s, a, p):
+    return {"h": s.v, "v": p.k * a.thrust - 9.81, "q": a.turn - s.q}
+
+model = Model(states={"h": "m", "v": "m/s", "q": "deg/s"}, inputs={"thrust": "1", "turn": "deg/s"},
+              params={"k": Param(20.0, "m/s^2")}, derivative=rate)
+"""
+
+
+def test_what_holds_the_start_is_told_of_an_adopted_model_with_all_that_is_given(tmp_path):
+    """An effect that fades with time never rests; what was given is to stay in the line told."""
+    (tmp_path / "lifted.py").write_text(LIFTED)
+    w = Workspace.create(tmp_path / "w", model=tmp_path / "lifted.py")
+    w.target({"h": np.linspace(1.0, 1.5, 101)})
+    file = w.folder / "grounded.toml"
+    limits = "[limits]\nthrust = [0.1, 1]\nturn = [-200, 200]"
+    text = file.read_text().replace("[limits]", limits)
+
+    def told(effects: str, start: str) -> str:
+        changed = re.sub(r"(?m)^start = .*$", f"start = {{ {start} }}", text)
+        file.write_text(changed.replace("[task]", f"effects = [{effects}]\n[task]", 1))
+        notes = [n for n in Workspace(w.folder).propose().proposal.notes if "counts as held" in n]
+        return " ".join(notes).partition("start = ")[2]
+
+    fading = '{name = "input_fade:thrust", k = 0.001}'
+    dead = '{name = "dead_zone:thrust", c = 0.2}'
+    assert told(fading, "h = 1") == "{ h = 1, thrust = 0.4905, turn = 0 }"
+    assert told(dead, "h = 1") == "{ h = 1, thrust = 0.6905, turn = 0 }"
+    given = "h = 1, thrust = 0.4905, turn = 0"
+    assert told("", given) == ""
+    # the model that was planned with is another now, and what held it then holds no longer
+    assert told(dead, given) == "{ h = 1, thrust = 0.6905, turn = 0 }"
+    assert told(dead, given) == ""  # once
+
+
+PLANE = """
+from math import sin, cos
+from grounded import Model, Param
+
+def rate(s, a, p):
+    up, aside = p.k * a.thrust * cos(s.th), p.k * a.thrust * sin(s.th)
+    return {"x": s.vx, "z": s.vz, "th": a.turn, "vx": aside, "vz": up - 9.81}
+
+model = Model(states={"x": "m", "z": "m", "th": "rad", "vx": "m/s", "vz": "m/s"},
+              inputs={"thrust": "1", "turn": "rad/s"}, params={"k": Param(20.0, "m/s^2")},
+              derivative=rate)
+"""
+
+
+def test_a_position_that_a_target_leaves_free_is_named_with_the_target_that_holds_it(tmp_path):
+    """It rose to 24 m, and the advice was to widen [safety]."""
+    (tmp_path / "plane.py").write_text(PLANE)
+    folder = tmp_path / "w"
+    Workspace.create(folder, model=tmp_path / "plane.py")
+    file = folder / "grounded.toml"
+    tables = "[safety]\nz = [0.8, 1.2]\n[limits]\nthrust = [0, 1]\nturn = [-3, 3]"
+    text = file.read_text().replace("[limits]", tables)
+    file.write_text(re.sub(r"(?m)^start = .*$", "start = { z = 1, thrust = 0.4905 }", text))
+
+    def asked():
+        return [n for n in Workspace(folder).propose().proposal.notes if "leaves [safety]" in n]
+
+    assert grounded("-C", folder, "target", "line", "--to", "x=2").code == 0
+    (note,) = asked()
+    assert "widen" not in note
+    (command,) = re.findall("`grounded (.*)`", note)
+    assert command.endswith("target line --to x=2 --to z=1")
+    assert grounded(*command.split()).code == 0 and not asked()
+    assert Workspace(folder).propose().candidate is not None
+    weights = re.sub(r"(?m)^state = .*$", "state = { x = 2.0 }", file.read_text())
+    file.write_text(weights)
+    (note,) = asked()
+    assert holds(note, "z leaves", "[reward] state") and "target line" not in note
+
+
+CART = """
+from grounded import Model, Param
+
+def rate(s, a, p):
+    return {"x": s.v, "v": (a.force - 0.3 * s.v) / p.M}
+
+model = Model(states={"x": "m", "v": "m/s"}, inputs={"force": "N"},
+              params={"M": Param(1.0, "kg", 0.5, 2.0)}, derivative=rate)
+"""
+
+
+def test_weights_that_were_made_of_the_limits_seen_follow_those_that_are_given(tmp_path):
+    """They stayed as the log's narrow range had made them: 700 times too heavy."""
+    (tmp_path / "cart.py").write_text(CART)
+    t = np.arange(400) * 0.05
+    rows = np.column_stack([t, np.sin(t), np.cos(t), np.sin(3 * t)])
+    np.savetxt(tmp_path / "r.csv", rows, "%.5f", ",", header="t,x,v,force", comments="")
+    folder = tmp_path / "w"
+    begin(folder, tmp_path / "r.csv", model=tmp_path / "cart.py")
+    file = folder / "grounded.toml"
+    step = ("-C", folder, "target", "step", "--seconds", "2", "--to")
+
+    def weight() -> float:
+        return tomllib.loads(file.read_text())["reward"]["input_change"]["force"]
+
+    def limited(low: float, high: float) -> list[str]:
+        given = f"[limits]\nforce = [{low}, {high}]\n"
+        file.write_text(re.sub(r"(?ms)^\[limits\].*?\n(?=\n)", given, file.read_text()))
+        notes = Workspace(folder).propose().proposal.notes
+        return [note for note in notes if "input_change" in note and "init" in note]
+
+    assert weight() == pytest.approx(0.01, rel=1e-3) and not limited(-1, 1)
+    (note,) = limited(-20, 20)
+    assert "force = 2.5e-05" in note
+    assert grounded(*step, "x=1").code == 0
+    assert weight() == 2.5e-05 and not limited(-20, 20)
+    assert limited(-2, 2) and grounded(*step, "x=2").code == 0
+    assert weight() == 0.0025
+    file.write_text(
+        re.sub(r"(?m)^input_change = .*$", "input_change = { force = 1 }", file.read_text())
+    )
+    assert not limited(-20, 20) and grounded(*step, "x=1").code == 0
+    assert weight() == 1
