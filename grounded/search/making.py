@@ -355,9 +355,8 @@ class Maker:
 
     def checked(self, made: Candidate) -> Proposal:
         """A candidate that is finite, inside the limits and predicted to stay safe; or none."""
-        task = self.planner.task
-        found = objections(task, made, spread(task, self.now.history, self.fingerprint))
-        if not found:
+        task, history = self.planner.task, self.now.history
+        if not (found := objections(task, made, spread(task, history, self.fingerprint))):
             return Proposal(self.now, made, is_new=True)
         stopped = replace(self.now, phase="stopped", sentence=found[0], ending="not allowed")
         return Proposal(stopped, None, is_new=False, notes=tuple(found), refused=made)
@@ -391,8 +390,8 @@ class Proposal(Result):
             sentence=now.sentence,
             notes=self.notes,
         )
-        best = now.incumbent and now.incumbent.utility
-        return known | document(best_utility=best, new=self.is_new) if made else known
+        best = document(best_utility=now.incumbent and now.incumbent.utility, new=self.is_new)
+        return known | best if made else known
 
 
 def _gain(policy: Policy) -> float:
