@@ -142,7 +142,8 @@ class Task:
                 raise GroundedError(
                     f"[reward] weighs state '{name}', but the target has no value for it at "
                     f"step {int(np.argmax(bad))}: add the column '{name}' to the target (where "
-                    "only `terminal` weighs it, its last value counts) or drop the weight"
+                    "only `terminal` weighs it, the last value counts, the others may be anything) "
+                    "or drop the weight"
                 )
         if not np.isfinite(self.start).all():
             raise GroundedError(f"task: the start state must be finite, got {self.start.tolist()}")

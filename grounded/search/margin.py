@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from grounded.compile import Problem
+from grounded.frozen import Array
 from grounded.policy import Policy, z_difference
 
 OLD = 0.4  # of a step: the age of the samples that a loop has to bear
@@ -40,39 +41,46 @@ def steadied(problem: Problem, policy: Policy, gently: Callable[[float], Policy]
 
 def holds(problem: Problem, policy: Policy) -> bool:
     """Whether what old samples cost grows as in a loop that holds."""
-    fresh, half, old = (cost_of(problem, policy, age) for age in (0.0, OLD / 2, OLD))
+    fresh, half, old = costs_of(problem, policy, np.array([0.0, OLD / 2, OLD])).tolist()
     if not np.isfinite([fresh, half, old]).all():
         return False
-    return old - fresh <= max(LINEAR * (half - fresh), NOTHING * fresh)
+    return bool(old - fresh <= max(LINEAR * (half - fresh), NOTHING * fresh))
 
 
-def cost_of(problem: Problem, policy: Policy, age: float) -> float:
-    """What a run costs in a model, fed back by samples of an age (infinite where it diverges).
+def costs_of(problem: Problem, policy: Policy, ages: Array) -> Array:
+    """What runs cost in a model, fed back by samples of an age, (A,); infinite where they diverge.
 
     Args:
         problem: the model, with a bias or without.
         policy: over its z, or fewer states, as a robot runs it.
-        age: of the samples in steps, at most 1; between two of them on the line that joins them.
+        ages: (A,) of the samples in steps, at most 1; between two of them on the line that joins
+            them.
     """
-    n = problem.system.n
+    n, H, rows = problem.system.n, problem.horizon, len(ages)
     angles = tuple(map(bool, problem.angles))
     policy = policy.laid_out(problem.system.states, angles, problem.depths)
-    z, last, total, sent = problem.z_start(), problem.start, 0.0, problem.past
+    z, total = np.repeat(problem.z_start()[None], rows, axis=0), np.zeros(rows)
+    last, sent = z[:, :n], np.repeat(problem.past[None], rows, axis=0)
     with np.errstate(all="ignore"):
-        for t in range(problem.horizon):
-            u, seen = policy.feedforward[t], z.copy()
-            seen[:n] += age * z_difference(last, z[:n], angles)
+        for t in range(H):
+            u, seen = np.repeat(policy.feedforward[t][None], rows, axis=0), z.copy()
+            seen[:, :n] += ages[:, None] * z_difference(last, z[:, :n], angles)
             if policy.gain is not None and policy.reference is not None:
-                u = u + policy.gain[t] @ z_difference(seen, policy.reference[t], angles)
+                u += z_difference(seen, policy.reference[t], angles) @ policy.gain[t].T
             u = np.clip(u, problem.low, problem.high)
-            off = z_difference(z[:n], problem.target[t], angles)
-            total += float(problem.state_weight[t] @ np.nan_to_num(off) ** 2)
-            total += float(problem.input_weight @ (u - problem.input_target[t]) ** 2)
-            total += float(problem.change_weight @ (u - sent) ** 2)
-            received = problem.received(z[None], u[None], t).reshape(1, -1)
-            x = problem.system.step(z[None, :n], received, problem.p, problem.dt)[0]
-            last, sent = z[:n], u
-            z = np.concatenate([x + problem.bias[t], problem.queue.after(z[n:], u)])
-        off = z_difference(z[:n], problem.target[problem.horizon], angles)
-        total += float(problem.state_weight[problem.horizon] @ np.nan_to_num(off) ** 2)
-    return total if np.isfinite(total) and np.isfinite(z).all() else np.inf
+            total += _off(problem, z, t)
+            total += (u - problem.input_target[t]) ** 2 @ problem.input_weight
+            total += (u - sent) ** 2 @ problem.change_weight
+            received = np.ascontiguousarray(problem.received(z, u, t))
+            x = np.ascontiguousarray(z[:, :n])
+            moved = problem.system.step(x, received, problem.p, problem.dt) + problem.bias[t]
+            last, sent = z[:, :n], u
+            z = np.concatenate([moved, problem.queue.after(z[:, n:], u)], axis=1)
+        total += _off(problem, z, H)
+    return np.where(np.isfinite(z).all(axis=1) & np.isfinite(total), total, np.inf)
+
+
+def _off(problem: Problem, z: Array, t: int) -> Array:
+    """What the states cost at step t, (A,)."""
+    off = z_difference(z[:, : problem.system.n], problem.target[t], tuple(problem.angles))
+    return np.asarray(np.nan_to_num(off) ** 2 @ problem.state_weight[t])

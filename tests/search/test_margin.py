@@ -8,7 +8,7 @@ from test_limited_plans import rover, task
 
 from grounded.search.improve import SearchOptions, propose
 from grounded.search.making import Maker
-from grounded.search.margin import OLD, cost_of, holds
+from grounded.search.margin import OLD, costs_of, holds
 from grounded.search.planner import planner_with, predicted
 from grounded.search.standing import standing
 
@@ -27,7 +27,9 @@ def planner():
 def test_fresh_samples_give_the_predicted_run(planner):
     problem, (policy, _) = planner.plan.problem(exact=True), planner.first_policy()
     want = -predicted(problem, planner.narrowed(policy)).utility
-    assert cost_of(problem, planner.narrowed(policy), 0.0) == pytest.approx(want, rel=1e-9)
+    assert costs_of(problem, planner.narrowed(policy), np.array([0.0]))[0] == pytest.approx(
+        want, rel=1e-9
+    )
 
 
 def test_the_first_policy_of_a_late_model_holds_on_old_samples(planner):
@@ -36,10 +38,12 @@ def test_the_first_policy_of_a_late_model_holds_on_old_samples(planner):
     own, _ = planner.first_policy()
     made = propose(planner.task, [], [], SearchOptions(), planner=planner).candidate
     assert made is not None and holds(problem, made.policy)
-    fresh = cost_of(problem, made.policy, 0.0)
+    fresh = costs_of(problem, made.policy, np.array([0.0]))[0]
     assert fresh == pytest.approx(-made.predicted_utility, rel=1e-6)
-    assert fresh < 1.01 * cost_of(problem, planner.narrowed(own), 0.0)
-    mine, its = (cost_of(problem, p, OLD) for p in (made.policy, planner.narrowed(own)))
+    assert fresh < 1.01 * costs_of(problem, planner.narrowed(own), np.array([0.0]))[0]
+    mine, its = (
+        costs_of(problem, p, np.array([OLD]))[0] for p in (made.policy, planner.narrowed(own))
+    )
     assert mine <= its
 
 

@@ -41,7 +41,10 @@ class OneClock:
         """What a person should know of it."""
         commands = "Commands" if self.whole else f"Commands of {_and(self.inputs)}"
         sensors = "all sensors" if self.whole else f"the sensors of {_and(self.states)}"
-        return f"{commands} or {sensors} late by as much: no run tells which; plans are the same."
+        return (
+            f"{commands} or {sensors} late by as much: no run tells which; plans are the same, but "
+            "late sensors show where the robot was."
+        )
 
 
 def one_clock(
