@@ -3,8 +3,9 @@
 Read `family` first (what an effect is), then any of the families: `actuator`, `joint`, `friction`,
 `rate`, `geometry`, `medium`, `sensor`. `places` says where in a model they can act. `registry` has
 the `Library` of all families: what of it applies to a model, and the way from a name to its effect.
-`wrap` adds an effect to a model, which is then a plain model again; `order` says which of several
-is wrapped first. A new family is a value in one of these files, or comes from a package of your own
+`wrap` adds an effect to a model, which is then a plain model again, inside what it has got already;
+`order` says which of several is wrapped first; `sensed` keeps late logs apart from the true values
+that move. A new family is a value in one of these files, or comes from a package of your own
 by the entry point group `grounded.effects`.
 """
 

@@ -17,7 +17,7 @@ the rate of a model that has another of them in it. A limit acts inside the adde
 It is a `step` model in plain NumPy, so that it is traced and compiled where the original was.
 Memory (a lag's output, a queue, a clock) becomes further states, all of them functions of the
 commands and the measured states (`memory`). In which order several effects are wrapped:
-`wrapping_order`.
+`wrapping_order`; what moves the model goes inside late sensors, a medium and inputs (`_inside`).
 """
 
 from __future__ import annotations
