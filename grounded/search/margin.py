@@ -73,7 +73,7 @@ def costs_of(problem: Problem, policy: Policy, ages: Array) -> Array:
             total += (u - sent) ** 2 @ problem.change_weight
             received = np.ascontiguousarray(problem.received(z, u, t))
             x = np.ascontiguousarray(z[:, :n])
-            moved = problem.system.step(x, received, problem.p, problem.dt) + problem.bias[t]
+            moved = problem.system.moved(problem, x, received, t) + problem.bias[t]
             last, sent = z[:, :n], u
             z = np.concatenate([moved, problem.queue.after(z[:, n:], u)], axis=1)
         total += _off(problem, z, H)

@@ -10,6 +10,7 @@ from grounded.plant import Plant
 from grounded.rollout import simulate
 from grounded.search.ask_tell import Search
 from grounded.search.making import About, Maker
+from grounded.search.margin import costs_of
 from grounded.search.mispredictions import apart, believed, shared
 from grounded.search.planner import Planner, predicted
 from grounded.search.standing import SearchOptions
@@ -189,3 +190,15 @@ def test_after_two_lost_more_than_foretold_steps_are_by_the_models_own_slopes(ut
     ]  # it was said that they may well lose so much
     maker = replace(maker, now=replace(now, history=tuple(doubted)))
     assert About(maker, found.best, SearchOptions(), "").slopes == "corrected"
+
+
+def test_old_samples_are_asked_of_corrected_slopes_too(found):
+    """A law is one of its step: of all runs at once it ended in a traceback."""
+    planner, now = Planner(found.task, found.task), found.search.standing
+    maker = Maker(planner, now, "c0099", found.best.candidate.model)
+    about = About(maker, found.best, SearchOptions(), "")
+    assert (about.slopes == "corrected") is (found.task.model.m == 1)
+    policy = found.best.candidate.policy
+    fresh, old = costs_of(about.real, policy, np.array([0.0, 0.4]))
+    assert fresh == pytest.approx(-predicted(about.real, policy).utility, rel=1e-9)
+    assert np.isfinite(old) and (policy.gain is None or old != fresh)
