@@ -52,6 +52,14 @@ def shifted(signal: Array, held: Array, steps: float) -> Array:
     return (1 - part) * line[:, 1 : T + 1] + part * line[:, :T]
 
 
+def late_inputs(inputs: Array, held: Array, latency: Array, dt: float) -> Array:
+    """What arrives of inputs (S, T, m), `held` (S, m) before, after a latency (m,) [s]."""
+    if not latency.any():
+        return inputs
+    each = [shifted(inputs[:, :, j], held[:, j], d / dt) for j, d in enumerate(latency.tolist())]
+    return np.stack(each, axis=2)
+
+
 def memory_of(wrapped: Model, base: Model, trial: Trial, latency: Array | None = None) -> Array:
     """The memory states along a recorded trial, (T + 1, wrapped.n - base.n).
 
@@ -65,13 +73,9 @@ def memory_of(wrapped: Model, base: Model, trial: Trial, latency: Array | None =
         latency: transport delay of the inputs (m,) [s], which acts before the memory; None: none.
     """
     inputs = trial.inputs
-    if latency is not None and latency.any() and trial.steps:
+    if latency is not None:
         held = np.zeros(base.m) if trial.start_inputs is None else trial.start_inputs
-        late = [
-            shifted(inputs[None, :, j], held[[j]], float(d) / trial.dt)[0]
-            for j, d in enumerate(latency)
-        ]
-        inputs = np.stack(late, axis=1)
+        inputs = late_inputs(inputs[None], held[None], latency, trial.dt)[0]
     found = [now := memory_start(wrapped, base, trial)]
     for t in range(trial.steps):
         x = np.concatenate([trial.states[t], now])[None]

@@ -136,8 +136,8 @@ class Library:
         same = aliases(model, idle | outright) | joint.renamed(model) | medium.renamed(model)
         for family in self.families:
             moves = isinstance(family, LossFamily | MediumFamily | RateFamily)
-            site = model if moves else whole
-            for target in family.targets(site):
+            where = model if moves else whole
+            for target in family.targets(where):
                 driven = target.partition("<-")
                 if isinstance(family, RateFamily) and {driven[0], driven[2]} & idle:
                     continue
@@ -149,7 +149,7 @@ class Library:
                     continue
                 if same.get(f"{family.name}:{target}", "").partition(":")[0] in offered:
                     continue
-                found.append(_build(family, target, site, scales or Scales()))
+                found.append(_build(family, target, where, scales or Scales()))
         return tuple(found)
 
     def joints(self, model: Model, scales: Scales | None = None) -> tuple[Effect, ...]:

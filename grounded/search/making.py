@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from grounded.search.feedback import Alternative
 
 GENTLER = 1e3  # factor on the price of inputs from which gentler gains are designed
-HALF, FINE = 0.5, 12  # of the mean gain is left where no limit is met; parts of caution
+HALF, FINE = 0.5, 12  # of the mean gain is left where no limit is met; parts of a caution
 NEAR = 0.2  # of the way that one that lost would go: a step that ends so near is the same one
 REFUTED = 2  # steps by corrected slopes that lost too much: then the model's own are believed
 FORETOLD = 0.2  # of the incumbent's cost: a plain model that is off by more there is no judge
@@ -140,9 +140,9 @@ class About:
         history, model = make.now.history, make.fingerprint
         first = options.due(history, self.incumbent, model, self.way, self.slopes) or first
         lost = losers_of(history, self.incumbent.candidate.id, model)
-        foretold = [predicted(self.real, one.policy) for one in lost]
+        foretold = [predicted(self.real, candidate.policy) for candidate in lost]
         unsafe: Proposal | None = None
-        doubted, ruinous = unsafe, self.ruinous
+        doubted: Proposal | None = None
         directions: dict[float, Policy] = {}
         for step in options.steps_from(first):
             if step.damping not in directions:
@@ -167,7 +167,7 @@ class About:
                 told = self._told(proposal.candidate)
                 proposal = replace(proposal, candidate=told)
                 if self._ruinous(told):
-                    ruinous = ruinous or told
+                    self.ruinous = self.ruinous or told
                 elif made.expected_gain > self.least:
                     return proposal
                 else:
@@ -176,7 +176,6 @@ class About:
             promised.append(made.predicted_gain)
             if abs(made.predicted_gain) <= self.least:
                 break
-        self.ruinous = ruinous
         return doubted or unsafe
 
     def _ruinous(self, made: Candidate) -> bool:
@@ -351,7 +350,8 @@ class Maker:
         if made.policy.gain is None or not self.planner.remembers:
             return made
         policy = steadied(problem, made.policy, lambda c: self._gently(made.policy, problem, c))
-        return self.foretold(made, policy, problem, made.expected_of_base)
+        same = policy is made.policy
+        return made if same else self.foretold(made, policy, problem, made.expected_of_base)
 
     def checked(self, made: Candidate) -> Proposal:
         """A candidate that is finite, inside the limits and predicted to stay safe; or none."""

@@ -13,13 +13,14 @@ from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import Credit, Remainder, RulerRow
 from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.hypotheses.leftover import whiteness
-from grounded.diagnosis.likelihood.data import prepare, shifted
+from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.report import Estimate, Ranked
 from grounded.diagnosis.ruler_words import rest
 from grounded.diagnosis.validation.claims import Blame, has_size, loss
 from grounded.diagnosis.validation.prediction_error import _stump
 from grounded.diagnosis.verdict import meaning, sentence, verdict
 from grounded.effects import Library
+from grounded.effects.memory import shifted
 from grounded.filter import kalman
 from grounded.models.pendulum import model as pendulum
 from grounded.policy import Policy

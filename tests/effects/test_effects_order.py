@@ -5,12 +5,13 @@ import pytest
 
 from grounded import Trial
 from grounded.diagnosis.excitation import _run
-from grounded.diagnosis.likelihood.data import prepare, shifted
+from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Diagnosis, Estimate, Ranked, Verdict
 from grounded.diagnosis.writer import _in_action
 from grounded.effects import Library, acting_order, memory_start, scales_of, wrapping_order
+from grounded.effects.memory import shifted
 from grounded.models.car import model as car
 from grounded.task import Task
 from grounded.utility import Reward

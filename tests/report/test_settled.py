@@ -16,7 +16,7 @@ from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.tables import candidate_table, parameter_table
 from grounded_trials.report.settled import told
 from grounded_trials.store.documents import write_document
-from grounded_trials.wording import changed, legend, told_apart
+from grounded_trials.wording import changed, in_digits_apart, legend
 from grounded_trials.workspace.adopted import better_model
 from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.folder import Folder
@@ -196,7 +196,7 @@ def test_the_order_of_candidates_is_explained(cart):
 
 def test_numbers_that_differ_are_told_apart():
     assert changed("l", 0.5, 0.4997, "m") == "l 0.5000 -> 0.4997 m"
-    assert told_apart(0.99973, 1.0) == ("0.9997", "1.000")  # not 1.000 and 1.00
+    assert in_digits_apart(0.99973, 1.0) == ("0.9997", "1.000")  # not 1.000 and 1.00
     assert changed("g", 2.0, 2.0, "1") == "g 2.000 -> 2.000"
 
 

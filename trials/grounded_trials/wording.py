@@ -70,10 +70,10 @@ def with_unit(text: str, unit: str) -> str:
 
 def changed(name: str, old: float, new: float, unit: str) -> str:
     """`m 1.00 -> 1.30 kg`, in as many digits as tell the two apart."""
-    return with_unit(f"{name} {' -> '.join(told_apart(old, new))}", unit)
+    return with_unit(f"{name} {' -> '.join(in_digits_apart(old, new))}", unit)
 
 
-def told_apart(one: float, other: float) -> tuple[str, str]:
+def in_digits_apart(one: float, other: float) -> tuple[str, str]:
     """Two numbers in as many digits, three or more, as tell them apart."""
     for digits in range(3, 9):
         if float(f"{one:.{digits}g}") != float(f"{other:.{digits}g}"):

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from grounded.effects import Scales, scales_of
-from grounded.effects.memory import shifted, true_values
+from grounded.effects.memory import late_inputs, true_values
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
@@ -130,12 +130,7 @@ class Data:
 
     def delayed(self, inputs: Array, held: Array) -> Array:
         """What arrives of (S, T_max, m), `held` (S, m) before, after the latency of the task."""
-        if not self.latency.any():
-            return inputs
-        out = np.empty_like(inputs)
-        for j, latency in enumerate(self.latency):
-            out[:, :, j] = shifted(inputs[:, :, j], held[:, j], latency / self.dt)
-        return out
+        return late_inputs(inputs, held, self.latency, self.dt)
 
 
 def prepare(

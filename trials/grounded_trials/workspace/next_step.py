@@ -76,10 +76,7 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
     if now is None or verdict == "probe":
         return DIAGNOSE
     if _none_stood(now) and (found := read_diagnosis(workspace.reports)) is not None:
-        usable = usable_ids(workspace)
-        changed = since_diagnosis(workspace, found, usable).changed
-        if not changed and (follow := to_adopt(workspace, found)) is not None:
-            return follow
+        return next_command(workspace, now, found, usable_ids(workspace))
     return PROPOSE if now.phase in ("propose", "await-trial") else status_of(workspace, now).then
 
 

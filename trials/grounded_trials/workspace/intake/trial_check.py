@@ -15,7 +15,7 @@ from grounded.model import Model
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
-from grounded_trials.wording import count, percent, told_apart, with_unit
+from grounded_trials.wording import count, in_digits_apart, percent, with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.estimating import read_estimate
 from grounded_trials.workspace.intake.who_drove import UNLIKE, follows, latest, second_differences
@@ -165,7 +165,7 @@ def _start(task: Task, trial: Trial) -> list[str]:
     found = []
     for i in sorted(np.flatnonzero(told), key=lambda i: (weight[i] == 0, -share[i])):
         name, unit = list(task.model.states.items())[i]
-        began, start = told_apart(float(trial.states[0, i]), float(task.start[i]))
+        began, start = in_digits_apart(float(trial.states[0, i]), float(task.start[i]))
         costs = f", which costs {percent(share[i])} of a mean step of the run" * bool(weight[i])
         found.append(
             f"the run started with {name} = {with_unit(began, unit)}, the task's start is "
