@@ -86,6 +86,11 @@ class Param:
         return (self.high - self.low) / 12**0.5
 
 
+def is_clock(state: str) -> bool:
+    """Whether a memory state is the time since the start, which goes on where all else rests."""
+    return state.endswith("_clock")
+
+
 def all_at_bounds(params: Mapping[str, Param], values: Mapping[str, float]) -> bool:
     """Whether there are values, and each is one of its parameter's bounds (`Param.at_bound`)."""
     return bool(values) and all(params[n].at_bound(v) for n, v in values.items())

@@ -19,6 +19,8 @@ from grounded.errors import GroundedError
 if TYPE_CHECKING:
     from grounded.figures.figure import Figure
 
+SCALED = ("m", "rad", "s")  # units, and their rates, of which thousandths have a name
+SMALL = 1e-3  # below which they are used
 # what reading a document of another shape may raise
 MALFORMED = (ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError)
 
@@ -51,6 +53,23 @@ def percent(share: float) -> str:
     if 0 < value < 0.05 or 99.95 <= value < 100:
         return "< 0.1 %" if value < 50 else "> 99.9 %"
     return f"{value:.0f} %" if 10 <= value <= 90 else f"{value:.1f} %"
+
+
+def number(value: float) -> str:
+    """Three digits; a dash for what is no number."""
+    return "-" if math.isnan(value) else f"{value:.3g}"
+
+
+def measured(value: float, unit: str) -> str:
+    """An error in two digits: in cm, mm, mrad ... where it is small in its own unit."""
+    if unit == "m" and SMALL <= value < 1.0:
+        value, unit = 100 * value, "cm"
+    elif unit.startswith(SCALED) and 0 < value < SMALL:
+        step = 1 if value >= 1e-5 else 2
+        value, unit = value * 1e3**step, "-mµ"[step] + unit
+    shape = ",.0f" if 9.95 <= value < 1e6 else "#.2g" if SMALL <= value < 1e6 else ".1e"
+    text = "-" if math.isnan(value) else f"{value:{shape}}" if value else "0"
+    return text if unit == "1" else f"{text} {unit}".rstrip()
 
 
 class Result:

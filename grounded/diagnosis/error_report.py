@@ -7,10 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from grounded.result import Document
+from grounded.result import Document, measured, number
 
-SCALED = ("m", "rad", "s")  # units, and their rates, of which thousandths have a name
-SMALL = 1e-3  # below which they are used
 ABOVE = 1.3  # times the noise floor: what is left is stated
 SURE = 3.0  # standard deviations of the floor: it is compared in each channel, at each horizon
 BRIEF: dict[str, Any] = {"brief": True}  # a field whose key is left out where there is nothing
@@ -254,20 +252,3 @@ def noise_of(error: float, floor: float, unit: str, *, at_most: bool) -> str:
     if at_most and error <= ABOVE * floor:
         return " (noise: at most that, only repeated trials tell)"
     return f" (noise: {'at most ' * at_most}{measured(floor, unit)})"
-
-
-def number(value: float) -> str:
-    """Three digits; a dash for what is no number."""
-    return "-" if math.isnan(value) else f"{value:.3g}"
-
-
-def measured(value: float, unit: str) -> str:
-    """An error in two digits: in cm, mm, mrad ... where it is small in its own unit."""
-    if unit == "m" and SMALL <= value < 1.0:
-        value, unit = 100 * value, "cm"
-    elif unit.startswith(SCALED) and 0 < value < SMALL:
-        step = 1 if value >= 1e-5 else 2
-        value, unit = value * 1e3**step, "-mµ"[step] + unit
-    shape = ",.0f" if 9.95 <= value < 1e6 else "#.2g" if SMALL <= value < 1e6 else ".1e"
-    text = "-" if math.isnan(value) else f"{value:{shape}}" if value else "0"
-    return text if unit == "1" else f"{text} {unit}".rstrip()

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from grounded.diagnosis.error_report import Credit, RulerRow, furthest, measured, number
+from grounded.diagnosis.error_report import Credit, RulerRow, furthest
 from grounded.diagnosis.report import Diagnosis
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
-from grounded.result import percent
+from grounded.result import measured, number, percent
 
 MOST = 12
 SHOWS = 1.02  # times the error without a cause, from which on bars show its worth

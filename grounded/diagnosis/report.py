@@ -21,12 +21,11 @@ from grounded.diagnosis.error_report import (
     RunChange,
     UtilityPrediction,
     Where,
-    number,
 )
 from grounded.diagnosis.ruler_words import contested
 from grounded.errors import NextCommand
 from grounded.instruments.finding import Finding
-from grounded.result import Document
+from grounded.result import Document, number
 
 if TYPE_CHECKING:
     from grounded.figures.figure import Figure

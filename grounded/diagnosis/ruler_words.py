@@ -6,16 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.error_report import (
-    ABOVE,
-    SURE,
-    RulerRow,
-    furthest,
-    measured,
-    noise_of,
-    number,
-)
-from grounded.result import listed
+from grounded.diagnosis.error_report import ABOVE, SURE, RulerRow, furthest, noise_of
+from grounded.result import listed, measured, number
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Agreement

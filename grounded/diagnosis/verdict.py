@@ -7,18 +7,11 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.error_report import (
-    Credit,
-    Remainder,
-    RulerRow,
-    furthest,
-    number,
-    runaway,
-)
+from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, furthest, runaway
 from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
 from grounded.diagnosis.ruler_words import floor, improvement, rest, worsened
 from grounded.model import Model, all_at_bounds
-from grounded.result import listed, percent
+from grounded.result import listed, number, percent
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.validation.claims import Claims

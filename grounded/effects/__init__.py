@@ -29,7 +29,7 @@ from grounded.effects.family import (
     scales_of,
 )
 from grounded.effects.joint import like_a_load, one_friction
-from grounded.effects.memory import is_clock, memory_of, memory_start
+from grounded.effects.memory import memory_of, memory_start
 from grounded.effects.order import acting_order, wrapping_order
 from grounded.effects.plain_step import param_name
 from grounded.effects.registry import Library
@@ -52,7 +52,6 @@ __all__ = [
     "SensorLagFamily",
     "Site",
     "acting_order",
-    "is_clock",
     "like_a_load",
     "memory_of",
     "memory_start",

@@ -9,7 +9,7 @@ import numpy as np
 
 from grounded.compile.names import Named
 from grounded.frozen import Array
-from grounded.model import Model
+from grounded.model import Model, is_clock
 from grounded.trial import Trial
 
 
@@ -17,11 +17,6 @@ def settled(model: Model, a: Named, p: Named) -> dict[str, Any]:
     """What the memories of inputs hold after the inputs a were held for long, by `input_family`."""
     found = getattr(model.step, "settled", None)
     return {} if found is None else dict(found(a, p))
-
-
-def is_clock(memory: str) -> bool:
-    """Whether a memory state is the time since the start, which goes on where all else rests."""
-    return memory.endswith("_clock")
 
 
 def true_values(names: Sequence[str], memory: Collection[str]) -> dict[int, int]:

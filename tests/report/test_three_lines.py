@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from grounded.diagnosis.error_report import measured
 from grounded.diagnosis.report import Diagnosis, Verdict
+from grounded.result import measured
 from grounded_trials.report.diagnosis_words import verdict_lines
 from grounded_trials.report.three_lines import gained_most, three_lines
 from reported import DIAGNOSIS

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from grounded.diagnosis.error_report import measured
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.result import measured
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.planner import Planner
 from grounded.search.standing import Standing

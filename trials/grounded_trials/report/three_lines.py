@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from grounded.diagnosis.error_report import measured
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.ruler_words import open_noise, rest, telling, worsened
 from grounded.diagnosis.verdict import told_apart
-from grounded.result import listed
+from grounded.result import listed, measured
 from grounded.task import Task
 from grounded_trials.wording import count, shown
 from grounded_trials.workspace.off_target import weighed_groups

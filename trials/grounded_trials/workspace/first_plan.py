@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.errors import NextCommand
-from grounded.result import listed, percent
+from grounded.model import is_clock
+from grounded.result import listed, measured, percent
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import step_rewards
@@ -92,7 +93,7 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
             "(`target`), and propose again"
         )
     name = str(workspace.config.task.target)
-    rows = len(workspace.read_target((workspace.folder / name).resolve())[1])
+    rows = len(workspace.read_target(workspace.folder / name)[1])
     if rows > task.horizon + 1:
         found.append(
             f"{name} has {rows} rows, of which [task] horizon = {task.horizon} uses the first "
@@ -197,8 +198,6 @@ def _held_back(task: Task, first: Candidate) -> list[str]:
 
 def _falls_short(task: Task, first: Candidate) -> list[str]:
     """Where a plan ends far from where its target ends, though no input is at its limit."""
-    from grounded.diagnosis.error_report import measured
-
     if not (groups := weighed_groups(task)):
         return []
     names, what = groups[0]
@@ -218,8 +217,6 @@ def _falls_short(task: Task, first: Candidate) -> list[str]:
 
 def _shaken(workspace: Folder, first: Candidate) -> list[str]:
     """Inputs that the sensors' noise moves much through the gains, before anything was run."""
-    from grounded.diagnosis.error_report import measured
-
     task, gain, found = workspace.task, first.policy.gain, []
     if gain is None:
         return []
@@ -257,8 +254,6 @@ def sensor_noise(workspace: Folder) -> Array:
 
 def _most_missed(task: Task, plan: Trial) -> str:
     """What a plan misses by most, beside the way that its target asks for; "" for nothing much."""
-    from grounded.diagnosis.error_report import measured
-
     error, way, found = tracking_error(task, plan), np.vstack([task.start, task.target]), []
     for names, what in weighed_groups(task):
         states = [task.model.state_names.index(name) for name in names]
@@ -337,7 +332,6 @@ def resting(task: Task, free: NDArray[np.bool_]) -> Array | None:
         task: whose start it is.
         free: (n,), states that may be others than those of the start.
     """
-    from grounded.effects import is_clock
     from grounded.search.first_guess import trim
 
     clocks = free & [is_clock(name) for name in task.model.state_names]

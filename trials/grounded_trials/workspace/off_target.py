@@ -13,7 +13,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.result import Document
+from grounded.result import Document, measured
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -45,8 +45,6 @@ class OffTarget(Document):
 
     def summary(self) -> str:
         """`position 2.1 mm rms, 7.3 mm at most (at 7.95 s)`."""
-        from grounded.diagnosis.error_report import measured
-
         told = []
         if np.isfinite(self.rms):
             most = f"{measured(self.most, self.unit)} at most (at {self.at_s:.4g} s)"

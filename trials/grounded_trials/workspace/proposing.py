@@ -132,10 +132,11 @@ def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
     Its export counts as made where its file lies in the workspace or the current folder; a file
     of that name may as well be another workspace's, or a log.
     """
-    from grounded_trials.workspace.exporting import is_export
-
     if workspace.config.system.reachable:
         return NextCommand("run", named)
+
+    from grounded_trials.workspace.exporting import is_export
+
     name = named[0] if named else candidate
     files = (path for at in (workspace.folder, Path()) for path in at.glob(f"{name}.*"))
     if any(is_export(workspace, candidate, path) for path in files):
