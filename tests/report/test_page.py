@@ -14,7 +14,7 @@ import pytest
 
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import NextCommand
-from grounded_trials.report.findings import improvements_in, utility_terms
+from grounded_trials.report.findings import Improved, improvements_in, utility_terms
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
 from grounded_trials.report.page.tables import UNKNOWN
@@ -136,6 +136,38 @@ def test_what_improved_is_said_in_the_units_of_the_states(car):
     assert re.fullmatch(r"[\d.]+ (m|cm|mm) → [\d.]+ (cm|mm)", found[0].text)
     assert found[0].after < found[0].before
     assert {"rad", "m/s"} <= {one.unit for one in found}
+
+
+def test_what_reads_the_same_before_and_after_is_not_told_first(car):
+    """A quadrotor's page began with "0.11 m/s → 0.11 m/s"."""
+    assert Improved("v", "m/s", 0.1101, 0.1099).is_same
+    assert not Improved("v", "m/s", 0.1101, 0.1249).is_same
+    assert not Improved("v", "m/s", float("nan"), 0.11).is_same
+    findings = gather(Folder(car))
+    first, best = findings.first, findings.best
+    assert first is not None and best is not None and findings.task.model.state_names[3] == "v"
+    states = best.trial.states.copy()
+    states[:, 3] = first.trial.states[:, 3]  # and so much weight that its rounding is all that pays
+    states[1, 3] += 1e-6
+    runs = tuple(
+        replace(r, trial=replace(r.trial, states=states)) if r.candidate is best.candidate else r
+        for r in findings.runs
+    )
+    reward = replace(findings.task.reward, state=np.array([1.0, 1.0, 1.0, 1e12]))
+    found = improvements_in(
+        replace(findings, task=replace(findings.task, reward=reward), runs=runs)
+    )
+    told_same = [one.is_same for one in found]
+    assert not told_same[0] and any(told_same)
+
+
+def test_a_calibrated_model_is_not_called_crude(car):
+    findings = gather(Folder(car))
+    assert findings.plain == "crude model" and not findings.effects
+    name, value = next(iter(findings.nominal.items()))
+    other = replace(findings, nominal={**findings.nominal, name: 2 * value + 1})
+    assert other.plain == "calibrated model"
+    assert replace(other, effects=("dead_zone:u",)).plain.startswith("calibrated model without")
 
 
 def test_a_gain_at_the_end_is_said_first_and_the_terms_add_up(cart):

@@ -106,8 +106,10 @@ class Findings:
 
     @property
     def plain(self) -> str:
-        """What the model is called that judges: nothing that was adopted is in it."""
-        return "model without adopted effects" if self.effects else "crude model"
+        """What the model is called that judges: no effect that was adopted is in it."""
+        changed = any(self.values[name] != value for name, value in self.nominal.items())
+        model = "calibrated model" if changed else "model" if self.effects else "crude model"
+        return f"{model} without adopted effects" if self.effects else model
 
     @property
     def values(self) -> dict[str, float]:
@@ -193,6 +195,11 @@ class Improved:
         return " → ".join(measured(value, self.unit) for value in self._known)
 
     @property
+    def is_same(self) -> bool:
+        """Whether both read the same, as they are told."""
+        return len({measured(value, self.unit) for value in (self.before, self.after)}) == 1
+
+    @property
     def _known(self) -> list[float]:
         return [v for v in (self.before, self.after) if np.isfinite(v)]
 
@@ -229,7 +236,7 @@ def improvements_in(findings: Findings) -> list[Improved]:
             paid = worse * (missed[-1] > WORSE * missed[0])
             found.append((moved, Improved(words + note + paid, unit, before, missed[-1])))
     reached = next((one for _, one in found if arrives and one.what.startswith(AT_END)), None)
-    found.sort(key=lambda each: -each[0])
+    found.sort(key=lambda each: (each[1].is_same, -each[0]))
     least = MOVED * sum(moved for moved, _ in found)
     told = [one for k, (moved, one) in enumerate(found[:SHOWN]) if not k or moved >= least]
     return told if reached is None or reached in told else [*told[: SHOWN - 1], reached]

@@ -114,7 +114,7 @@ def forecast_table(findings: Findings) -> list[Block]:
     trials = ([run.trial] if run is not None else []) + [log.trial for log in findings.logs]
     if not trials:
         return []
-    planners = [("without adopted effects" if findings.effects else "crude", findings.crude)]
+    planners = [(findings.plain, findings.crude)]
     if findings.better is not None:
         planners.append((findings.better.name, findings.better.planner))
     names = [f"{t.id or t.candidate}, {words}" for t in trials for words, _ in planners]
