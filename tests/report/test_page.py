@@ -145,15 +145,17 @@ def test_what_reads_the_same_before_and_after_is_not_told_first(car):
     assert not Improved("v", "m/s", float("nan"), 0.11).is_same
     findings = gather(Folder(car))
     first, best = findings.first, findings.best
-    assert first is not None and best is not None and findings.task.model.state_names[3] == "v"
+    assert first is not None and best is not None
+    v = findings.task.model.state_names.index("v")
     states = best.trial.states.copy()
-    states[:, 3] = first.trial.states[:, 3]  # and so much weight that its rounding is all that pays
-    states[1, 3] += 1e-6
+    states[:, v] = first.trial.states[:, v] + 1e-6  # weighed so much that it is all that pays
     runs = tuple(
         replace(r, trial=replace(r.trial, states=states)) if r.candidate is best.candidate else r
         for r in findings.runs
     )
-    reward = replace(findings.task.reward, state=np.array([1.0, 1.0, 1.0, 1e12]))
+    reward = replace(
+        findings.task.reward, state=np.where(np.arange(6) == v, 1e12, findings.task.reward.state)
+    )
     found = improvements_in(
         replace(findings, task=replace(findings.task, reward=reward), runs=runs)
     )
