@@ -343,7 +343,16 @@ class Diagnosis(Document):
             if effect == curve.effect:
                 return dict(curve.quantities)
         row = self.ranked(effect)
-        return {} if row is None else row.values
+        return self.filters.get(effect, {}) if row is None else row.values
+
+    @property
+    def filters(self) -> dict[str, dict[str, float]]:
+        """The filters of sensors that were found and corrected, as effects by name.
+
+        The physics was judged without them; what a controller feeds back comes through them.
+        """
+        found = (f for f in self.preflight if f.kind == "lag" and f.corrected and not f.log)
+        return {f"sensor_lag:{f.signal}": {"tau": f.delay_s} for f in found if f.delay_s > 0}
 
     @property
     def known_parameters(self) -> dict[str, Estimate]:

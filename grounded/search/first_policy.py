@@ -114,12 +114,15 @@ def _sharpened(task: Task, problem: Problem, best: ddp.Solution, tick: Tick | No
     blends = [replace(problem, smoothing=share * problem.smoothing) for share in (1.0, *SHARPER)]
     size = problem.horizon * (problem.nz + task.model.m) ** 2
     most = int(np.clip(WORK / (len(blends) * size), FEWEST, ITERATIONS))
-    last, found = best, [best]
+    last, found = best, [(best, problem)]
     for sharper in blends[1:]:
         last = finished(sharper, last.u, last.K, last.z[:-1], most=most, tick=tick)
-        found.append(last)
-    found.append(finished(exact, next(_rivals(task)), most=most, tick=tick))
-    return min(found, key=lambda plan: sum(_cost(blend, plan) for blend in blends))
+        found.append((last, sharper))
+    found.append((finished(exact, next(_rivals(task)), most=most, tick=tick), exact))
+    plan, made = min(found, key=lambda each: sum(_cost(blend, each[0]) for blend in blends))
+    if plan.status != "max iterations":
+        return plan
+    return finished(made, plan.u, plan.K, plan.z[:-1], tick=tick)
 
 
 def _cost(problem: Problem, plan: ddp.Solution) -> float:

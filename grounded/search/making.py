@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -336,7 +336,7 @@ class Maker:
         run = predicted(problem, policy)
         factor = GENTLER**caution
         weight = factor * problem.input_weight + (factor - 1) * problem.change_weight
-        gentle = replace(problem, input_weight=weight)
+        gentle = replace(self.planner.loosened(problem) or problem, input_weight=weight)
         found = ddp.sweep(gentle, run.z, run.inputs)
         if not (found.ok and np.isfinite(run.z).all()):
             return policy
@@ -346,12 +346,15 @@ class Maker:
         return self.planner.narrowed(policy)
 
     def with_margin(self, made: Candidate, problem: Problem) -> Candidate:
-        """The same run with gains that hold on old samples, where memory was adopted."""
-        if made.policy.gain is None or not self.planner.remembers:
+        """The same run with gains that hold under worse conditions, see `margin`."""
+        planner, own = self.planner, made.policy
+        if own.gain is None or not (planner.is_late or planner.widths):
             return made
-        policy = steadied(problem, made.policy, lambda c: self._gently(made.policy, problem, c))
-        same = policy is made.policy
-        return made if same else self.foretold(made, policy, problem, made.expected_of_base)
+        gently = partial(self._gently, own, problem)
+        policy = steadied(problem, own, gently, planner.loosened(problem))
+        return (
+            made if policy is own else self.foretold(made, policy, problem, made.expected_of_base)
+        )
 
     def checked(self, made: Candidate) -> Proposal:
         """A candidate that is finite, inside the limits and predicted to stay safe; or none."""

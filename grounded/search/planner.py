@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from grounded.solve.ddp import Solution
 
 
+LOOSE = 64.0  # times the speed a dry friction builds up over: it damps what moves next to nothing
+
+
 @dataclass(frozen=True, eq=False)
 class Planner:
     """`task` judges; `plan` has the planning model, whose first states are the task's."""
@@ -49,9 +52,24 @@ class Planner:
         return model_fingerprint(self.plan)
 
     @property
-    def remembers(self) -> bool:
-        """Whether the planning model has memory, which no sensor of the robot shows."""
-        return self.plan.model.n > self.task.model.n
+    def is_late(self) -> bool:
+        """Whether gains may rely on fresh samples: a delay, or memory that no sensor shows."""
+        assert self.plan.latency is not None
+        return self.plan.model.n > self.task.model.n or bool(self.plan.latency.any())
+
+    def loosened(self, problem: Problem) -> Problem | None:
+        """The plan's problem with dry frictions that build up slowly; None where it has none."""
+        if not self.widths:
+            return None
+        p = np.where(np.isin(self.plan.model.param_names, self.widths), LOOSE, 1.0) * problem.p
+        return dataclasses.replace(problem, p=p)
+
+    @property
+    def loose(self) -> Task:
+        """The plan's task with such frictions; its own where it has none."""
+        model = self.plan.model
+        slow = {name: LOOSE * model.params[name].value for name in self.widths}
+        return self.plan.with_model(model.with_values(slow)) if slow else self.plan
 
     def lift(self, trial: Trial) -> Trial:
         """A trial with the planning model's memory states beside its own."""

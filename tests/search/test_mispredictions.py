@@ -10,7 +10,7 @@ from grounded.plant import Plant
 from grounded.rollout import simulate
 from grounded.search.ask_tell import Search
 from grounded.search.making import About, Maker
-from grounded.search.margin import costs_of
+from grounded.search.margin import AGES, worse_costs
 from grounded.search.mispredictions import apart, believed, shared
 from grounded.search.planner import Planner, predicted
 from grounded.search.standing import SearchOptions
@@ -198,7 +198,6 @@ def test_old_samples_are_asked_of_corrected_slopes_too(found):
     maker = Maker(planner, now, "c0099", found.best.candidate.model)
     about = About(maker, found.best, SearchOptions(), "")
     assert (about.slopes == "corrected") is (found.task.model.m == 1)
-    policy = found.best.candidate.policy
-    fresh, old = costs_of(about.real, policy, np.array([0.0, 0.4]))
-    assert fresh == pytest.approx(-predicted(about.real, policy).utility, rel=1e-9)
-    assert np.isfinite(old) and (policy.gain is None or old != fresh)
+    costs = worse_costs([about.real], found.best.candidate.policy)
+    assert costs.shape == (1, len(AGES)) and np.isfinite(costs).all()
+    assert costs[0, -1] > -predicted(about.real, found.best.candidate.policy).utility

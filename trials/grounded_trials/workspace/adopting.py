@@ -97,8 +97,9 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     names = _corrections(found, list(dict.fromkeys(names)))
     before = {} if found.made is None else found.made.effects
     _check(names, found, workspace, before)
-    claimed = _claimed(found, names)
-    calibrated = found.known_parameters if parameters and claimed else {}
+    physics = [name for name in names if name not in found.filters]
+    claimed = not physics or _claimed(found, physics)
+    calibrated = found.known_parameters if parameters and physics and claimed else {}
     nominal = nominal_values(found, workspace, names)
     old = workspace.config.model.effects
     own, both = joined(found, names, old, nominal, calibrated)
@@ -110,14 +111,14 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     after = {"effects": adopted or model.effects, "params": whole if own else model.params}
     step = {"names": names, "before": _written(model), "after": after}
     write_document(workspace.reports / KEPT, {"adoptions": [*earlier, step], "undone": []})
-    fitted = {*names, *before, *(found.effects if claimed else ())}
+    fitted = {*names, *before, *(found.effects if claimed else ()), *found.filters}
     beside = (str(effect["name"]) for effect in adopted)
     return Adopted(
         tuple(adopted),
         own,
         claimed,
         beside=tuple(n for n in beside if n not in fitted),
-        left=left_behind(found) if parameters and claimed else {},
+        left=left_behind(found) if parameters and physics and claimed else {},
     )
 
 
@@ -299,7 +300,7 @@ def _check(
     names: Sequence[str], found: Diagnosis, workspace: Folder, before: Mapping[str, Any]
 ) -> None:
     """Each must have been weighed, and not be adopted since."""
-    known = [row.effect for row in found.ranking] + _curves(found)
+    known = [row.effect for row in found.ranking] + _curves(found) + [*found.filters]
     adopted = [e["name"] for e in workspace.config.model.effects if e["name"] not in before]
     for name in names:
         if name not in known:

@@ -279,7 +279,8 @@ def held_before(workspace: Folder, again: bool = False) -> list[str]:
         workspace: whose first plan it is.
         again: another model was planned with before: what somebody gave may have held that one.
     """
-    base, task, config = workspace.task, workspace.planner.plan, workspace.config.task
+    base, planner, config = workspace.task, workspace.planner, workspace.config.task
+    task, loose = planner.plan, planner.loose
     assert base.latency is not None
     names, states, n = task.model.input_names, task.model.state_names, base.model.n
     memory = np.arange(task.model.n) >= n  # of adopted effects: it settles
@@ -289,9 +290,9 @@ def held_before(workspace: Folder, again: bool = False) -> list[str]:
     ]
     chosen = any(name in config.start for name in names)
     priced = bool(base.reward.input_change.any() or base.latency.any())
-    stands = None if (chosen and not again) or not priced else resting(task, memory)
+    stands = None if (chosen and not again) or not priced else resting(task, memory, loose)
     if stands is None and 0 < free[:n].sum() <= UNGIVEN:
-        stands = resting(task, free)
+        stands = resting(task, free, loose)
     if stands is None:
         return []
     units = {**base.model.states, **task.model.inputs}
@@ -322,7 +323,7 @@ def held_before(workspace: Folder, again: bool = False) -> list[str]:
     ]
 
 
-def resting(task: Task, free: NDArray[np.bool_]) -> Array | None:
+def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> Array | None:
     """States and inputs (n + m,) inside the limits that stay as they are, from where a run starts.
 
     None where it stands under the input held before, or nothing holds it: the start is in motion.
@@ -331,6 +332,8 @@ def resting(task: Task, free: NDArray[np.bool_]) -> Array | None:
     Args:
         task: whose start it is.
         free: (n,), states that may be others than those of the start.
+        loose: the task with dry frictions that build up slowly: what sticks tells of no input
+            whether it holds.
     """
     from grounded.search.first_guess import trim
 
@@ -345,7 +348,7 @@ def resting(task: Task, free: NDArray[np.bool_]) -> Array | None:
     middle[inside] = 0.5 * (task.low[inside] + task.high[inside])
     for first in [*(task.past + move for move in BEGUN), middle]:
         begun = np.clip(first, task.low, task.high)
-        one = replace(task, target=still, input_target=None, past=begun)
+        one = replace(loose or task, target=still, input_target=None, past=begun)
         x, u = (found[0] for found in trim(one, still, ~free))
         moved = np.abs(moved_at_start(replace(task, start=x), u))[~clocks]
         if (moved <= STILL * away).all():

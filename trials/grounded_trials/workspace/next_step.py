@@ -22,6 +22,7 @@ PROPOSE = NextCommand("propose")
 DIAGNOSE = NextCommand("diagnose")
 EXPORT = NextCommand("export", ("best", "--runner"))
 TARGET = NextCommand("target", ("SHAPE",))
+SHORT = 0.1  # of a control step: a filter that makes no difference
 
 
 def next_command(
@@ -104,14 +105,19 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
 
 
 def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
-    """What to do about the effects that a diagnosis claims, None where there is nothing to do."""
-    new = diagnosis.open(workspace.config.model.effects, workspace.config.model.params)
-    if diagnosis.kind not in ("effect", "several") or not new or diagnosis.contested:
-        return None
+    """What to do about what a diagnosis found, None where there is nothing to do.
+
+    Filters of sensors come along where states are fed back: the physics was judged without them,
+    and gains that were made without them swing a robot that has them.
+    """
     from grounded_trials.workspace.adopting import declined
 
-    if set(new) <= set(declined(workspace)):
-        return None  # adopted, and undone: whoever did that is not asked to do it again
+    new = diagnosis.open(workspace.config.model.effects, workspace.config.model.params)
+    undone = {*declined(workspace)}  # whoever did that is not asked to do it again
+    late = tuple(name for name in filters_open(workspace, diagnosis) if name not in undone)
+    claimed = diagnosis.kind in ("effect", "several") and not diagnosis.contested
+    if not claimed or {*new} <= undone:
+        return NextCommand("adopt", late) if late else None
     if most := diagnosis.verdict.look_for:
         return _with_more(most, diagnosis.made or Made())
     params = workspace.base_model.params
@@ -121,7 +127,18 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     own = {f"parameter:{name}" for name in params}
     if own.issuperset(new):
         return NextCommand("fit")  # the model's form is right: all of its numbers at once
-    return NextCommand("adopt", new)
+    return NextCommand("adopt", (*new, *late))
+
+
+def filters_open(workspace: Folder, diagnosis: Diagnosis) -> tuple[str, ...]:
+    """The filters of sensors that a diagnosis found and the model that plans has not."""
+    task = workspace.config.task
+    if not (task.target and task.feedback):
+        return ()
+    known = {effect["name"] for effect in workspace.config.model.effects}
+    least = SHORT * task.dt
+    found = diagnosis.filters.items()
+    return tuple(name for name, value in found if name not in known and value["tau"] > least)
 
 
 def _with_more(effects: int, made: Made) -> NextCommand:
