@@ -48,6 +48,33 @@ def test_what_holds_the_start_is_told_of_an_adopted_model_with_all_that_is_given
     assert told(dead, given) == ""  # once
 
 
+LINK = """
+import numpy as np
+from grounded import Model
+
+def rate(s, a, p):
+    return {"q": s.w, "w": 4.0 * (a.tau - 5.0 * np.cos(s.q))}
+
+model = Model(states={"q": "rad", "w": "rad/s"}, inputs={"tau": "N m"}, params={}, derivative=rate)
+"""
+
+
+def test_what_holds_a_joint_is_told_though_it_sticks(tmp_path):
+    """With an adopted friction nothing was said, and the elbow beside it began with a drop."""
+    (tmp_path / "link.py").write_text(LINK)
+    w = Workspace.create(tmp_path / "w", model=tmp_path / "link.py")
+    w.target({"q": np.linspace(0.3, 0.8, 101)})
+    file = w.folder / "grounded.toml"
+    friction = '{name = "joint_friction:tau<-w", c = 0.9, b = 0.35, width = 0.004}'
+    text = file.read_text().replace("[limits]", "[limits]\ntau = [-20, 20]")
+    text = re.sub(r"(?m)^start = .*$", "start = { q = 0.3 }", text)
+    for effects in ("", friction):
+        file.write_text(text.replace("[task]", f"effects = [{effects}]\n[task]", 1))
+        notes = Workspace(w.folder).propose().proposal.notes
+        (note,) = [note for note in notes if "counts as held" in note]
+        assert f"tau = {5 * np.cos(0.3):.4g}" in note.partition("start = ")[2]
+
+
 PLANE = """
 from math import sin, cos
 from grounded import Model, Param

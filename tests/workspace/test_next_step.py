@@ -139,6 +139,50 @@ def test_nothing_claimed_nothing_to_adopt(cart, tmp_path):
     assert last(grounded("-C", folder, "status")) == "grounded export best --runner"
 
 
+LAGGING = {"signal": "v", "finding": "", "kind": "lag", "delay_s": 0.03, "corrected": True}
+
+
+def test_a_filter_of_a_sensor_is_adopted_with_the_physics(cart, tmp_path):
+    """A cart-pole's swing-up crashed on the plan of a model that had fresh speeds: -2.7 with it."""
+    folder = copied(cart, tmp_path / "w")
+    diagnosed(folder, preflight=[LAGGING])
+    command = last(grounded("-C", folder, "status"))
+    assert command == "grounded adopt viscous_friction:v sensor_lag:v"
+    done = grounded("-C", folder, *shlex.split(command)[1:], "--json").json
+    assert done["effects"][-1] == {"name": "sensor_lag:v", "tau": 0.03}
+    assert done["params"] == {"mass": 1.4}
+    assert "v_true" in " ".join(Folder(folder).planner.plan.model.state_names)
+    assert last(grounded("-C", folder, "status")) == "grounded diagnose"
+
+
+def test_a_filter_is_adopted_alone_where_nothing_else_was_found(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    nothing = {"kind": "none", "effects": [], "sentence": "None."}
+    diagnosed(folder, verdict=nothing, preflight=[LAGGING])
+    assert last(grounded("-C", folder, "status")) == "grounded adopt sensor_lag:v"
+    done = grounded("-C", folder, "adopt", "sensor_lag:v", "--json").json
+    assert done["claimed"] and done["params"] == {}  # what was calibrated is another question
+    assert grounded("-C", folder, "adopt", "--undo").code == 0
+    assert last(grounded("-C", folder, "status")) == "grounded export best --runner"
+
+
+@pytest.mark.parametrize(
+    "finding",
+    [
+        LAGGING | {"delay_s": 1e-4},  # of a step of 50 ms
+        LAGGING | {"corrected": False},
+        LAGGING | {"log": "delay_s = 0.03"},
+        LAGGING | {"kind": "delay"},
+    ],
+)
+def test_a_filter_that_makes_no_difference_or_is_mended_elsewhere_is_not_adopted(
+    cart, tmp_path, finding
+):
+    folder = copied(cart, tmp_path / "w")
+    diagnosed(folder, preflight=[finding])
+    assert last(grounded("-C", folder, "status")) == "grounded adopt viscous_friction:v"
+
+
 def test_a_damaged_diagnosis_is_made_again(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     (folder / "reports" / "diagnosis.json").write_text("[")
