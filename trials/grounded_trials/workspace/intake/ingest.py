@@ -129,6 +129,7 @@ def ingest_log(
         warnings=warnings,
         signals=read.signals,
         verdict=verdict,
+        crashed=tried.failed if tried and verdict == "crashed" else (),
         notes=(*read.notes, *(odd_run(workspace, now, added.id) if now and read.doubted else ())),
         off_target=off_target_of(workspace.task, judged),
         then=after_log(workspace, verdict, now),
