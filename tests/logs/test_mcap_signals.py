@@ -226,7 +226,7 @@ def test_a_log_that_is_missing_is_none_of_the_candidates_beside_it(tmp_path):
         log_files(tmp_path / "s1.csv")
     assert "c000" not in str(missing.value) and "target" not in str(missing.value)
     (tmp_path / "s2.csv").touch()
-    with pytest.raises(GroundedError, match=re.escape("did you mean 's2.csv'")):
+    with pytest.raises(GroundedError, match=r"did you mean 's2\.csv'"):
         log_files(tmp_path / "s1.csv")
 
 
