@@ -171,8 +171,10 @@ def agreed(
     signals.read(fields)
 
     def like(a: str, b: str) -> Follows | None:
-        gridded = signals.grid((a, b))
-        return follows(*gridded[1], gridded[0]) if gridded else None
+        if (gridded := signals.grid((a, b))) is None:
+            return None
+        step, (position, rate) = gridded
+        return follows(position, rate, step)
 
     own = like(q.path, w.path)
     if own is None or own.correlation < SURELY or abs(own.slope - 1) > SAME:
