@@ -24,7 +24,7 @@ from grounded_trials.workspace.intake.other_scale import (
 from grounded_trials.workspace.intake.run_start import TRIED, Recording, recording
 from grounded_trials.workspace.intake.who_drove import follows
 
-PAIRS = 66  # of states that are tried in each other's column: all of twelve
+PAIRS = 28  # of states that are tried in each other's column: all of eight
 PACES = (2.0, 0.5)  # of a recording that was played twice as fast, or half
 
 
