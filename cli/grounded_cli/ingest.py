@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded.errors import NextCommand
+from grounded.result import listed
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, progress, remark, sentence, show, show_json, table
@@ -96,7 +97,7 @@ def _tell(name: str, one: Ingested) -> None:
     if not one.candidate:
         show(field("data", "for fit and diagnose: it ran no candidate", "  "))
     else:
-        meaning = VERDICTS.get(one.verdict, "")
+        meaning = _earlier(one) or VERDICTS.get(one.verdict, "")
         text = f"utility {number(one.utility)}, {one.verdict}{meaning}"
         show(field(one.candidate, text, "  "))
     if one.off_target:
@@ -116,3 +117,13 @@ def _tell(name: str, one: Ingested) -> None:
         ]
         header = ("signal", "Hz", "jitter ms", "gap ms", "skew ms", "bridged", "range")
         show(table(rows, header))
+
+
+def _earlier(one: Ingested) -> str:
+    """That other runs than this one crashed; "" where this one did, or none."""
+    if not one.crashed or one.trial in one.crashed:
+        return ""
+    return (
+        f": this run came to its end, but {listed(one.crashed)} did not, and one such run fails "
+        "the candidate (`discard` takes out a run that somebody stopped)"
+    )

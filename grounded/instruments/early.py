@@ -1,12 +1,16 @@
 """States that answer commands before they are sent: two clocks that were put together wrongly.
 
 No physics does that. A run of a feedback controller looks like it, though: its commands follow the
-states, so what will be sent tells how a disturbance goes on. But it tells it with the wrong sign,
-and not as the model says. So the model predicts a quarter of a second ahead with the commands as
-they are logged and with commands of later, both times calibrated (`short_runs`), and the later ones
-are believed where they leave much less, do about what the model says, and no causal change of the
-model leaves as little: a delay, gains and parameters, a quicker actuator (commands ahead by their
-own slope). Less than EARLY_S is not looked for: that little an actuator's crude lag may make.
+states, so what will be sent tells how the motion goes on; a friction or a back-EMF that the model
+lacks makes the robot quicker than the model as well. So the model predicts a quarter of a second
+ahead with the commands as they are logged and with commands of later, both times calibrated
+(`short_runs`) and without what is linear in the states, which a friction would be. The later ones
+are believed where they do about what the model says and leave much less than whatever the commands
+up to then may do: by the model with a delay, gains, parameters or a quicker actuator (commands
+ahead by their own slope), and by any law that is linear in them. A smooth motion foretells its own
+commands, so that such a law follows it as well as the commands of later do; of a short one it
+follows nearly all. Less than EARLY_S is not looked for: that little an actuator's crude lag may
+make.
 """
 
 from __future__ import annotations
@@ -26,7 +30,7 @@ from grounded.trial import Trial
 
 EARLY_S, REACH_S, GRID_S = 0.1, 1.0, 0.05  # [s] the least and the most that is looked for, and how
 PART = 0.25  # of a trial, at most
-HINT, CLEAR = 0.5, 2.0  # [nats] by which later commands must lower the errors: as it is, calibrated
+HINT, CLEAR = 0.5, 0.8  # [nats] by which later commands must lower the errors: as it is, calibrated
 HALF = 0.5  # of the error of one state at least
 LIKE = 4.0  # times what the model says, or a part of it: what gain an input may have
 LEADS = (0.1, 0.3)  # [s] by which commands are ahead of themselves, by their slope
@@ -111,11 +115,12 @@ def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | N
     trial, known = _with_differences(model, trial, seen)
 
     def later(k: int) -> Ahead:
-        return Ahead(model, _moved(trial, k, reach), known, STARTS, delays=(0.0,))
+        moved = _moved(trial, k, reach)
+        return Ahead(model, moved, known, STARTS, delays=(0.0,), linear=True)
 
     ones = np.ones(model.m)
     with np.errstate(all="ignore"):
-        logged = Ahead(model, _moved(trial, 0, reach), known, STARTS)
+        logged = Ahead(model, _moved(trial, 0, reach), known, STARTS, linear=True)
         if not logged.enough:
             return None
         moved = {k: later(k).plain(ones).score for k in range(least, reach + 1, every)}
@@ -127,10 +132,12 @@ def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | N
         k = min(fits, key=lambda k: fits[k].score)
         if fits[k].score > logged.still().score - CLEAR:
             return None  # commands tell nothing
-        before = min(
-            (logged.best([ones, np.zeros(model.m)]), *_quicker(model, trial, reach, known)),
-            key=lambda fit: fit.score,
-        )
+        causal = [
+            logged.best([ones, np.zeros(model.m)]),
+            logged.whatever_commands_do().best([ones]),
+            *_quicker(model, trial, reach, known),
+        ]
+        before = min(causal, key=lambda fit: fit.score)
     parts = fits[k].rms / before.rms
     if before.score - fits[k].score < CLEAR or parts.min() > HALF:
         return None
@@ -161,7 +168,7 @@ def _quicker(model: Model, trial: Trial, reach: int, known: Sequence[int]) -> li
     sent = trial.inputs
     slope = np.diff(sent, axis=0, prepend=sent[:1]) / trial.dt
     ahead = [replace(trial, inputs=sent + lead * slope) for lead in LEADS]
-    some = [Ahead(model, _moved(one, 0, reach), known, STARTS) for one in ahead]
+    some = [Ahead(model, _moved(one, 0, reach), known, STARTS, linear=True) for one in ahead]
     return [one.best([np.ones(model.m)]) for one in some]
 
 

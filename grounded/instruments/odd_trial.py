@@ -207,19 +207,32 @@ def missed(
     model: Model, trial: Trial, some: Sequence[int], shown: Sequence[int], unit: Array | float = 1.0
 ) -> float:
     """Rms error of predictions a quarter of a second ahead, of the states `some` together."""
+    if (ahead := predicted(model, trial, shown)) is None:
+        return float("nan")
+    _, x, logged = ahead
+    return size_of(model.difference(x, logged)[:, some] / unit)
+
+
+def predicted(
+    model: Model, trial: Trial, shown: Sequence[int]
+) -> tuple[Array, Array, Array] | None:
+    """Logged states (N, n), what the model makes of them in 0.25 s, those logged then.
+
+    None where too little is known. States that are not `shown` are taken for 0.
+    """
     steps = max(1, round(AHEAD / trial.dt))
     logged = np.array(trial.states)
     logged[:, [i for i in range(model.n) if i not in shown]] = 0.0  # nobody knows
     good = np.asarray(np.isfinite(logged).all(axis=1))
     at = np.flatnonzero(good[:-steps] & good[steps:])
     if len(at) < 5:
-        return float("nan")
+        return None
     at = at[:: max(1, len(at) // STARTS)]
     x = logged[at]
     for j in range(steps):
         x = model.system.step(x, trial.inputs[at + j], model.values, trial.dt)
         x = np.fmax(np.fmin(x, FAR), -FAR)
-    return size_of(model.difference(x, logged[at + steps])[:, some] / unit)
+    return logged[at], x, logged[at + steps]
 
 
 def judge_stamps(model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios]) -> None:

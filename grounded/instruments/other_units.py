@@ -24,6 +24,8 @@ from grounded.instruments.odd_trial import (
     Odd,
     Ratios,
     missed,
+    predicted,
+    ratios_of,
     size_of,
     slow_or_fast,
     spread,
@@ -31,8 +33,11 @@ from grounded.instruments.odd_trial import (
 from grounded.model import Model
 from grounded.trial import Trial
 
-FACTORS = (STAMPS, 100.0, 0.01, 1 / STAMPS)  # a position's rate over its velocity
+MILLION = STAMPS**2  # mm for m, multiplied by a thousand once more
+FACTORS = (MILLION, STAMPS, 100.0, 0.01, 1 / STAMPS, 1 / MILLION)  # rates by velocities
+MEND = "Multiply the scale in [log] (1 where none is given), or correct the log"
 TOLD = 0.5  # of how far a velocity changes, and of the other's error: a model that explains it
+ALIKE = 30.0  # times as large, or as small, as a crude model makes a change
 PREFIXES = {1000.0: "m", 100.0: "c"}
 SINGLE = ("m", "rad", "V", "A", "N")  # units that are written with a prefix
 
@@ -73,8 +78,20 @@ def judge_units(
         return
     clauses = [_clause(model, trials, ratios, one, found, shown) for one in found]
     odd = sorted({k for one in found for k in one.trials})
-    mend = "Multiply the scale in [log] (1 where none is given), or correct the log"
-    raise unusable(trials, odd, "; ".join(clauses), mend)
+    raise unusable(trials, odd, "; ".join(clauses), MEND)
+
+
+def units_apart(model: Model, trial: Trial, shown: Sequence[int]) -> list[str]:
+    """What one trial says of that by itself, a clause for each position and velocity.
+
+    Args:
+        model: however crude.
+        trial: without gaps.
+        shown: states that a sensor has.
+    """
+    ratios = ratios_of(model, [trial], shown)
+    found = list(_found(ratios))
+    return [_clause(model, [trial], ratios, one, found, shown) for one in found]
 
 
 def unusable(trials: Sequence[Trial], odd: Sequence[int], clauses: str, mend: str) -> GroundedError:
@@ -124,7 +141,7 @@ def _clause(
         f"{names[one.relation.i]} moves {ratio:.4g} times as fast as {names[one.relation.j]} says: "
         f"{described(model, first.states[0], first.factor)}"
     )
-    if not one.sound:
+    if not (one.sound or _clear(model, trials[one.trials[0]], one, shown, first, second)):
         text += f", or else {described(model, second.states[0], second.factor)}"
         if slow_or_fast(model, ratios[one.trials[0]]) is not None:
             text += ", or the stamps are in milliseconds" if one.factor < 1 else ""
@@ -150,9 +167,44 @@ def _ranked(
     votes = [sum(c.states[0] in (r.relation.i, r.relation.j) for r in found) for c in (a, b)]
     if votes[0] != votes[1]:  # a velocity that is the position of another
         return (a, b) if votes[0] > votes[1] else (b, a)
-    error = [_unexplained(model, c.mended(odd), one.relation.j, shown) for c in (a, b)]
-    swap = error[1] < TOLD and error[1] < TOLD * error[0]
+    swap = _explains(model, odd, one, shown, b, a) or _clear(model, odd, one, shown, b, a)
     return (b, a) if swap else (a, b)
+
+
+def _explains(
+    model: Model, trial: Trial, one: _Off, shown: Sequence[int], first: Odd, second: Odd
+) -> bool:
+    """Whether the model explains the velocity with the first mended, and not with the second."""
+    j = one.relation.j
+    a, b = (_unexplained(model, odd.mended(trial), j, shown) for odd in (first, second))
+    return a < TOLD and a < TOLD * b
+
+
+def _clear(
+    model: Model, trial: Trial, one: _Off, shown: Sequence[int], first: Odd, second: Odd
+) -> bool:
+    """Whether the model says which of the two it is: of factors that no common unit is apart by.
+
+    It explains the velocity with the first mended. Or, however crude, it makes about as large a
+    change of it as was logged, and one that is not comparable with the second mended in its place.
+    """
+    if max(one.factor, 1 / one.factor) <= STAMPS:
+        return False
+    if _explains(model, trial, one, shown, first, second):
+        return True
+    a, b = (_off_by(model, odd.mended(trial), one.relation.j, shown) for odd in (first, second))
+    return a < ALIKE < STAMPS < b
+
+
+def _off_by(model: Model, trial: Trial, j: int, shown: Sequence[int]) -> float:
+    """How many times too large, or too small, a model's change of a velocity is."""
+    if (ahead := predicted(model, trial, shown)) is None:
+        return float("nan")
+    start, then, logged = ahead
+    made, seen = (size_of(model.difference(x, start)[:, [j]]) for x in (then, logged))
+    if not (made > 0 and seen > 0):
+        return np.inf if made != seen else np.nan
+    return max(made / seen, seen / made)
 
 
 def _unexplained(model: Model, trial: Trial, j: int, shown: Sequence[int]) -> float:

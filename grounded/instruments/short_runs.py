@@ -1,7 +1,9 @@
 """What a model makes of one trial a quarter of a second ahead, from many of its samples at once.
 
 Its uncertain parameters and a gain on every input may move, all commands may be late, and a
-constant rate of each state is left out: what remains no plain calibration takes away.
+constant rate of each state is left out: what remains no plain calibration takes away. On request
+all that is linear in the states is left out as well (friction, back-EMF, springs that the model
+lacks), and what is linear in the commands.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ DELAYS = (0.0, 0.05, 0.1, 0.2)  # [s], of all commands
 LEAST = 20  # samples that tell enough
 LITTLE, TINY = 1e-3, 1e-12  # of a state's spread, and in its unit: no smaller error counts
 ROUNDS, DAMPING, SLOPE = 5, (1.0, 0.3, 0.1), 0.02
+SAME = 1e-6  # of the largest: columns that say the same
 ENOUGH = 0.01  # [nats]: a round that gains less is the last
 
 
@@ -50,6 +53,7 @@ class Ahead:
         shown: states that a sensor has.
         starts: samples to predict from, at most.
         delays: that all commands may have [s].
+        linear: leave out what is linear in the states predicted from, too.
     """
 
     def __init__(
@@ -59,6 +63,8 @@ class Ahead:
         shown: Sequence[int],
         starts: int,
         delays: Sequence[float] = DELAYS,
+        *,
+        linear: bool = False,
     ) -> None:
         self.model, self.shown, self.sent, self.dt = model, list(shown), trial.inputs, trial.dt
         self.steps = max(1, round(AHEAD / trial.dt))
@@ -70,6 +76,7 @@ class Ahead:
         at = at[(at >= max(self.delays)) & (at + self.steps <= len(self.sent))]
         self.at = at[:: -(-len(at) // starts)] if len(at) else at
         self.first, self.last = logged[self.at], logged[self.at + self.steps]
+        self.left_out = _basis(self.first[:, self.shown] if linear else self.first[:, :0])
         self.least = LITTLE * np.nanstd(logged[:, self.shown], axis=0) + TINY
         params = list(model.params.values())
         self.moving = [k for k, param in enumerate(params) if param.uncertain]
@@ -86,6 +93,17 @@ class Ahead:
     def enough(self) -> bool:
         """Whether there are samples to tell anything by."""
         return len(self.at) >= LEAST and bool(self.shown)
+
+    def whatever_commands_do(self) -> Ahead:
+        """The same, and what is linear in the commands before and while they act is left out."""
+        h, half = self.steps, max(1, self.steps // 2)
+        sums = np.concatenate([np.zeros((1, self.model.m)), np.cumsum(self.sent, axis=0)])
+        spans = [(-h, 0), (0, half)] + ([(half, h)] if half < h else [])
+        starts = [np.maximum(self.at + a, 0) for a, _ in spans]
+        told = [sums[self.at + b] - sums[a] for a, (_, b) in zip(starts, spans, strict=True)]
+        other = self._with(self.sent)
+        other.left_out = _basis(np.hstack([self.left_out, *told]))
+        return other
 
     def plain(self, gains: Array) -> Fit:
         """As the model is, with some gains (m,) of its inputs."""
@@ -149,13 +167,13 @@ class Ahead:
         return self._fit(size, found)
 
     def _off(self, gains: Array, values: Array, late: int) -> Array:
-        """Errors (N, shown) without their means."""
+        """Errors (N, shown) without what is left out: their means at least."""
         x, sent = self.first, self.sent * gains
         for j in range(self.steps):
             x = self.model.system.step(x, sent[self.at + j - late], values, self.dt)
             x = np.fmax(np.fmin(x, FAR), -FAR)
         off = self.model.difference(x, self.last)[:, self.shown]
-        return np.asarray(off - off.mean(axis=0))
+        return np.asarray(off - self.left_out @ (self.left_out.T @ off))
 
     def _size(self, off: Array) -> Array:
         size = np.sqrt((off**2).mean(axis=0))
@@ -165,3 +183,13 @@ class Ahead:
         rms = np.ones(self.model.n)
         rms[self.shown] = size
         return Fit(rms, gains)
+
+
+def _basis(told: Array) -> Array:
+    """An orthonormal basis (N, k) of a constant and the columns told (N, m)."""
+    told = told - told.mean(axis=0) if len(told) else told
+    spread = told.std(axis=0) if len(told) else np.zeros(told.shape[1])
+    own = spread > TINY
+    columns = np.hstack([np.ones((len(told), 1)), told[:, own] / spread[own]])
+    turned, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(turned[:, size > SAME * size.max(initial=0.0)])

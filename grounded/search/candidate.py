@@ -123,6 +123,12 @@ class Tried(Result):
             return float("nan")
         return float(self.deviation / np.sqrt(len(self.utilities)))
 
+    @property
+    def failed(self) -> tuple[str, ...]:
+        """The names of its trials that did not run to the end."""
+        each = zip(self.trials, self.utilities, strict=True)
+        return tuple(trial.id for trial, utility in each if utility == -np.inf)
+
     def verdict(self, last: bool = True) -> str:
         """What became of the candidate: first, better, no better, crashed; or why not decided.
 

@@ -6,6 +6,7 @@ from test_swapped import PLANE, SLED, driven
 
 from grounded import Model, Param
 from grounded.errors import GroundedError
+from grounded.instruments.other_units import units_apart
 from grounded.instruments.preflight import preflight
 from grounded.trial import Trial
 
@@ -65,6 +66,21 @@ def test_what_the_model_makes_of_the_velocity_says_which_is_off(by, first):
     """Logs have mm rather than km; but here commands tell how large the velocity must be."""
     said = str(stopped(SLED, [scaled(driven(SLED), **by)]))
     assert said.index(first) < said.index("or else") and "stamps" in said
+
+
+@pytest.mark.parametrize(
+    ("by", "named"), [({"v": 1e6}, "v"), ({"x": 1e-6}, "x"), ({"x": 1e6}, "x")]
+)
+def test_a_factor_of_a_million_is_named_with_the_one_that_it_is(by, named):
+    """`v: shows 1e+08 % of the rate of x; either may be wrong`: a scale put upside down."""
+    trial = scaled(driven(SLED), **by)
+    said = str(stopped(SLED, [trial]))
+    (factor,) = by.values()
+    assert f"{named} looks 1e+06 times" in said and "or else" not in said
+    assert f"[log.state.{named}] scale = {1 / factor:g}" in said
+    (clause,) = units_apart(SLED, trial, range(SLED.n))
+    assert clause in said
+    assert not units_apart(SLED, driven(SLED), range(SLED.n))
 
 
 def test_the_odd_one_among_sound_trials_is_named_alone():

@@ -218,6 +218,18 @@ def test_what_a_person_is_told(tmp_path: Path) -> None:
     refused(tmp_path / "c.mcap", U, "`recover` saves")
 
 
+def test_a_log_that_is_missing_is_none_of_the_candidates_beside_it(tmp_path):
+    """`valid names: c0001.npz, ...`: those are to be run, and no logs."""
+    for name in ("c0001.npz", "c0002.mcap", "target.csv"):
+        (tmp_path / name).touch()
+    with pytest.raises(GroundedError, match="does not exist") as missing:
+        log_files(tmp_path / "s1.csv")
+    assert "c000" not in str(missing.value) and "target" not in str(missing.value)
+    (tmp_path / "s2.csv").touch()
+    with pytest.raises(GroundedError, match=r"did you mean 's2\.csv'"):
+        log_files(tmp_path / "s1.csv")
+
+
 def one_message(path: Path, encoding: str, schema: tuple[str, str, bytes], body: bytes) -> Path:
     with path.open("wb") as stream:
         writer = Writer(stream)

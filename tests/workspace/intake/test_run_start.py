@@ -491,6 +491,20 @@ def test_commands_that_were_logged_before_the_states_are_a_lead_in(w, tmp_path):
         w.ingest(late)
 
 
+def test_a_delay_that_puts_states_off_is_named_where_a_run_seems_to_begin_too_early(tmp_path):
+    """What to take out where the clocks were said to differ, and did not."""
+    w = waiting(tmp_path)
+    log = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0)
+    toml = w.folder / "grounded.toml"
+    written = toml.read_text()
+    toml.write_text(written.replace('path = "/csv.x"\n', 'path = "/csv.x"\ndelay_s = -0.24\n'))
+    assert toml.read_text() != written
+    with pytest.raises(GroundedError, match=r"\[log\.state\.x\] delay_s = -0\.24 .*take that out"):
+        Workspace(w.folder).ingest(log, candidate="c0002")
+    toml.write_text(written)
+    assert Workspace(w.folder).ingest(log, candidate="c0002").candidate == "c0002"
+
+
 @pytest.mark.parametrize("before", [0.91, 0.92, 0.93, 0.94])
 def test_a_run_whose_commands_are_logged_as_they_are_sent_begins_with_its_own(w, tmp_path, before):
     """A step too early, and the log was blamed for it."""

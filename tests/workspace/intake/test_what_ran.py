@@ -188,6 +188,23 @@ def test_a_run_that_ended_early_says_how_to_take_it_back(waiting, tmp_path):
         assert found.verdict == "crashed" or candidate == "c0001"
 
 
+def test_a_candidate_that_crashed_before_names_the_run_that_did(tmp_path):
+    """Of a run that came to its end: `c0010 utility -83.04, crashed: it did not run to the end`."""
+    w = Workspace(make(tmp_path / "w").folder)
+    ran = w.run(w.propose().candidate.id).trial_file
+    short = w.ingest(said_to_have_run("c0001", ran, tmp_path / "short.mcap", 20))
+    assert short.crashed == (short.trial,)
+    run = said_to_have_run("c0001", ran, tmp_path / "run.mcap", nudge=1e-9)
+    done = grounded("-C", w.folder, "ingest", run)
+    told = " ".join(done.out.split())
+    assert holds(told, "t0002", f"{short.trial} did not") and "it did not run" not in told
+    again = w.ingest(run)
+    assert (again.verdict, again.crashed) == ("crashed", ("t0001",))
+    assert np.isfinite(again.utility) and again.to_json()["crashed"] == ["t0001"]
+    w.discard(short.trial)
+    assert (w.ingest(run).verdict, w.ingest(run).crashed) == ("first", ())
+
+
 def test_a_discarded_trial_counts_nowhere_until_it_is_restored(waiting):
     w, _, driven = waiting
     w.ingest(w.run().trial_file)

@@ -30,6 +30,7 @@ from grounded_trials.logs.inspect_pairs import (
     COMBINATIONS,
     FOLLOWS,
     Signals,
+    agreed,
     paired,
     velocities,
 )
@@ -78,6 +79,8 @@ def weigh(
     pairs = [(q, w) for q, w in velocities(model).items() if q in guesses and w in guesses]
     for pair in sorted(pairs, key=lambda qw: not any(guesses[name].path for name in qw)):
         guesses |= paired(guesses, pair, signals, units, log)
+    for pair in pairs:
+        guesses |= agreed(guesses, pair, signals, units, log)
     guesses |= by_steps(model, guesses, signals)
     guesses |= _taken_by_inputs(guesses, model)
     guesses = {name: _as_logged(guess, log) for name, guess in guesses.items()}

@@ -17,12 +17,12 @@ from grounded.errors import GroundedError
 from grounded.instruments.kinematics import integrals
 from grounded.model import Model
 from grounded_trials.formats.messages import Floats
-from grounded_trials.logs.following import DEGREE, SAME, follows, scale_of
+from grounded_trials.logs.following import DEGREE, SAME, Follows, follows, scale_of
 from grounded_trials.logs.inspect_guess import SIMULATED_S, Guess
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.samples import Samples, tidy
 from grounded_trials.logs.signals import Series, SignalSpec, read_signals
-from grounded_trials.logs.stated_units import Stated
+from grounded_trials.logs.stated_units import Stated, factor_between
 
 SLOPE = 0.01
 FOLLOWS = 0.8  # correlation of a rate with the derivative of its position
@@ -143,6 +143,47 @@ def _derivative(q: Guess, w: Guess, signals: Signals, units: Mapping[str, str]) 
         why += f", but {best.slope:.3g} times as large"
         found_w = replace(found_w, sure=False)
     return {q.name: found_q, w.name: replace(found_w, reasons=(*found_w.reasons, why))}
+
+
+def agreed(
+    guesses: Mapping[str, Guess],
+    pair: tuple[str, str],
+    signals: Signals,
+    units: Mapping[str, str],
+    log: LogReport,
+) -> dict[str, Guess]:
+    """A position and its rate that are sure without a name: all that the log says agrees.
+
+    The position's is the only number in a unit of its kind, the rate's follows its derivative in
+    that unit, and neither of them fits any other number so.
+    """
+    stated, (q, w) = signals.stated, (guesses[name] for name in pair)
+    fields = [f.path for t in log.topics for f in t.fields if f.low != f.high]
+    if (q.sure and w.sure) or not (q.path and w.path) or len(fields) > MANY:
+        return {}
+
+    def of_its_kind(path: str) -> bool:
+        said = stated.unit(path)
+        return bool(said) and factor_between(said, units[q.name]) is not None
+
+    if [path for path in fields if of_its_kind(path)] != [q.path]:
+        return {}
+    signals.read(fields)
+
+    def like(a: str, b: str) -> Follows | None:
+        if (gridded := signals.grid((a, b))) is None:
+            return None
+        step, (position, rate) = gridded
+        return follows(position, rate, step)
+
+    own = like(q.path, w.path)
+    if own is None or own.correlation < SURELY or abs(own.slope - 1) > SAME:
+        return {}
+    rest = [path for path in fields if path not in (q.path, w.path)]
+    rivals = [like(q.path, path) for path in rest] + [like(path, w.path) for path in rest]
+    if any(one is not None and abs(one.correlation) > FOLLOWS for one in rivals):
+        return {}
+    return {one.name: replace(one, sure=True, others=()) for one in (q, w)}
 
 
 def rates_among(log: LogReport, paths: Sequence[str]) -> dict[str, tuple[str, float]]:

@@ -30,6 +30,7 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 _LISTED = re.compile(
     r"^\s*-\s+(?:path:\s*)?[\"']?([^\"'\s#]+\.(?:mcap|db3)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE
 )
+_NO_LOG = re.compile(r"c\d{4,}\.\w+|target\.csv")  # a candidate, as it was exported, or a target
 _DIGITS = re.compile(r"(\d+)")
 
 
@@ -81,9 +82,10 @@ def _nearby(path: Path) -> str:
     """What to do about a file that is not there."""
     if not path.parent.is_dir():
         return f", nor does its folder {path.parent}: name a log, seen from the folder you are in"
-    names = sorted(p.name for p in path.parent.iterdir() if p.name.endswith(KINDS))
+    there = (p.name for p in path.parent.iterdir() if p.name.endswith(KINDS))
+    names = sorted(name for name in there if not _NO_LOG.fullmatch(name))
     if names:
-        return f": {nearest(path.name, names[:5])}"
+        return f": {nearest(path.name, names)}"
     return ": name a log or a bag's folder, seen from the folder you are in"
 
 

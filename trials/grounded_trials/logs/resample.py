@@ -12,7 +12,7 @@ else is counted and reported.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -42,6 +42,8 @@ from grounded_trials.logs.signals import Clock, Series, SignalSpec
 START, END = "[log.span] start", "[log.span] end"  # names of the series that a span watches
 ABSOLUTE_S = 1e8  # a time beyond this is a stamp, not one that counts from the log's beginning
 STEP_LIMIT = 2_000_000
+UNITS_OF_TIME = (1e3, 1e6, 1e9)  # seconds that were read as milliseconds, say
+MANY, STEPS_APART = 10, (0.02, 3.0)  # samples that tell so, as far apart as a log's may be
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,7 @@ def to_grid(
     moved, uneven = (0, "") if rest is None else first_step(sent, start, dt, unknown)
     start += moved
     stop = min(until, _end(span, series, start, origin, until))
-    count = _steps(start, stop, dt, steps, origin)
+    count = _steps(start, stop, dt, steps, origin, _stamped_otherwise(samples.values(), dt))
     grid = start + np.round(dt * 1e9 * np.arange(count + 1)).astype(np.int64)
     middle = start + np.round(dt * 1e9 * (np.arange(count) + 0.5)).astype(np.int64)
     columns, reports = [], []
@@ -242,12 +244,26 @@ def _crossing(crossing: Crossing, series: Series, which: str, after: int | None)
     return int(t[np.argmax(beyond)])
 
 
-def _steps(start: int, stop: int, dt: float, most: int | None, origin: int) -> int:
+def _stamped_otherwise(samples: Iterable[Samples], dt: float) -> str:
+    """What says that times are in another unit: samples that would come about every step."""
+    many = [one for one in samples if len(one.t) >= MANY]
+    every = max((one.interval for one in many), default=0.0)
+    for factor in UNITS_OF_TIME:
+        if STEPS_APART[0] * dt <= factor * every <= STEPS_APART[1] * dt:
+            return (
+                f". Its samples are {every:.3g} s apart; times {factor:g} they would be "
+                f"{factor * every:.3g} s: are its times in another unit than their column says "
+                "(seconds under t_ms)?"
+            )
+    return ""
+
+
+def _steps(start: int, stop: int, dt: float, most: int | None, origin: int, hint: str) -> int:
     count = int(np.floor((stop - start) / (dt * 1e9) + 1e-6))
     if not 1 <= count <= STEP_LIMIT:
         raise GroundedError(
             f"the trial would have {max(count, 0)} steps of {dt} s: it starts {_s(start, origin)} "
-            f"and ends {_s(stop, origin)} after the log's first sample; see [log.span]"
+            f"and ends {_s(stop, origin)} after the log's first sample{hint or '; see [log.span]'}"
         )
     return count if most is None else min(count, most)
 

@@ -95,11 +95,23 @@ class ForeignLog:
         Raises:
             GroundedError: if a state is first known after it began.
         """
-        if found.late_s > self.workspace.config.task.dt / 2:
+        dt = self.workspace.config.task.dt
+        if found.late_s > dt / 2:
+            put_off = [
+                f"[log.state.{name}] delay_s = {one.spec.delay_s:g}"
+                for name, one in self.series.items()
+                if name in self.mapping.states and one.spec.delay_s < dt - found.late_s
+            ]
+            mend = "Start recording before the run"
+            if put_off:
+                mend = (
+                    f"{listed(put_off)} put{'s' * (len(put_off) == 1)} states later by about as "
+                    "much: take that out, unless the clocks do differ so; else start recording "
+                    "before the run"
+                )
             raise GroundedError(
                 f"{self.path}: the run starts {found.late_s:.2f} s before every state is known: "
-                "the trial's time would not be the candidate's. Start recording before the run, "
-                "or take it in with --data"
+                f"the trial's time would not be the candidate's. {mend}, or take it in with --data"
             )
 
     @property

@@ -27,11 +27,12 @@ from grounded_trials.store.store import DIGITS
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.intake.acted_on import sender_of
+from grounded_trials.workspace.intake.earlier_task import OfEarlierTask, of_earlier_task
 from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.intake.odd_run import odd_run
 from grounded_trials.workspace.intake.other_scale import other_units, units_told
-from grounded_trials.workspace.intake.read_otherwise import pace_of, unit_of
+from grounded_trials.workspace.intake.read_otherwise import misled, pace_of, unit_of
 from grounded_trials.workspace.intake.reading import (
     NoneWaits,
     Read,
@@ -56,7 +57,7 @@ from grounded_trials.workspace.intake.stored_before import (
     same_recording,
     what_repeats,
 )
-from grounded_trials.workspace.intake.trial_check import mistaken_in, warnings_about
+from grounded_trials.workspace.intake.trial_check import dead_sensors, mistaken_in, warnings_about
 from grounded_trials.workspace.intake.who_drove import OTHERS, Following, suspicion
 from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of
@@ -129,6 +130,7 @@ def ingest_log(
         warnings=warnings,
         signals=read.signals,
         verdict=verdict,
+        crashed=tried.failed if tried and verdict == "crashed" else (),
         notes=(*read.notes, *(odd_run(workspace, now, added.id) if now and read.doubted else ())),
         off_target=off_target_of(workspace.task, judged),
         then=after_log(workspace, verdict, now),
@@ -141,6 +143,8 @@ def _by_its_commands(workspace: Folder, path: Path, error: NoneWaits) -> Grounde
         return error
     try:
         _recognised(workspace, path, read_log_file(workspace, path, error.best, False), None)
+    except OfEarlierTask as refused:
+        return refused
     except GroundedError as refused:
         return GroundedError(str(error), refused.then)
     return error
@@ -195,7 +199,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     )
     if candidate is not None:
         seem = f"{listed(units)}, times {by:.6g}, would be its run: another unit, or sign?"
-        doubts = [seem if units else pace or why]
+        doubts = [seem if units else pace or misled(log, workspace.task, own.policy) or why]
         if log and not (found and found.opens_alike):
             doubts.append(
                 f"no start of {ran} was found in it: it is taken from {log.first:.3f} s on, its "
@@ -213,8 +217,19 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             f"diagnosis, or with --candidate {ran} all the same",
             NextCommand("ingest", (str(path), "--data")),
         )
+    if not other and (left := of_earlier_task(workspace, log, whole)):
+        raise OfEarlierTask(
+            f"{path} ran {left}, which was made for an earlier task (other target, reward, limits, "
+            "start or horizon): its utility can't be compared. Take it in with --data for fitting "
+            "and diagnosis, and run a candidate of this task",
+            NextCommand("ingest", (str(path), "--data")),
+        )
     sent, _ = mistaken_in(workspace.base_model, replace(read.trial, id=""))
-    if named := [*(misread(read.log) if read.log else ()), *sent]:
+    named = [*(misread(read.log) if read.log else ()), *sent]
+    named += dead_sensors(workspace.base_model, whole)
+    if not named and not other:
+        named += filter(None, [misled(log, workspace.task, own.policy)])
+    if named:
         raise GroundedError(f"{path} is not read as a run of {ran}: {'; '.join(named)}")
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
     if log and (guessed := [n for n in log.names[0] if n not in log.logged]):

@@ -25,6 +25,7 @@ class Ingested(Result):
     warnings: tuple[str, ...]
     signals: tuple[SignalReport, ...]  # for a foreign log
     verdict: str = ""  # a word of `wording.verdict`, run again, probe; "" for data
+    crashed: tuple[str, ...] = ()  # the candidate's trials that ended early, where it crashed
     notes: tuple[str, ...] = ()  # where in a longer log the run was found
     off_target: tuple[OffTarget, ...] = ()  # how far the run is off it, in units
     then: NextCommand = PROPOSE
@@ -44,6 +45,7 @@ class Ingested(Result):
             "failed": self.utility == float("-inf"),
             "accepted": self.accepted,
             "verdict": self.verdict or None,
+            "crashed": list(self.crashed),
             "off_target": [one.to_json() for one in self.off_target],
             "warnings": list(self.warnings),
             "notes": list(self.notes),

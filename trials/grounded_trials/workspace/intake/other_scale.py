@@ -8,8 +8,9 @@ every length that it measures, a gyro that is mounted upside down turns the sign
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -106,6 +107,25 @@ def _any_factor(
     return found
 
 
+def any_offset(
+    task: Task, policy: Policy, trial: Trial, names: Sequence[str]
+) -> tuple[str, float] | None:
+    """The state, one of `names`, and the constant without which a trial is a run of a policy."""
+    trial, late = trial.until(task.horizon), latest(task)
+    if (plain := follows(policy, trial, late)) is None or plain.alike:
+        return None
+    trial = trial.until(min(trial.finite_steps, policy.horizon))
+    best, found = min(LEAVES * _left(plain), CLOSE), None
+    for name in names:
+        by = _solved(partial(_off_from, policy, trial, name), 0.0, 1e-4)
+        if not np.isfinite(by):
+            continue
+        fit = follows(policy, _less(trial, name, by), late)
+        if fit and fit.alike and _left(fit) < best and evidence(plain, fit) > DECISIVE:
+            best, found = _left(fit), (name, float(f"{by:.3g}"))
+    return found
+
+
 def _left(ran: Following) -> float:
     """Root mean square of the commands less those of the policy, in units of the largest."""
     return float(np.sqrt(np.nanmean((ran.off / ran.fine) ** 2))) * FINE
@@ -138,13 +158,18 @@ def _of_one_unit(model: Model) -> list[tuple[str, ...]]:
 
 def _factor(policy: Policy, trial: Trial, names: Sequence[str], start: float) -> float:
     """What columns are multiplied by, so that the policy sends the logged commands."""
-    by, small = start, 1e-4
+    return _solved(lambda by: _off(policy, _multiplied(trial, names, by)), start, 1e-4 * start)
+
+
+def _solved(off: Callable[[float], Array], start: float, small: float) -> float:
+    """The number at which what is off is least, by Gauss-Newton; NaN where nothing hangs on it."""
+    by = start
     for _ in range(ROUNDS):
-        here, near = (_off(policy, _multiplied(trial, names, k)) for k in (by, by * (1 + small)))
-        slope = (near - here) / (small * by)
+        here, near = off(by), off(by + small)
+        slope = (near - here) / small
         size = float((slope**2).sum())
         if size <= 0:
-            return np.nan  # nothing hangs on them
+            return np.nan
         step = -float((slope * here).sum()) / size
         by += step
         if not np.isfinite(by) or abs(step) < 1e-6 * abs(by):
@@ -162,12 +187,22 @@ def _off(policy: Policy, trial: Trial) -> Array:
     return off
 
 
+def _off_from(policy: Policy, trial: Trial, name: str, zero: float) -> Array:
+    return _off(policy, _less(trial, name, zero))
+
+
 def _multiplied(trial: Trial, names: Sequence[str], factor: float) -> Trial:
     states, inputs = (
         np.array([factor if name in names else 1.0 for name in every])
         for every in (trial.state_names, trial.input_names)
     )
     return replace(trial, states=trial.states * states, inputs=trial.inputs * inputs)
+
+
+def _less(trial: Trial, name: str, constant: float) -> Trial:
+    states = np.array(trial.states)
+    states[:, trial.state_names.index(name)] -= constant
+    return replace(trial, states=states)
 
 
 def units_tried(model: Model) -> Iterator[tuple[Sequence[str], float]]:

@@ -1,8 +1,12 @@
-"""Whether a run begins in a log that is read otherwise: at another pace, in another unit."""
+"""Whether a run begins in a log that is read otherwise.
+
+At another pace, in another unit, with two states in each other's column, or from another zero.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -10,10 +14,17 @@ from grounded.policy import Policy
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.logs.signals import Series
-from grounded_trials.workspace.intake.other_scale import NEARLY, any_factor, units_tried
+from grounded_trials.wording import with_unit
+from grounded_trials.workspace.intake.other_scale import (
+    NEARLY,
+    any_factor,
+    any_offset,
+    units_tried,
+)
 from grounded_trials.workspace.intake.run_start import TRIED, Recording, recording
 from grounded_trials.workspace.intake.who_drove import follows
 
+PAIRS = 28  # of states that are tried in each other's column: all of eight
 PACES = (2.0, 0.5)  # of a recording that was played twice as fast, or half
 
 
@@ -60,6 +71,63 @@ def unit_of(log: Recording, task: Task, policy: Policy) -> tuple[tuple[str, ...]
             if names:
                 return names, by
     return (), 1.0
+
+
+def misled(log: Recording | None, task: Task, policy: Policy) -> str:
+    """What else a log has wrong that makes it look like nobody's run, and what mends it; or ""."""
+    if log is None:
+        return ""
+    if pair := exchanged_in(log, task, policy):
+        a, b = pair
+        return (
+            f"it would be, with {a} and {b} in each other's column: exchange the paths in "
+            f"[log.state.{a}] and [log.state.{b}], or the columns' heads in the log"
+        )
+    if off := offset_in(log, task, policy):
+        name, by = off
+        much = with_unit(f"{abs(by):.3g}", task.model.states[name])
+        return (
+            f"it would be, were {name} {much} {'less' if by > 0 else 'more'}: is its zero "
+            f"elsewhere than that of the program? Add {-by:.3g} to the offset in "
+            f"[log.state.{name}] (0 where none is given); if the log is right, the robot's program "
+            "measures it wrong"
+        )
+    return ""
+
+
+def exchanged_in(log: Recording, task: Task, policy: Policy) -> tuple[str, str] | None:
+    """Two states in each other's column, with which back a run of a policy begins in a log.
+
+    Args:
+        log: in which none begins as it is.
+        task: whose steps it is cut into.
+        policy: what is sought.
+    """
+    states = [name for name in task.model.state_names if name in log.logged]
+    for a, b in list(combinations(states, 2))[:PAIRS]:
+        one, other = log.logged[a], log.logged[b]
+        back = {a: replace(other, spec=one.spec), b: replace(one, spec=other.spec)}
+        run = _run_in(recording({**log.logged, **back}, task, log.complete), policy)
+        fit = run and follows(policy, run.until(policy.horizon), 0)
+        if fit and fit.error < NEARLY:
+            return a, b
+    return None
+
+
+def offset_in(log: Recording, task: Task, policy: Policy) -> tuple[str, float] | None:
+    """The state that is off by a constant, and by how much, in a log that is else a policy's run.
+
+    Args:
+        log: in which no run of the policy begins.
+        task: whose steps it is cut into.
+        policy: what is sought.
+    """
+    for begins in (log.first, *log.openings[:TRIED]):
+        if trial := log.trial_from(begins):
+            names = [name for name in task.model.state_names if name in log.logged]
+            if found := any_offset(task, policy, trial, names):
+                return found
+    return None
 
 
 def _run_in(log: Recording | None, policy: Policy) -> Trial | None:

@@ -40,7 +40,6 @@ def warnings_about(
         last_s: when the last of its states was logged, seconds of the run; NaN where all are on
             the control grid.
     """
-    from grounded.instruments.dead import dead_rates
     from grounded.instruments.kinematics import integrals
     from grounded.instruments.swapped import exchanged, swapped_columns
 
@@ -63,11 +62,8 @@ def warnings_about(
     relations = integrals(model)
     if pair := swapped_columns(model, whole.until(whole.known_steps), relations=relations):
         found.append(exchanged(pair))
-    found += [
-        f"{model.state_names[one.relation.j]} {one.told(model)}: is [log] its column, is its "
-        "sensor on?"
-        for one in dead_rates(model, whole, relations)
-    ]
+    found += dead_sensors(model, whole)
+    found += thousands(model, whole)
     found += way_warnings(model, whole)
     found += told_in_degrees(model, whole, found) or _in_degrees(task, whole)
     found += clocks_apart(workspace, whole)
@@ -222,6 +218,28 @@ def _in_degrees(task: Task, trial: Trial) -> list[str]:
                 f"{np.deg2rad(most):.3g} rad"
             )
     return found
+
+
+def dead_sensors(model: Model, trial: Trial) -> list[str]:
+    """Velocities that show nothing of what their positions do."""
+    from grounded.instruments.dead import dead_rates
+
+    return [
+        f"{model.state_names[one.relation.j]} {one.told(model)}: is [log] its column, is its "
+        "sensor on?"
+        for one in dead_rates(model, trial)
+    ]
+
+
+def thousands(model: Model, trial: Trial) -> list[str]:
+    """That a position, or its velocity, is in mm, or a thousand times too large twice over."""
+    from grounded.instruments.other_units import MEND, units_apart
+
+    known = trial.until(trial.known_steps)
+    with np.errstate(all="ignore"):
+        apart = units_apart(model, known, range(model.n)) if known.steps > 1 else []
+    stored = f", without {trial.id}" if trial.id else ""
+    return [f"{one}. {MEND}, and ingest it again{stored}" for one in apart]
 
 
 def way_warnings(model: Model, trial: Trial) -> list[str]:

@@ -1,0 +1,109 @@
+"""A run that its log hides: each was told as `somebody, or another controller, drove`."""
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from facts import holds
+from grounded.errors import GroundedError, NextCommand
+from grounded_trials import Workspace
+from recorded import record, waiting
+
+
+@pytest.fixture
+def w(tmp_path):
+    """It waits for c0002; c0001 was run."""
+    return waiting(tmp_path)
+
+
+def edited(log, change):
+    """The same table (t, x, v, force) after a change of its numbers."""
+    table = np.loadtxt(log, delimiter=",", skiprows=1)
+    change(table)
+    np.savetxt(log, table, "%.7f", ",", header=log.read_text().splitlines()[0], comments="")
+    return log
+
+
+def refused(w, log):
+    with pytest.raises(GroundedError) as error:
+        w.ingest(log)
+    return error.value
+
+
+@pytest.mark.parametrize("by", [0.4, -0.4])
+@pytest.mark.parametrize("before", [0.0, 1.0])
+def test_a_state_from_another_zero_is_named_with_the_offset(w, tmp_path, by, before):
+    def moved(table):
+        table[:, 1] += by
+
+    run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, before, noise=(2e-4, 1e-3))
+    said = str(refused(w, edited(run, moved)))
+    assert holds(said, "[log.state.x]", "offset", "c0002") and "somebody" not in said
+    told = float(said.split("Add ")[1].split(" ")[0])
+    assert told == pytest.approx(-by, abs=0.02)
+    toml = w.folder / "grounded.toml"
+    toml.write_text(
+        toml.read_text().replace('path = "/csv.x"\n', f'path = "/csv.x"\noffset = {told}\n')
+    )
+    assert Workspace(w.folder).ingest(run).candidate == "c0002"
+
+
+def test_two_states_in_each_other_s_column_are_named(w, tmp_path):
+    def exchanged(table):
+        table[:, [1, 2]] = table[:, [2, 1]]
+
+    run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5)
+    said = str(refused(w, edited(run, exchanged)))
+    assert holds(said, "c0002", "[log.state.x]", "[log.state.v]", "each other's column")
+
+
+def test_a_speed_that_stays_at_zero_is_the_reason_that_is_given(w, tmp_path):
+    def stuck(table):
+        table[:, 2] = 0.0
+
+    run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0)
+    said = str(refused(w, edited(run, stuck)))
+    assert holds(said, "v stays at 0 m/s") and "somebody" not in said
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_person_s_driving_is_none_of_these(w, tmp_path, seed):
+    def driven(table):
+        t, rng = table[:, 0] - table[0, 0], np.random.default_rng(seed)
+        rate = rng.uniform(0.5, 3)
+        table[:, 1], table[:, 2] = np.sin(rate * t), rate * np.cos(rate * t)
+        table[:, 3] = np.repeat(rng.uniform(-2, 2, len(t)), 25)[: len(t)]
+
+    run = edited(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0), driven)
+    error = refused(w, run)
+    assert holds(str(error), "did not run c0002")
+    assert error.then == NextCommand("ingest", (str(run), "--data"))
+
+
+def test_seconds_under_the_name_of_milliseconds_are_named(w, tmp_path):
+    run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0)
+    run.write_text(run.read_text().replace("t,x", "time_ms,x", 1))
+    said = str(refused(w, run))
+    assert holds(said, "0 steps", "times 1000", "1e-05 s apart", "unit")
+
+
+@pytest.mark.parametrize("waits", [True, False])
+def test_a_candidate_of_an_earlier_task_is_found(w, tmp_path, waits):
+    """Its file is still on the robot; it was said that somebody drove."""
+    run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5)
+    toml = w.folder / "grounded.toml"
+    written = toml.read_text()
+    toml.write_text(written.replace("[reward]\n", "[reward]\nterminal = { x = 77.0 }\n", 1))
+    if toml.read_text() == written or "terminal" in written:
+        raise AssertionError("the task is to change")
+    w = Workspace(w.folder)
+    own = w.propose().candidate
+    if not waits:
+        w.ingest(record(w, tmp_path / "own.csv", own.policy, 0.0, seed=3))
+    error = refused(w, run)
+    assert holds(str(error), "ran c0002", "earlier task", "--data")
+    assert error.then == NextCommand("ingest", (str(run), "--data"))
+    done = grounded("-C", w.folder, "ingest", run, "--data")
+    assert done.code == 0, done.err
+    fresh = record(w, tmp_path / "b.csv", own.policy, 0.5, seed=5)
+    assert w.ingest(fresh, candidate=own.id).candidate == own.id
