@@ -333,28 +333,25 @@ class Maker:
         """The same run with the gains of a regulator whose inputs cost GENTLER ** caution more."""
         if policy.gain is None:
             return policy
-        run = predicted(problem, policy)
-        factor = GENTLER**caution
-        weight = factor * problem.input_weight + (factor - 1) * problem.change_weight
+        run, change = predicted(problem, policy), problem.change_weight
+        weight = GENTLER**caution * (problem.input_weight + change) - change
         gentle = replace(self.planner.loosened(problem) or problem, input_weight=weight)
         found = ddp.sweep(gentle, run.z, run.inputs)
         if not (found.ok and np.isfinite(run.z).all()):
             return policy
         plan, columns = self.planner.plan, base_columns(problem, self.planner.plan)
         K = measured_gains(gentle, run.z, run.inputs, found.gains.K, self.planner.task.model.n)
-        policy = plan.policy(run.inputs, K[:, :, columns], run.z[:-1, columns])
-        return self.planner.narrowed(policy)
+        made = plan.policy(run.inputs, K[:, :, columns], run.z[:-1, columns])
+        return self.planner.narrowed(made)
 
     def with_margin(self, made: Candidate, problem: Problem) -> Candidate:
         """The same run with gains that hold under worse conditions, see `margin`."""
-        planner, own = self.planner, made.policy
-        if own.gain is None or not (planner.is_late or planner.widths):
+        own = made.policy
+        if own.gain is None or not self.planner.needs_margin:
             return made
-        gently = partial(self._gently, own, problem)
-        policy = steadied(problem, own, gently, planner.loosened(problem))
-        return (
-            made if policy is own else self.foretold(made, policy, problem, made.expected_of_base)
-        )
+        gently, loose = partial(self._gently, own, problem), self.planner.loosened(problem)
+        new = steadied(problem, own, gently, loose)
+        return made if new is own else self.foretold(made, new, problem, made.expected_of_base)
 
     def checked(self, made: Candidate) -> Proposal:
         """A candidate that is finite, inside the limits and predicted to stay safe; or none."""

@@ -52,10 +52,11 @@ class Planner:
         return model_fingerprint(self.plan)
 
     @property
-    def is_late(self) -> bool:
-        """Whether gains may rely on fresh samples: a delay, or memory that no sensor shows."""
+    def needs_margin(self) -> bool:
+        """Whether gains may rely on what a robot has not: no delay, all memory shown, no slip."""
         assert self.plan.latency is not None
-        return self.plan.model.n > self.task.model.n or bool(self.plan.latency.any())
+        remembers = self.plan.model.n > self.task.model.n
+        return remembers or bool(self.plan.latency.any() or self.widths)
 
     def loosened(self, problem: Problem) -> Problem | None:
         """The plan's problem with dry frictions that build up slowly; None where it has none."""

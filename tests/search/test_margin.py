@@ -70,7 +70,7 @@ def test_what_holds_stays_as_it_is():
     """Little noise, no sticking, no memory: nothing costs more than it does on fresh samples."""
     planner = joint([("delay:tau", {"d": 0.005})], change=1.0)
     own = planner.narrowed(planner.first_policy()[0])
-    assert planner.is_late and planner.loosened(planner.plan.problem(exact=True)) is None
+    assert planner.needs_margin and planner.loosened(planner.plan.problem(exact=True)) is None
     np.testing.assert_array_equal(made_by(planner).gain, own.gain)
 
 
