@@ -132,6 +132,15 @@ def test_a_gain_that_nobody_measured_is_not_claimed(cart, tmp_path):
     assert len(found["clauses"]) == 1 and found["gained"] == ""
 
 
+def test_what_was_measured_holds_with_a_filter_that_was_adopted_too(cart, tmp_path):
+    """The physics was judged with it: `propose` said that nothing had measured the model."""
+    lagging = {"signal": "v", "finding": "", "kind": "lag", "delay_s": 0.03, "corrected": True}
+    folder = written(copied(cart, tmp_path / "w"), preflight=[lagging])
+    assert grounded("-C", folder, "adopt", "viscous_friction:v", "sensor_lag:v").code == 0
+    found = grounded("-C", folder, "report", "--json").json["adopted"]
+    assert len(found["clauses"]) == 3 and "1.2 cm instead of 25 cm" in found["gained"]
+
+
 def test_a_parameter_that_was_adopted_by_name_is_not_missing(cart, tmp_path):
     names = ["viscous_friction:v", "parameter:mass"]
     blamed = {"effect": names[1], "claimed": True, "evidence": 9.0}

@@ -122,16 +122,20 @@ def _still(diagnosis: Diagnosis) -> str:
 
 
 def _as_claimed(diagnosis: Diagnosis, table: ModelTable) -> bool:
-    """Whether the model is what the diagnosis measured: `adopt` of all that it claims made it."""
+    """Whether the model is what the diagnosis measured: `adopt` of all that it claims made it.
+
+    It was measured with the filters of sensors that were found, adopted or not.
+    """
     if left_behind(diagnosis):
         return False
     made, names = diagnosis.made or Made(), diagnosis.effects
+    now = {str(effect["name"]): dict(effect) for effect in table.effects}
+    both = [*names, *(name for name in diagnosis.filters if name in now)]
     try:
         known = diagnosis.known_parameters
-        own, effects = joined(diagnosis, names, made.adopted, made.nominal, known)
+        own, effects = joined(diagnosis, both, made.adopted, made.nominal, known)
     except (GroundedError, KeyError):  # of an older document
         return False
-    now = {str(effect["name"]): dict(effect) for effect in table.effects}
     wanted = {str(effect["name"]): effect for effect in effects}
     return bool(names) and now == wanted and dict(made.params or {}) | own == dict(table.params)
 

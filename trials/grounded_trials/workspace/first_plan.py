@@ -234,7 +234,7 @@ def _shaken(workspace: Folder, first: Candidate) -> list[str]:
         found.append(
             f"the sensors' noise moves {name} by {measured(rms[j], unit)} rms through the gains, "
             f"most of it that of {state} ({measured(noise[k], its)}): for a calmer {name} give "
-            f"[reward] input_change of {name} more weight, or filter {state}"
+            f"[reward] input_change of {name} more weight"
         )
     return found
 
