@@ -33,7 +33,7 @@ def command(params: str | None, latency: bool, apply_: bool, engine: Engine, jso
 
     What the sensors show (a delay, a filter of speeds, degrees) is corrected first, as `diagnose`
     does. Prediction errors are measured on a quarter of the time that the fit has not seen; values
-    that predict it no better are never written.
+    that predict it worse are never written.
     """
     workspace = open_workspace()
     from grounded.errors import GroundedError

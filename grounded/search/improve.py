@@ -98,7 +98,7 @@ def propose(
 def refitted(task: Task, trials: Sequence[Trial]) -> Model:
     """The task's model with parameters fitted to all trials that are finite to their end.
 
-    What their instruments show is corrected first. Values that predict held-out time no better
+    What their instruments show is corrected first. Values that predict held-out time worse
     than the model's own are not taken.
     """
     from grounded.fit import fit
@@ -117,7 +117,7 @@ def refitted(task: Task, trials: Sequence[Trial]) -> Model:
     ]
     looked = sound_trials(task, lifted, memory)
     found = fit(task, looked.trials, filters=looked.filters)
-    return found.model if found.helps else task.model
+    return task.model if found.worse else found.model
 
 
 def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Proposal:

@@ -402,9 +402,14 @@ def test_a_fit_that_predicts_no_better_is_not_recommended():
 
     trials = simulated(SPRING, np.random.default_rng(0), NOISE, B=1, T=30)
     found = fit(SPRING, trials, hold_out=0.0)
-    assert not fitted((0.00694, 0.0281), (0.0111, 0.0382)).helps
-    assert fitted((0.0111, 0.0382), (0.00694, 0.0281)).helps
-    assert not fitted((0.01, 0.02), (np.nan, 0.02)).helps
+    worse = fitted((0.00694, 0.0281), (0.0111, 0.0382))
+    assert worse.worse and not worse.helps
+    tied = fitted((0.01, 0.02), (0.01005, 0.02))
+    assert not tied.worse and not tied.helps
+    better = fitted((0.0111, 0.0382), (0.00694, 0.0281))
+    assert better.helps and not better.worse
+    assert not found.worse and found.helps  # nothing was held out
+    assert fitted((0.01, 0.02), (np.nan, 0.02)).worse
 
 
 def test_a_gain_that_ties_with_what_is_at_its_bound_is_identified():

@@ -216,7 +216,7 @@ class Workspace(Folder):
             progress: told of the stage, the share done and the time left.
 
         Raises:
-            GroundedError: if they should be written and predict held-out time no better.
+            GroundedError: if they should be written and predict held-out time worse.
         """
         from grounded_trials.workspace.fitting import fit_in
 

@@ -63,7 +63,7 @@ def fit_in(
     """Fits the workspace's model to its trials, see `Workspace.fit`.
 
     Raises:
-        GroundedError: where it should be applied and predicts held-out time no better than before:
+        GroundedError: where it should be applied and predicts held-out time worse than before:
             nothing is written then.
     """
     from grounded_trials.workspace.next_step import after_fit
@@ -72,24 +72,24 @@ def fit_in(
     if not (names or latency):
         _keep(workspace, found)
     asked = (*(("--params", ",".join(names)) if names else ()), *["--latency"] * latency)
-    if not found.helps:
-        then = after_fit(workspace)
-        if apply:
-            raise GroundedError(f"nothing was written: {_worse(found)}", then=then)
-        return Fitted(found, False, seen, then)
+    if apply and found.worse:
+        why = f"nothing was written: {_worse(found)}"
+        raise GroundedError(why, then=after_fit(workspace))
     if not apply:
+        if not found.helps:
+            return Fitted(found, False, seen, after_fit(workspace))
         return Fitted(found, False, seen, NextCommand("fit", (*asked, "--apply")))
     apply_fit(workspace, found)
     return Fitted(found, True, seen, NextCommand("propose"))
 
 
 def _worse(found: Fit) -> str:
-    """What a fit that does not help predicts worse, in the state that loses most."""
+    """What a fit predicts worse, in the state that loses most."""
     before, after = found.before, found.after
     assert before is not None and after is not None
     far = before.windows > 0
     was, now = (before.ahead, after.ahead) if far else (before.one_step, after.one_step)
-    text = "the fitted values predict held-out time no better than those that the model has"
+    text = "the fitted values predict held-out time worse than those that the model has"
     known = np.isfinite(was) & np.isfinite(now) & (was > 0)
     if not known.any():
         return text
