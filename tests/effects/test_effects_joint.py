@@ -161,7 +161,7 @@ def test_an_adopted_loss_is_the_one_that_was_diagnosed(family):
 
 @pytest.mark.parametrize(("w", "push"), [(0.8, 3.0), (-0.8, 3.0), (0.1, -2.0), (2.0, 0.0)])
 def test_a_position_moves_by_the_loss_as_it_grows_within_the_step(w, push):
-    """Held at its mean over the step it moved a cart ahead: a delay of 20 ms was found as 19.4."""
+    """Held at its mean over the step it left a cart behind: a delay of 20 ms was found as 19.4."""
     cart = Model(
         states={"x": "m", "v": "m/s", "y": "m", "r": "m/s"},
         inputs={"u": "N"},
