@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, parallel
-from grounded_cli.terminal import names_in, number, remark, show, show_json, stages, table
+from grounded_cli.terminal import field, names_in, number, remark, show, show_json, stages, table
 from grounded_trials.wording import count, shown
 
 if TYPE_CHECKING:
@@ -31,10 +31,13 @@ STANDS_IN = (
 def command(params: str | None, latency: bool, apply_: bool, engine: Engine, json_: bool) -> None:
     """Estimate parameters by maximum likelihood of the trials, noise included.
 
-    Prediction errors are measured on a quarter of the time that the fit has not seen.
+    What the sensors show (a delay, a filter of speeds, degrees) is corrected first, as `diagnose`
+    does. Prediction errors are measured on a quarter of the time that the fit has not seen; values
+    that predict it worse are never written.
     """
     workspace = open_workspace()
     from grounded.errors import GroundedError
+    from grounded_trials.report.diagnosis_words import instrument_lines
 
     names = names_in(params) or None
     if params is not None and names is None:
@@ -47,7 +50,10 @@ def command(params: str | None, latency: bool, apply_: bool, engine: Engine, jso
         show_json(done.to_json())
         return
     found = done.fit
-    show(_parameters(found))
+    corrected = instrument_lines(one for one in done.preflight if one.corrected)
+    for k, line in enumerate(corrected):
+        show(field("sensors" if k == 0 else "", line))
+    show("\n" * bool(corrected) + _parameters(found))
     if found.before is not None and found.after is not None:
         show(f"\n{_errors(found, workspace.base_model)}")
     remark("fit", f"{found.sentence}; {count(found.samples, 'sample')}")

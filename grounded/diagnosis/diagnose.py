@@ -1,6 +1,6 @@
 """START HERE: the sim-to-real gap, diagnosed. Trials and a crude model in, a verdict out.
 
-preflight         the instruments, from their signals alone: corrected first  (instruments)
+sound_trials      the instruments, from their signals alone: corrected first  (instruments)
 limits            what can't be known from these data; which parameters they identify
 attribution       which effects, by evidence       (search, hypotheses, scan, refine, noise, fitted)
 ruler             held-out prediction errors in the channels' units
@@ -46,9 +46,7 @@ from grounded.diagnosis.writer import Writer
 from grounded.effects import Library
 from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError
-from grounded.instruments.early import judge_clocks
-from grounded.instruments.mistaken import judge_commands
-from grounded.instruments.preflight import preflight
+from grounded.instruments.sound_trials import sound_trials
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
 from grounded.task import Task
@@ -128,11 +126,9 @@ def diagnose(
     copies += more
     exact = bool(copies) and not scattered([*trials, *compare])
     first = sum(trial.known_steps >= 2 for trial in trials)
-    looked = preflight(subject, [*trials, *compare], options.hidden)
+    looked = sound_trials(subject, [*trials, *compare], options.hidden)
     trials = looked.trials
     data = prepare(model, trials, latency, past, options.hidden)
-    judge_clocks(model, trials, options.hidden)
-    judge_commands(model, trials, options.hidden, looked.findings)
     filters = {model.state_names.index(name): tau for name, tau in looked.filters.items()}
     data = replace(data, filters=filters)
     known = limits(data, looked.left_out)

@@ -182,6 +182,27 @@ class RulerRow(Document):
         return not any(name in self.runs_away.get(column, ()) for column in columns)
 
 
+def gain(rows: Sequence[RulerRow], before: str, after: str) -> float:
+    """What the errors of one column are less than another's, over channels and horizons.
+
+    Args:
+        rows: of the ruler.
+        before: "outset", "crude", "calibrated" or "with_effects".
+        after: likewise.
+
+    Returns:
+        The sum of the logarithms; 0 where nothing can be told.
+    """
+    ratios = [
+        math.log(was / now)
+        for row in rows
+        for name, now in getattr(row, after).items()
+        if now > 0 and (was := getattr(row, before).get(name, 0)) > 0
+        if row.tells(name, before, after)
+    ]
+    return sum(ratios)
+
+
 def furthest(rows: Sequence[RulerRow]) -> RulerRow | None:
     """The longest horizon at which noise leaves something to be told, or else the shortest."""
     ahead = [row for row in rows if not row.whole_trial]

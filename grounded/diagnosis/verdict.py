@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -21,6 +22,7 @@ LOG, LOST = "is a log that no candidate made", "was lost"  # why a trial can't b
 MOST_EFFECTS, FURTHER = 6, 2  # that may be blamed at once; so many more are looked for next
 AS_STRONG = 0.2  # of what is modelled: a turned input that is so near to it has the wrong sign
 TURNED = ": turn its sign in model.py, or if only the log counts so, with {log} scale = -1"
+MOST_DIGITS = 6  # of a value, however sure it is
 NAMED = 3  # parameters, channels and leftovers that a sentence names at most
 
 
@@ -143,7 +145,7 @@ def at_bounds(claims: Claims) -> bool:
 
 
 def _moved(claims: Claims) -> str:
-    """`L should be 0.166 m (+11 %)` of the parameters that have to differ."""
+    """`L should be 0.1662 +- 0.0011 m (+11 %)` of the parameters that have to differ."""
     params, known = claims.data.model.params, claims.parameters()
     named, texts = _off(claims), []
     for name in named[:NAMED]:
@@ -152,9 +154,19 @@ def _moved(claims: Claims) -> str:
         beside = [f"{change:+.{0 if abs(change) >= 1 else 1}f}%"] * bool(old)
         beside += ["at its bound: the data ask for more"] * params[name].at_bound(known[name].value)
         part = f" ({', '.join(beside)})" * bool(beside)
-        texts.append(f"{name} should be {quantity(known[name])}{part}")
+        texts.append(f"{name} should be {give_or_take(known[name])}{part}")
     more = len(named) - NAMED
     return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
+
+
+def give_or_take(estimate: Estimate) -> str:
+    """A value with its +-, as precise as that is: `1.5763 +- 0.0012 N/V`."""
+    value, std = estimate.value, estimate.std
+    if not (0 < std < math.inf and math.isfinite(value)):
+        return quantity(estimate)
+    places = math.floor(math.log10(max(abs(value), std))) - math.floor(math.log10(std)) + 2
+    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    return f"{value:.{min(max(places, 3), MOST_DIGITS)}g} +- {std:.2g}{unit}"
 
 
 def next_trial(
@@ -323,7 +335,7 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
         and effect.site.target in model.params
     ):
         old = model.params[effect.site.target].value
-        new = quantity(params["d"].moved(old))
+        new = give_or_take(params["d"].moved(old))
         return f"the parameter {effect.site.target} should be {new} instead of {number(old)}"
 
     def signed(found: re.Match[str]) -> str:

@@ -235,11 +235,13 @@ class LossFamily(Family):
 
     loss(w, free, gain, u, c, dt): its mean over a step that begins at the speed w and would end at
     `free`; a unit of u adds `gain` to that. torque(w, rate, gain, u, c): the same at one moment,
-    where the speed's own rate is `rate` and a unit of u adds `gain` to it.
+    where the speed's own rate is `rate` and a unit of u adds `gain` to it. early: as `loss`, over
+    the first half of a step, which need not be as fine; None: `loss` itself.
     """
 
     loss: Callable[[Any, Any, Any, Any, Any, Any], Any] = lambda w, free, gain, u, c, dt: 0.0
     torque: Callable[[Any, Any, Any, Any, Any], Any] = lambda w, rate, gain, u, c: 0.0
+    early: Callable[[Any, Any, Any, Any, Any, Any], Any] | None = None
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,9 @@ from grounded.effects.family import (
     Values,
     braked,
 )
-from grounded.effects.joint import inputs_left
+from grounded.effects.joint import step_with
 from grounded.effects.medium import medium_of, over_ground, through_it
+from grounded.effects.places import integrated
 from grounded.effects.plain_step import Step, own_state, param_name, plain_step, quantities_of
 from grounded.effects.registry import partner
 from grounded.effects.sensed import behind_logs, late_step, sensor_step
@@ -223,13 +224,12 @@ def _loss_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str
     """One more loss: solved together with those that the model has already."""
     model = effect.site.model
     inner, others = getattr(model.step, "losing", (model, ()))
-    base, effects = plain_step(inner), (*others, effect)
+    base, effects, moved = plain_step(inner), (*others, effect), integrated(inner)
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
         start, given = own_state(inner, s), _replaced(inner, a, {})
         pairs = [(e, quantities_of(e, p)) for e in effects]
-        left = inputs_left(pairs, start, given, dt, lambda u: base(start, u, p, dt))
-        return base(start, left, p, dt)
+        return step_with(pairs, start, given, dt, lambda u: base(start, u, p, dt), moved)
 
     vars(step)["losing"] = (inner, effects)
     return step, {}

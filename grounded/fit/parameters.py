@@ -6,7 +6,8 @@ second ahead. Then it joins the rest for the final values.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -34,6 +35,7 @@ def fit(
     latency: Array | None = None,
     fit_latency: Latency = "known",
     measurement: Measurement | None = None,
+    filters: Mapping[str, float] | None = None,
     hold_out: float = 0.25,
     horizon_s: float = 1.0,
     rng: np.random.Generator | None = None,
@@ -49,6 +51,7 @@ def fit(
         latency: of each input [s], known, or where to begin, (m,); None: zero (or the task's).
         fit_latency: "known", "common" (fit one for all inputs) or "each".
         measurement: what the records measure; None: the states as they are.
+        filters: time constants of the sensors that filter, by state [s], as `Preflight.filters`.
         hold_out: share of the time that judges the fit.
         horizon_s: how far ahead predictions are judged [s].
         rng: draws the trials that the noise is estimated on, if there are very many.
@@ -70,8 +73,12 @@ def fit(
         )
     delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
     measurement = of_states(model) if measurement is None else measurement
+    records, given = records_of(model, trials), model
+    if filters:
+        from grounded.fit.filtered import behind_filters
+
+        model, records, measurement = behind_filters(model, records, measurement, filters)
     unknowns = unknowns_of(model, names, delay, fit_latency)
-    records = records_of(model, trials)
     if max(r.steps for r in records) < 3:
         raise GroundedError("a fit needs a trial of at least 3 steps")
     rng = np.random.default_rng(0) if rng is None else rng
@@ -81,8 +88,16 @@ def fit(
             found = _fitted(model, records, measurement, unknowns, hold_out, horizon_s, rng, tick)
             least = least_known(model, found)
             if least is None or unknowns.k == 1:
-                return found.beside(held)
+                return _of(found.beside(held), given)
             unknowns = unknowns.less(unknowns.names.index(least))
+
+
+def _of(found: Fit, model: Model) -> Fit:
+    """The fit of the model that was given, without the true values beside filtered logs."""
+    if found.model.n == model.n:
+        return found
+    values = {name: found.model.params[name].value for name in model.param_names}
+    return replace(found, model=model.with_values(values))
 
 
 USUAL = 25  # rounds and scans of a fit

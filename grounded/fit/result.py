@@ -91,7 +91,12 @@ class Fit(Result):
     @property
     def helps(self) -> bool:
         """Whether held-out time is predicted better than before; True where none was held out."""
-        return _lowered(self.before, self.after)
+        return _change(self.before, self.after) < 0
+
+    @property
+    def worse(self) -> bool:
+        """Whether held-out time is predicted worse than before, by more than a tie's TIE."""
+        return _change(self.before, self.after) > TIE
 
     def summary(self) -> str:
         """The values with their standard deviations."""
@@ -157,7 +162,7 @@ def report(
         loglik=at.loglik,
         status=last.status,
         sentence=_sentence(unknowns, params, wide, last)
-        + "; held-out time is predicted no better than before" * (not _lowered(before, after)),
+        + "; held-out time is predicted no better than before" * (_change(before, after) >= 0),
         before=before,
         after=after,
         samples=at.count,
@@ -165,16 +170,24 @@ def report(
     )
 
 
-def _lowered(before: PredictionError | None, after: PredictionError | None) -> bool:
-    """Whether errors fell, by the geometric mean over the states, as far ahead as is known."""
+TIE = 0.01  # of held-out errors: as much more says nothing, the values come from all of the time
+
+
+def _change(before: PredictionError | None, after: PredictionError | None) -> float:
+    """Mean logarithm of what errors grew by, over the states, as far ahead as is known.
+
+    Minus infinity where nothing was held out, infinity where predictions diverge.
+    """
     if before is None or after is None:
-        return True
+        return -np.inf
     far = bool(np.isfinite(before.ahead).any())
     was, now = (before.ahead, after.ahead) if far else (before.one_step, after.one_step)
     told = np.isfinite(was) & (was > 0)
-    if not told.any() or not np.isfinite(now[told]).all():
-        return not told.any()
-    return bool(np.log(np.maximum(now[told], 1e-300) / was[told]).mean() < 0)
+    if not told.any():
+        return -np.inf
+    if not np.isfinite(now[told]).all():
+        return np.inf
+    return float(np.log(np.maximum(now[told], 1e-300) / was[told]).mean())
 
 
 def _estimates(unknowns: Unknowns, found: SearchEnd) -> tuple[dict[str, FittedValue], Uncertainty]:

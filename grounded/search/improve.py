@@ -96,10 +96,28 @@ def propose(
 
 
 def refitted(task: Task, trials: Sequence[Trial]) -> Model:
-    """The task's model with parameters fitted to all trials that are finite to their end."""
-    from grounded.fit import fit
+    """The task's model with parameters fitted to all trials that are finite to their end.
 
-    return fit(task, [t for t in trials if t.finite_steps == t.steps and t.steps > 2]).model
+    What their instruments show is corrected first. Values that predict held-out time worse
+    than the model's own are not taken.
+    """
+    from grounded.fit import fit
+    from grounded.instruments.sound_trials import sound_trials
+
+    names = task.model.state_names
+    whole = [t for t in trials if t.finite_steps == t.steps and t.steps > 2]
+    memory = names[len(whole[0].state_names) :] if whole else ()
+    lifted = [
+        replace(
+            t,
+            states=np.hstack([t.states, np.full((t.steps + 1, len(memory)), np.nan)]),
+            state_names=(*t.state_names, *memory),
+        )
+        for t in whole
+    ]
+    looked = sound_trials(task, lifted, memory)
+    found = fit(task, looked.trials, filters=looked.filters)
+    return task.model if found.worse else found.model
 
 
 def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Proposal:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from facts import holding, holds
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import GroundedError
 from grounded.estimate import NoiseStd, of_states, record_of
 from grounded.estimate.extended import filter_batch
 from grounded.estimate.steps import ModelSteps
@@ -20,7 +20,6 @@ from grounded.fit.unknowns import unknowns_of
 from grounded.model import Model, Param
 from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
-from grounded_trials.workspace.fitting import Fitted
 
 DT = 0.05
 
@@ -399,17 +398,18 @@ def test_a_fit_that_predicts_no_better_is_not_recommended():
 
     def fitted(*ahead):
         made = [PredictionError(("q", "w"), np.full(2, 0.01), np.array(a), 1.0, 9) for a in ahead]
-        return Fitted(
-            dataclasses.replace(found, before=made[0], after=made[1]), False, ("--apply",)
-        )
+        return dataclasses.replace(found, before=made[0], after=made[1])
 
     trials = simulated(SPRING, np.random.default_rng(0), NOISE, B=1, T=30)
     found = fit(SPRING, trials, hold_out=0.0)
     worse = fitted((0.00694, 0.0281), (0.0111, 0.0382))
-    assert not worse.fit.helps and worse.then.verb == "diagnose"
+    assert worse.worse and not worse.helps
+    tied = fitted((0.01, 0.02), (0.01005, 0.02))
+    assert not tied.worse and not tied.helps
     better = fitted((0.0111, 0.0382), (0.00694, 0.0281))
-    assert better.fit.helps and better.then == NextCommand("fit", ("--apply",))
-    assert not fitted((0.01, 0.02), (np.nan, 0.02)).fit.helps
+    assert better.helps and not better.worse
+    assert not found.worse and found.helps  # nothing was held out
+    assert fitted((0.01, 0.02), (np.nan, 0.02)).worse
 
 
 def test_a_gain_that_ties_with_what_is_at_its_bound_is_identified():

@@ -14,6 +14,7 @@ frozen result whose `to_json()` is the document that the command prints with --j
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -205,7 +206,7 @@ class Workspace(Folder):
         engine: Engine | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> Fitted:
-        """Estimates the model's parameters from all trials.
+        """Estimates the model's parameters from all trials, their instruments corrected first.
 
         Args:
             params: only these; None: all of them.
@@ -213,18 +214,16 @@ class Workspace(Folder):
             apply: write the values to grounded.toml.
             engine: workers for the trials' likelihoods; the same comes out on any number.
             progress: told of the stage, the share done and the time left.
-        """
-        from grounded_trials.workspace.fitting import Fitted, apply_fit, fit_trials
 
-        found = fit_trials(
-            self._afresh(), params, latency=latency, engine=engine, progress=progress
-        )
-        if apply:
-            apply_fit(self, found)
-            self.forget()
-            return Fitted(found, applied=True)
-        chosen = ("--params", ",".join(params)) if params else ()
-        return Fitted(found, False, (*chosen, *["--latency"] * latency, "--apply"))
+        Raises:
+            GroundedError: if they should be written and predict held-out time worse.
+        """
+        from grounded_trials.workspace.fitting import fit_in
+
+        asked = partial(fit_in, self._afresh(), params, latency=latency, apply=apply)
+        done = asked(engine=engine, progress=progress)
+        self.forget()
+        return done
 
     def diagnose(
         self,

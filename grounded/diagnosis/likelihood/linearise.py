@@ -132,7 +132,7 @@ def sensitivities_of(
         before, later = medium.slopes(start, end)
         return logged_slopes(predictor, h, later @ F @ before), later @ f_p
     data = predictor.data
-    flat, p = predictor.flat(x, predictor.left(h, x, u)), predictor.params(h)
+    flat, p = predictor.flat(x, predictor.left(h, x, u)[0]), predictor.params(h)
 
     def take(x: Array, u: Array) -> tuple[Array, ...]:
         return sensitivities(data.model, x, u, p, data.dt)
@@ -158,7 +158,7 @@ def step_jacobian(
         before, later = medium.slopes(start, end)
         F = step_jacobian(predictor, medium.still, start, end)
         return logged_slopes(predictor, h, later @ F @ before)
-    f_x, f_u = predictor.slopes(x, predictor.left(h, x, u), predictor.params(h))
+    f_x, f_u = predictor.slopes(x, predictor.left(h, x, u)[0], predictor.params(h))
     if losses_of(h):
         f_x = f_x - f_u @ predictor.loss_slopes(h, x, u, f_x)[0]
     return with_effects(predictor, h, x, u, f_x, after)

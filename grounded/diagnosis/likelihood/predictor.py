@@ -37,8 +37,9 @@ from grounded.effects import (
     acting_order,
 )
 from grounded.effects.family import braked, coupled
-from grounded.effects.joint import Loads, loads, solved
+from grounded.effects.joint import Left, Loads, ahead, loads, solved
 from grounded.effects.medium import medium_of, through_it
+from grounded.effects.places import integrated
 from grounded.effects.plain_step import quantities_of
 from grounded.effects.registry import partner
 from grounded.effects.sensed import behind_logs, logged, moved_model, seen_names
@@ -218,20 +219,24 @@ class Predictor(SentOnce):
     def moved(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
         """The model's step with what its motion takes off the inputs, without further rates."""
         if medium := moving(h, self.seen):
-            after = self.moved(medium.still, medium.through(x), u, dt)
-            return medium.over(after, dt or self.data.dt)
-        return self.step(x, self.left(h, x, u, dt), self.params(h), dt)
+            x = medium.through(x)
+            return medium.over(self.moved(medium.still, x, u, dt), dt or self.data.dt)
+        left, more = self.left(h, x, u, dt)
+        after = self.step(x, left, self.params(h), dt)
+        for q in more:
+            after[..., self.seen.index(q)] += more[q]
+        return after
 
-    def left(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
-        """What losses leave of the inputs u (..., m) that reach the model at x (..., n)."""
+    def left(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Left:
+        """What losses leave of inputs u (..., m) at x (..., n); what positions get (`ahead`)."""
         pairs, names = losses_of(h), self.data.model.input_names
         if not pairs:
-            return u
-        found = u.copy()
-        taken = solved(pairs, self.loads(h, x, u, dt), dt or self.data.dt)
+            return u, {}
+        found, at, dt = u.copy(), self.loads(h, x, u, dt), dt or self.data.dt
+        taken = solved(pairs, at, dt)
         for (effect, _), loss in zip(pairs, taken, strict=True):
             found[..., names.index(coupled(effect.site)[0])] -= loss
-        return found
+        return found, ahead(pairs, at, taken, dt, self.positions)
 
     def loads(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Loads:
         """Of each loss: speed at the start, at the end without it, gains, the input (`joint`)."""
@@ -240,8 +245,8 @@ class Predictor(SentOnce):
         def step(a: Named) -> Named:
             return self.named(self.step(x, np.stack([a[n] for n in names], axis=-1), p, dt))
 
-        given = Named("input", names, list(np.moveaxis(u, -1, 0)))
-        return loads(losses_of(h), self.named(x), given, step)
+        inputs = list(np.moveaxis(u, -1, 0))
+        return loads(losses_of(h), self.named(x), Named("input", names, inputs), step)
 
     def loss_slopes(
         self, h: Hypothesis, x: Array, u: Array, f_x: Array, f_p: Array | None = None
@@ -251,21 +256,19 @@ class Predictor(SentOnce):
         f_x, f_p: slopes of the model's own step (..., n, n), (..., n, k).
         """
         names, pairs = self.data.model.input_names, losses_of(h)
-        f_p = f_x[..., :0] if f_p is None else f_p
-        m = len(names)
+        f_p, m = f_x[..., :0] if f_p is None else f_p, len(names)
         by_x, by_p = (np.zeros((*x.shape[:-1], m, f.shape[-1])) for f in (f_x, f_p))
         if not pairs:
             return by_x, by_p
-        at = w, free, gain, given = self.loads(h, x, u)
+        drives, at = [coupled(effect.site) for effect, _ in pairs], self.loads(h, x, u)
         base = solved(pairs, at, self.data.dt)
-        drives = [coupled(effect.site) for effect, _ in pairs]
         for i, (_, source) in enumerate(drives):
             k = self.seen.index(source)
             size = 1e-6 * self.data.scales.peak(source)
-            more = [value + size if j == i else value for j, value in enumerate(w)]
-            ends = [value + size if j == i else value for j, value in enumerate(free)]
-            started = solved(pairs, (more, free, gain, given), self.data.dt)
-            ended = solved(pairs, (w, ends, gain, given), self.data.dt)
+            more = [value + size if j == i else value for j, value in enumerate(at.w)]
+            ends = [value + size if j == i else value for j, value in enumerate(at.free)]
+            started = solved(pairs, at._replace(w=more), self.data.dt)
+            ended = solved(pairs, at._replace(free=ends), self.data.dt)
             for (tau, _), was, by_w, by_end in zip(drives, base, started, ended, strict=True):
                 row, slope = names.index(tau), (by_end - was)[..., None] / size
                 by_x[..., row, :] += slope * f_x[..., k, :]
@@ -288,6 +291,11 @@ class Predictor(SentOnce):
             x, mean = x + dt * (own + added), mean + own / parts
             touched |= (added != 0).any(axis=-1, keepdims=True)
         return np.where(touched, x, after), np.where(touched, mean, free)
+
+    @cached_property
+    def positions(self) -> dict[str, tuple[str, float]]:
+        """The positions among the states, see `places.integrated`."""
+        return integrated(moved_model(self.data.model))
 
     @cached_property
     def seen(self) -> tuple[str, ...]:

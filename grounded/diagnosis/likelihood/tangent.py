@@ -38,6 +38,6 @@ def tangent(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Predicto
         return predictor
     if medium := moving(h, predictor.seen):
         return tangent(predictor, medium.still, medium.through(x), u)
-    left, p, kept = predictor.left(h, x, u), predictor.params(h), predictor._inputs
+    left, p, kept = predictor.left(h, x, u)[0], predictor.params(h), predictor._inputs
     after, slopes = predictor.step(x, left, p), predictor.slopes(x, left, p)
     return Tangent(predictor.data, kept, x=x, u=left, p=p, after=after, slopes_there=slopes)

@@ -207,7 +207,10 @@ class Measured:
         )
 
     def remainders(self) -> tuple[Remainder, ...]:
-        """What is left above the floor, and what a flexible model finds that would show there."""
+        """What is left above the floor, and what a flexible model finds that would show there.
+
+        Farthest above its noise first: of more than a flexible model explains it is no less left.
+        """
         data, ruler = self.data, self.ruler
         k = int(np.flatnonzero(~self.drowned[:-1]).max(initial=0))
         now, fine = self.rms(self.best), ruler.fine[ruler.shown]
@@ -234,8 +237,9 @@ class Measured:
                 error_unit=self.units[name],
                 floor_at_most=self.at_most,
             )
-            found.append((left is None, -error / max(floor, float(fine[i])), i, left, row))
-        return tuple(self.with_region(row, left) for *_, left, row in sorted(found, key=_first))
+            found.append((-error / max(floor, float(fine[i])), i, left, row))
+        found.sort(key=lambda each: each[:2])
+        return tuple(self.with_region(row, left) for *_, left, row in found)
 
     def with_region(self, row: Remainder, left: Leftover | None) -> Remainder:
         """A remainder with what a flexible model says of it: the missing rate, and where."""
@@ -264,11 +268,6 @@ class Measured:
         before, after = self.rms(self.decision.crude)[-1], self.rms(self.best)[-1]
         rows = zip(self.units.items(), before, after, strict=True)
         return {n: RunChange(float(b), float(a), unit) for (n, unit), b, a in rows}
-
-
-def _first(each: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Sorts remainders: where a flexible model finds a rate first, then by size."""
-    return each[:3]
 
 
 def root_mean_square(error: Any) -> Any:

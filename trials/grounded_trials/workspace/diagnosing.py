@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded_trials.store.documents import read_document, write_document
@@ -141,7 +142,8 @@ def _in_vain(workspace: Folder, found: Diagnosis) -> str:
     from grounded_trials.workspace.proposing import standing_in
 
     names = [str(effect["name"]) for effect in workspace.config.model.effects]
-    if not names or found.no_cause or found.kind != "unknown" or _paid(found):
+    paid = gain(found.prediction_error, "outset", "crude") > 0
+    if not names or found.no_cause or found.kind != "unknown" or paid:
         return ""
     lost, model = 0, workspace.planner.fingerprint
     for tried in reversed(standing_in(workspace).history):
@@ -156,29 +158,14 @@ def _in_vain(workspace: Folder, found: Diagnosis) -> str:
     )
 
 
-def _paid(found: Diagnosis) -> bool:
-    """Whether predictions are better by what was adopted, on average over channels and horizons."""
-    ratios = [
-        math.log(row.outset[name] / now)
-        for row in found.prediction_error
-        for name, now in row.crude.items()
-        if now > 0 and row.outset.get(name, 0) > 0 and row.tells(name, "outset", "crude")
-    ]
-    return sum(ratios) > 0
-
-
 def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
     """What the stored trials say of the instruments, before any physics."""
-    from grounded.instruments.early import judge_clocks
-    from grounded.instruments.mistaken import judge_commands
-    from grounded.instruments.preflight import preflight
+    from grounded.instruments.sound_trials import sound_trials
 
     planner = workspace.planner
     memory = planner.plan.model.state_names[planner.task.model.n :]
     used = _chosen(workspace, trials)
-    found = preflight(planner.plan, [planner.lift(trial) for trial in used], memory)
-    judge_clocks(planner.plan.model, found.trials, memory)
-    judge_commands(planner.plan.model, found.trials, memory, found.findings)
+    found = sound_trials(planner.plan, [planner.lift(trial) for trial in used], memory)
     return where_to_mend(workspace, used, found.findings)
 
 

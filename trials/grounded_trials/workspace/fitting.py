@@ -1,4 +1,9 @@
-"""fit in a workspace: which trials are used, and how the result goes into grounded.toml."""
+"""fit in a workspace: which trials are used, and how the result goes into grounded.toml.
+
+The trials are those that a diagnosis would judge the same model on: the instruments' findings are
+corrected first (`sound_trials`). reports/fit.json keeps of the last fit of everything what it was
+made from and whether it predicts better, so that nobody is sent to make it again in vain.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.result import Result
+from grounded.result import Result, measured
 from grounded.trial import Trial
+from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.workspace.adopting import settled
 from grounded_trials.workspace.config import set_in_model, set_latency
 from grounded_trials.workspace.folder import Folder
@@ -18,6 +24,10 @@ from grounded_trials.workspace.folder import Folder
 if TYPE_CHECKING:
     from grounded.engine import Engine
     from grounded.fit import Fit
+    from grounded.instruments.finding import Finding
+
+
+KEPT = "fit.json"  # in reports/
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -26,14 +36,8 @@ class Fitted(Result):
 
     fit: Fit
     applied: bool
-    asked: tuple[str, ...] = ()  # the options of the command that fits the same again
-
-    @property
-    def then(self) -> NextCommand:
-        """Write the values where they predict better; go on with those that were written."""
-        if not (self.applied or self.fit.helps):
-            return NextCommand("diagnose")
-        return NextCommand("propose" if self.applied else "fit", self.asked)
+    preflight: tuple[Finding, ...]  # of the instruments, before any physics
+    then: NextCommand  # write what predicts better; go on with what was written
 
     def summary(self) -> str:
         """The values."""
@@ -41,7 +45,80 @@ class Fitted(Result):
 
     def to_json(self) -> dict[str, Any]:
         """The document of `fit --json`: values, intervals, held-out prediction errors."""
-        return self.fit.to_json() | {"applied": self.applied}
+        return self.fit.to_json() | {
+            "applied": self.applied,
+            "preflight": [one.to_json() for one in self.preflight],
+        }
+
+
+def fit_in(
+    workspace: Folder,
+    names: Sequence[str] | None,
+    *,
+    latency: bool = False,
+    apply: bool = False,
+    engine: Engine | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Fitted:
+    """Fits the workspace's model to its trials, see `Workspace.fit`.
+
+    Raises:
+        GroundedError: where it should be applied and predicts held-out time worse than before:
+            nothing is written then.
+    """
+    from grounded_trials.workspace.next_step import after_fit
+
+    found, seen = fit_trials(workspace, names, latency=latency, engine=engine, progress=progress)
+    if not (names or latency):
+        _keep(workspace, found)
+    asked = (*(("--params", ",".join(names)) if names else ()), *["--latency"] * latency)
+    if apply and found.worse:
+        why = f"nothing was written: {_worse(found)}"
+        raise GroundedError(why, then=after_fit(workspace))
+    if not apply:
+        if not found.helps:
+            return Fitted(found, False, seen, after_fit(workspace))
+        return Fitted(found, False, seen, NextCommand("fit", (*asked, "--apply")))
+    apply_fit(workspace, found)
+    return Fitted(found, True, seen, NextCommand("propose"))
+
+
+def _worse(found: Fit) -> str:
+    """What a fit predicts worse, in the state that loses most."""
+    before, after = found.before, found.after
+    assert before is not None and after is not None
+    far = before.windows > 0
+    was, now = (before.ahead, after.ahead) if far else (before.one_step, after.one_step)
+    text = "the fitted values predict held-out time worse than those that the model has"
+    known = np.isfinite(was) & np.isfinite(now) & (was > 0)
+    if not known.any():
+        return text
+    i = int(np.argmax(np.where(known, now / np.where(known, was, 1.0), -np.inf)))
+    name, when = before.names[i], f"{before.horizon_s:g} s ahead" if far else "one step ahead"
+    unit = found.model.states.get(name, "")
+    return f"{text} ({name} {when}: off by {measured(now[i], unit)} instead of " + (
+        f"{measured(was[i], unit)}); values that must differ that much stand in for something else"
+    )
+
+
+def _keep(workspace: Folder, found: Fit) -> None:
+    workspace.reports.mkdir(exist_ok=True)
+    write_document(workspace.reports / KEPT, _made_from(workspace) | {"helps": found.helps})
+
+
+def _made_from(workspace: Folder) -> dict[str, Any]:
+    """The trials and the model of a fit."""
+    trials = [trial.id for trial in usable_trials(workspace)]
+    return {"trials": trials, "model": workspace.planner.fingerprint}
+
+
+def fitted_in_vain(workspace: Folder) -> bool:
+    """Whether these trials were fitted with this model, and it predicted no better than before."""
+    try:
+        kept = read_document(workspace.reports / KEPT)
+    except (OSError, ValueError, RecursionError, GroundedError):  # it only spares a fit
+        return False
+    return kept.get("helps") is False and _made_from(workspace).items() <= kept.items()
 
 
 def usable_trials(workspace: Folder) -> list[Trial]:
@@ -66,42 +143,49 @@ def fit_trials(
     latency: bool = False,
     engine: Engine | None = None,
     progress: Callable[[str], None] | None = None,
-) -> Fit:
-    """Parameters of the workspace's model, adopted effects in it, from its trials.
+) -> tuple[Fit, tuple[Finding, ...]]:
+    """Parameters of the workspace's model, adopted effects in it, from its trials; and its sensors.
 
-    The memory of an effect (a lag's output) is measured by nothing: the filter follows it from
-    what the commands say of its start.
+    What the instruments show is corrected first, as `diagnose` does. The memory of an effect (a
+    lag's output) is measured by nothing: the filter follows it from what the commands say of its
+    start.
     """
     from grounded.estimate import of_states, record_of
     from grounded.fit import fit
+    from grounded.instruments.sound_trials import sound_trials
+    from grounded_trials.workspace.intake.where_to_mend import where_to_mend
 
     planner = workspace.planner
     guessed = {n for t in workspace.trials() for n in t.meta.get("estimated", "").split(",")}
     model, n = planner.plan.model, planner.task.model.n
-    measured = [i for i, name in enumerate(model.state_names[:n]) if name not in guessed]
+    shown = [i for i, name in enumerate(model.state_names[:n]) if name not in guessed]
+    used = usable_trials(workspace)
+    hidden = [name for i, name in enumerate(model.state_names) if i not in shown]
+    looked = sound_trials(planner.plan, [planner.lift(trial) for trial in used], hidden)
     records = []
-    for trial in usable_trials(workspace):
-        lifted = planner.lift(trial)
-        known = np.r_[np.ones(n), 0.1 * np.ptp(lifted.states[:, n:], axis=0) + 1e-6]
-        record = record_of(model, lifted)
+    for trial in looked.trials:
+        known = np.r_[np.ones(n), 0.1 * np.ptp(trial.states[:, n:], axis=0) + 1e-6]
+        record = record_of(model, trial)
         records.append(
             replace(
                 record,
-                measured=record.measured[:, measured],
-                start=np.where(np.arange(model.n) < n, 0.0, lifted.states),
+                measured=record.measured[:, shown],
+                start=np.where(np.arange(model.n) < n, 0.0, trial.states),
                 start_std=known,
             )
         )
-    return fit(
+    found = fit(
         planner.plan,
         records,
         names,
         fit_latency="common" if latency else "known",
-        measurement=of_states(model, [model.state_names[i] for i in measured]),
+        measurement=of_states(model, [model.state_names[i] for i in shown]),
+        filters=looked.filters,
         rng=np.random.default_rng(0),
         engine=engine,
         progress=progress,
     )
+    return found, where_to_mend(workspace, used, looked.findings)
 
 
 def apply_fit(workspace: Folder, found: Fit) -> None:

@@ -6,15 +6,17 @@ about the model and the trials of its day; what was adopted since is no longer m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import GroundedError, NextCommand
 from grounded.model import all_at_bounds
 from grounded.search.standing import Standing
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.diagnosing import diagnosable, read_diagnosis
+from grounded_trials.workspace.fitting import fitted_in_vain
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.proposing import standing_in, status_of, to_run
 
@@ -23,6 +25,7 @@ DIAGNOSE = NextCommand("diagnose")
 EXPORT = NextCommand("export", ("best", "--runner"))
 TARGET = NextCommand("target", ("SHAPE",))
 SHORT = 0.1  # of a control step: a filter that makes no difference
+SAME = 1e-6  # of a value: what writing it in eight digits may take
 
 
 def next_command(
@@ -104,6 +107,27 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
     return next_command(workspace, now, found, usable_ids(workspace))
 
 
+def after_fit(workspace: Folder) -> NextCommand:
+    """What follows a fit that predicts no better: what else the last diagnosis leaves to do.
+
+    Where there is none of today's model and trials: to make one.
+    """
+    try:
+        found = read_diagnosis(workspace.reports)
+    except GroundedError:
+        found = None
+    if found is None:
+        return DIAGNOSE
+    try:
+        now = standing_in(workspace, ahead=True)
+    except GroundedError:  # it can't be planned with this model
+        now = standing_in(workspace)
+    since = since_diagnosis(workspace, found, usable_ids(workspace))
+    if since.changed or since.newer:
+        return DIAGNOSE
+    return next_command(workspace, now, found, usable_ids(workspace))
+
+
 def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     """What to do about what a diagnosis found, None where there is nothing to do.
 
@@ -126,7 +150,10 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
         return NextCommand("diagnose", ("--instruments",))  # they ask for more than can be
     own = {f"parameter:{name}" for name in params}
     if own.issuperset(new):
-        return NextCommand("fit")  # the model's form is right: all of its numbers at once
+        if not fitted_in_vain(workspace):
+            return NextCommand("fit")  # the model's form is right: all of its numbers at once
+        if gain(diagnosis.prediction_error, "crude", "with_effects") <= 0:
+            return NextCommand("adopt", late) if late else None
     return NextCommand("adopt", (*new, *late))
 
 
@@ -208,7 +235,8 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
     seen, params = set(made.trials), made.params
     last = max((k for k, name in enumerate(usable) if name in seen), default=-1)
     missing = diagnosis.open(model.effects, model.params)
-    adopted = tuple(name for name in diagnosis.effects if name not in missing)
+    other = [name for name in diagnosis.effects if _other_value(diagnosis, name, model.params)]
+    adopted = tuple(name for name in diagnosis.effects if name not in (*missing, *other))
     same = [dict(e) for e in model.effects] == [dict(e) for e in made.adopted]
     return Since(
         used=sum(name in seen for name in usable),
@@ -218,3 +246,15 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
         missing=missing if adopted else (),
         changed=not same or params not in (None, dict(model.params)),
     )
+
+
+def _other_value(diagnosis: Diagnosis, name: str, params: Mapping[str, float]) -> bool:
+    """Whether a claimed parameter has another value now than was claimed: it was not adopted."""
+    family, _, own = name.partition(":")
+    row, made = diagnosis.ranked(name), diagnosis.made or Made()
+    if family != "parameter" or own not in params or own not in made.nominal or row is None:
+        return False
+    said = row.params["d"].moved(made.nominal[own])
+    low, high = said.interval or (said.value - 2 * said.std, said.value + 2 * said.std)
+    room = SAME * abs(said.value)
+    return not low - room <= params[own] <= high + room

@@ -82,6 +82,6 @@ def _documents(workspace: Folder) -> Iterator[tuple[Path, Callable[[], Any]]]:
     """The documents of reports/ that there are, and how they are checked."""
     if (path := workspace.reports / "diagnosis.json").exists():
         yield path, lambda: read_diagnosis(workspace.reports)
-    for name in ("optimum.json", "adoptions.json"):
+    for name in ("optimum.json", "adoptions.json", "fit.json"):
         if (place := workspace.reports / name).exists():
             yield place, partial(read_document, place)

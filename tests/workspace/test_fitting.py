@@ -1,0 +1,145 @@
+"""`fit` in a workspace: the sensors first, nothing written that predicts worse, no round trips."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from facts import holds
+from grounded.effects.sensor import lagging
+from grounded.errors import GroundedError, NextCommand
+from grounded.rollout import simulate
+from grounded.trial import Trial
+from grounded_trials import Workspace
+from grounded_trials.store.documents import write_document
+from grounded_trials.store.trial_file import write_trial
+from grounded_trials.workspace.diagnosing import read_diagnosis
+from grounded_trials.workspace.next_step import since_diagnosis, usable_ids
+from reported import DIAGNOSIS
+from workspaces import make
+
+FILTER_S = 0.1
+
+
+def filtered(v: np.ndarray, tau: float, dt: float) -> np.ndarray:
+    """A speed (T + 1,) as a sensor shows it that filters."""
+    off, y = 0.0, v.copy()
+    for t in range(1, len(v)):
+        off = lagging(off, v[t] - v[t - 1], tau, dt)
+        y[t] = v[t] + off
+    return y
+
+
+def logs(folder: Path, masses: list[float], tau: float = 0.0, steps: int = 40) -> Workspace:
+    """A workspace of a cart whose trials were driven with these masses [kg]."""
+    w, rng = Workspace(make(folder).folder), np.random.default_rng(0)
+    names = (w.base_model.state_names, w.base_model.input_names)
+    for k, mass in enumerate(masses):
+        robot = w.task.with_model(w.base_model.with_values({"mass": mass}))
+        force = np.repeat(rng.uniform(-4, 4, (steps // 8, 1)), 8, axis=0)
+        run = simulate(robot.problem(exact=True), robot.policy(force, None, None))
+        seen = run.states + rng.normal(0, 0.002, run.states.shape)
+        if tau:
+            seen[:, 1] = filtered(run.states[:, 1], tau, 0.05) + rng.normal(0, 0.002, steps + 1)
+        write_trial(folder / f"{k}.mcap", Trial(seen, force, 0.05, *names), {"kind": "data"})
+        w.ingest(folder / f"{k}.mcap", data=True)
+    return w
+
+
+@pytest.fixture
+def misled(tmp_path: Path) -> Workspace:
+    """Every fourth trial, which judges a fit, is of the model as it is; the others are not."""
+    return logs(tmp_path / "w", [1.4, 1.4, 1.4, 1.0] * 2)
+
+
+def claimed(w: Workspace, value: float = 1.2, crude: float = 0.3, after: float = 0.1) -> None:
+    """A diagnosis of today's trials and model that says what the mass should be."""
+    mass = {"value": value - 1.0, "std": 0.01, "interval": [value - 1.02, value - 0.98]}
+    row = {"effect": "parameter:mass", "params": {"d": mass}, "claimed": True, "evidence": 40.0}
+    ruler = {
+        "horizon_s": 1.0,
+        "held_out": "trials",
+        "unit_by_channel": {"x": "m"},
+        "crude": {"x": crude},
+        "with_effects": {"x": after},
+    }
+    made = {"trials": usable_ids(w), "adopted": [], "params": {}, "nominal": {"mass": 1.0}}
+    changes = {
+        "verdict": {"kind": "effect", "effects": ["parameter:mass"], "sentence": "One."},
+        "ranking": [row],
+        "parameters": {},
+        "prediction_error": [ruler],
+        "diagnosed": made,
+    }
+    w.reports.mkdir(exist_ok=True)
+    write_document(w.reports / "diagnosis.json", {**DIAGNOSIS, **changes})
+
+
+def test_what_the_sensors_filter_is_corrected_before_parameters_are_fitted(tmp_path):
+    w = logs(tmp_path / "w", [1.4] * 6, FILTER_S)
+    (seen,) = w.preflight()
+    assert (seen.signal, seen.kind) == ("v", "lag")
+    found = w.fit()
+    assert [one.to_json() for one in found.preflight] == [seen.to_json()]
+    assert found.fit.params["mass"].value == pytest.approx(1.4, rel=0.02)
+    assert found.fit.helps and found.then == NextCommand("fit", ("--apply",))
+    said = grounded("-C", w.folder, "fit")
+    assert holds(" ".join(said.out.split()), "sensors", "filter", "corrected here")
+    w.fit(apply=True)
+    assert w.base_model.params["mass"].value == pytest.approx(1.4, rel=0.02)
+
+
+def test_values_that_predict_worse_are_never_written(misled):
+    before = misled.config.file.read_text()
+    found = misled.fit()
+    assert not found.fit.helps and found.fit.params["mass"].value > 1.2
+    assert found.then == NextCommand("diagnose")  # nobody has yet
+    with pytest.raises(GroundedError) as refused:
+        misled.fit(apply=True)
+    assert holds(str(refused.value), "nothing was written", "held-out", "instead of")
+    assert refused.value.then == NextCommand("diagnose")
+    done = grounded("-C", misled.folder, "fit", "--params", "mass", "--apply")
+    assert done.code == 1 and "Traceback" not in done.err
+    assert misled.config.file.read_text() == before
+
+
+def test_a_fit_in_vain_is_not_asked_for_again(misled):
+    """`diagnose` said fit, and `fit` said diagnose, for ever."""
+    claimed(misled)
+    assert misled.status().then == NextCommand("fit")
+    adopt = NextCommand("adopt", ("parameter:mass",))
+    assert misled.fit(["mass"]).then == NextCommand("fit")  # which was not of everything
+    assert misled.fit().then == adopt
+    assert misled.status().then == adopt
+    claimed(misled, after=0.5)  # which predicts worse, too
+    assert misled.status().then.verb not in ("fit", "adopt", "diagnose")
+    claimed(misled)
+    (misled.reports / "fit.json").write_text("[")
+    assert misled.status().then == NextCommand("fit")
+
+
+def test_a_fit_of_other_trials_or_another_model_says_nothing_of_these(misled):
+    misled.fit()
+    claimed(misled)
+    assert misled.status().then.verb == "adopt"
+    misled.discard("t0001")
+    claimed(misled)
+    assert misled.status().then.verb == "fit"
+    misled.fit()
+    model = misled.folder / "model.py"
+    model.write_text(model.read_text().replace("Param(0.2,", "Param(0.3,"))
+    claimed(misled)
+    assert misled.status().then.verb == "fit"
+
+
+@pytest.mark.parametrize(("value", "adopted"), [(1.2, True), (1.19, True), (1.4, False)])
+def test_another_value_than_was_claimed_was_not_adopted(misled, value, adopted):
+    """`fit --apply` wrote k = 1.20 where 1.58 was claimed: the page said that was adopted."""
+    claimed(misled)
+    text = misled.config.file.read_text()
+    told = f'file = "model.py"\nparams = {{ mass = {value} }}'
+    misled.config.file.write_text(text.replace('file = "model.py"', told, 1))
+    w = Workspace(misled.folder)
+    since = since_diagnosis(w, read_diagnosis(w.reports), usable_ids(w))
+    assert since.changed and since.adopted == ("parameter:mass",) * adopted
