@@ -1,7 +1,7 @@
 """START HERE: the instruments, from their own signals alone, before any physics is judged.
 
 odd_trial     a whole trial in other units than the rest
-slow_clock    one pace of the stamps behind several rates that are off
+clocks        one pace of the stamps behind several rates that are off, states that answer early
 other_units   a position in mm beside a velocity in m/s
 swapped       two columns of a trial in each other's place
 way           speeds in the axes of positions or in knots, a compass's heading
@@ -11,7 +11,6 @@ dead          a velocity that stays at one value while its position moves
 constant      a velocity that is off by a constant, against the way of its position
 kinematics    velocities against the rates of their positions, courses against headings
 late_position both positions of a plane behind what velocities and a heading say
-early         states that answer commands before they are sent
 mistaken      commands in each other's place, or in percent, once the rest is put right
 inputs        copies of one another, at their limits or beyond, constant within each trial
 
@@ -29,6 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.frozen import Array
+from grounded.instruments.clocks import told_by_the_clock
 from grounded.instruments.constant import constant_of
 from grounded.instruments.dead import judge_dead
 from grounded.instruments.finding import DEGREES, Finding, in_degrees, put_right
@@ -66,7 +66,6 @@ from grounded.instruments.odd_trial import (
 from grounded.instruments.other_units import judge_units
 from grounded.instruments.rows import kinematic_rows, tied
 from grounded.instruments.single import Signal, judge_signal
-from grounded.instruments.slow_clock import told_by_the_clock
 from grounded.instruments.swapped import judge_columns
 from grounded.instruments.way import judge_way, rate_agrees
 from grounded.model import Model

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from grounded.instruments.early import judge_clocks
+from grounded.instruments.clocks import judge_clocks
 from grounded.instruments.mistaken import judge_commands
 from grounded.instruments.preflight import Preflight, preflight
 from grounded.model import Model

@@ -277,7 +277,7 @@ def told_in_degrees(model: Model, trial: Trial, told: Sequence[str]) -> list[str
 
 def clocks_apart(workspace: Folder, trial: Trial) -> list[str]:
     """That measured states answer commands before they are sent."""
-    from grounded.instruments.early import answers_early, one_clock, too_soon
+    from grounded.instruments.clocks import answers_early, one_clock, too_soon
 
     model, table = workspace.base_model, workspace.config.estimate
     measured = read_estimate(table, model).measured if table.names() else model.state_names
