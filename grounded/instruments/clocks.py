@@ -6,14 +6,14 @@ of each; where two or more agree, and none contradicts, it is the clock (`told_b
 States that answer commands before they are sent have another clock: no physics does that. A run of
 a feedback controller looks like it, though: its commands follow the states, so what will be sent
 tells how the motion goes on; a friction or a back-EMF that the model lacks makes the robot quicker
-than the model as well. So the model predicts a quarter of a second ahead with the commands as they are logged and with commands of later, both times calibrated
-(`short_runs`) and without what is linear in the states, which a friction would be. The later ones
-are believed where they do about what the model says and leave much less than whatever the commands
-up to then may do: by the model with a delay, gains, parameters or a quicker actuator (commands
-ahead by their own slope), and by any law that is linear in them. A smooth motion foretells its own
-commands, so that such a law follows it as well as the commands of later do; of a short one it
-follows nearly all. Less than EARLY_S is not looked for: that little an actuator's crude lag may
-make.
+than the model as well. So the model predicts a quarter of a second ahead with the commands as they
+are logged and with commands of later, both times calibrated (`short_runs`) and without what is
+linear in the states, which a friction would be. The later ones are believed where they do about
+what the model says and leave much less than whatever the commands up to then may do: by the model
+with a delay, gains, parameters or a quicker actuator (commands ahead by their own slope), and by
+any law that is linear in them. A smooth motion foretells its own commands, so that such a law
+follows it as well as the commands of later do; of a short one it follows nearly all. Less than
+EARLY_S is not looked for: that little an actuator's crude lag may make.
 """
 
 from __future__ import annotations
