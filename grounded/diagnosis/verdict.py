@@ -195,7 +195,7 @@ def next_trial(
         further: more effects are to be looked for first (`Verdict.look_for`).
         ended: all parameters that moved are at their bounds (`at_bounds`).
     """
-    from grounded.effects import places
+    from grounded.effects import like_a_load, places
 
     if claims.known.no_cause:
         return "Run two or more trials in which every input changes."
@@ -223,6 +223,8 @@ def next_trial(
         return f"Nothing is tied, but predictions get worse with {_it(claims)}: {REPEAT}."
     if further:
         return "None is needed yet: nothing is tied, and more effects have to be looked for first."
+    if like_a_load(claims.data.model, claims.names):
+        return "Nothing is tied: give the model a parameter for a load, then diagnose again."
     if ended:
         return "Nothing is tied, but the parameters are at their bounds: are the sensors right?"
     if _own_numbers(claims, adopted):

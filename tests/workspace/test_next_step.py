@@ -139,6 +139,18 @@ def test_nothing_claimed_nothing_to_adopt(cart, tmp_path):
     assert last(grounded("-C", folder, "status")) == "grounded export best --runner"
 
 
+def test_gains_in_the_place_of_a_load_are_not_offered(cart, tmp_path, monkeypatch):
+    """The verdict said to give the model a parameter first, `next:` to adopt: -526 to -22,904."""
+    folder = copied(cart, tmp_path / "w")
+    names = two_claimed(folder)
+    asked = []
+    monkeypatch.setattr(
+        "grounded.effects.joint.like_a_load", lambda model, given: asked.append(given) or True
+    )
+    assert last(grounded("-C", folder, "status")) == "grounded export best --runner"
+    assert asked and set(asked[0]) == set(names)
+
+
 LAGGING = {"signal": "v", "finding": "", "kind": "lag", "delay_s": 0.03, "corrected": True}
 
 

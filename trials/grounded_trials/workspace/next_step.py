@@ -140,7 +140,7 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     undone = {*declined(workspace)}  # whoever did that is not asked to do it again
     late = tuple(name for name in filters_open(workspace, diagnosis) if name not in undone)
     claimed = diagnosis.kind in ("effect", "several") and not diagnosis.contested
-    if not claimed or {*new} <= undone:
+    if not claimed or {*new} <= undone or _like_a_load(workspace, new):
         return NextCommand("adopt", late) if late else None
     if most := diagnosis.verdict.look_for:
         return _with_more(most, diagnosis.made or Made())
@@ -155,6 +155,15 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
         if gain(diagnosis.prediction_error, "crude", "with_effects") <= 0:
             return NextCommand("adopt", late) if late else None
     return NextCommand("adopt", (*new, *late))
+
+
+def _like_a_load(workspace: Folder, effects: Sequence[str]) -> bool:
+    """Whether they stand in the place of a load, for which the model wants a parameter."""
+    if len(effects) < 2:  # and nothing is imported
+        return False
+    from grounded.effects.joint import like_a_load
+
+    return like_a_load(workspace.planner.plan.model, effects)
 
 
 def filters_open(workspace: Folder, diagnosis: Diagnosis) -> tuple[str, ...]:
