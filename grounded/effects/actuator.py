@@ -204,8 +204,11 @@ def _advance_lag(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tupl
     return u + behind * (1 - e) * tau / dt, (u + behind * e,)
 
 
-def _along_lag(u: Any, z: Any, c: Any, dt: float) -> Any:
-    """1 / (1 - e B) = (1 + e B) (1 + e^2 B^2) (1 + e^4 B^4) ..., B a step back."""
+def along_lag(u: Any, z: Any, c: Any, dt: float) -> Any:
+    """What a first-order lag makes of signals u (S, T), from z (S,) on.
+
+    1 / (1 - e B) = (1 + e B) (1 + e^2 B^2) (1 + e^4 B^4) ..., B a step back.
+    """
     e, back = float(np.exp(-dt / max(c["tau"], 1e-6))), 1
     path = np.concatenate([z[:, None], (1 - e) * u[:, :-1]], axis=1)
     while back < u.shape[1] and e > 1e-18:
@@ -271,7 +274,7 @@ first_order_lag = MemoryFamily(
     quantities=_lag,
     lookalikes=("delay", "rate_limit", "slew_limit", "parameter"),
     advance=_advance_lag,
-    along=_along_lag,
+    along=along_lag,
     linear=True,
 )
 

@@ -32,7 +32,7 @@ from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import NoiseModel
 from grounded.effects import Effect, SensorDelayFamily, SensorFamily, SensorLagFamily
-from grounded.effects.sensor import lagging
+from grounded.effects.actuator import along_lag
 from grounded.filter.augmented import Delayed
 from grounded.filter.kalman import Adjoint
 from grounded.frozen import Array
@@ -241,11 +241,10 @@ def filter_lag(track: Array, tau: float, settled: Any = ()) -> Array:
     a trial, `settled`, the sensor has settled.
     """
     count = int(np.clip(np.ceil(2 * tau), 1, len(track) - 1))
-    off = [-(track[count] - track[0]) / count * tau]
-    off[0][list(settled)] = 0.0
-    for step in np.diff(track, axis=0):
-        off.append(lagging(off[-1], step, tau, 1.0))
-    return np.array(off)
+    first = -(track[count] - track[0]) / count * tau
+    first[list(settled)] = 0.0
+    follows = -tau * np.diff(track, axis=0, append=track[-1:])
+    return np.ascontiguousarray(along_lag(follows.T, first, {"tau": tau}, 1.0).T)
 
 
 def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt: float) -> Array:
