@@ -223,7 +223,7 @@ def next_trial(
         return f"Nothing is tied, but predictions get worse with {_it(claims)}: {REPEAT}."
     if further:
         return "None is needed yet: nothing is tied, and more effects have to be looked for first."
-    if like_a_load(claims.data.model, claims.names):
+    if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names):
         return "Nothing is tied: give the model a parameter for a load, then diagnose again."
     if ended:
         return "Nothing is tied, but the parameters are at their bounds: are the sensors right?"
