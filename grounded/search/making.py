@@ -136,7 +136,7 @@ class About:
             first: the step that is due, whatever the slopes of those that lost.
             promised: gains that were too small.
         """
-        make, options, plan = self.make, self.options, self.make.planner.plan
+        make, options = self.make, self.options
         history, model = make.now.history, make.fingerprint
         first = options.due(history, self.incumbent, model, self.way, self.slopes) or first
         lost = losers_of(history, self.incumbent.candidate.id, model)
@@ -147,7 +147,7 @@ class About:
         for step in options.steps_from(first):
             if step.damping not in directions:
                 directions[step.damping] = direction(
-                    plan,
+                    make.planner.aim,
                     self.theta,
                     self.grounding,
                     options,

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from grounded.solve.ddp import Solution
 
 
+DEARER = (1.0, 10.0, 100.0, 1000.0)  # times what inputs cost: gains that are tried
 LOOSE = 64.0  # times the speed a dry friction builds up over: it damps what moves next to nothing
 
 
@@ -72,6 +73,26 @@ class Planner:
         slow = {name: LOOSE * model.params[name].value for name in self.widths}
         return self.plan.with_model(model.with_values(slow)) if slow else self.plan
 
+    @cached_property
+    def aim(self) -> Task:
+        """The plan's task, whose end is asked of true values where the log of a state is late.
+
+        What a filter shows is judged, but a plan that ends by it kicks in its last steps: then the
+        filter shows rest, and the robot moves.
+        """
+        n, names = self.task.model.n, self.plan.model.state_names
+        if len(names) == n:
+            return self.plan
+        from grounded.effects.memory import true_values
+
+        terminal, target = self.plan.reward.terminal.copy(), self.plan.target.copy()
+        for true, logged in true_values(names, names[n:]).items():
+            if terminal[logged] > 0:
+                terminal[true], terminal[logged] = terminal[logged], 0.0
+                target[:, true] = target[:, logged]
+        goals = dataclasses.replace(self.plan.reward, terminal=terminal)
+        return dataclasses.replace(self.plan, target=target, reward=goals)
+
     def lift(self, trial: Trial) -> Trial:
         """A trial with the planning model's memory states beside its own."""
         plan, base = self.plan.model, self.task.model
@@ -97,15 +118,28 @@ class Planner:
         return policy.laid_out(model.state_names, angles, policy.depths)
 
     def first_policy(self, caution: int = 0, tick: Tick | None = None) -> tuple[Policy, Solution]:
-        """The planning model's own policy with gains on what the robot measures alone."""
-        from grounded.search.first_policy import cautious, first_policy
+        """The planning model's own policy with gains on what the robot measures alone.
 
-        policy, found = first_policy(self.plan, caution, tick, self.widths)
+        Of several, whose predicted run costs least: made where kinks are blended; or where dry
+        friction does not count, for inputs that are dearer and dearer.
+        """
+        from grounded.search.first_policy import cautious, first_policy
+        from grounded.solve.ddp import sweep
+
+        policy, found = first_policy(self.aim, caution, tick, self.widths)
         if self.plan.model.n == self.task.model.n or policy.gain is None:
             return policy, found
-        problem = cautious(self.plan, caution).problem()
-        K = measured_gains(problem, found.z, found.u, found.K, self.task.model.n)
-        return dataclasses.replace(policy, gain=K), found
+        task, n = cautious(self.aim, caution), self.task.model.n
+        made = [measured_gains(task.problem(), found.z, found.u, found.K, n)]
+        exact = self.plan.problem(exact=True)
+        if (loose := self.loosened(task.problem(exact=True))) is not None:
+            for factor in DEARER:
+                weight = factor * loose.input_weight + (factor - 1) * loose.change_weight
+                dear = dataclasses.replace(loose, input_weight=weight)
+                K = sweep(dear, found.z, found.u).gains.K
+                made.append(measured_gains(dear, found.z, found.u, K, n))
+        policies = [dataclasses.replace(policy, gain=K) for K in made]
+        return max(policies, key=lambda one: predicted(exact, one).utility), found
 
     def with_model(self, model: Model) -> Planner:
         """The same with other parameter values of the planning model."""

@@ -1,0 +1,67 @@
+"""Where a sensor shows a speed late, a run is to end at rest itself, not its log."""
+
+import numpy as np
+import pytest
+
+from grounded.model import Model
+from grounded.search.planner import Planner, planner_with, predicted
+from grounded.task import Task
+from grounded.utility import Reward
+
+STEPS = 60
+
+
+def cart(terminal: float, lag: float = 0.04) -> Planner:
+    """A cart that goes 0.4 m in 1.2 s; its speed is shown through a filter."""
+    model = Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"force": "N"},
+        params={},
+        derivative=lambda s, a, p: {"x": s.v, "v": 2.0 * a.force - 0.5 * s.v},
+    )
+    way = np.clip(np.arange(STEPS + 1) / 50, 0.0, 1.0)
+    x = 0.4 * way**2 * (3 - 2 * way)
+    task = Task(
+        model=model,
+        dt=0.02,
+        target=np.column_stack([x, np.gradient(x, 0.02)]),
+        reward=Reward(
+            np.array([10.0, 0.5]),
+            terminal * np.array([500.0, 50.0]),
+            np.zeros(1),
+            np.array([1e-4]),
+        ),
+        start=np.zeros(2),
+        past=np.zeros(1),
+        low=np.array([-10.0]),
+        high=np.array([10.0]),
+    )
+    return planner_with(task, [("sensor_lag:v", {"tau": lag})] if lag else [])
+
+
+@pytest.mark.parametrize("terminal", [1.0, 10.0])
+def test_the_end_is_asked_of_the_true_speed(terminal):
+    """A student's cart was kicked in its last steps: its filter read 0.02, and it moved at 0.3."""
+    planner = cart(terminal)
+    policy, _ = planner.first_policy()
+    run = predicted(planner.plan.problem(exact=True), policy)
+    true = run.states[-1, planner.plan.model.state_names.index("v_true")]
+    assert abs(true) < 0.02 and abs(run.states[-1, 0] - 0.4) < 0.005
+    assert np.abs(run.inputs[-3:]).max() < 0.5 * np.abs(run.inputs).max()
+
+
+def test_what_is_judged_stays_what_is_logged():
+    planner = cart(1.0)
+    aim, plan = planner.aim, planner.plan
+    v, true = (plan.model.state_names.index(name) for name in ("v", "v_true"))
+    assert aim.reward.terminal[true] == plan.reward.terminal[v] == 50.0
+    assert aim.reward.terminal[v] == plan.reward.terminal[true] == 0.0
+    np.testing.assert_array_equal(aim.reward.state, plan.reward.state)
+    np.testing.assert_array_equal(aim.target[:, true], plan.target[:, v])
+
+
+def test_nothing_changes_without_a_late_sensor_or_a_goal_for_the_end():
+    bare, free = cart(1.0, lag=0.0), cart(0.0)
+    assert bare.aim is bare.plan
+    np.testing.assert_array_equal(free.aim.reward.terminal, free.plan.reward.terminal)
+    np.testing.assert_array_equal(free.aim.target, free.plan.target)
