@@ -146,7 +146,10 @@ def test_weights_that_were_made_of_the_limits_seen_follow_those_that_are_given(t
         notes = Workspace(folder).propose().proposal.notes
         return [note for note in notes if "input_change" in note and "init" in note]
 
+    (note,) = [n for n in Workspace(folder).propose().proposal.notes if "happened" in n]
+    assert holds(note, "r.csv", "[limits]", "`target`")
     assert weight() == pytest.approx(0.01, rel=1e-3) and not limited(-1, 1)
+    assert not any("happened" in n for n in Workspace(folder).propose().proposal.notes)
     (note,) = limited(-20, 20)
     assert "force = 2.5e-05" in note
     assert grounded(*step, "x=1").code == 0

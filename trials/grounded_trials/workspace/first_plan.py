@@ -23,7 +23,7 @@ from grounded_trials.wording import rendered, with_unit
 from grounded_trials.workspace.config import FILE, made_changes
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import tracked, tracking_error, weighed_groups
-from grounded_trials.workspace.task_file import limited_changes
+from grounded_trials.workspace.task_file import limited_changes, seen_in
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -68,6 +68,11 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
     if free:
         found.append(
             f"[limits] has none for {', '.join(free)}: what a plan asks for is sent, however much"
+        )
+    if log := seen_in(workspace.config):
+        found.append(
+            f"[limits] are those that {log} happened to use, and a target that `init` wrote is "
+            "what that log did: put in what the robot may get, and draw the manoeuvre (`target`)"
         )
     if first is not None and first.predicted_utility < 0:
         none = np.zeros(task.model.n)
