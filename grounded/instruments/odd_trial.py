@@ -131,6 +131,9 @@ def spread(trial: Trial, some: Sequence[int]) -> Array:
 
 
 PREDICTED = 1.0  # of what the signals do: an error below that predicts them
+FULL_TURNS = 4 * np.pi  # [rad] that an angle spans: degrees, or wheels, or a heading
+SOON = 0.1  # [s] ahead: a body that a model lacks much of goes its own way later
+CONCORDANT, PLAINLY = 0.1, 1.5  # concordance, and times that with other factors
 
 
 def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Odd]:
@@ -164,7 +167,47 @@ def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) 
     told = judges.any() and all(
         np.median(mended[judges] / other[judges]) < 1 for other in (own / 2, *near)
     )
+    if not told and angles:
+        best = Odd(0, DEGREES, moving)
+        told = _turning_as_degrees(model, some, shown, best)
     return [replace(best, trial=k) for k in range(len(trials))] if told else []
+
+
+def _turning_as_degrees(
+    model: Model, trials: Sequence[Trial], shown: Sequence[int], odd: Odd
+) -> bool:
+    """Whether angles beyond full turns turn as a model says that is crude, were they degrees.
+
+    A payload and friction that a model lacks can make its errors larger than all that moves. Still
+    what it predicts goes with what happened, and is about as large, of no angles but the right
+    ones: sines of others are noise, and pushes on them are too weak, or too strong.
+    """
+    units = list(model.states.values())
+    angles = [i for i in odd.states if units[i] == "rad"]
+    if max(float(np.ptp(t.states[:, angles], axis=0).max()) for t in trials) < FULL_TURNS:
+        return False
+
+    driven = [i for i in shown if i not in {r.i for r in integrals(model) if r.exact}]
+
+    def concord(factor: float) -> float:
+        turned = replace(odd, factor=factor)
+        return float(
+            np.median([_concordance(model, turned.mended(t), shown, driven) for t in trials])
+        )
+
+    mended = concord(DEGREES)
+    others = [concord(factor) for factor in (1.0, DEGREES / LIKE, DEGREES * LIKE)]
+    return mended > CONCORDANT and all(mended > PLAINLY * other for other in others)
+
+
+def _concordance(model: Model, trial: Trial, shown: Sequence[int], some: Sequence[int]) -> float:
+    """Of what the states `some` do in a moment with what is predicted (Lin 1989), their mean."""
+    if not some or (ahead := predicted(model, trial, shown, SOON)) is None:
+        return 0.0
+    start, x, logged = ahead
+    said, moved = (model.difference(to, start)[:, some] for to in (x, logged))
+    both = said.var(axis=0) + moved.var(axis=0) + (said - moved).mean(axis=0) ** 2 + 1e-300
+    return float((1 - ((said - moved) ** 2).mean(axis=0) / both).mean())
 
 
 def odd_commands(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Iterator[Odd]:
@@ -214,13 +257,13 @@ def missed(
 
 
 def predicted(
-    model: Model, trial: Trial, shown: Sequence[int]
+    model: Model, trial: Trial, shown: Sequence[int], horizon: float = AHEAD
 ) -> tuple[Array, Array, Array] | None:
-    """Logged states (N, n), what the model makes of them in 0.25 s, those logged then.
+    """Logged states (N, n), what the model makes of them by a horizon [s], those logged then.
 
     None where too little is known. States that are not `shown` are taken for 0.
     """
-    steps = max(1, round(AHEAD / trial.dt))
+    steps = max(1, round(horizon / trial.dt))
     logged = np.array(trial.states)
     logged[:, [i for i in range(model.n) if i not in shown]] = 0.0  # nobody knows
     good = np.asarray(np.isfinite(logged).all(axis=1))
