@@ -6,6 +6,7 @@ Models, and controllers, count from the base.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -20,6 +21,8 @@ LIMB = ("base", "waist", "torso", "shoulder", "upper", "elbow", "fore", "wrist",
 LEG = ("hip", "thigh", "knee", "shin", "ankle", "foot", "toe")
 WITHIN = ("yaw", "pan", "lift", "pitch", "flex", "roll")  # of the joints of one part
 SIDES = ("left", "right", "front", "rear")  # of several limbs
+ROLLS = re.compile("wheel|caster|track|rotor|prop|crank|spindle")  # turns on and on
+FULL_TURNS, DEGREES = 4 * math.pi, 720.0  # of a joint: what spans more; its most, in degrees
 
 
 def joint_names(log: LogReport) -> dict[str, tuple[str, ...]]:
@@ -97,6 +100,35 @@ def of_joint(
                 why = f"{topic} names its joint {i} '{joint}'"
                 return replace(guess, path=path, sure=True, others=others[:3], reasons=(why,))
     return guess
+
+
+def wide_joints(
+    guesses: Sequence[Guess],
+    units: Mapping[str, str],
+    joints: Mapping[str, tuple[str, ...]],
+    log: LogReport,
+) -> tuple[str, ...]:
+    """Joints that span turns in rad, as ROS's conventions have it, and no wheel does: degrees?"""
+    fields = {field.path: field for topic in log.topics for field in topic.fields}
+    called = {f"{t}.position[{i}]": j for t, names in joints.items() for i, j in enumerate(names)}
+    found = []
+    for one in guesses:
+        field, joint = fields.get(one.path), called.get(one.path, "")
+        if field is None or field.low is None or field.high is None or units[one.name] != "rad":
+            continue
+        low, high = (one.scale * end for end in (field.low, field.high))
+        if not joint or ROLLS.search(joint.lower()) or abs(high - low) <= FULL_TURNS:
+            continue
+        if max(abs(low), abs(high)) <= DEGREES:
+            found.append(f"{one.name}, from {min(low, high):.3g} to {max(low, high):.3g}")
+    if not found:
+        return ()
+    several = len(found) > 1
+    return (
+        f"{'; '.join(found)}: turns of a joint, if {'these are' if several else 'that is'} rad. "
+        f"In degrees? Then scale = {math.pi / 180:.8g} in [log.state] of each, of "
+        "the joints' velocities too, makes it rad",
+    )
 
 
 def in_order(
