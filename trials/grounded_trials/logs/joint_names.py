@@ -84,9 +84,18 @@ def _first(words: Sequence[str], joint: str) -> int:
 
 
 def of_joint(
-    guess: Guess, unit: str, joints: Mapping[str, tuple[str, ...]], log: LogReport
+    guess: Guess,
+    unit: str,
+    joints: Mapping[str, tuple[str, ...]],
+    log: LogReport,
+    *,
+    sent: bool = False,
 ) -> Guess:
-    """A state whose name holds a joint's is that joint's number of its unit, if the log has it."""
+    """A name that holds a joint's is that joint's number of its unit, if the log has it.
+
+    `sent`: an input. Efforts are what came out, after the drive's delay and limits: an array with a
+    command for each joint comes before them.
+    """
     there = _there(log)
     for topic, names in joints.items():
         for i, joint in enumerate(names):
@@ -95,6 +104,15 @@ def of_joint(
             kind = next((k for k, u in JOINT_UNITS.items() if u == unit), None)
             kind = kind or ("position" if unit in ("m", "1") else None)
             path = f"{topic}.{kind}[{i}]"
+            commanded = _commands(log, len(names)) if sent and kind == "effort" else []
+            if commanded:
+                at = from_base(names).index(joint)
+                paths = [f"{command}[{at}]" for command in commanded]
+                paths += [path] if path in there else []
+                rest = [f"{c}[{k}]" for c in commanded for k in range(len(names)) if k != at]
+                why = f"commands name no joint; in their order from the base, {at} is '{joint}'"
+                others = (*paths[1:], *rest)
+                return replace(guess, path=paths[0], sure=False, others=others, reasons=(why,))
             if path in there:
                 others = tuple(p for p in (guess.path, *guess.others) if p and p != path)
                 why = f"{topic} names its joint {i} '{joint}'"
@@ -181,6 +199,7 @@ def _commands(log: LogReport, count: int) -> list[str]:
         for topic in log.topics
         if "MultiArray" in topic.type
         and any(word in topic.topic.lower() for word in words)
+        and not any(word in topic.topic.lower() for word in ("position", "velocity"))
         and sum(".data[" in field.path for field in topic.fields) == count
     ]
 
