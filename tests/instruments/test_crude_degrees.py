@@ -9,12 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded import Trial
+from grounded import Model, Param, Trial
 from grounded.instruments.odd_trial import all_in_degrees
 from grounded.instruments.preflight import preflight
-from test_preflight import ARM, DT
 
-FINE = 20  # parts of a step
+DT, FINE = 0.02, 20  # [s], and parts of a step
+ARM = Model(
+    states={"q": "rad", "w": "rad/s"},
+    inputs={"u": "N m"},
+    params={"b": Param(0.3, "1/s", 0.0, 3.0)},
+    derivative=lambda s, a, p: {"q": s.w, "w": a.u - p.b * s.w - 4 * np.sin(s.q)},
+)
 
 
 def driven(force, start, friction, load, seed=0, steps=800):
