@@ -134,6 +134,7 @@ PREDICTED = 1.0  # of what the signals do: an error below that predicts them
 FULL_TURNS = 4 * np.pi  # [rad] that an angle spans: degrees, or wheels, or a heading
 SOON = 0.1  # [s] ahead: a body that a model lacks much of goes its own way later
 CONCORDANT, PLAINLY = 0.1, 1.5  # concordance, and times that with other factors
+WHOLE = 0.3  # concordance of positions with what their rates say
 
 
 def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Odd]:
@@ -187,14 +188,15 @@ def _turning_as_degrees(
     if max(float(np.ptp(t.states[:, angles], axis=0).max()) for t in trials) < FULL_TURNS:
         return False
 
-    driven = [i for i in shown if i not in {r.i for r in integrals(model) if r.exact}]
+    going = [r.i for r in integrals(model) if r.exact and {r.i, r.j} <= set(shown)]
+    driven = [i for i in shown if i not in going]
 
-    def concord(factor: float) -> float:
-        turned = replace(odd, factor=factor)
-        return float(
-            np.median([_concordance(model, turned.mended(t), shown, driven) for t in trials])
-        )
+    def concord(factor: float, some: Sequence[int] = driven) -> float:
+        mended = [replace(odd, factor=factor).mended(t) for t in trials]
+        return float(np.median([_concordance(model, t, shown, some) for t in mended]))
 
+    if concord(DEGREES, going) < WHOLE:  # what moves by no rate of its own is nobody's motion
+        return False
     mended = concord(DEGREES)
     others = [concord(factor) for factor in (1.0, DEGREES / LIKE, DEGREES * LIKE)]
     return mended > CONCORDANT and all(mended > PLAINLY * other for other in others)
