@@ -185,9 +185,11 @@ def _turning_as_degrees(
     """
     units = list(model.states.values())
     angles = [i for i in odd.states if units[i] == "rad"]
-    if max(float(np.ptp(t.states[:, angles], axis=0).max()) for t in trials) < FULL_TURNS:
+    wide = [
+        np.nanmax(x, axis=0) - np.nanmin(x, axis=0) for t in trials if len(x := t.states[:, angles])
+    ]
+    if max((float(one.max()) for one in wide), default=0.0) < FULL_TURNS:
         return False
-
     going = [r.i for r in integrals(model) if r.exact and {r.i, r.j} <= set(shown)]
     driven = [i for i in shown if i not in going]
 
