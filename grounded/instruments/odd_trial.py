@@ -134,7 +134,7 @@ PREDICTED = 1.0  # of what the signals do: an error below that predicts them
 FULL_TURNS = 4 * np.pi  # [rad] that an angle spans: degrees, or wheels, or a heading
 SOON = 0.1  # [s] ahead: a body that a model lacks much of goes its own way later
 CONCORDANT, PLAINLY = 0.1, 1.5  # concordance, and times that with other factors
-WHOLE = 0.3  # concordance of positions with what their rates say
+WHOLE = 0.3  # concordance of each angle with what its rate says
 
 
 def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Odd]:
@@ -197,7 +197,8 @@ def _turning_as_degrees(
         mended = [replace(odd, factor=factor).mended(t) for t in trials]
         return float(np.median([_concordance(model, t, shown, some) for t in mended]))
 
-    if concord(DEGREES, going) < WHOLE:  # what moves by no rate of its own is nobody's motion
+    own = [concord(DEGREES, [i]) for i in going if i in angles]
+    if min(own, default=0.0) < WHOLE:  # one that its rate does not move is not in its unit
         return False
     mended = concord(DEGREES)
     others = [concord(factor) for factor in (1.0, DEGREES / LIKE, DEGREES * LIKE)]
