@@ -339,20 +339,24 @@ def _odd_signs(model: Model, change: Mistake) -> list[Array]:
 
 
 def _best(found: Mapping[Mistake, Mapping[int, tuple[Fit, Fit]]]) -> Told:
-    """The change that leaves least, with those that leave nearly as little."""
+    """The change that leaves least, with those that leave nearly as little.
+
+    Of these an exchange comes first: it is one mistake of [log], where a sensor that counts the
+    other way than the model says has the robot's program wrong as well.
+    """
     most = max(len(fits) for fits in found.values())
     left = {
         change: float(np.mean([after.score for _, after in fits.values()]))
         for change, fits in found.items()
         if len(fits) == most
     }
-    first = min(left, key=lambda change: left[change])
+    least = min(left, key=lambda change: left[change])
+    near = [c for c in left if c == least or (c.swap and left[c] < left[least] + CLEAR)]
+    near = near if least.swap else [least]
+    first, *others = sorted(near, key=lambda change: (change.turned != (), left[change]))
     before, after = next(iter(found[first].values()))
     i = int(np.argmin(after.rms / before.rms))
-    others = tuple(
-        c for c in left if c != first and c.swap and first.swap and left[c] < left[first] + CLEAR
-    )
-    return Told(first, i, float(before.rms[i]), float(after.rms[i]), others)
+    return Told(first, i, float(before.rms[i]), float(after.rms[i]), tuple(others))
 
 
 def _mirrored(model: Model, mistake: Mistake) -> tuple[str, ...]:

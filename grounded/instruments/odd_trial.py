@@ -131,6 +131,10 @@ def spread(trial: Trial, some: Sequence[int]) -> Array:
 
 
 PREDICTED = 1.0  # of what the signals do: an error below that predicts them
+FULL_TURNS = 4 * np.pi  # [rad] that an angle spans: degrees, or wheels, or a heading
+SOON = 0.1  # [s] ahead: a body that a model lacks much of goes its own way later
+CONCORDANT, PLAINLY = 0.1, 1.5  # concordance, and times that with other factors
+WHOLE = 0.3  # concordance of each angle with what its rate says
 
 
 def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Odd]:
@@ -164,7 +168,51 @@ def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) 
     told = judges.any() and all(
         np.median(mended[judges] / other[judges]) < 1 for other in (own / 2, *near)
     )
+    if not told and angles:
+        best = Odd(0, DEGREES, moving)
+        told = _turning_as_degrees(model, some, shown, best)
     return [replace(best, trial=k) for k in range(len(trials))] if told else []
+
+
+def _turning_as_degrees(
+    model: Model, trials: Sequence[Trial], shown: Sequence[int], odd: Odd
+) -> bool:
+    """Whether angles beyond full turns turn as a model says that is crude, were they degrees.
+
+    A payload and friction that a model lacks can make its errors larger than all that moves. Still
+    what it predicts goes with what happened, and is about as large, of no angles but the right
+    ones: sines of others are noise, and pushes on them are too weak, or too strong.
+    """
+    units = list(model.states.values())
+    angles = [i for i in odd.states if units[i] == "rad"]
+    wide = [
+        np.nanmax(x, axis=0) - np.nanmin(x, axis=0) for t in trials if len(x := t.states[:, angles])
+    ]
+    if max((float(one.max()) for one in wide), default=0.0) < FULL_TURNS:
+        return False
+    going = [r.i for r in integrals(model) if r.exact and {r.i, r.j} <= set(shown)]
+    driven = [i for i in shown if i not in going]
+
+    def concord(factor: float, some: Sequence[int] = driven) -> float:
+        mended = [replace(odd, factor=factor).mended(t) for t in trials]
+        return float(np.median([_concordance(model, t, shown, some) for t in mended]))
+
+    own = [concord(DEGREES, [i]) for i in going if i in angles]
+    if min(own, default=0.0) < WHOLE:  # one that its rate does not move is not in its unit
+        return False
+    mended = concord(DEGREES)
+    others = [concord(factor) for factor in (1.0, DEGREES / LIKE, DEGREES * LIKE)]
+    return mended > CONCORDANT and all(mended > PLAINLY * other for other in others)
+
+
+def _concordance(model: Model, trial: Trial, shown: Sequence[int], some: Sequence[int]) -> float:
+    """Of what the states `some` do in a moment with what is predicted (Lin 1989), their mean."""
+    if not some or (ahead := predicted(model, trial, shown, SOON)) is None:
+        return 0.0
+    start, x, logged = ahead
+    said, moved = (model.difference(to, start)[:, some] for to in (x, logged))
+    both = said.var(axis=0) + moved.var(axis=0) + (said - moved).mean(axis=0) ** 2 + 1e-300
+    return float((1 - ((said - moved) ** 2).mean(axis=0) / both).mean())
 
 
 def odd_commands(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Iterator[Odd]:
@@ -214,13 +262,13 @@ def missed(
 
 
 def predicted(
-    model: Model, trial: Trial, shown: Sequence[int]
+    model: Model, trial: Trial, shown: Sequence[int], horizon: float = AHEAD
 ) -> tuple[Array, Array, Array] | None:
-    """Logged states (N, n), what the model makes of them in 0.25 s, those logged then.
+    """Logged states (N, n), what the model makes of them by a horizon [s], those logged then.
 
     None where too little is known. States that are not `shown` are taken for 0.
     """
-    steps = max(1, round(AHEAD / trial.dt))
+    steps = max(1, round(horizon / trial.dt))
     logged = np.array(trial.states)
     logged[:, [i for i in range(model.n) if i not in shown]] = 0.0  # nobody knows
     good = np.asarray(np.isfinite(logged).all(axis=1))

@@ -9,7 +9,15 @@ import grounded as gr
 from facts import holding, holds
 from grounded import Model, Param
 from grounded.errors import GroundedError
-from grounded.instruments.mistaken import Mistake, described, judge_commands, mended_by, mistaken
+from grounded.instruments.mistaken import (
+    Mistake,
+    _best,
+    described,
+    judge_commands,
+    mended_by,
+    mistaken,
+)
+from grounded.instruments.short_runs import Fit
 from grounded.trial import Trial
 
 
@@ -291,3 +299,18 @@ def test_a_diagnosis_stops_at_exchanged_commands():
     ) as stopped:
         gr.diagnose(vessel(), trials)
     assert stopped.value.then is not None and stopped.value.then.verb == "discard"
+
+
+def test_of_two_explanations_an_exchange_comes_before_a_turned_sensor():
+    """It is a mistake of [log] alone; the other has the robot's program wrong as well."""
+
+    def fits(left):
+        return {0: (Fit(np.ones(4), np.ones(2)), Fit(left, np.ones(2)))}
+
+    turned, swapped = Mistake(turned=(0, 2)), Mistake(states=((0, 1), (2, 3)))
+    close, clear = np.array([0.5, 0.4, 0.5, 0.4]), np.array([0.5, 0.2, 0.5, 0.2])
+    told = _best({turned: fits(close), swapped: fits(1.1 * close)})
+    assert (told.mistake, told.others) == (swapped, (turned,))
+    assert told.mended == pytest.approx(0.44)
+    told = _best({turned: fits(clear), swapped: fits(close)})
+    assert (told.mistake, told.others) == (turned, ())

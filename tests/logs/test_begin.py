@@ -98,6 +98,17 @@ def test_torques_that_motion_does_not_tell_apart_are_unsure_and_both_are_named(t
     assert {guess.name for guess in found.unsure} >= {"shoulder_effort", "elbow_effort"}
 
 
+def test_an_array_of_commands_comes_before_the_torques_that_were_measured(tmp_path):
+    """Efforts are what came out, after the drive's delay, at the rate of the encoders."""
+    log = commanded_arm_bag(tmp_path / "bag", measured_torques=True)
+    found = begin(tmp_path / "arm", log, kind="arm")
+    paths = ["/effort_controller/commands.data[0]", "/effort_controller/commands.data[1]"]
+    assert [guess.path for guess in found.inputs] == paths
+    assert not any(guess.sure for guess in found.inputs)
+    assert all(any(".effort[" in path for path in guess.others) for guess in found.inputs)
+    assert found.dt == 0.02
+
+
 @pytest.mark.parametrize(
     "joints, ordered",
     [

@@ -46,6 +46,8 @@ def gaps(every, rows, seed=0, jitter=0.0, drift=0.0, held=0.3, odd=0):
         (0.0166667, 0.002, {}),
         (0.008, 0.002, {}),  # not 0.00833333 s, of which it is within a row
         (0.00833333, 0.002, {}),
+        (0.01, 0.005, {"jitter": 0.0007, "held": 0.0}),  # a quarter of the gaps is 5 ms, or 15
+        (0.01, 0.005, {"jitter": 0.0007, "held": 0.0, "drift": 3e-4}),
     ],
 )
 def test_the_interval_is_found_in_what_rows_show(every, rows, more):
@@ -60,6 +62,7 @@ def test_the_interval_is_found_in_what_rows_show(every, rows, more):
         np.full(15, 0.05),  # too few
         np.round(np.random.default_rng(0).exponential(0.08, 500) + 0.01, 2),  # whenever
         np.tile([0.05, 0.05, 0.06, 0.08], 30),
+        0.02 + np.random.default_rng(0).choice([-0.005, 0.0, 0.0, 0.005], 400),  # in no step
     ],
 )
 def test_what_no_interval_explains_has_none(times):

@@ -128,7 +128,9 @@ def arm_bag(folder, scale=1.0):
     return bag(folder, topics, messages)
 
 
-def commanded_arm_bag(folder, order=("shoulder", "elbow"), goals=True, seed=0):
+def commanded_arm_bag(
+    folder, order=("shoulder", "elbow"), goals=True, seed=0, measured_torques=False
+):
     """A vertical arm whose JointState is in the order of the alphabet, its commands without names.
 
     Args:
@@ -136,6 +138,7 @@ def commanded_arm_bag(folder, order=("shoulder", "elbow"), goals=True, seed=0):
         order: of the torques in the array of commands.
         goals: new ones every second; False: it hangs at rest, the torques are noise of the loop.
         seed: of goals and noise.
+        measured_torques: JointState has efforts, noisy.
     """
     rng, own, h = np.random.default_rng(seed), ("shoulder", "elbow"), 0.002
     topics = {
@@ -143,7 +146,7 @@ def commanded_arm_bag(folder, order=("shoulder", "elbow"), goals=True, seed=0):
         "/effort_controller/commands": "std_msgs/msg/Float64MultiArray",
     }
     q, w, goal, near, u = np.zeros((5, 2))
-    layout = T["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
+    layout, none = T["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0), np.zeros(0)
     messages = []
     for k in range(10_000):
         t = START + k * 2 * 10**6
@@ -153,7 +156,8 @@ def commanded_arm_bag(folder, order=("shoulder", "elbow"), goals=True, seed=0):
         if k % 5 == 0:
             names = ["elbow_joint", "shoulder_joint"]
             both = [one[::-1] for one in measured]
-            messages.append(("/joint_states", t, joints(t, names, *both, np.zeros(0))))
+            torques = (np.array(u) + 0.05 * rng.normal(size=2))[::-1] if measured_torques else none
+            messages.append(("/joint_states", t, joints(t, names, *both, torques)))
         if k % 10 == 0:
             near = near + 0.05 * (goal - near)
             u = [16, 4] * (near - measured[0]) - [2.5, 0.35] * measured[1]

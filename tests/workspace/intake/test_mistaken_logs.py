@@ -8,6 +8,8 @@ from facts import holds
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial
+from grounded_trials.workspace.intake.foreign import mapping_of, read_foreign
+from grounded_trials.workspace.intake.read_otherwise import exchanged_in
 from workspaces import make
 
 MODEL = """import numpy as np
@@ -128,3 +130,28 @@ def test_a_run_whose_commands_are_in_percent_is_its_candidate_s(w, tmp_path):
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
     assert holds(str(refused.value), plan.id, "port and starboard 100", "in percent", "by 0.01")
+
+
+def test_a_run_with_exchanged_commands_names_them(w, tmp_path):
+    """It was told as `somebody, or another controller, drove`."""
+    plan = w.propose().candidate
+    w.run()
+    trial = read_trial(next((w.folder / "runs").iterdir()))[0]
+    t = trial.dt * np.arange(trial.steps)
+    table = np.column_stack([t, trial.states[:-1], trial.inputs])
+    path = tmp_path / "run.csv"
+    np.savetxt(path, table, "%.9f", ",", header="t,v,r,psi,starboard,port", comments="")
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(path)
+    said = str(refused.value)
+    assert holds(said, plan.id, "port", "starboard") and "somebody" not in said
+    recording = read_foreign(w, path, mapping_of(w, path)).recording
+    assert exchanged_in(recording, w.task, plan.policy) == ("port", "starboard")
+    toml = w.folder / "grounded.toml"
+    toml.write_text(
+        toml.read_text()
+        .replace('port = { path = "/csv.port" }', 'port = { path = "/csv.A" }')
+        .replace('starboard = { path = "/csv.starboard" }', 'starboard = { path = "/csv.port" }')
+        .replace("/csv.A", "/csv.starboard")
+    )
+    assert Workspace(w.folder).ingest(path).candidate == plan.id

@@ -66,7 +66,10 @@ def weigh(
     units = {**model.states, **model.inputs}
     joints = joint_names(log) if joints is None else joints
     guesses = {guess.name: guess for guess in (*states, *inputs)}
-    guesses = {name: of_joint(guess, units[name], joints, log) for name, guess in guesses.items()}
+    guesses = {
+        name: of_joint(guess, units[name], joints, log, sent=name in model.inputs)
+        for name, guess in guesses.items()
+    }
     guesses |= in_order(guesses, units, joints, log)
     guesses = {name: _unit(guess, units[name]) for name, guess in guesses.items()}
     guesses |= _by_unit(guesses, model)

@@ -6,6 +6,7 @@ Models, and controllers, count from the base.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -20,6 +21,8 @@ LIMB = ("base", "waist", "torso", "shoulder", "upper", "elbow", "fore", "wrist",
 LEG = ("hip", "thigh", "knee", "shin", "ankle", "foot", "toe")
 WITHIN = ("yaw", "pan", "lift", "pitch", "flex", "roll")  # of the joints of one part
 SIDES = ("left", "right", "front", "rear")  # of several limbs
+ROLLS = re.compile("wheel|caster|track|rotor|prop|crank|spindle")  # turns on and on
+FULL_TURNS, DEGREES = 4 * math.pi, 720.0  # of a joint: what spans more; its most, in degrees
 
 
 def joint_names(log: LogReport) -> dict[str, tuple[str, ...]]:
@@ -81,9 +84,18 @@ def _first(words: Sequence[str], joint: str) -> int:
 
 
 def of_joint(
-    guess: Guess, unit: str, joints: Mapping[str, tuple[str, ...]], log: LogReport
+    guess: Guess,
+    unit: str,
+    joints: Mapping[str, tuple[str, ...]],
+    log: LogReport,
+    *,
+    sent: bool = False,
 ) -> Guess:
-    """A state whose name holds a joint's is that joint's number of its unit, if the log has it."""
+    """A name that holds a joint's is that joint's number of its unit, if the log has it.
+
+    `sent`: an input. Efforts are what came out, after the drive's delay and limits: an array with a
+    command for each joint comes before them.
+    """
     there = _there(log)
     for topic, names in joints.items():
         for i, joint in enumerate(names):
@@ -92,11 +104,49 @@ def of_joint(
             kind = next((k for k, u in JOINT_UNITS.items() if u == unit), None)
             kind = kind or ("position" if unit in ("m", "1") else None)
             path = f"{topic}.{kind}[{i}]"
+            commanded = _commands(log, len(names)) if sent and kind == "effort" else []
+            if commanded:
+                at = from_base(names).index(joint)
+                paths = [f"{command}[{at}]" for command in commanded]
+                paths += [path] if path in there else []
+                rest = [f"{c}[{k}]" for c in commanded for k in range(len(names)) if k != at]
+                why = f"commands name no joint; in their order from the base, {at} is '{joint}'"
+                others = (*paths[1:], *rest)
+                return replace(guess, path=paths[0], sure=False, others=others, reasons=(why,))
             if path in there:
                 others = tuple(p for p in (guess.path, *guess.others) if p and p != path)
                 why = f"{topic} names its joint {i} '{joint}'"
                 return replace(guess, path=path, sure=True, others=others[:3], reasons=(why,))
     return guess
+
+
+def wide_joints(
+    guesses: Sequence[Guess],
+    units: Mapping[str, str],
+    joints: Mapping[str, tuple[str, ...]],
+    log: LogReport,
+) -> tuple[str, ...]:
+    """Joints that span turns in rad, as ROS's conventions have it, and no wheel does: degrees?"""
+    fields = {field.path: field for topic in log.topics for field in topic.fields}
+    called = {f"{t}.position[{i}]": j for t, names in joints.items() for i, j in enumerate(names)}
+    found = []
+    for one in guesses:
+        field, joint = fields.get(one.path), called.get(one.path, "")
+        if field is None or field.low is None or field.high is None or units[one.name] != "rad":
+            continue
+        low, high = (one.scale * end for end in (field.low, field.high))
+        if not joint or ROLLS.search(joint.lower()) or abs(high - low) <= FULL_TURNS:
+            continue
+        if max(abs(low), abs(high)) <= DEGREES:
+            found.append(f"{one.name}, from {min(low, high):.3g} to {max(low, high):.3g}")
+    if not found:
+        return ()
+    several = len(found) > 1
+    return (
+        f"{'; '.join(found)}: turns of a joint, if {'these are' if several else 'that is'} rad. "
+        f"In degrees? Then scale = {math.pi / 180:.8g} in [log.state] of each, of "
+        "the joints' velocities too, makes it rad",
+    )
 
 
 def in_order(
@@ -149,6 +199,7 @@ def _commands(log: LogReport, count: int) -> list[str]:
         for topic in log.topics
         if "MultiArray" in topic.type
         and any(word in topic.topic.lower() for word in words)
+        and not any(word in topic.topic.lower() for word in ("position", "velocity"))
         and sum(".data[" in field.path for field in topic.fields) == count
     ]
 

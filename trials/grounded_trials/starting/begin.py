@@ -24,7 +24,7 @@ from grounded_trials.logs.inspect_evidence import as_stated, weigh
 from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated, mapping_toml
 from grounded_trials.logs.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.inspect_pairs import velocities
-from grounded_trials.logs.joint_names import joint_names
+from grounded_trials.logs.joint_names import joint_names, wide_joints
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.stated_units import Stated
@@ -183,7 +183,7 @@ def _begin(
             tuple(_asked(g, ask, partial(as_stated, said, units[g.name])) for g in some)
             for some in (states, inputs)
         )
-    notes = (*notes, *_in_seconds(report))
+    notes = (*notes, *_in_seconds(report), *wide_joints(states, units, joints, report))
     step, whose, note = (dt, "", "") if dt else interval_of(report, inputs, states)
     ranges = {g.name: _range(report, g) for g in (*states, *inputs)}
     if chosen != "drone":  # what is sent after a run must be allowed: rest

@@ -74,9 +74,12 @@ def write_first(
         f"# input_change = {_inline(changes)}",
         f"input_change = {_inline(changes)}",
         "",
-        "[limits]                      # SEEN in the log, and 0: put in what your robot may get",
+        "[limits]" + "                      # put in what your robot may get" * (not limits),
         *limits,
-        *[f"seen_in = {json.dumps(log, ensure_ascii=False)}  # delete this line once you did"]
+        *[
+            "# SEEN in the log, and 0: put in what your robot may get, then delete these two lines",
+            f"seen_in = {json.dumps(log, ensure_ascii=False)}",
+        ]
         * bool(limits),
         "",
         "[search]",

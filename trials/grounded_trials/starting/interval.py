@@ -28,6 +28,8 @@ ONCE = 0.25  # of them are the interval itself
 APART = 1.5  # rows, from which an interval is another one than theirs
 NEAR = 0.03  # of an interval: it is one of STEPS, whose rows come that nearly so often
 OFF = 0.05  # of an interval, that the mean of the times between changes may be from it
+MOSTLY, IN_STEP = 0.5, 0.6  # of times between changes, and of their phases, where a loop jitters
+TOGETHER = 40  # changes whose phases are compared: clocks drift
 EXACT, LOOSE = 0.1, 0.25  # of an interval: how far a multiple may be off it
 
 
@@ -111,9 +113,25 @@ def changes_every(gaps: Array, rows: float) -> float | None:
             found[step] = abs(float((gaps / whole)[on].mean()) / step - 1)
     fits = [step for step, off in found.items() if off < OFF]
     if not fits:
-        return None
+        return _in_phase(gaps, rows)
     alike = [step for step in fits if step > max(fits) / (1 + 2 * OFF)]  # 120 and 125 Hz
     return min(alike, key=found.__getitem__)
+
+
+def _in_phase(gaps: Array, rows: float) -> float | None:
+    """The interval of a loop whose jitter takes changes a row earlier or later; None for none.
+
+    Times between them are then off by a row now and then, but the next ones make up for it.
+    """
+    changes, found = np.cumsum(gaps), dict[float, float]()
+    parts = np.array_split(changes, max(1, len(changes) // TOGETHER))
+    for step in STEPS:
+        once = np.abs(gaps - step) <= LOOSE * step
+        if APART * rows < step <= LONGEST and once.mean() >= MOSTLY:
+            turns = [abs(np.exp(2j * np.pi * part / step).mean()) for part in parts]
+            found[step] = float(np.median(turns))
+    best = max(found, key=found.__getitem__, default=None)
+    return best if best is not None and found[best] >= IN_STEP else None
 
 
 def _topic(report: LogReport, guess: Guess) -> Any:

@@ -80,6 +80,7 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     """
     from grounded_trials.logs.inspect_evidence import weigh
     from grounded_trials.logs.inspect_guess import guess_mapping, is_simulated, mapping_toml
+    from grounded_trials.logs.joint_names import joint_names, wide_joints
     from grounded_trials.logs.log_table import log_mapping
     from grounded_trials.logs.unnamed import from_the_rest
     from grounded_trials.workspace.intake.no_angle import no_angles
@@ -100,4 +101,5 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     table = mapping_toml(states, inputs, simulated=is_simulated(report))
     mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
     odd = tuple(f"{name} {said}" for name, said in no_angles(model, mapping).items())
+    odd += wide_joints(states, model.states, joint_names(report), report)
     return Inspected(str(log), report, table, ran_nothing=not workspace.candidate_ids(), odd=odd)

@@ -206,9 +206,17 @@ class ForeignLog:
     @cached_property
     def recording(self) -> Recording | None:
         """The log where its run may begin anywhere; None where [log.span] is set."""
-        if self.workspace.config.log.sub("span").names():
-            return None
+        return None if self.spanned else self.anywhere
+
+    @cached_property
+    def anywhere(self) -> Recording | None:
+        """The log, to be cut anywhere, whatever [log.span] says; None where it can't be."""
         return recording(self.series, self.workspace.task, self.complete, self.whole)
+
+    @property
+    def spanned(self) -> bool:
+        """Whether [log.span] says where its run begins."""
+        return bool(self.workspace.config.log.sub("span").names())
 
 
 def mapping_of(workspace: Folder, path: Path) -> LogMapping:

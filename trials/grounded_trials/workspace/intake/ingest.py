@@ -334,6 +334,11 @@ class _Look:
                 there = judged(rival)  # as it lies where that one fits best
                 told = there if there.other else seen if seen.why else replace(seen, why=there.why)
                 seen = replace(told, ran=seen.ran)
+        elif log and read.cut and log.spanned and (seen.why or seen.other) and log.anywhere:
+            begins = 1e-9 * (read.cut.start_ns - log.anywhere.whole.origin_ns)
+            given = Start(begins, 0.0, alike=True, opens_alike=True)
+            if sender_of(log.anywhere, own, [], lambda _: given).sure:
+                seen = replace(seen, why="", other="")
         self.suspicion = seen
 
     @property

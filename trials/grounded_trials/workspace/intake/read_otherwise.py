@@ -1,6 +1,6 @@
 """Whether a run begins in a log that is read otherwise.
 
-At another pace, in another unit, with two states in each other's column, or from another zero.
+At another pace, in another unit, with two signals in each other's column, or from another zero.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from grounded_trials.workspace.intake.other_scale import (
 from grounded_trials.workspace.intake.run_start import TRIED, Recording, recording
 from grounded_trials.workspace.intake.who_drove import follows
 
-PAIRS = 28  # of states that are tried in each other's column: all of eight
+PAIRS = 28  # of states, and of inputs, that are tried in each other's column: all of eight
 PACES = (2.0, 0.5)  # of a recording that was played twice as fast, or half
 
 
@@ -79,9 +79,10 @@ def misled(log: Recording | None, task: Task, policy: Policy) -> str:
         return ""
     if pair := exchanged_in(log, task, policy):
         a, b = pair
+        of = "state" if a in task.model.state_names else "input"
         return (
             f"it would be, with {a} and {b} in each other's column: exchange the paths in "
-            f"[log.state.{a}] and [log.state.{b}], or the columns' heads in the log"
+            f"[log.{of}.{a}] and [log.{of}.{b}], or the columns' heads in the log"
         )
     if off := offset_in(log, task, policy):
         name, by = off
@@ -96,15 +97,16 @@ def misled(log: Recording | None, task: Task, policy: Policy) -> str:
 
 
 def exchanged_in(log: Recording, task: Task, policy: Policy) -> tuple[str, str] | None:
-    """Two states in each other's column, with which back a run of a policy begins in a log.
+    """Two states, or inputs, in each other's column: back, a run of a policy begins in a log.
 
     Args:
         log: in which none begins as it is.
         task: whose steps it is cut into.
         policy: what is sought.
     """
+    inputs = list(combinations(task.model.input_names, 2))[:PAIRS]
     states = [name for name in task.model.state_names if name in log.logged]
-    for a, b in list(combinations(states, 2))[:PAIRS]:
+    for a, b in (*inputs, *list(combinations(states, 2))[:PAIRS]):
         one, other = log.logged[a], log.logged[b]
         back = {a: replace(other, spec=one.spec), b: replace(one, spec=other.spec)}
         run = _run_in(recording({**log.logged, **back}, task, log.complete), policy)

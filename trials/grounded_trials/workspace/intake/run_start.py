@@ -29,6 +29,7 @@ from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.logs.command_steps import changes_of, phase_of
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
+from grounded_trials.workspace.intake.acted_on import acted_on
 from grounded_trials.workspace.intake.who_drove import (
     FINE,
     LEAST,
@@ -116,10 +117,34 @@ class Recording:
             return None
         apart, until = self._apart(policy)
         whole = self._starts(policy, apart)
-        if any(one.alike for one in whole):
-            return min(whole, key=lambda one: (not one.alike, one.apart))
+        if (surest := self._surest(policy, whole)) is not None:
+            return surest
         begun = [one for one in self._starts(policy, until) if one.opens_alike]
         return min(begun or whole, key=lambda one: (not one.alike, one.apart), default=None)
+
+    def _surest(self, policy: Policy, starts: Sequence[Start]) -> Start | None:
+        """Of a run's likeliest places, where most of its commands are the policy's; None: nowhere.
+
+        A mean counts what a program sent in the first steps' place, and what is at its limits as
+        much as what says when it was sent; half of the commands, on the samples that they were
+        made from, count neither.
+        """
+        alike = [one for one in starts if one.alike]
+        likeliest = min(alike or starts, key=lambda one: one.apart, default=None)
+        if likeliest is None:
+            return None
+        near = [one for one in starts if SAME * one.apart <= likeliest.apart] if alike else []
+        if len(near) == 1:
+            return likeliest
+        fits = [(acted_on(self, policy, one.seconds), one) for one in near or [likeliest]]
+        told = [(fit, one) for fit, one in fits if fit is not None and fit.told.sum() >= LEAST]
+        fit, best = min(told, key=lambda pair: pair[0].left, default=(None, likeliest))
+        if fit is not None and fit.throughout:
+            return replace(best, alike=True, opens_alike=True)
+        usual = next((other.left for other, one in told if one is likeliest), np.inf)
+        if fit is not None and alike and fit.left < SAME * usual:
+            return replace(best, opens_alike=True)
+        return likeliest if alike else None
 
     def _starts(self, policy: Policy, apart: Array) -> list[Start]:
         """The likeliest places, by how little differs from each instant on."""
