@@ -367,7 +367,10 @@ def test_one_log_is_one_trial(w, tmp_path):
         assert refused.value.then == NextCommand("discard", (first.trial,))
     assert w.ingest(path, candidate="c0002").known and len(w.trials()) == 2
     w.discard(first.trial)
-    assert w.ingest(path, data=True).candidate == ""
+    kept = w.ingest(path, data=True)
+    assert kept.candidate == ""
+    with pytest.raises(GroundedError, match=f"stored already, as {kept.trial}, data"):
+        w.ingest(path)  # "ran c0001, which was made for an earlier task"
 
 
 def recorded_in_motion(path, change=0.3, begun=0.13):

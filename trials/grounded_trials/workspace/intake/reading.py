@@ -147,6 +147,7 @@ def read_log_file(workspace: Folder, path: Path, candidate: str | None, data: bo
     refuse_as_another(path, log.stored, "" if data else candidate)
     chosen = "" if data else ran or _outstanding(workspace, path)
     if chosen:
+        refuse_as_another(path, log.stored, chosen)
         _check_candidate(workspace, path, chosen)
     return cut_log(log, chosen)
 
