@@ -239,10 +239,6 @@ class System(ABC):
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
         """From x (N, n), u (N, m) to the next x (N, n)."""
 
-    def moved(self, problem: Problem, x: Array, received: Array, t: int) -> Array:
-        """A step of a problem at t, without its bias: x (N, n), what is received (N, m)."""
-        return self.step(x, received, problem.p, problem.dt, problem.smoothing)
-
     @abstractmethod
     def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
         """Compares a trace with the user's own function at points x (N, n), u (N, m).

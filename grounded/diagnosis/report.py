@@ -24,7 +24,7 @@ from grounded.diagnosis.error_report import (
 )
 from grounded.diagnosis.ruler_words import contested
 from grounded.errors import NextCommand
-from grounded.instruments.finding import Finding
+from grounded.instruments.finding import Finding, filters_of
 from grounded.result import Document, number
 
 if TYPE_CHECKING:
@@ -351,8 +351,8 @@ class Diagnosis(Document):
 
         The physics was judged without them; what a controller feeds back comes through them.
         """
-        found = (f for f in self.preflight if f.kind == "lag" and f.corrected and not f.log)
-        return {f"sensor_lag:{f.signal}": {"tau": f.delay_s} for f in found if f.delay_s > 0}
+        found = filters_of(one for one in self.preflight if not one.log)
+        return {f"sensor_lag:{name}": {"tau": tau} for name, tau in found.items() if tau > 0}
 
     @property
     def known_parameters(self) -> dict[str, Estimate]:

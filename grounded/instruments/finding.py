@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from grounded.result import Document
@@ -52,6 +53,11 @@ def put_right(
 ) -> Finding:
     """A finding that the trials were corrected for."""
     return Finding(name, text, kind, delay_s, std_s, scale, corrected=True, log=log)
+
+
+def filters_of(findings: Iterable[Finding]) -> dict[str, float]:
+    """Time constants of the sensors that filter and were corrected for, by state [s]."""
+    return {f.signal: f.delay_s for f in findings if f.corrected and f.kind == "lag"}
 
 
 def in_degrees(name: str, unit: str) -> Finding:

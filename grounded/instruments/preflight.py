@@ -31,7 +31,7 @@ from grounded.frozen import Array
 from grounded.instruments.clocks import told_by_the_clock
 from grounded.instruments.constant import constant_of
 from grounded.instruments.dead import judge_dead
-from grounded.instruments.finding import DEGREES, Finding, in_degrees, put_right
+from grounded.instruments.finding import DEGREES, Finding, filters_of, in_degrees, put_right
 from grounded.instruments.inputs import judge_inputs
 from grounded.instruments.kinematics import (
     AGREE,
@@ -90,7 +90,7 @@ class Preflight:
     @property
     def filters(self) -> dict[str, float]:
         """Time constants of the sensors that filter, by state [s]."""
-        return {f.signal: f.delay_s for f in self.findings if f.corrected and f.kind == "lag"}
+        return filters_of(self.findings)
 
     @property
     def left_out(self) -> frozenset[str]:

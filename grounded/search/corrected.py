@@ -109,18 +109,15 @@ class Corrected(System):
         alphas: Array | None = None,
     ) -> Swarm:
         """See `System.rollout`."""
+        angles = problem.angles[: self.base.n]
 
-        def step(x: Array, received: Array, t: int) -> Array:
-            return self.moved(problem, x, received, t)
+        def step(x: Array, sent: Array, t: int) -> Array:
+            state, settings = self._own(x), (problem.dt, problem.smoothing)
+            moved = self.base.step(state, np.ascontiguousarray(sent), problem.p, *settings)
+            shift = 0.0 if problem.input_shift is None else problem.input_shift[t]
+            return self._next(moved, x, sent + shift, t, angles)
 
         return rolled_out(problem, step, ubar, K, zbar, k, alphas)
-
-    def moved(self, problem: Problem, x: Array, received: Array, t: int) -> Array:
-        """See `System.moved`: the law of that step."""
-        state, settings = self._own(x), (problem.dt, problem.smoothing)
-        moved = self.base.step(state, np.ascontiguousarray(received), problem.p, *settings)
-        shift = 0.0 if problem.input_shift is None else problem.input_shift[t]
-        return self._next(moved, x, received + shift, t, problem.angles[: self.base.n])
 
     def _own(self, x: Array) -> Array:
         """The base's states (N, n) of x (N, 2 n + m)."""

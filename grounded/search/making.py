@@ -333,9 +333,7 @@ class Maker:
         """The same run with the gains of a regulator whose inputs cost GENTLER ** caution more."""
         if policy.gain is None:
             return policy
-        run, change = predicted(problem, policy), problem.change_weight
-        weight = GENTLER**caution * (problem.input_weight + change) - change
-        gentle = replace(self.planner.loosened(problem) or problem, input_weight=weight)
+        run, gentle = predicted(problem, policy), self.planner.dearer(problem, GENTLER**caution)
         found = ddp.sweep(gentle, run.z, run.inputs)
         if not (found.ok and np.isfinite(run.z).all()):
             return policy

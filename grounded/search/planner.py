@@ -61,12 +61,15 @@ class Planner:
 
     def loosened(self, problem: Problem) -> Problem | None:
         """The plan's problem with dry frictions that build up slowly; None where it has none."""
-        if not self.widths:
-            return None
-        p = np.where(np.isin(self.plan.model.param_names, self.widths), LOOSE, 1.0) * problem.p
-        return dataclasses.replace(problem, p=p)
+        return dataclasses.replace(problem, p=self.loose.model.values) if self.widths else None
 
-    @property
+    def dearer(self, problem: Problem, factor: float) -> Problem:
+        """The same, if it has any, whose inputs cost `factor` times as much: for gentler gains."""
+        easier = self.loosened(problem) or problem
+        weight = factor * easier.input_weight + (factor - 1) * easier.change_weight
+        return dataclasses.replace(easier, input_weight=weight)
+
+    @cached_property
     def loose(self) -> Task:
         """The plan's task with such frictions; its own where it has none."""
         model = self.plan.model
@@ -132,12 +135,10 @@ class Planner:
         task, n = cautious(self.aim, caution), self.task.model.n
         made = [measured_gains(task.problem(), found.z, found.u, found.K, n)]
         exact = self.plan.problem(exact=True)
-        if (loose := self.loosened(task.problem(exact=True))) is not None:
-            for factor in DEARER:
-                weight = factor * loose.input_weight + (factor - 1) * loose.change_weight
-                dear = dataclasses.replace(loose, input_weight=weight)
-                K = sweep(dear, found.z, found.u).gains.K
-                made.append(measured_gains(dear, found.z, found.u, K, n))
+        for factor in DEARER if self.widths else ():
+            dear = self.dearer(task.problem(exact=True), factor)
+            K = sweep(dear, found.z, found.u).gains.K
+            made.append(measured_gains(dear, found.z, found.u, K, n))
         policies = [dataclasses.replace(policy, gain=K) for K in made]
         return max(policies, key=lambda one: predicted(exact, one).utility), found
 

@@ -98,13 +98,18 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
             return to_run(workspace, found.probe, found.probe)
         if found.kind != "none" or not workspace.config.task.target:
             return NextCommand("report", ("--html",))
-    try:
-        now = standing_in(workspace, ahead=True)
-    except GroundedError:  # it can't be planned with this model
-        now = standing_in(workspace)
+    now = _standing_ahead(workspace)
     if found.no_cause:
         return another_trial(workspace, now)
     return next_command(workspace, now, found, usable_ids(workspace))
+
+
+def _standing_ahead(workspace: Folder) -> Standing:
+    """Where the search stands, one proposal ahead where that can be planned with this model."""
+    try:
+        return standing_in(workspace, ahead=True)
+    except GroundedError:
+        return standing_in(workspace)
 
 
 def after_fit(workspace: Folder) -> NextCommand:
@@ -118,10 +123,7 @@ def after_fit(workspace: Folder) -> NextCommand:
         found = None
     if found is None:
         return DIAGNOSE
-    try:
-        now = standing_in(workspace, ahead=True)
-    except GroundedError:  # it can't be planned with this model
-        now = standing_in(workspace)
+    now = _standing_ahead(workspace)
     since = since_diagnosis(workspace, found, usable_ids(workspace))
     if since.changed or since.newer:
         return DIAGNOSE
