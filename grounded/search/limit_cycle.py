@@ -13,12 +13,17 @@ SWINGS = 6  # of an input about its plan, each as large as the plan's own range:
 
 
 def limit_cycle(tried: Tried, task: Task) -> bool:
-    """Whether feedback swung an input to and fro about its plan, each time by the plan's range."""
+    """Whether feedback swung an input to and fro about its plan, each time by the plan's range.
+
+    And by more than it is off lastingly: a load that sags, or friction that holds a joint, needs
+    the gains that it has, whatever noise they carry.
+    """
     made = tried.candidate
     range_ = np.minimum(np.ptp(made.predicted_inputs, axis=0), task.high - task.low)
     for trial in tried.trials:
         off = trial.inputs - made.predicted_inputs[: trial.steps]
-        if any(_swings(off[:, i], size) >= SWINGS for i, size in enumerate(range_) if size > 0):
+        sizes = np.maximum(range_, np.abs(np.median(off, axis=0)))
+        if any(_swings(off[:, i], size) >= SWINGS for i, size in enumerate(sizes) if range_[i] > 0):
             return True
     return False
 
