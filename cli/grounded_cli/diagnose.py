@@ -111,6 +111,10 @@ def command(
         params = workspace.base_model.params
         _tell(found, {name: param.value for name, param in params.items()})
         show("\n" + field("next trial", found.next_trial))
+        if found.probe:
+            from grounded_cli.propose import show_extent
+
+            show_extent(workspace.candidate(found.probe)[0], workspace.task)
         assert found.then is not None
         show(f"\n{next_line(found.then)}")
 

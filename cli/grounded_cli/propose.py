@@ -70,10 +70,7 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
     if standing.incumbent is not None:
         show(field("so far", _so_far(candidate, standing.incumbent), "  "))
     show(field("trust", _trust(candidate, standing, workspace), "  "))
-    rows = _extent(candidate, workspace.task)
-    width = max(LABEL, *(len(name) for name, _ in rows))
-    for name, text in rows:
-        show(field(name, text, "  ", width))
+    show_extent(candidate, workspace.task)
     if last:
         show(f"\n{next_line(proposed.then)}")
 
@@ -140,6 +137,14 @@ def _gain(candidate: Candidate) -> float:
     """The mean size of the feedback's gains."""
     gain = candidate.policy.gain
     return 0.0 if gain is None else float(abs(gain).mean())
+
+
+def show_extent(candidate: Candidate, task: Task) -> None:
+    """Shows where a candidate's predicted run goes."""
+    rows = _extent(candidate, task)
+    width = max(LABEL, *(len(name) for name, _ in rows))
+    for name, text in rows:
+        show(field(name, text, "  ", width))
 
 
 def _extent(candidate: Candidate, task: Task) -> list[tuple[str, str]]:

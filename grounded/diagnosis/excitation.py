@@ -151,10 +151,13 @@ def probe(
         text = f"{same} they do the same"
         return Probe(chosen, expected, (group[0], group[1]), text, little=True)
     gain = f"{expected:,.{int(expected < 100)}f} nats"
-    sentence = f"{words}: expected to tell {group[0]} from {group[1]} by {gain}" + (
-        " (too little: try larger inputs or another manoeuvre)" if expected < TIE else ""
-    )
-    return Probe(chosen, expected, (group[0], group[1]), sentence)
+    tells = f"{words}: expected to tell {group[0]} from {group[1]} by {gain}"
+    if little := expected < TIE:
+        tells = (
+            f"no candidate inside the limits tells enough, not even {tells}, of {TIE:g} that are "
+            "needed: record larger inputs or another manoeuvre"
+        )
+    return Probe(chosen, expected, (group[0], group[1]), tells, little)
 
 
 def _teaching(

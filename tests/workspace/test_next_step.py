@@ -679,10 +679,17 @@ def test_who_goes_on_after_steps_that_lost_is_told_of_a_diagnosis(tmp_path, monk
     folder = make(tmp_path / "w", CONFIG).folder
     Workspace(folder).learn(1)
     monkeypatch.setattr(standing_of_a_search, "_suspicion", lambda *given: "2 steps were lost")
+    status = Workspace(folder).status()
+    assert status.standing.doubt and status.then.verb == "propose"  # one run confirms nothing
+    run = Workspace(folder).run(Workspace(folder).propose().candidate.id)
+    assert Workspace(folder).ingest(run.trial_file).then.verb == "diagnose"
+    assert Workspace(folder).status().then.verb == "diagnose"
     notes = Workspace(folder).propose().proposal.notes
     assert any(holds(note, "2 steps were lost", "grounded", "diagnose") for note in notes)
-    for file in (folder / "candidates").glob("c0002*"):
+    for file in (folder / "candidates").glob("c0003*"):
         file.unlink()
     (folder / "reports").mkdir()
-    diagnosed(folder, made={"trials": ["t0001"]})
-    assert not any("diagnose" in note for note in Workspace(folder).propose().proposal.notes)
+    diagnosed(folder, diagnosed={"trials": ["t0001", "t0002"]})
+    assert Workspace(folder).status().then.verb == "adopt"
+    notes = Workspace(folder).propose().proposal.notes
+    assert not any("2 steps were lost" in note for note in notes), notes

@@ -107,6 +107,19 @@ def test_a_trial_that_teaches_little_is_not_advised(diagnosed, monkeypatch):
     assert identity and "teaches much" in sentence
 
 
+def test_a_trial_that_hardly_tells_a_tie_apart_is_not_run_next(diagnosed, monkeypatch):
+    """A trial that was to bring 0.1 nats was what `next:` named."""
+    w, found = diagnosed
+    (w.folder / "grounded.toml").write_text(NOISY)
+    w.forget()
+    assert found.indistinguishable and offered(w, found)[0]
+    trials = [w.planner.lift(trial) for trial in w.task_trials()]
+    monkeypatch.setattr(excitation, "TIE", 1e9)
+    identity, sentence = _probe(w, found, trials, Library(), write=False)
+    assert identity == "" and "tells enough" in sentence
+    assert offered(w, found)[0]  # who asks for it
+
+
 def test_numbers_that_one_motion_told_get_no_promise_in_another(diagnosed):
     w, found = diagnosed
     (w.folder / "grounded.toml").write_text(NOISY)

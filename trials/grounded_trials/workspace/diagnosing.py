@@ -234,7 +234,7 @@ def _probe(
     """
     if found.no_cause:
         return "", ""
-    from grounded.diagnosis.excitation import probe
+    from grounded.diagnosis.excitation import NOTHING, probe
     from grounded.diagnosis.verdict import sentence
     from grounded.search.safety import objections, spread
     from grounded_trials.workspace.handover import outside_limits
@@ -258,7 +258,8 @@ def _probe(
         made = None if inside is None else probe(inside, base, found, trials, library)
         if made is None:
             break
-        if made.little and not (write and not ties):  # asked for, the best of them is written
+        worth = not made.little or (write and (not ties or made.expected >= NOTHING))
+        if not worth:  # asked for, the best of them is written nevertheless
             return "", made.sentence if ties else f"{found.next_trial} {sentence([made.sentence])}"
         if not offer:
             return "", f"{made.sentence} (`{rendered(PROBE)}` makes the candidate)"

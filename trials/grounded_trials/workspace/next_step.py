@@ -13,7 +13,7 @@ from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import GroundedError, NextCommand
 from grounded.model import all_at_bounds
-from grounded.search.standing import Standing
+from grounded.search.standing import LOST, Standing
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.diagnosing import diagnosable, read_diagnosis
 from grounded_trials.workspace.fitting import fitted_in_vain
@@ -50,12 +50,25 @@ def next_command(
     if diagnosis is None:
         logs = usable and not now.history  # what they show comes before the first candidate
         teach = usable and (logs or now.phase != "propose")
-        return now.then or (DIAGNOSE if teach else PROPOSE)
+        then = None if now.doubt and not doubted(now, None, usable) else now.then
+        return then or (DIAGNOSE if teach else PROPOSE)
     if now.phase == "propose":
-        return DIAGNOSE if follow and not now.history else PROPOSE
+        logs = follow is not None and not now.history
+        return DIAGNOSE if logs or doubted(now, since, usable) else PROPOSE
     if since.changed or since.newer:
         return DIAGNOSE
     return another_trial(workspace, now) if diagnosis.no_cause else EXPORT
+
+
+def doubted(now: Standing, since: Since | None, usable: Sequence[str]) -> bool:
+    """Whether the search doubts its model, and a diagnosis of what came since may say why.
+
+    Args:
+        now: where the search stands.
+        since: what the last diagnosis does not know; None without one.
+        usable: what a diagnosis can use now. One run alone confirms nothing.
+    """
+    return bool(now.doubt) and (len(usable) if since is None else since.newer) >= LOST
 
 
 def another_trial(workspace: Folder, now: Standing) -> NextCommand:
@@ -81,7 +94,8 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
         return DIAGNOSE
     if _none_stood(now) and (found := read_diagnosis(workspace.reports)) is not None:
         return next_command(workspace, now, found, usable_ids(workspace))
-    return PROPOSE if now.phase in ("propose", "await-trial") else status_of(workspace, now).then
+    goes_on = now.phase in ("propose", "await-trial") and not now.doubt
+    return PROPOSE if goes_on else status_of(workspace, now).then
 
 
 def _none_stood(now: Standing) -> bool:

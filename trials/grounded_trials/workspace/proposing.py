@@ -111,10 +111,10 @@ def propose_in(workspace: Folder) -> Proposed:
         held = held_before(workspace, _other_model(workspace, before))
         notes += left_open(workspace, proposal, held)
     if doubt := proposal.standing.doubt:
-        from grounded.search.standing import LOST
+        from grounded_trials.workspace.next_step import doubted, usable_ids
 
-        last = status_of(workspace, proposal.standing)
-        if last.since is None or last.since.newer >= LOST:
+        since = status_of(workspace, proposal.standing).since
+        if doubted(proposal.standing, since, usable_ids(workspace)):
             notes.append(f"{doubt}: `{rendered(NextCommand('diagnose'), workspace.address)}`")
     proposal = replace(proposal, notes=(*proposal.notes, *notes))
     if candidate is None:
