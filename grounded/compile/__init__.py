@@ -57,6 +57,7 @@ def system_of(
     integrator: Integrator = "rk4",
     substeps: int = 1,
     jacobian: Callable[..., tuple[Any, Any]] | None = None,
+    derivatives: bool = True,
 ) -> System:
     """The System of a user's function.
 
@@ -69,6 +70,7 @@ def system_of(
         integrator: "rk4" or "euler", for a derivative.
         substeps: steps of the integrator within a control step, for a derivative.
         jacobian: f(s, a, p, dt) -> f_x (n, n), f_u (n, m) of a step; None: by the fastest path.
+        derivatives: whether they are asked for often: else they are not compiled.
 
     Raises:
         GroundedError: if the function can't be a model of these names, naming its file and line.
@@ -76,10 +78,10 @@ def system_of(
     signature = Signature(function, kind, tuple(states), tuple(inputs), tuple(params))
     if kind == "derivative" and substeps > 1:
         signature = replace(signature, kind="step", within=(integrator, substeps))
-    return system_from(replace(signature, jacobian=jacobian), integrator)
+    return system_from(replace(signature, jacobian=jacobian), integrator, derivatives)
 
 
-def system_from(signature: Signature, integrator: Integrator) -> System:
+def system_from(signature: Signature, integrator: Integrator, derivatives: bool = True) -> System:
     """The System of a function that is called so; also in another process, see `Interpreted`."""
     from grounded.compile.run import jit
     from grounded.compile.run.compiled import MAX_PLACES, CompiledSteps, CompiledSystem
@@ -93,6 +95,8 @@ def system_from(signature: Signature, integrator: Integrator) -> System:
     trouble = jit.trouble()
     if trouble:
         return TracedSystem(signature, found, integrator, f"not compiled: {trouble}")
+    if not derivatives and len(found.graph.live(found.outputs)) <= MAX_STEPS:
+        return CompiledSteps(signature, found, integrator, "")
     system, place = CompiledSystem(signature, found, integrator), where(signature.function)
     try:
         operations, wide = system.operations, system.n * (system.n + system.m) > MAX_PLACES

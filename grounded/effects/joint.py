@@ -4,26 +4,7 @@
 
 A joint's friction is a torque: through the inertia matrix, M(q)^-1 T, it acts on all accelerations,
 not on its own alone. So it is put in where the model's own torque enters, and needs nothing of the
-model but its step, be it NumPy, MuJoCo or any black box. Over a step of h
-
-    w_free            the speed that w has at the end without the loss
-    B = d w / d tau   what a unit of tau, held over the step, adds to it
-    w_end = w_free - B T                                                    T: mean over the step
-
-and w' = (w_free - w) / h - B T(w) / h is solved for this one speed, in a few implicit parts of the
-step, as if all else were constant over it. A dry friction slows a joint until it stands, holds it
-while the rest is less than c, and lets it go the other way for what is left of the step; it can't
-be too stiff for a step. It builds up over a width of speed, a hundredth of the largest or what data
-show, never so wide that it were a viscous one. Losses of several joints act on each other by B
-(k, k): a few sweeps of Gauss and Seidel.
-
-Held over the step, the mean T leads w where it should be, but not what w moves meanwhile: a loss
-that grows within the step takes less off early, more off late. With T_1, the mean over the first
-half, and a loss that grows evenly, each position q' = c w is ahead by
-
-    c h B (T - T_1) / 3                                              (`ahead`)
-
-A hundredth of a step's way; without it a delay found from positions is half a millisecond short.
+model but its step, be it NumPy, MuJoCo or any black box. How it is solved within a step: `losses`.
 
 Where tau drives w alone through a constant inertia, the same friction is a Coulomb and a viscous
 one of w itself, an inertia a gain of its rate, and they go by those names (`renamed`).
@@ -34,137 +15,22 @@ joint's velocity; the inertia matrix is positive there, elsewhere it changes sig
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from grounded.compile.names import Named
 from grounded.effects import places
 from grounded.effects.family import Effect, LossFamily, Quantity, Site, coupled, width
+from grounded.effects.losses import PARTS, dry
 from grounded.frozen import Array
 from grounded.model import Model
 
-SWEEPS = 3
-PARTS = 4  # of a step
-NUDGE = 1e-2  # of the input's unit: the difference that B is taken over
 ALIKE = 0.999  # cosine from which two slopes are one
 ONLY = 2e-3  # of a speed's answer: what an input may do besides
 TURNS = 4  # times as many samples where axes stand anywhere
 FORCES = ("N", "V", "A")  # what a unit of an effort begins with: N m, V ...
-
-Pairs = Sequence[tuple[Effect, Mapping[str, Any]]]
-Left = tuple[Array, dict[str, Array]]  # inputs (..., m), and what positions get beside them
-Integrated = Mapping[str, tuple[str, float]]  # positions: their velocity, and its factor
-
-
-class Loads(NamedTuple):
-    """What losses are solved from: of each pair, and what inputs do to all states."""
-
-    w: Sequence[Any]  # speed at the start
-    free: Sequence[Any]  # and at the end, without a loss
-    gain: Sequence[Sequence[Any]]  # B [w][tau]
-    u: Sequence[Any]  # the input
-    answers: Sequence[Mapping[str, Any]]  # what a unit of it adds to each state
-
-
-def step_with(
-    pairs: Pairs, s: Any, a: Named, dt: Any, step: Callable[[Named], Any], moved: Integrated
-) -> dict[str, Any]:
-    """The next state by name, with what is left of the inputs `a`: step(a) -> next state."""
-    at, given = loads(pairs, s, a, step), dict(a)
-    losses = solved(pairs, at, dt)
-    for (effect, _), loss in zip(pairs, losses, strict=True):
-        name = coupled(effect.site)[0]
-        given[name] = given[name] - loss
-    after = dict(step(Named("input", tuple(given), list(given.values()))))
-    more = ahead(pairs, at, losses, dt, moved)
-    return after | {q: after[q] + by for q, by in more.items()}
-
-
-def loads(pairs: Pairs, s: Any, a: Named, step: Callable[[Named], Any]) -> Loads:
-    """What the losses of a step are solved from; step(a) -> next state by name."""
-    drives = [coupled(effect.site) for effect, _ in pairs]
-    free, found = step(a), dict[str, dict[str, Any]]()
-    for name in dict.fromkeys(tau for tau, _ in drives):
-        more = [a[n] + NUDGE if n == name else a[n] for n in a]
-        reached = step(Named("input", tuple(a), more))
-        found[name] = {n: (reached[n] - free[n]) / NUDGE for n in free}
-    gain = [[found[tau][w] for tau, _ in drives] for _, w in drives]
-    speeds, ends = ([x[w] for _, w in drives] for x in (s, free))
-    return Loads(
-        speeds, ends, gain, [a[tau] for tau, _ in drives], [found[tau] for tau, _ in drives]
-    )
-
-
-def solved(pairs: Pairs, at: Loads, dt: Any) -> list[Any]:
-    """The mean loss of each pair over a step of dt."""
-    count = len(pairs)
-    found: list[Any] = [0.0] * count
-    for _ in range(SWEEPS if count > 1 else 1):
-        for i, (effect, _values) in enumerate(pairs):
-            assert isinstance(effect.family, LossFamily)
-            found[i] = _loss(effect.family.loss, pairs, at, found, i, dt)
-    return found
-
-
-def _loss(
-    loss: Callable[..., Any], pairs: Pairs, at: Loads, found: Sequence[Any], i: int, dt: Any
-) -> Any:
-    """The mean loss of one pair beside those that were found of the others."""
-    rest, own = at.free[i], np.maximum(np.abs(at.gain[i][i]), 1e-12)
-    for j, other in enumerate(found):
-        if j != i:
-            rest = rest - at.gain[i][j] * other
-    return loss(at.w[i], rest, own, at.u[i], pairs[i][1], dt)
-
-
-def ahead(
-    pairs: Pairs, at: Loads, losses: Sequence[Any], dt: Any, moved: Integrated
-) -> dict[str, Any]:
-    """How much farther positions get in a step than with the losses' means held over it.
-
-    Args:
-        pairs: effects with their quantities.
-        at: what the losses were solved from.
-        losses: their means over the step.
-        dt: the step [s].
-        moved: the positions among the states, see `places.integrated`.
-    """
-    half = at._replace(
-        free=[0.5 * (start + end) for start, end in zip(at.w, at.free, strict=True)],
-        gain=[[0.5 * by for by in row] for row in at.gain],
-    )
-    found = dict[str, Any]()
-    for i, (loss, answer) in enumerate(zip(losses, at.answers, strict=True)):
-        family = pairs[i][0].family
-        assert isinstance(family, LossFamily)
-        early = _loss(family.early or family.loss, pairs, half, losses, i, 0.5 * dt)
-        later = dt / 3 * (loss - early)
-        for q, (w, c) in moved.items():
-            found[q] = found.get(q, 0.0) + c * answer[w] * later
-    return found
-
-
-def dry(w: Any, free: Any, gain: Any, c: Any, b: Any, width: Any, parts: int = PARTS) -> Any:
-    """Mean of c clip(w / width, -1, 1) + b w over a step that would end at `free`.
-
-    By the implicit Euler method for the one, the trapezoidal rule for the other: in each part the
-    end is known in closed form.
-    """
-    part = gain / parts
-    push, by = (free - w) / parts, np.maximum(1 + 0.5 * part * b, 0.1)
-    g = part * c / by
-    total: Any = 0.0
-    for _ in range(parts):
-        end = (w + push - 0.5 * part * b * w) / by
-        slow, fast = end / (1 + g / width), np.maximum(np.abs(end) - g, 0.0)
-        last = np.where(np.abs(slow) < width, slow, np.where(end > 0, fast, -fast))
-        dry = np.minimum(np.maximum(last / width, -1.0), 1.0)
-        total = total + c * dry + 0.5 * b * (w + last)
-        w = last
-    return total / parts
 
 
 def _friction(site: Site) -> tuple[Quantity, ...]:

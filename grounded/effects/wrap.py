@@ -44,7 +44,7 @@ from grounded.effects.family import (
     Values,
     braked,
 )
-from grounded.effects.joint import step_with
+from grounded.effects.losses import step_with
 from grounded.effects.medium import medium_of, over_ground, through_it
 from grounded.effects.places import integrated
 from grounded.effects.plain_step import Step, own_state, param_name, plain_step, quantities_of

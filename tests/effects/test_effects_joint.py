@@ -14,8 +14,9 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import sensitivities_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.effects import Library, wrap
-from grounded.effects.joint import FAMILIES, dry, has_viscous, like_a_load, pairs_of
+from grounded.effects import Library, losses, wrap
+from grounded.effects.joint import FAMILIES, has_viscous, like_a_load, pairs_of
+from grounded.effects.losses import dry
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
@@ -299,3 +300,27 @@ def test_a_mujoco_model_finds_mujocos_own_friction():
     assert found.ranking[0].params["c"].value == pytest.approx(0.5, rel=0.05)
     assert not found.preflight  # its own half step is no sensor's delay
     assert not any(name.startswith("sensor_") for name in found.effects)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_rows_of_losses_are_solved_by_machine_code_as_by_numpy(count):
+    """A diagnosis of an arm spent a third of its time in a few lines of NumPy."""
+    rng = np.random.default_rng(5)
+    rows = [list(rng.normal(size=(count, 40))) for _ in range(3)]
+    gain = [list(row) for row in np.abs(rng.normal(size=(count, count, 40)))]
+    at = losses.Loads(rows[0], rows[1], gain, rows[2], ())
+    for family, values in (
+        (FAMILIES[0], {"c": 0.6, "b": 0.1, "width": np.full(40, 0.02)}),
+        (FAMILIES[1], {"c": 0.1, "k": 0.2, "b": 0.0, "width": 0.02}),
+        (FAMILIES[2], {"J": 0.3}),
+    ):
+        for means, known in ((family.loss, ()), (family.early, rows[2])):
+            every, own = (means,) * count, [values] * count
+            mine = losses._compiled(every, own, at, known, 0.01)
+            theirs = (
+                [losses._beside(every, own, at, known, i, 0.01) for i in range(count)]
+                if known
+                else losses._swept(every, own, at, 0.01)
+            )
+            assert mine is not None
+            np.testing.assert_allclose(mine, theirs, rtol=1e-13, atol=1e-13)

@@ -1,0 +1,243 @@
+"""A step with losses: what a motion takes off the inputs that drive it, solved within the step.
+
+Over a step of h
+
+    w_free            the speed that w has at the end without the loss
+    B = d w / d tau   what a unit of tau, held over the step, adds to it
+    w_end = w_free - B T                                                    T: mean over the step
+
+and w' = (w_free - w) / h - B T(w) / h is solved for this one speed, in a few implicit parts of the
+step, as if all else were constant over it. A dry friction slows a joint until it stands, holds it
+while the rest is less than c, and lets it go the other way for what is left of the step; it can't
+be too stiff for a step. It builds up over a width of speed, a hundredth of the largest or what data
+show, never so wide that it were a viscous one. Losses of several joints act on each other by B
+(k, k): a few sweeps of Gauss and Seidel.
+
+Held over the step, the mean T leads w where it should be, but not what w moves meanwhile: a loss
+that grows within the step takes less off early, more off late. With T_1, the mean over the first
+half, and a loss that grows evenly, each position q' = c w is ahead by
+
+    c h B (T - T_1) / 3                                              (`ahead`)
+
+A hundredth of a step's way; without it a delay found from positions is half a millisecond short.
+
+A diagnosis asks this hundreds of thousands of times, of a few hundred rows: arrays are left to
+compiled code, where the families' functions can be compiled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from itertools import chain
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from grounded.compile import System, system_of
+from grounded.compile.names import Named
+from grounded.effects.family import Effect, LossFamily, coupled
+from grounded.frozen import Array
+
+SWEEPS = 3
+PARTS = 4  # of a step
+NUDGE = 1e-2  # of the input's unit: the difference that B is taken over
+NONE = np.zeros(0)
+
+Pairs = Sequence[tuple[Effect, Mapping[str, Any]]]
+Left = tuple[Array, dict[str, Array]]  # inputs (..., m), and what positions get beside them
+Integrated = Mapping[str, tuple[str, float]]  # positions: their velocity, and its factor
+Losses = tuple[Callable[..., Any], ...]
+
+
+class Loads(NamedTuple):
+    """What losses are solved from: of each pair, and what inputs do to all states."""
+
+    w: Sequence[Any]  # speed at the start
+    free: Sequence[Any]  # and at the end, without a loss
+    gain: Sequence[Sequence[Any]]  # B [w][tau]
+    u: Sequence[Any]  # the input
+    answers: Sequence[Mapping[str, Any]]  # what a unit of it adds to each state
+
+
+def step_with(
+    pairs: Pairs, s: Any, a: Named, dt: Any, step: Callable[[Named], Any], moved: Integrated
+) -> dict[str, Any]:
+    """The next state by name, with what is left of the inputs `a`: step(a) -> next state."""
+    at, given = loads(pairs, s, a, step), dict(a)
+    losses = solved(pairs, at, dt)
+    for (effect, _), loss in zip(pairs, losses, strict=True):
+        name = coupled(effect.site)[0]
+        given[name] = given[name] - loss
+    after = dict(step(Named("input", tuple(given), list(given.values()))))
+    more = ahead(pairs, at, losses, dt, moved)
+    return after | {q: after[q] + by for q, by in more.items()}
+
+
+def loads(pairs: Pairs, s: Any, a: Named, step: Callable[[Named], Any]) -> Loads:
+    """What the losses of a step are solved from; step(a) -> next state by name."""
+    drives = [coupled(effect.site) for effect, _ in pairs]
+    free, found = step(a), dict[str, dict[str, Any]]()
+    for name in dict.fromkeys(tau for tau, _ in drives):
+        more = [a[n] + NUDGE if n == name else a[n] for n in a]
+        reached = step(Named("input", tuple(a), more))
+        found[name] = {n: (reached[n] - free[n]) / NUDGE for n in free}
+    gain = [[found[tau][w] for tau, _ in drives] for _, w in drives]
+    speeds, ends = ([x[w] for _, w in drives] for x in (s, free))
+    return Loads(
+        speeds, ends, gain, [a[tau] for tau, _ in drives], [found[tau] for tau, _ in drives]
+    )
+
+
+def solved(pairs: Pairs, at: Loads, dt: Any) -> list[Any]:
+    """The mean loss of each pair over a step of dt."""
+    losses, values = tuple(_family(effect).loss for effect, _ in pairs), [v for _, v in pairs]
+    if (found := _compiled(losses, values, at, (), dt)) is not None:
+        return found
+    return _swept(losses, values, at, dt)
+
+
+def _swept(losses: Losses, values: Sequence[Mapping[str, Any]], at: Loads, dt: Any) -> list[Any]:
+    """The same of whatever NumPy takes: each loss beside the others, again and again."""
+    count = len(losses)
+    found: list[Any] = [0.0] * count
+    for _ in range(SWEEPS if count > 1 else 1):
+        for i in range(count):
+            found[i] = _beside(losses, values, at, found, i, dt)
+    return found
+
+
+def _beside(
+    losses: Losses,
+    values: Sequence[Mapping[str, Any]],
+    at: Loads,
+    found: Sequence[Any],
+    i: int,
+    dt: Any,
+) -> Any:
+    """The mean loss of one pair beside those that were found of the others."""
+    rest, own = at.free[i], np.maximum(np.abs(at.gain[i][i]), 1e-12)
+    for j, other in enumerate(found):
+        if j != i:
+            rest = rest - at.gain[i][j] * other
+    return losses[i](at.w[i], rest, own, at.u[i], values[i], dt)
+
+
+def ahead(
+    pairs: Pairs, at: Loads, losses: Sequence[Any], dt: Any, moved: Integrated
+) -> dict[str, Any]:
+    """How much farther positions get in a step than with the losses' means held over it.
+
+    Args:
+        pairs: effects with their quantities.
+        at: what the losses were solved from.
+        losses: their means over the step.
+        dt: the step [s].
+        moved: the positions among the states, see `places.integrated`.
+    """
+    half = at._replace(
+        free=[0.5 * (start + end) for start, end in zip(at.w, at.free, strict=True)],
+        gain=[[0.5 * by for by in row] for row in at.gain],
+    )
+    families = [_family(effect) for effect, _ in pairs]
+    means, values = tuple(one.early or one.loss for one in families), [v for _, v in pairs]
+    early = _compiled(means, values, half, losses, 0.5 * dt)
+    if early is None:
+        early = [_beside(means, values, half, losses, i, 0.5 * dt) for i in range(len(pairs))]
+    found = dict[str, Any]()
+    for mean, first, answer in zip(losses, early, at.answers, strict=True):
+        later = dt / 3 * (mean - first)
+        for q, (w, c) in moved.items():
+            found[q] = found.get(q, 0.0) + c * answer[w] * later
+    return found
+
+
+def _family(effect: Effect) -> LossFamily:
+    assert isinstance(effect.family, LossFamily)
+    return effect.family
+
+
+def _compiled(
+    losses: Losses,
+    values: Sequence[Mapping[str, Any]],
+    at: Loads,
+    found: Sequence[Any],
+    dt: Any,
+) -> list[Any] | None:
+    """The losses of rows by machine code; None where these are no rows, or there is no such code.
+
+    found: the mean of each, where those beside them are known; else all are solved.
+    """
+    free = at.free[0]
+    if not (isinstance(free, np.ndarray) and free.dtype == np.float64):
+        return None
+    kernel = _kernel(losses, tuple(tuple(sorted(own)) for own in values), bool(found))
+    if kernel is None:
+        return None
+    gains = [by for row in at.gain for by in row]
+    numbers = [own[name] for own in values for name in sorted(own)]
+    given = [*at.free, *at.u, *gains, *numbers, *found]
+    shape = np.broadcast_shapes(*{np.shape(value) for value in (*at.w, *given)})
+    x, u = np.empty((*shape, len(losses))), np.empty((*shape, len(given)))
+    for into, columns in ((x, at.w), (u, given)):
+        for i, value in enumerate(columns):
+            into[..., i] = value
+    rows = kernel.step(x.reshape(-1, len(losses)), u.reshape(-1, len(given)), NONE, float(dt))
+    after = rows.reshape(x.shape)
+    return [after[..., i] for i in range(len(losses))]
+
+
+@cache
+def _kernel(losses: Losses, names: tuple[tuple[str, ...], ...], known: bool) -> System | None:
+    """The losses of many rows as a step of the speeds; None where they can't be compiled.
+
+    Args:
+        losses: of each pair.
+        names: of each pair's quantities.
+        known: whether the mean of each is given.
+    """
+    pairs = range(len(losses))
+    quantities = [[f"{name}_{i}" for name in own] for i, own in enumerate(names)]
+    gains = [[f"gain_{i}_{j}" for j in pairs] for i in pairs]
+    free, u, means = ([f"{letter}_{i}" for i in pairs] for letter in ("free", "u", "mean"))
+
+    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        values = [
+            {name: a[key] for name, key in zip(own, keys, strict=True)}
+            for own, keys in zip(names, quantities, strict=True)
+        ]
+        gain = [[a[key] for key in row] for row in gains]
+        at = Loads([s[f"w_{i}"] for i in pairs], [a[k] for k in free], gain, [a[k] for k in u], ())
+        if known:
+            given = [a[key] for key in means]
+            found = [_beside(losses, values, at, given, i, dt) for i in pairs]
+        else:
+            found = _swept(losses, values, at, dt)
+        return {f"w_{i}": found[i] for i in pairs}
+
+    inputs = [*free, *u, *chain(*gains, *quantities), *(means if known else ())]
+    states = [f"w_{i}" for i in pairs]
+    system = system_of(
+        step, kind="step", states=states, inputs=inputs, params=(), derivatives=False
+    )
+    return system if system.how.startswith("compiled") else None
+
+
+def dry(w: Any, free: Any, gain: Any, c: Any, b: Any, width: Any, parts: int = PARTS) -> Any:
+    """Mean of c clip(w / width, -1, 1) + b w over a step that would end at `free`.
+
+    By the implicit Euler method for the one, the trapezoidal rule for the other: in each part the
+    end is known in closed form.
+    """
+    part = gain / parts
+    push, by = (free - w) / parts, np.maximum(1 + 0.5 * part * b, 0.1)
+    g = part * c / by
+    total: Any = 0.0
+    for _ in range(parts):
+        end = (w + push - 0.5 * part * b * w) / by
+        slow, fast = end / (1 + g / width), np.maximum(np.abs(end) - g, 0.0)
+        last = np.where(np.abs(slow) < width, slow, np.where(end > 0, fast, -fast))
+        dry = np.minimum(np.maximum(last / width, -1.0), 1.0)
+        total = total + c * dry + 0.5 * b * (w + last)
+        w = last
+    return total / parts
