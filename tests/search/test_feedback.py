@@ -253,9 +253,7 @@ def test_the_noise_of_a_first_row_is_no_start_elsewhere():
     made = SimpleNamespace(
         base="c0001", expected_of_base=-8.0, predicted_gain=0.5, base_as_run=-10.0
     )
-    best = SimpleNamespace(
-        candidate=SimpleNamespace(id="c0001"), utility=-10.0, standard_error=0.1
-    )
+    best = SimpleNamespace(candidate=SimpleNamespace(id="c0001"), utility=-10.0, standard_error=0.1)
     best.trials = [begun(task, noise=0.02)]
     text = _so_far(made, best, task)
     assert "began" not in text and "2.000 more that it does not explain" in text

@@ -127,6 +127,17 @@ def test_what_is_calibrated_to_its_bound_is_not_to_be_adopted(cart, tmp_path, pa
     assert last(grounded("-C", folder, "status")) == f"grounded {then}"
 
 
+def test_adopting_says_of_what_its_std_stopped_what_to_widen(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    mass = {"value": 1.3, "std": 0.02, "interval": [1.26, 1.34], "unit": "kg", "stopped": "prior"}
+    diagnosed(folder, parameters={"mass": mass})
+    done = grounded("-C", folder, "adopt", "viscous_friction:v")
+    assert holds(" ".join(done.err.split()), "mass went as far as its std", "widen its std")
+    assert grounded("-C", folder, "adopt", "--undo").code == 0
+    diagnosed(folder, parameters={"mass": {**mass, "stopped": ""}})
+    assert "std" not in grounded("-C", folder, "adopt", "viscous_friction:v").err
+
+
 def test_a_diagnosis_of_another_model_is_made_again(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     diagnosed(folder, diagnosed={"trials": [], "adopted": [], "params": {"mass": 9.0}})
@@ -536,10 +547,10 @@ def test_trust_sets_the_promised_gain_against_the_last_misses(tmp_path):
     little = gain < missed[1] and gain < 0.1 * abs(ran[1].utility)
     assert holds(" ".join(said[2].split()), "stop here", "c0002") == little
     assert "stop here" not in said[1]  # which promises all of the cost
-    made, best = ran[2].candidate, ran[1]
-    assert made.base == best.candidate.id and "model" not in _so_far(made, best)
+    made, best, task = ran[2].candidate, ran[1], Workspace(folder).task
+    assert made.base == best.candidate.id and "model" not in _so_far(made, best, task)
     poor = replace(made, predicted_gain=made.predicted_gain - 2)  # a trial worse than its policy
-    assert holds(_so_far(poor, best), f"{poor.predicted_utility - poor.predicted_gain:.4g}")
+    assert holds(_so_far(poor, best, task), f"{poor.predicted_utility - poor.predicted_gain:.4g}")
     now = ran_standing(folder, best)
     assert f"{poor.predicted_gain:.4g}" in _came_true(poor, ran[:2], now)
     near = replace(made, predicted_gain=0.95 * gain)  # not told to be replayed otherwise
