@@ -144,6 +144,17 @@ def test_a_diagnosis_of_another_model_is_made_again(cart, tmp_path):
     assert last(grounded("-C", folder, "status")) == "grounded diagnose"
 
 
+def test_a_stale_diagnosis_tells_to_do_what_next_does(tmp_path):
+    """`status` said "run `grounded diagnose` again", and below it `next: grounded propose`."""
+    folder = make(tmp_path / "w").folder
+    grounded("-C", folder, "learn", "--trials", "2")
+    (folder / "reports").mkdir(exist_ok=True)
+    diagnosed(folder, diagnosed=taken_in(folder, 1))
+    found = grounded("-C", folder, "status")
+    assert last(found) == "grounded propose"
+    assert "diagnosed with 1 of 2 trials" in found.out and "diagnose`" not in found.out
+
+
 def test_nothing_claimed_nothing_to_adopt(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     diagnosed(folder, verdict={"kind": "none", "effects": [], "sentence": "None."})
@@ -336,11 +347,11 @@ def test_trials_that_came_after_a_diagnosis_make_it_old(cart, tmp_path):
     assert last(grounded("-C", folder, "status")) == "grounded adopt viscous_friction:v"
     assert "diagnosed with" not in grounded("-C", folder, "report").out
     diagnosed(folder, diagnosed=taken_in(folder, 1, 2))
-    words = f"diagnosed with 2 of {count} trials; run `grounded diagnose` again"
+    words = f"diagnosed with 2 of {count} trials"
     for command in ("status", "report"):
         done = grounded("-C", folder, command)
         assert words in " ".join(plain(done.out).split()).replace("Diagnosed", "diagnosed")
-        assert last(done) == "grounded diagnose"
+        assert last(done) == "grounded diagnose" and "diagnose`" not in done.out
     page = Path(grounded("-C", folder, "report", "--html", "--json").json["paths"]["html"])
     assert f"Diagnosed with 2 of {count} trials" in page.read_text()
 
