@@ -98,8 +98,8 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
     found += loose
     if proposal.standing.ending == "not allowed" and not held and not loose:
         found.append(
-            "nothing was run yet: widen [safety], or draw a target whose run stays inside "
-            "(`target`), and propose again"
+            "nothing was run yet: draw a target whose run stays inside [safety] (`target`) and "
+            "propose again; widen [safety] only where the robot may really go there"
         )
     name = str(workspace.config.task.target)
     rows = len(workspace.read_target(workspace.folder / name)[1])
@@ -112,7 +112,7 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
 
 
 def _of_other_limits(workspace: Folder) -> list[str]:
-    """Where weights on changes of inputs are still those that `init` made, by other [limits]."""
+    """Where weights on changes of inputs are still those that were made by other [limits]."""
     config, model = workspace.config, workspace.base_model
     made = made_changes(config.file.read_text(encoding="utf-8"))
     weights = dict(zip(model.input_names, workspace.task.reward.input_change, strict=True))
@@ -127,7 +127,7 @@ def _of_other_limits(workspace: Folder) -> list[str]:
     was = ", ".join(f"{name} = {weights[name]:.4g}" for name in off)
     new = ", ".join(f"{name} = {now.get(name, w):.4g}" for name, w in weights.items() if w)
     return [
-        f"[reward] input_change has {was}, which `init` made of the range that it saw in the log. "
+        f"[reward] input_change has {was}, made for another range than [limits] have now. "
         f"By [limits] as they are now it would be input_change = {{ {new} }}: write that, or draw "
         "the target again (`target` does so where no weight in [reward] was changed)"
     ]
