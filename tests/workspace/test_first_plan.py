@@ -196,3 +196,17 @@ def test_of_weights_by_other_limits_nobody_is_said_to_have_made_them(tmp_path):
     notes = Workspace(folder).propose().proposal.notes
     (note,) = [n for n in notes if "input_change has" in n]
     assert holds(note, "thrust = 0.04,", "thrust = 0.25") and "init" not in note
+
+
+def test_a_target_says_what_it_leaves_free(tmp_path):
+    """A cart-pole's line said nothing of the pole, which no column holds."""
+    folder, file = planar(tmp_path)
+    done = grounded("-C", folder, "target", "line", "--to", "x=2")
+    assert "free       z, th" in done.out and "[reward] counts for nothing" not in done.out
+    file.write_text(re.sub(r"(?m)^state = .*$", "state = { x = 2, z = 3 }", file.read_text()))
+    done = grounded("-C", folder, "target", "line", "--to", "x=2")
+    assert "the weight of z in [reward] counts for nothing" in " ".join(done.out.split())
+    found = grounded("-C", folder, "target", "line", "--to", "x=2", "--json").json
+    assert found["free"] == ["z", "th", "vz"] and {*found["columns"]} == {"x", "vx"}
+    ends = [word for name in ("x", "z", "th") for word in ("--to", f"{name}=1")]
+    assert "free" not in grounded("-C", folder, "target", "line", *ends).out
