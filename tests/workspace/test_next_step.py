@@ -363,7 +363,7 @@ def test_what_was_adopted_is_not_missing_any_more(cart, tmp_path):
     diagnosed(folder, verdict=verdict, diagnosed=taken_in(folder, 1, 2, 3, 4))
     assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
     out = " ".join(plain(grounded("-C", folder, "report").out).split())
-    assert re.search("viscous_friction:v, .*delay:force; .*`grounded diagnose", out)
+    assert re.search("viscous_friction:v, .*delay:force.*next: grounded .*diagnose", out)
     assert "made from 4 trials, t0001 to t0004, said: Friction; late." in out
     assert "crude model" not in out and "adopted effects" in out
     page = Path(grounded("-C", folder, "report", "--html", "--json").json["paths"]["html"])
