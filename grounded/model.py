@@ -26,6 +26,8 @@ from grounded.frozen import Array, readonly, wrapped
 
 Function = Callable[..., Mapping[str, Any]]
 MAX_SUBSTEPS = 1000
+BELIEVED = 3.0  # standard deviations, as the user gave them, that a parameter may be off
+LEAST = 0.2  # of a parameter without a bound on the side of zero: its sign is known
 MAX_SIZE = 200  # states and inputs: a step costs their cube, and minutes from here on
 
 
@@ -73,6 +75,27 @@ class Param:
         """Whether a value is one of its bounds, which it would pass if it could."""
         ends = [end for end in (self.low, self.high) if self.uncertain and end is not None]
         return any(abs(value - end) <= 1e-6 * self.spread for end in ends)
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """The least and the most that it may be: where no bound is given its sign stays.
+
+        Nor does it go further than three of its own standard deviations: thousands of nats of a
+        model that is wrong elsewhere would carry a measured length to a fifth of itself.
+        """
+        far = np.inf if self.std is None else BELIEVED * self.std
+        low = (LEAST * self.value if self.value > 0 else -np.inf) if self.low is None else self.low
+        high = (
+            (LEAST * self.value if self.value < 0 else np.inf) if self.high is None else self.high
+        )
+        return max(low, self.value - far), min(high, self.value + far)
+
+    def stopped(self, value: float) -> str:
+        """What keeps a fitted value from going on: "bound", "prior" (its `reach`), "" nothing."""
+        if self.at_bound(value):
+            return "bound"
+        ended = any(abs(value - end) <= 1e-6 * self.spread for end in self.reach)
+        return "prior" * (self.uncertain and ended)
 
     @property
     def spread(self) -> float:

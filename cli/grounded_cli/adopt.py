@@ -80,6 +80,8 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
         kept, beside = (with_unit(number(value), one.unit) for value in (one.kept, one.value))
         text = f"{one.called} stays at {kept}: these trials do not tell it"
         remark("note", f"{text}. The effects were fitted beside {beside}")
+    if done.stopped:
+        remark("note", done.stopped)
     if done.left:
         remark("note", REMEASURE)
     show(f"\n{next_line(done.then)}")

@@ -11,8 +11,12 @@ from grounded_cli.terminal import number, progress, remark, show, show_json, tab
 from grounded_trials.wording import count
 
 if TYPE_CHECKING:
-    from grounded_trials.logs.inspect_log import TopicReport
+    from collections.abc import Sequence
+
+    from grounded_trials.logs.inspect_log import FieldReport, TopicReport
     from grounded_trials.workspace.inspecting import Inspected
+
+MANY = 9  # constants of one array, as of an IMU's smallest covariance: they are one line
 
 
 @click.command("inspect")
@@ -65,9 +69,28 @@ def _tell(topic: TopicReport) -> None:
         show(f"  header stamps {1e3 * abs(topic.skew_s):.1f} ms {side} the log's own times")
     if topic.problem:
         show(f"  can't be read: {topic.problem}")
-    rows = [(f"  {f.path}", number(f.low), number(f.high)) for f in topic.fields]
-    if rows:
+    if rows := _rows(topic.fields):
         show(table(rows, ("  field", "low", "high")))
+
+
+def _rows(fields: Sequence[FieldReport]) -> list[tuple[str, str, str]]:
+    """A line a field; the many constants of one array, a covariance's say, are one line."""
+    arrays: dict[str, list[FieldReport]] = {}
+    for one in fields:
+        array = one.path.rpartition("[")[0]
+        if array and one.low is not None and one.low == one.high:
+            arrays.setdefault(array, []).append(one)
+    many = {array: same for array, same in arrays.items() if len(same) >= MANY}
+    folded = {one.path for same in many.values() for one in same}
+    rows = []
+    for one in fields:
+        if one.path not in folded:
+            rows.append((f"  {one.path}", number(one.low), number(one.high)))
+        elif same := many.pop(one.path.rpartition("[")[0], []):
+            values = [each.low for each in same if each.low is not None]
+            name = f"  {one.path.rpartition('[')[0]}[...], {len(same)} constants"
+            rows.append((name, number(min(values)), number(max(values))))
+    return rows
 
 
 def _what(found: Inspected) -> str:

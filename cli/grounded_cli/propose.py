@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from grounded.result import listed
 from grounded.search.candidate import LITTLE
 from grounded.search.step_size import Step
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
@@ -68,7 +69,7 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
     show(field("what", _what(candidate, standing, workspace.task), "  "))
     show(field("predicted", f"utility {number(candidate.predicted_utility)}", "  "))
     if standing.incumbent is not None:
-        show(field("so far", _so_far(candidate, standing.incumbent), "  "))
+        show(field("so far", _so_far(candidate, standing.incumbent, workspace.task), "  "))
     show(field("trust", _trust(candidate, standing, workspace), "  "))
     show_extent(candidate, workspace.task)
     if last:
@@ -81,12 +82,15 @@ def _otherwise(candidate: Candidate, best: Tried) -> bool:
     return candidate.base == best.candidate.id and off > UNLIKE * abs(candidate.predicted_gain)
 
 
-def _so_far(candidate: Candidate, best: Tried) -> str:
+def _so_far(candidate: Candidate, best: Tried, task: Task) -> str:
     """The best one's utility; beside it what the model gives it, and why, as far as that is known.
 
-    The model's own run of it starts at s_0: what that is worth is known, and so is the scatter of
-    its runs once something near it was repeated. What is left, the model does not replay.
+    The model's own run of it starts at s_0: what that is worth is known where its runs began
+    elsewhere by more than their sensors' noise, and so is the scatter of its runs once something
+    near it was repeated. What is left, the model does not replay.
     """
+    from grounded_trials.workspace.off_target import began_elsewhere
+
     text = f"{number(best.utility)} by {best.candidate.id}"
     if not _otherwise(candidate, best):
         return text
@@ -96,10 +100,12 @@ def _so_far(candidate: Candidate, best: Tried) -> str:
     text = f"{text}, to which the same model gives {number(same)}"
     if not math.isfinite(candidate.base_as_run):
         return text
-    start, rest = same - candidate.base_as_run, candidate.base_as_run - best.utility
-    why = []
+    elsewhere, why = began_elsewhere(task, best.trials), []
+    start = same - candidate.base_as_run if elsewhere else 0.0
+    rest = same - start - best.utility
     if abs(start) > told:
-        why.append(f"{_signed(start)} because its runs began elsewhere than [task] start")
+        where = f"elsewhere than [task] start in {listed(elsewhere)}"
+        why.append(f"{_signed(start)} because its runs began {where}")
     if abs(rest) > told and math.isfinite(best.standard_error):
         within = abs(rest) <= LUCKY * best.standard_error
         known = "within the scatter of its runs" if within else "more than its runs scatter"

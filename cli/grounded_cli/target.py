@@ -97,13 +97,17 @@ def command(
     reward = _reward(workspace)
     rows = len(next(iter(columns.values())))
     ranges = {name: (float(v.min()), float(v.max())) for name, v in columns.items()}
+    free = [name for name in model.states if name not in columns]
     if json_:
-        show_json({"target": str(path), "horizon": rows - 1, "columns": ranges})
+        found = {"target": str(path), "horizon": rows - 1, "columns": ranges, "free": free}
+        show_json(found)
         return
     show(f"{path}: {shape}, {(rows - 1) * dt:g} s, {rows - 1} steps")
     for name, (low, high) in ranges.items():
         text = with_unit(f"{number(low)} to {number(high)}", model.states[name])
         show(field(name, text, "  "))
+    if free:
+        show(field("free", _free(free, reward), "  "))
     for kind, by in (
         ("state", "1 for an error as large as a range here, a position's smaller one"),
         ("input_change", "0.04 / (range of [limits])^2"),
@@ -127,6 +131,16 @@ def command(
             "[reward] state",
         )
     show(f"\n{next_line(NextCommand('propose'))}")
+
+
+def _free(names: list[str], reward: dict[str, dict[str, float]]) -> str:
+    """What it means for states that the target has no column for them."""
+    weighed = [n for n in names if any(reward.get(k, {}).get(n) for k in ("state", "terminal"))]
+    it = "them" if len(names) > 1 else "it"
+    text = f"{listed(names)}: no column in the target, so nothing asks where a run takes {it}"
+    if weighed:
+        text += f"; the weight of {listed(weighed)} in [reward] counts for nothing"
+    return text
 
 
 def _reward(workspace: Workspace) -> dict[str, dict[str, float]]:

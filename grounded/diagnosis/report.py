@@ -66,6 +66,7 @@ class Estimate(Document):
     std: float = math.nan
     interval: tuple[float, float] | None = field(metadata=BRIEF, default=None)
     unit: str = ""
+    stopped: str = field(metadata=BRIEF, default="")  # what kept it from going on (`Param`)
 
     def moved(self, by: float) -> Estimate:
         """The same of a quantity that is so much larger."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, furthest, runaway
 from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
 from grounded.diagnosis.ruler_words import floor, improvement, rest, worsened
+from grounded.diagnosis.stopped import ENDED, wider
 from grounded.model import Model, all_at_bounds
 from grounded.result import listed, number, percent
 
@@ -79,7 +80,7 @@ def verdict(
     several = len(causes) > 1
     shares = [f" ({percent(one.share)} of the gain)" * several for one in credit]
     words = [sentence(map(str.__add__, causes, shares)), improvement(rows), worsened(rows)]
-    words.append(runaway(rows))
+    words += [runaway(rows), wider(claims.parameters())]
     words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed])
     words += [f"{told_apart(group, same)}." for group in groups[:1]]
     words += [one.sentence() for one in claims.one_clock[:1]]
@@ -152,7 +153,7 @@ def _moved(claims: Claims) -> str:
         old = params[name].value
         change = 100 * (known[name].value - old) / abs(old) if old else 0.0
         beside = [f"{change:+.{0 if abs(change) >= 1 else 1}f}%"] * bool(old)
-        beside += ["at its bound: the data ask for more"] * params[name].at_bound(known[name].value)
+        beside += ENDED[known[name].stopped]
         part = f" ({', '.join(beside)})" * bool(beside)
         texts.append(f"{name} should be {give_or_take(known[name])}{part}")
     more = len(named) - NAMED

@@ -10,11 +10,10 @@ import numpy as np
 
 from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
-from grounded.model import Model
+from grounded.model import BELIEVED, Model
 
 Latency = Literal["known", "common", "each"]
 LONGEST = 0.5  # [s] no latency is sought beyond
-STDS = 3.0  # prior standard deviations that a parameter without bounds may move
 BOUNDS = (
     "what may move has bounds, Param(value, unit, low, high), or a prior, Param(value, unit, std=s)"
 )
@@ -103,7 +102,7 @@ def unknowns_of(
         labels = [f"latency:{name}" for name in model.input_names]
     if not names and not labels:
         raise GroundedError(f"model '{model.name}' has no uncertain parameter to fit: {BOUNDS}")
-    far = [np.inf if p.std is None else STDS * p.std for p in params]  # where no bound is given
+    far = [np.inf if p.std is None else BELIEVED * p.std for p in params]  # where no bound is given
     low = [p.value - f if p.low is None else p.low for p, f in zip(params, far, strict=True)]
     high = [p.value + f if p.high is None else p.high for p, f in zip(params, far, strict=True)]
     low, high = low + [0.0] * len(delayed), high + [LONGEST] * len(delayed)

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from grounded.result import Document
 
 DEGREES = 57.29577951308232  # in a radian
+RPM = 9.549296585513721  # turns a minute in a radian a second
+ALIKE = 0.02  # of a factor, to be taken for a unit's
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,3 +66,17 @@ def in_degrees(name: str, unit: str) -> Finding:
     """A finding of a signal that was put into radians."""
     text, log = f"is in degrees, not in {unit}", f"scale = {1 / DEGREES:.8g}"
     return put_right(name, text, "degrees", log, scale=DEGREES)
+
+
+def why_scaled(size: float, unit: str) -> str:
+    """Why a sensor may show `size` times what another says, as the end of a clause."""
+    for factor, text in (
+        (RPM, f", 60 / (2 pi) times it: it looks to be in rpm; if so, [log] scale = {1 / RPM:.8g}"),
+        (
+            1 / RPM,
+            ", 2 pi / 60 times it: it looks to have been taken for rpm, and converted",
+        ),
+    ):
+        if unit == "rad/s" and abs(size / factor - 1) < ALIKE:
+            return text
+    return "; either may be wrong"

@@ -31,7 +31,14 @@ from grounded.frozen import Array
 from grounded.instruments.clocks import told_by_the_clock
 from grounded.instruments.constant import constant_of
 from grounded.instruments.dead import judge_dead
-from grounded.instruments.finding import DEGREES, Finding, filters_of, in_degrees, put_right
+from grounded.instruments.finding import (
+    DEGREES,
+    Finding,
+    filters_of,
+    in_degrees,
+    put_right,
+    why_scaled,
+)
 from grounded.instruments.inputs import judge_inputs
 from grounded.instruments.kinematics import (
     AGREE,
@@ -281,7 +288,8 @@ class _Bench:
                 yield self.from_degrees(i)
                 return
         if lag.low > 1 + OFF or lag.high < 1 - OFF:
-            text = f"shows {100 * size:.3g} % of the rate of {q}; either may be wrong"
+            why = why_scaled(size, self.model.states[w])
+            text = f"shows {100 * size:.3g} % of the rate of {q}{why}"
             yield Finding(w, text, "scale", scale=size)
         elif relation.exact and lag.one_size:
             self.refuted |= {f"sensor_scale:{w}", f"sensor_scale:{q}", f"rate_gain:{q}"}

@@ -7,8 +7,8 @@ import pytest
 
 from grounded import Trial
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.predictor import Predictor, losses_of, rates_of
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, losses_of, rates_of
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.ahead import missed
 from grounded.effects import Library
 from grounded.models.car import model as car

@@ -68,6 +68,23 @@ def test_table_and_document_say_it(found):
     assert "held" not in dict(error_lines(free, {}))
 
 
+def test_a_value_that_its_std_stopped_is_told_with_what_to_widen():
+    """It was told with a tight +-, and without a word that three std were used up."""
+    model, trials = motor(2)
+    known = {"m": Param(1.0, "kg"), "k": Param(1.0, "N/V", std=0.05)}
+    sure = replace(model, params={**model.params, **known})
+    said = diagnose(sure, trials, DiagnosisOptions(library=Library(())))
+    assert said.parameters["k"].value == pytest.approx(1.15)
+    assert {n for n, e in said.parameters.items() if e.stopped == "prior"} == {"k"}
+    assert "k should be 1.15" in said.sentence and "as far as its std" in said.sentence
+    assert "widen its std" in said.sentence
+    again = type(said).from_json(said.to_json())
+    assert again.parameters["k"].stopped == "prior"
+    beside = replace(again, verdict=replace(again.verdict, effects=("delay:u",)))
+    text = dict(error_lines(beside, {"k": 1.0, "b": 0.5}))["parameters"]
+    assert "N/V (as far as its std" in text and text.count("std") == 1
+
+
 def test_a_line_names_no_twenty_parameters():
     """An aircraft's page had a paragraph of them, all known together with one inertia."""
     names = [f"C{k}" for k in range(20)]

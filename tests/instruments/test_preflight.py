@@ -568,3 +568,15 @@ def test_one_factor_of_all_rates_is_the_clock(off, told):
     assert [one.signal for one in found] == told
     assert found[0].scale == pytest.approx(off[2], rel=0.05)
     assert ("clock" in found[0].finding) == ("+" in told[0])
+
+
+@pytest.mark.parametrize(
+    ("factor", "rpm", "scale"),
+    [(60 / (2 * np.pi), True, True), (2 * np.pi / 60, True, False), (9.2, False, False)],
+)
+def test_a_rate_in_rpm_is_said_to_be_in_rpm(factor, rpm, scale):
+    """`w shows 955 % of the rate of q`: a motor's driver gives turns a minute."""
+    (found,) = preflight(ARM, arm(columns(w=lambda x: factor * x))).findings
+    assert (found.signal, found.kind, found.corrected) == ("w", "scale", False)
+    assert ("rpm" in found.finding) == rpm
+    assert ("[log] scale = 0.1047" in found.finding) == scale

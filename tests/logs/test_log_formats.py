@@ -11,6 +11,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from cli import grounded
 from grounded.errors import GroundedError
 from grounded_trials.formats.text_tables import column_units, cut_off
 from grounded_trials.logs.inspect_log import inspect_log
@@ -276,3 +277,15 @@ def test_zstd_files_of_any_log(tmp_path):
     packed = tmp_path / "log.csv.zst"
     packed.write_bytes(zstandard.compress(plain.read_bytes()))
     assert inspect_log(packed).messages == N
+
+
+def test_constants_of_an_array_are_one_line(tmp_path):
+    """An IMU's three covariances filled a screen with 27 lines of zeros."""
+    log = ros2(tmp_path / "bag")
+    rows = [line.split() for line in grounded("inspect", log).out.splitlines()]
+    assert [row for row in rows if row and "covariance" in row[0]] == [
+        [f"/imu.{name}_covariance[...],", "9", "constants", "0", "0"]
+        for name in ("orientation", "angular_velocity", "linear_acceleration")
+    ]
+    found = grounded("inspect", log, "--json").json["topics"]
+    assert sum("covariance" in f["path"] for t in found for f in t["fields"]) == 27

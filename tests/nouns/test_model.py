@@ -77,6 +77,11 @@ def test_a_parameter_lies_between_its_bounds():
     two = Param(0.5, "1", 0.0, 1.0)
     assert two.at_bound(0.0) and two.at_bound(1.0) and not two.at_bound(0.999)
     assert not Param(0.5, std=0.1).at_bound(0.5) and not Param(0.5).at_bound(0.5)
+    assert not two.stopped(0.9) and two.stopped(1.0) == "bound" and not Param(0.5).stopped(0.5)
+    prior = Param(0.5, std=0.1)
+    assert prior.reach == pytest.approx((0.2, 0.8)) and prior.stopped(prior.reach[1]) == "prior"
+    assert not prior.stopped(0.799) and Param(-0.5, std=1.0).reach == (-3.5, -0.1)
+    assert Param(0.5, "1", 0.0, 1.0, std=0.1).stopped(0.8) == "prior"
     assert not Param(0.5).uncertain and not Param(0.5, "1", 0.5, 0.5).uncertain
     assert Param(0.5, "1", 0.0, 1.0).spread == pytest.approx(1 / 12**0.5)
     assert Param(0.5, std=0.1).spread == 0.1 and Param(0.5, std=0.1).uncertain

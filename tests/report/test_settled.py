@@ -165,7 +165,7 @@ def test_a_new_diagnosis_measures_model_py_beside_what_plans_now(adopted):
     findings = gather(Folder(adopted))
     diagnosis = findings.diagnosis
     assert isinstance(diagnosis, Diagnosis) and not findings.since.changed
-    lines = told(diagnosis, findings.task, findings.since, findings.settled, None)
+    lines = told(diagnosis, findings.task, findings.since, findings.settled)
     assert lines[0].startswith("Found and adopted") and "1.2 cm instead of 25 cm" in lines[1]
     assert lines[-1] == "Down to the noise." and lines.count("Down to the noise.") == 1
     assert "model.py" in words(adopted, "report") and "now" in words(adopted, "report")

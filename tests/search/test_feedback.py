@@ -17,8 +17,10 @@ from grounded.search.making import About, Maker
 from grounded.search.planner import Planner, model_fingerprint, planner_for, predicted
 from grounded.search.standing import SearchOptions, standing
 from grounded.search.step_size import Step
+from grounded.trial import Trial
 from grounded.utility import Reward
 from grounded_trials.workspace.adopted import planner_of
+from grounded_trials.workspace.off_target import began_elsewhere
 from small_tasks import cart_task, drive
 
 OPTIONS = SearchOptions()
@@ -211,14 +213,47 @@ def test_of_what_the_model_gives_otherwise_only_known_reasons_are_told(as_run, e
     made = SimpleNamespace(
         base="c0001", expected_of_base=-8.0, predicted_gain=1.0, base_as_run=as_run
     )
+    task = cart_task()
     best = SimpleNamespace(
         candidate=SimpleNamespace(id="c0001"), utility=-9.0, standard_error=error
     )
-    text = _so_far(made, best)
+    best.trials = [begun(task, off=0.02)]
+    text = _so_far(made, best, task)
     assert "-8.000" in text and "luck" not in text
     assert all(part in text for part in parts) and not any(word in text for word in never)
     made.expected_of_base = -766.0
-    assert "does not replay" in _so_far(made, best) and "scatter" not in _so_far(made, best)
+    told = _so_far(made, best, task)
+    assert "does not replay" in told and "scatter" not in told
     made.expected_of_base = -8.0
     near = SimpleNamespace(candidate=best.candidate, utility=-8.1, standard_error=error)
-    assert "same model" not in _so_far(made, near)
+    assert "same model" not in _so_far(made, near, task)
+
+
+def begun(task, off=0.0, noise=0.0, seed=0):
+    """A run that follows the target, from `off` beside the start, with a noisy position sensor."""
+    states = np.nan_to_num(task.target)
+    states[:, 0] += off + noise * np.random.default_rng(seed).standard_normal(len(states))
+    names = (task.model.state_names, task.model.input_names)
+    return Trial(states, np.zeros((len(states) - 1, 1)), task.dt, *names)
+
+
+def test_the_noise_of_a_first_row_is_no_start_elsewhere():
+    """Seen: "2.3 less because its runs began elsewhere", of a cart at rest with noisy sensors."""
+    from grounded_cli.propose import _so_far
+
+    task = cart_task()
+    rows = [begun(task, noise=0.02, seed=seed) for seed in range(40)]
+    assert max(abs(run.states[0, 0]) for run in rows) > 0.03
+    assert sum(began_elsewhere(task, [run]) != () for run in rows) <= 1
+    assert began_elsewhere(task, [begun(task, off=0.02)]) == ("x",)
+    assert began_elsewhere(task, [begun(task, off=0.1, noise=0.02)]) == ("x",)
+    assert began_elsewhere(task, rows) == ()
+    shifted = [begun(task, off=0.02, noise=0.02, seed=seed) for seed in range(40)]
+    assert began_elsewhere(task, shifted) == ("x",)  # the mean of many is known better
+    made = SimpleNamespace(
+        base="c0001", expected_of_base=-8.0, predicted_gain=0.5, base_as_run=-10.0
+    )
+    best = SimpleNamespace(candidate=SimpleNamespace(id="c0001"), utility=-10.0, standard_error=0.1)
+    best.trials = [begun(task, noise=0.02)]
+    text = _so_far(made, best, task)
+    assert "began" not in text and "2.000 more that it does not explain" in text

@@ -161,3 +161,52 @@ def test_weights_that_were_made_of_the_limits_seen_follow_those_that_are_given(t
     )
     assert not limited(-20, 20) and grounded(*step, "x=1").code == 0
     assert weight() == 1
+
+
+def planar(tmp_path, tables="[limits]"):
+    """A workspace of a planar drone whose target goes to x = 2 m, with further tables."""
+    (tmp_path / "plane.py").write_text(PLANE)
+    folder = tmp_path / "w"
+    Workspace.create(folder, model=tmp_path / "plane.py")
+    file = folder / "grounded.toml"
+    text = file.read_text().replace("[limits]", f"{tables}\nthrust = [0, 1]\nturn = [-3, 3]")
+    file.write_text(re.sub(r"(?m)^start = .*$", "start = { z = 1, thrust = 0.4905 }", text))
+    return folder, file
+
+
+def test_where_a_track_ends_another_target_is_advised_first(tmp_path):
+    """The advice was to widen [safety]: the ends of a real track, beyond which a crane stops."""
+    folder, _ = planar(tmp_path, "[safety]\nx = [-0.5, 0.5]\n[limits]")
+    assert grounded("-C", folder, "target", "line", "--to", "x=2", "--to", "z=1").code == 0
+    (note,) = [n for n in Workspace(folder).propose().proposal.notes if "nothing was run yet" in n]
+    assert 0 < note.index("draw a target") < note.index("widen [safety] only")
+
+
+def test_of_weights_by_other_limits_nobody_is_said_to_have_made_them(tmp_path):
+    """`target` had written them by [limits]; they were said to be `init`'s, of a log's range."""
+    folder, file = planar(tmp_path)
+    text = file.read_text()
+    made = re.search(r"(?m)^input_change = .*$", text)[0]
+    file.write_text(text.replace(made, f"# {made}\n{made}"))
+    assert grounded("-C", folder, "target", "line", "--to", "x=2", "--to", "z=1").code == 0
+    weights = tomllib.loads(file.read_text())["reward"]["input_change"]
+    assert weights["thrust"] == pytest.approx(0.04)
+    assert not [n for n in Workspace(folder).propose().proposal.notes if "input_change has" in n]
+    file.write_text(file.read_text().replace("thrust = [0, 1]", "thrust = [0.3, 0.7]"))
+    notes = Workspace(folder).propose().proposal.notes
+    (note,) = [n for n in notes if "input_change has" in n]
+    assert holds(note, "thrust = 0.04,", "thrust = 0.25") and "init" not in note
+
+
+def test_a_target_says_what_it_leaves_free(tmp_path):
+    """A cart-pole's line said nothing of the pole, which no column holds."""
+    folder, file = planar(tmp_path)
+    done = grounded("-C", folder, "target", "line", "--to", "x=2")
+    assert "free       z, th" in done.out and "[reward] counts for nothing" not in done.out
+    file.write_text(re.sub(r"(?m)^state = .*$", "state = { x = 2, z = 3 }", file.read_text()))
+    done = grounded("-C", folder, "target", "line", "--to", "x=2")
+    assert "the weight of z in [reward] counts for nothing" in " ".join(done.out.split())
+    found = grounded("-C", folder, "target", "line", "--to", "x=2", "--json").json
+    assert found["free"] == ["z", "th", "vz"] and {*found["columns"]} == {"x", "vx"}
+    ends = [word for name in ("x", "z", "th") for word in ("--to", f"{name}=1")]
+    assert "free" not in grounded("-C", folder, "target", "line", *ends).out

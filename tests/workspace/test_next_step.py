@@ -127,10 +127,32 @@ def test_what_is_calibrated_to_its_bound_is_not_to_be_adopted(cart, tmp_path, pa
     assert last(grounded("-C", folder, "status")) == f"grounded {then}"
 
 
+def test_adopting_says_of_what_its_std_stopped_what_to_widen(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    mass = {"value": 1.3, "std": 0.02, "interval": [1.26, 1.34], "unit": "kg", "stopped": "prior"}
+    diagnosed(folder, parameters={"mass": mass})
+    done = grounded("-C", folder, "adopt", "viscous_friction:v")
+    assert holds(" ".join(done.err.split()), "mass went as far as its std", "widen its std")
+    assert grounded("-C", folder, "adopt", "--undo").code == 0
+    diagnosed(folder, parameters={"mass": {**mass, "stopped": ""}})
+    assert "std" not in grounded("-C", folder, "adopt", "viscous_friction:v").err
+
+
 def test_a_diagnosis_of_another_model_is_made_again(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     diagnosed(folder, diagnosed={"trials": [], "adopted": [], "params": {"mass": 9.0}})
     assert last(grounded("-C", folder, "status")) == "grounded diagnose"
+
+
+def test_a_stale_diagnosis_tells_to_do_what_next_does(tmp_path):
+    """`status` said "run `grounded diagnose` again", and below it `next: grounded propose`."""
+    folder = make(tmp_path / "w").folder
+    grounded("-C", folder, "learn", "--trials", "2")
+    (folder / "reports").mkdir(exist_ok=True)
+    diagnosed(folder, diagnosed=taken_in(folder, 1))
+    found = grounded("-C", folder, "status")
+    assert last(found) == "grounded propose"
+    assert "diagnosed with 1 of 2 trials" in found.out and "diagnose`" not in found.out
 
 
 def test_nothing_claimed_nothing_to_adopt(cart, tmp_path):
@@ -325,11 +347,11 @@ def test_trials_that_came_after_a_diagnosis_make_it_old(cart, tmp_path):
     assert last(grounded("-C", folder, "status")) == "grounded adopt viscous_friction:v"
     assert "diagnosed with" not in grounded("-C", folder, "report").out
     diagnosed(folder, diagnosed=taken_in(folder, 1, 2))
-    words = f"diagnosed with 2 of {count} trials; run `grounded diagnose` again"
+    words = f"diagnosed with 2 of {count} trials"
     for command in ("status", "report"):
         done = grounded("-C", folder, command)
         assert words in " ".join(plain(done.out).split()).replace("Diagnosed", "diagnosed")
-        assert last(done) == "grounded diagnose"
+        assert last(done) == "grounded diagnose" and "diagnose`" not in done.out
     page = Path(grounded("-C", folder, "report", "--html", "--json").json["paths"]["html"])
     assert f"Diagnosed with 2 of {count} trials" in page.read_text()
 
@@ -341,7 +363,7 @@ def test_what_was_adopted_is_not_missing_any_more(cart, tmp_path):
     diagnosed(folder, verdict=verdict, diagnosed=taken_in(folder, 1, 2, 3, 4))
     assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
     out = " ".join(plain(grounded("-C", folder, "report").out).split())
-    assert re.search("viscous_friction:v, .*delay:force; .*`grounded diagnose", out)
+    assert re.search("viscous_friction:v, .*delay:force.*next: grounded .*diagnose", out)
     assert "made from 4 trials, t0001 to t0004, said: Friction; late." in out
     assert "crude model" not in out and "adopted effects" in out
     page = Path(grounded("-C", folder, "report", "--html", "--json").json["paths"]["html"])
@@ -536,10 +558,10 @@ def test_trust_sets_the_promised_gain_against_the_last_misses(tmp_path):
     little = gain < missed[1] and gain < 0.1 * abs(ran[1].utility)
     assert holds(" ".join(said[2].split()), "stop here", "c0002") == little
     assert "stop here" not in said[1]  # which promises all of the cost
-    made, best = ran[2].candidate, ran[1]
-    assert made.base == best.candidate.id and "model" not in _so_far(made, best)
+    made, best, task = ran[2].candidate, ran[1], Workspace(folder).task
+    assert made.base == best.candidate.id and "model" not in _so_far(made, best, task)
     poor = replace(made, predicted_gain=made.predicted_gain - 2)  # a trial worse than its policy
-    assert holds(_so_far(poor, best), f"{poor.predicted_utility - poor.predicted_gain:.4g}")
+    assert holds(_so_far(poor, best, task), f"{poor.predicted_utility - poor.predicted_gain:.4g}")
     now = ran_standing(folder, best)
     assert f"{poor.predicted_gain:.4g}" in _came_true(poor, ran[:2], now)
     near = replace(made, predicted_gain=0.95 * gain)  # not told to be replayed otherwise

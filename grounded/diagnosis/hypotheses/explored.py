@@ -25,9 +25,9 @@ import numpy as np
 
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, rates_of
 from grounded.diagnosis.likelihood.noise import Structure
-from grounded.diagnosis.likelihood.predictor import Predictor, rates_of
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Effect, InputFamily, MediumFamily, ParamFamily, RateFamily
 from grounded.filter.tempering import Tempering, tempering
 from grounded.frozen import Array

@@ -23,8 +23,8 @@ from grounded.diagnosis.hypotheses.scan import scan_candidates
 from grounded.diagnosis.hypotheses.search import CRUDE, TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
-from grounded.diagnosis.likelihood.predictor import Predictor, rates_of
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale, rates_of
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.report import Likeness
 from grounded.effects import Effect, InputFamily, ParamFamily, RateFamily, one_friction

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.effects import Effect
+from grounded.effects import Effect, LossFamily, MediumFamily, RateFamily
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -95,3 +95,24 @@ def by_row(hypotheses: Sequence[Hypothesis], which: Any) -> Hypothesis:
 def param_scale(model: Model) -> Array:
     """Prior standard deviation of each parameter (k,): 0 of a constant."""
     return np.array([param.spread for param in model.params.values()], float)
+
+
+def rates_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
+    """The rate effects of halves of a step, with their values."""
+    return [(e, v) for e, v in h.pairs if isinstance(e.family, RateFamily) and not e.family.parts]
+
+
+def limits_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
+    """Those of parts of it: limits of rates."""
+    return [(e, v) for e, v in h.pairs if isinstance(e.family, RateFamily) and e.family.parts]
+
+
+def losses_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
+    """What the motion takes off the inputs that drive it."""
+    return [(e, v) for e, v in h.pairs if isinstance(e.family, LossFamily)]
+
+
+def adds_to_steps(h: Hypothesis) -> bool:
+    """Whether a hypothesis adds more to the model's steps than what arrives of the inputs."""
+    medium = any(isinstance(e.family, MediumFamily) for e in h.effects)
+    return bool(rates_of(h) or limits_of(h) or losses_of(h) or medium)

@@ -35,10 +35,10 @@ import numpy as np
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, losses_of, param_scale
 from grounded.diagnosis.likelihood.moving import moving
 from grounded.diagnosis.likelihood.noise import NoiseModel
-from grounded.diagnosis.likelihood.predictor import Predictor, losses_of
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.rate_slopes import (
     heading_slope,
     logged_slopes,

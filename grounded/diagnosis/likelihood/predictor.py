@@ -22,15 +22,19 @@ from grounded.compile import Named
 from grounded.diagnosis.likelihood.arriving import arriving, memories_moved
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import filter_lag, sensor_offset
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.hypothesis import (
+    Hypothesis,
+    adds_to_steps,
+    limits_of,
+    losses_of,
+    param_scale,
+    rates_of,
+)
 from grounded.diagnosis.likelihood.moving import moving
 from grounded.diagnosis.likelihood.simulated import Slopes, simulated
 from grounded.effects import (
     Effect,
-    LossFamily,
-    MediumFamily,
     ParamFamily,
-    RateFamily,
     SensorDelayFamily,
     SensorFamily,
     SensorLagFamily,
@@ -204,7 +208,7 @@ class Predictor(SentOnce):
     def stepper(self, h: Hypothesis) -> Callable[[Array, Array, Array], Array]:
         """`advance` of many steps one after the other: from x (M, n) with u (M, m) at t (M,)."""
         step, p, dt = self.data.model.system.step, self.params(h), self.data.dt
-        if p.ndim > 1 or _more_than_steps(h):
+        if p.ndim > 1 or adds_to_steps(h):
             return lambda x, u, t: self.advance(h, x, u, t)
         return lambda x, u, t: step(x, u, p, dt)
 
@@ -214,7 +218,7 @@ class Predictor(SentOnce):
         None where a hypothesis adds to them, or the model is not compiled.
         """
         march = getattr(self.data.model.system, "march", None)
-        if march is None or _more_than_steps(h):
+        if march is None or adds_to_steps(h):
             return None
         return np.asarray(march(x, u, self.params(h), self.data.dt))
 
@@ -385,24 +389,3 @@ def _alike(p: Array) -> list[tuple[Array, Any]]:
     for i, one in enumerate(p):
         rows.setdefault(one.tobytes(), []).append(i)
     return [(p[own[0]], np.array(own)) for own in rows.values()]
-
-
-def rates_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
-    """The rate effects of halves of a step, with their values."""
-    return [(e, v) for e, v in h.pairs if isinstance(e.family, RateFamily) and not e.family.parts]
-
-
-def limits_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
-    """Those of parts of it: limits of rates."""
-    return [(e, v) for e, v in h.pairs if isinstance(e.family, RateFamily) and e.family.parts]
-
-
-def losses_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
-    """What the motion takes off the inputs that drive it."""
-    return [(e, v) for e, v in h.pairs if isinstance(e.family, LossFamily)]
-
-
-def _more_than_steps(h: Hypothesis) -> bool:
-    """Whether a hypothesis adds more to the model's steps than what arrives of the inputs."""
-    medium = any(isinstance(e.family, MediumFamily) for e in h.effects)
-    return bool(rates_of(h) or limits_of(h) or losses_of(h) or medium)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.predictor import Predictor, limits_of, rates_of
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, limits_of, rates_of
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects.sensed import behind_logs
 from grounded.frozen import Array
 

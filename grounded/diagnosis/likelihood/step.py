@@ -21,7 +21,6 @@ from grounded.frozen import Array
 
 LEAP = 0.3  # of a parameter's scale that its shift moves at once
 GAPS = 20  # differences, two gaps of its grid, that a scanned value moves at once
-BELIEVED = 3.0  # standard deviations, as the user gave them, that a parameter may be off
 
 
 @dataclass(eq=False)
@@ -108,18 +107,6 @@ def inside(data: Data, shift: Array) -> Array:
 
 
 def _bounds(data: Data) -> tuple[Array, Array]:
-    """Bounds of the model's parameters, (k,) each; where none is given the sign stays.
-
-    Nor does one go further than three of its own standard deviations: thousands of nats of a model
-    that is wrong elsewhere would carry a measured length to a fifth of itself.
-    """
-    params = data.model.params.values()
-    low = [
-        p.low if p.low is not None else 0.2 * p.value if p.value > 0 else -np.inf for p in params
-    ]
-    high = [
-        p.high if p.high is not None else 0.2 * p.value if p.value < 0 else np.inf for p in params
-    ]
-    far = np.array([np.inf if p.std is None else BELIEVED * p.std for p in params])
-    values = data.model.values
-    return np.maximum(low, values - far), np.minimum(high, values + far)
+    """The `reach` of the model's parameters, (k,) each."""
+    ends = np.array([p.reach for p in data.model.params.values()], float).reshape(-1, 2)
+    return ends[:, 0], ends[:, 1]

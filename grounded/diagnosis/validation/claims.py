@@ -379,5 +379,6 @@ class Claims:
             value = float(model.values[index] + h.shift[index])
             std, half = (float(a[k + at] * scale[index]) for a in (stds, halves))
             name, interval = model.param_names[index], (value - half, value + half)
-            found[name] = Estimate(value, std, interval, model.params[name].unit)
+            param = model.params[name]
+            found[name] = Estimate(value, std, interval, param.unit, param.stopped(value))
         return found

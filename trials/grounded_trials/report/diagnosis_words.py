@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping
 
 from grounded.diagnosis.error_report import Gap, RulerRow, furthest
 from grounded.diagnosis.report import Correction, Diagnosis, Estimate
+from grounded.diagnosis.stopped import ENDED
 from grounded.instruments.finding import Finding
 from grounded.result import listed
 from grounded_trials.wording import changed, count, figure, percent, ranges, shown, with_unit
@@ -183,7 +184,8 @@ def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> st
         old = then.get(name, math.nan)
         if abs(e.value - old) > 1e-6 * max(abs(e.value), abs(old)):
             change = abs(e.value - old) / abs(old) if old else math.inf
-            moved.append((-change, changed(name, old, e.value, e.unit)))
+            more = "".join(f" ({text})" for text in ENDED[e.stopped])
+            moved.append((-change, changed(name, old, e.value, e.unit) + more))
     named = ", ".join(text for _, text in sorted(moved)[:MOST])
     others = len(moved) - MOST
     return f"calibrated beside them: {named}{f' (and {others} more)' * (others > 0)}" * bool(moved)

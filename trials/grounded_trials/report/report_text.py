@@ -158,7 +158,7 @@ def _diagnosis(findings: Findings, table: Table) -> str:
         command = rendered(DIAGNOSE, findings.folder)
         return "\n".join(["gap to the model", *_wrapped(f"not diagnosed yet: {command}", "  ")])
     lines = ["gap to the model"]
-    shown = so_far(diagnosis, since, findings.settled, findings.folder)
+    shown = so_far(diagnosis, since, findings.settled)
     causes, others = verdict_lines(diagnosis)
     for line in (*shown, *(f"- {cause}" for cause in causes), *others):
         lines += _wrapped(line, "  ")

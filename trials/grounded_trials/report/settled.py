@@ -84,9 +84,7 @@ def _last(workspace: Folder) -> tuple[Diagnosis | None, Since]:
     return found, since_diagnosis(workspace, found, usable_ids(workspace)) if found else Since()
 
 
-def told(
-    diagnosis: Diagnosis, task: Task, since: Since, settled: Settled | None, folder: str | None
-) -> list[str]:
+def told(diagnosis: Diagnosis, task: Task, since: Since, settled: Settled | None) -> list[str]:
     """What a diagnosis says today: what was adopted first, then what is open.
 
     Args:
@@ -94,22 +92,19 @@ def told(
         task: whose weighed states it speaks of.
         since: what happened after it.
         settled: what the model has.
-        folder: the workspace as the user named it, None where it is the current one.
     """
-    lines = so_far(diagnosis, since, settled, folder)
+    lines = so_far(diagnosis, since, settled)
     if settled is not None and settled.closed:
         return lines[:-1]
     return [*lines, *three_lines(diagnosis, task)]
 
 
-def so_far(
-    diagnosis: Diagnosis, since: Since, settled: Settled | None, folder: str | None = None
-) -> list[str]:
+def so_far(diagnosis: Diagnosis, since: Since, settled: Settled | None) -> list[str]:
     """What was adopted and why the diagnosis is not the last word, before its own sentences."""
     lines = [] if settled is None else settled.lines
     if settled is not None and settled.left and not since.changed:
         lines = lines[:-1]  # the diagnosis is about to say it
-    if text := since.told(folder):
+    if text := since.sentence:
         lines.append(f"{text[:1].upper()}{text[1:]}.")
     return [*lines, f"The diagnosis, {made_from(diagnosis)}, said:"] if lines else []
 

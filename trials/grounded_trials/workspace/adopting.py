@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from grounded.diagnosis.report import Diagnosis, Estimate, Made
+from grounded.diagnosis.stopped import wider
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.result import Result, listed, percent
 from grounded_trials.store.documents import read_document, write_document
@@ -46,6 +47,7 @@ class Adopted(Result):
     then: NextCommand = PROPOSE
     beside: tuple[str, ...] = ()  # adopted before from the same diagnosis, fitted in their place
     left: Mapping[str, Left] = field(default_factory=dict)  # by name
+    stopped: str = ""  # what to do about parameters that went as far as they may
 
     def summary(self) -> str:
         """The effects that the model has now."""
@@ -119,6 +121,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
         claimed,
         beside=tuple(n for n in beside if n not in fitted),
         left=left_behind(found) if parameters and physics and claimed else {},
+        stopped=wider(found.parameters) if parameters and physics and claimed else "",
     )
 
 

@@ -22,7 +22,12 @@ from grounded.utility import step_rewards
 from grounded_trials.wording import rendered, with_unit
 from grounded_trials.workspace.config import FILE, made_changes
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.off_target import tracked, tracking_error, weighed_groups
+from grounded_trials.workspace.off_target import (
+    tracked,
+    tracking_error,
+    weighed_groups,
+    white_noise,
+)
 from grounded_trials.workspace.task_file import limited_changes, seen_in
 
 if TYPE_CHECKING:
@@ -37,7 +42,6 @@ HELD = 0.8  # of a plan's steps: an input is at a limit nearly all the time
 SHORT = 0.25  # of the way to where a target ends: the plan does not get there
 MISSED = 0.1  # of the way that a target asks for: the plan falls short
 SHAKEN = 0.05  # of what [limits] allow an input, else of what a plan uses of it
-MEDIAN = 0.6745  # standard deviations that half of all normal numbers lie within
 FARTHEST = 1e4  # in its unit: how far a state that nobody gave may be from where it starts
 UNGIVEN = 3  # states, whose values at the start are asked for: of more nobody has thought
 STILL = 1e-3  # of the rates under the held input: under another one the robot stands
@@ -94,8 +98,8 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
     found += loose
     if proposal.standing.ending == "not allowed" and not held and not loose:
         found.append(
-            "nothing was run yet: widen [safety], or draw a target whose run stays inside "
-            "(`target`), and propose again"
+            "nothing was run yet: draw a target whose run stays inside [safety] (`target`) and "
+            "propose again; widen [safety] only where the robot may really go there"
         )
     name = str(workspace.config.task.target)
     rows = len(workspace.read_target(workspace.folder / name)[1])
@@ -108,7 +112,7 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
 
 
 def _of_other_limits(workspace: Folder) -> list[str]:
-    """Where weights on changes of inputs are still those that `init` made, by other [limits]."""
+    """Where weights on changes of inputs are still those that were made by other [limits]."""
     config, model = workspace.config, workspace.base_model
     made = made_changes(config.file.read_text(encoding="utf-8"))
     weights = dict(zip(model.input_names, workspace.task.reward.input_change, strict=True))
@@ -123,7 +127,7 @@ def _of_other_limits(workspace: Folder) -> list[str]:
     was = ", ".join(f"{name} = {weights[name]:.4g}" for name in off)
     new = ", ".join(f"{name} = {now.get(name, w):.4g}" for name, w in weights.items() if w)
     return [
-        f"[reward] input_change has {was}, which `init` made of the range that it saw in the log. "
+        f"[reward] input_change has {was}, made for another range than [limits] have now. "
         f"By [limits] as they are now it would be input_change = {{ {new} }}: write that, or draw "
         "the target again (`target` does so where no weight in [reward] was changed)"
     ]
@@ -245,16 +249,9 @@ def _shaken(workspace: Folder, first: Candidate) -> list[str]:
 
 
 def sensor_noise(workspace: Folder) -> Array:
-    """The white noise of each state (n,) by second differences of the latest log; 0 without one.
-
-    A motion that is smooth from sample to sample hides none of it.
-    """
-    found, trials = np.zeros(workspace.base_model.n), workspace.task_trials(measured=True)
-    for j, column in enumerate(trials[-1].states.T if trials else ()):
-        bends = np.abs(np.diff(column, n=2))
-        bends = bends[np.isfinite(bends)]
-        found[j] = np.median(bends) / (MEDIAN * np.sqrt(6)) if len(bends) else 0.0
-    return found
+    """The white noise of each state (n,) in the latest log; 0 without one."""
+    trials = workspace.task_trials(measured=True)
+    return white_noise(trials[-1].states) if trials else np.zeros(workspace.base_model.n)
 
 
 def _most_missed(task: Task, plan: Trial) -> str:

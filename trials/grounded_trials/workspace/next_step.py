@@ -14,7 +14,6 @@ from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import GroundedError, NextCommand
 from grounded.model import all_at_bounds
 from grounded.search.standing import LOST, Standing
-from grounded_trials.wording import rendered
 from grounded_trials.workspace.diagnosing import diagnosable, read_diagnosis
 from grounded_trials.workspace.fitting import fitted_in_vain
 from grounded_trials.workspace.folder import Folder
@@ -218,15 +217,7 @@ class Since:
 
     @property
     def sentence(self) -> str:
-        """Why it is no longer the last word, and what to run; "" where it is."""
-        return self.told()
-
-    def told(self, folder: str | None = None) -> str:
-        """The same for who is elsewhere.
-
-        Args:
-            folder: the workspace as the user named it.
-        """
+        """Why it is no longer the last word; "" where it is. What to run, `next_command` says."""
         parts = []
         if self.newer:
             parts.append(f"diagnosed with {self.used} of {self.usable} trials")
@@ -235,8 +226,7 @@ class Since:
             parts.append(f"adopted since: {', '.join(self.adopted)}{but}")
         elif self.changed:
             parts.append("the model was changed since")
-        again = f"run `{rendered(DIAGNOSE, folder)}` again"
-        return "; ".join([*parts, again]) if parts else ""
+        return "; ".join(parts)
 
 
 def usable_ids(workspace: Folder) -> list[str]:

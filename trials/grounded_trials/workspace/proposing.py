@@ -276,7 +276,7 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
         standing,
         next_command(workspace, standing, found, usable),
         again_best(workspace, standing),
-        since.told(workspace.address) if since else "",
+        since.sentence if since else "",
         (*notes, *_namesakes(workspace)),
         workspace.discarded(),
         off_target_of(workspace.task, standing.incumbent.trials if standing.incumbent else ()),

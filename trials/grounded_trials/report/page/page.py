@@ -238,7 +238,7 @@ def _why(findings: Findings) -> dict[str, Any]:
     lines = [line for line in error_lines(diagnosis, before) if line[0] in shown]
     return {
         "kind": diagnosis.kind,
-        "verdict": told(diagnosis, findings.task, findings.since, findings.settled, None),
+        "verdict": told(diagnosis, findings.task, findings.since, findings.settled),
         "preflight": instrument_lines(diagnosis.preflight),
         "lines": lines,
         "credit": credit,

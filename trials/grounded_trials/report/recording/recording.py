@@ -288,10 +288,7 @@ def verdict(findings: Findings) -> str:
         lines.append("not diagnosed yet\n")
     else:
         lines += [
-            f"{line}\n"
-            for line in told(
-                diagnosis, findings.task, findings.since, findings.settled, findings.folder
-            )
+            f"{line}\n" for line in told(diagnosis, findings.task, findings.since, findings.settled)
         ]
         if diagnosis.credit:
             lines += ["| credit | | of what predictions gain |", "|---|---|---|"]

@@ -1,0 +1,32 @@
+"""Parameters that ended where they may go no further, though the data ask for more."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from grounded.diagnosis.report import Estimate
+from grounded.result import listed
+
+ENDED = {  # by `Estimate.stopped`
+    "": (),
+    "bound": ("at its bound: the data ask for more",),
+    "prior": ("as far as its std lets it go: the data ask for more",),
+}
+
+
+def wider(known: Mapping[str, Estimate]) -> str:
+    """What to do about those whose prior stopped them, a sentence; "" where it stopped none.
+
+    Args:
+        known: the calibrated values, by parameter.
+    """
+    names = [name for name, estimate in known.items() if estimate.stopped == "prior"]
+    if not names:
+        return ""
+    one = len(names) == 1
+    its, it, each = ("its", "it", "it is") if one else ("their", "them", "they are")
+    return (
+        f"{listed(names)} went as far as {its} std {'lets' if one else 'let'} {it}, and the data "
+        f"ask for more: if {each} known less well than that, widen {its} std in the model file, or "
+        "give bounds instead, and diagnose again before you adopt anything."
+    )
