@@ -121,7 +121,7 @@ def test_a_velocity_that_is_a_difference_of_its_position_says_no_more_than_that(
 
 @pytest.mark.parametrize("first", [0, 1])
 def test_a_velocity_computed_from_two_samples_of_its_position_is_no_sensor(first):
-    """Moved back by half a step it made a delay of 20 ms 1.3 ms shorter, or 2 ms longer."""
+    """Moved back by half a step it made an arm's delay of 20 ms 1.7 ms longer."""
 
     def fault(y):
         q = 1e-3 * np.round(y[:, 0] / 1e-3)  # an encoder
