@@ -19,7 +19,7 @@ excitation        what to run next, where two explanations tie
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -27,7 +27,7 @@ import numpy as np
 
 from grounded.diagnosis.hypotheses.attribution import attribute, grown, so_far
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
-from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.data import Data, prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Diagnosis
@@ -43,7 +43,8 @@ from grounded.diagnosis.validation.motions import without_others
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.verdict import MOST_EFFECTS
 from grounded.diagnosis.writer import Writer
-from grounded.effects import Library
+from grounded.effects import Effect, Library
+from grounded.effects.actuator import delay_again
 from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError
 from grounded.instruments.sound_trials import sound_trials
@@ -63,6 +64,8 @@ class DiagnosisOptions:
         horizon: how far ahead predictions are judged [s].
         hidden: states that no sensor has: the memory of effects that were adopted.
         but: effects that are not blamed, by name: adopted ones, whose numbers are parameters now.
+        delays: those that were adopted [s], by the names of their effects, which the task's latency
+            holds: they may have to be longer or shorter.
         origin: the task before anything was adopted: what matters is measured by what its model
             misses, in the second diagnosis as in the first.
     """
@@ -72,6 +75,7 @@ class DiagnosisOptions:
     horizon: float = 1.0
     hidden: tuple[str, ...] = ()
     but: Collection[str] = ()
+    delays: Mapping[str, float] = field(default_factory=dict)
     origin: Task | None = None
 
 
@@ -142,7 +146,12 @@ def diagnose(
             data = replace(data, model=held(uncertain, null[0]))
             model = without_others(Predictor(data), null[0].track, options.but, options.library)
             data = replace(data, model=model)
-    offered = options.library.candidates(data.model, data.scales)
+    offered = [
+        _again(effect, options.delays[effect.name], data)
+        if effect.name in options.delays
+        else effect
+        for effect in options.library.candidates(data.model, data.scales)
+    ]
     settled = {*options.but, *looked.settled}
     candidates = knowable(data, [e for e in offered if e.name not in settled])
     joints = options.library.joints(data.model, data.scales)
@@ -191,6 +200,12 @@ def diagnose(
             changed=apart.changed if apart else None,
             unchanged=apart.unchanged if apart else (),
         )
+
+
+def _again(effect: Effect, known: float, data: Data) -> Effect:
+    """An adopted delay as a change of it: no command arrives before it was sent."""
+    late = data.latency[[data.model.input_names.index(name) for name in effect.site.targets]]
+    return delay_again(effect, known, float(late.min()))
 
 
 USUAL_EFFECTS = 3  # that are looked for at first

@@ -40,8 +40,9 @@ from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.patterns import BASE, probes
-from grounded.diagnosis.report import Diagnosis, Estimate
-from grounded.effects import Library, Scales, memory_start, scales_of, wrap, wrapping_order
+from grounded.diagnosis.report import Diagnosis, Estimate, Made
+from grounded.effects import Effect, Library, Scales, memory_start, scales_of, wrap, wrapping_order
+from grounded.effects.actuator import delay_again
 from grounded.effects.memory import shifted
 from grounded.frozen import Array
 from grounded.model import Model
@@ -168,7 +169,7 @@ def _teaching(
     scales, h = _scales(task, trials), Hypothesis()
     spreads: dict[str, tuple[float, str]] = {}  # by column: standard deviation, unit
     for name in (n for n in diagnosis.joining if not n.startswith("parameter:")):
-        row, effect = diagnosis.ranked(name), library.effect(name, task.model, scales)
+        row, effect = diagnosis.ranked(name), _effect(library, name, task, diagnosis, scales)
         if row is None:
             return None
         h = h.plus(effect, row.values)
@@ -288,9 +289,22 @@ def _rivals(
     one = other = h
     for name in (n for n in names if n != pair[1]):
         rival = pair[1] if name == pair[0] else name  # it acts where the other one does
-        one = one.plus(library.effect(name, task.model, scales), diagnosis.values(name))
-        other = other.plus(library.effect(rival, task.model, scales), diagnosis.values(rival))
+        first, second = (_effect(library, n, task, diagnosis, scales) for n in (name, rival))
+        one = one.plus(first, diagnosis.values(name))
+        other = other.plus(second, diagnosis.values(rival))
     return task, one, other
+
+
+def _effect(
+    library: Library, name: str, task: Task, diagnosis: Diagnosis, scales: Scales
+) -> Effect:
+    """The effect as the diagnosis had it: a delay that was adopted is one that changes."""
+    effect, adopted = library.effect(name, task.model, scales), diagnosis.made or Made()
+    if name not in adopted.effects or effect.family.name != "delay":
+        return effect
+    assert task.latency is not None
+    late = task.latency[[task.model.input_names.index(n) for n in effect.site.targets]]
+    return delay_again(effect, float(adopted.effects[name]["d"]), float(late.min()))
 
 
 def _adapted(task: Task, runs: list[Trial], h: Hypothesis, noise: _Noise) -> Hypothesis:
@@ -325,6 +339,9 @@ def _run(task: Task, h: Hypothesis, policy: Policy, like: Trial | None = None) -
     z = np.concatenate([begin, memory_start(model, task.model, start)])
     states, inputs, runner = [begin], np.zeros((steps, model.m)), Runner(policy)
     late, past = task.latency / task.dt, held[:, None]
+    for effect, values in h.pairs:
+        if effect.known:
+            late[[model.input_names.index(n) for n in effect.site.targets]] += values["d"] / task.dt
     for t in range(steps):
         inputs[t] = like.inputs[t] if like else runner.action(t * policy.dt, states[-1])
         sent = inputs[None, : t + 1]
@@ -344,6 +361,8 @@ def _wrapped(task: Task, h: Hypothesis) -> Model:
         model = model.with_values(dict(zip(model.param_names, moved.tolist(), strict=True)))
     for i in wrapping_order([effect.family for effect in h.effects]):
         effect = h.effects[i]
+        if effect.known:  # a change of the task's latency
+            continue
         current = Library((effect.family,)).effect(effect.name, model, effect.site.scales)
         model = wrap(current, h.values[i], task.dt)
     return model

@@ -332,14 +332,16 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
         known = [p for p in parts if {*re.findall(r"\{(\w)[%}]", p)} <= told]
         return listed(known or (parts[1:] and parts[:1]))
 
-    if (
-        isinstance(effect.family, ParamFamily)
-        and "d" in params
-        and effect.site.target in model.params
-    ):
+    own = isinstance(effect.family, ParamFamily) and effect.site.target in model.params
+    if own and "d" in params:
         old = model.params[effect.site.target].value
         new = give_or_take(params["d"].moved(old))
         return f"the parameter {effect.site.target} should be {new} instead of {number(old)}"
+
+    if effect.known and "d" in params:
+        by, now = params["d"], params["d"].moved(effect.quantities[0].known)
+        more = f"{number(abs(by.value))} s {'less' if by.value < 0 else 'more'} than adopted"
+        return f"the delay of {words['target']} should be {give_or_take(now)}, {more}"
 
     def signed(found: re.Match[str]) -> str:
         name, positive, negative = found.groups()

@@ -16,6 +16,7 @@ the MEAN of what the actuator delivers over the step, and fractions of a step ma
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ import numpy as np
 from grounded.effects import places
 from grounded.effects.family import (
     LEAST_LIMIT,
+    Effect,
     InputFamily,
     MemoryFamily,
     Quantity,
@@ -33,6 +35,7 @@ from grounded.effects.family import (
 from grounded.model import Model
 
 LONGEST_DELAY = 0.5  # [s] that a scan considers, where steps are not longer than usual
+NEARBY = (0.05, 0.15, 0.4, 0.8, 1.3, 2.0)  # steps by which an adopted delay may be off
 LONGEST_LAG = 2.0  # [s] the same
 ONE_SIDED = 0.05  # of an input's peak: what it reached the other way is no second side
 
@@ -171,6 +174,26 @@ def _delay(site: Site) -> tuple[Quantity, ...]:
     count = int(min(max(round(2 * longest / dt), 6), 14))
     grid = tuple(float(v) for v in longest * (np.arange(1, count + 1) / count) ** 1.5)
     return (Quantity("d", "s", grid, 0.0, longest, places=6),)
+
+
+def delay_again(effect: Effect, known: float, room: float) -> Effect:
+    """A delay that the model has already, as an effect that makes it longer or shorter.
+
+    Args:
+        effect: a delay, at its site.
+        known: what the model has of it [s].
+        room: by how much it may be shorter at most [s].
+    """
+    dt, (d,) = effect.site.scales.dt, effect.quantities
+    less = min(known, room)
+    near = [part * dt for part in NEARBY if part * dt < d.high]
+    grid = (
+        *(-by for by in reversed(near) if by <= less),
+        *near,
+        *(g for g in d.grid if g > near[-1]),
+    )
+    one = replace(d, grid=grid, low=-less, places=1.0, known=known)
+    return replace(effect, quantities=(one,))
 
 
 def _lag(site: Site) -> tuple[Quantity, ...]:

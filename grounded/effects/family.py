@@ -60,6 +60,7 @@ class Quantity:
         tunable: a constant that data may set (above zero) where they show the effect well.
         tuned: it was.
         absurd: a size beyond which it is no finding but a sign of other units, or of other logs.
+        known: what the model has of it already; the value is what it has to have more, or less.
     """
 
     name: str
@@ -73,6 +74,7 @@ class Quantity:
     tunable: bool = False
     tuned: bool = False
     absurd: float = np.inf
+    known: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -327,6 +329,11 @@ class Effect:
             replace(q, start=value, tuned=True) if q.name == name else q for q in self.quantities
         )
         return replace(self, quantities=tuple(new))
+
+    @property
+    def known(self) -> bool:
+        """Whether the model has it already, and its values are changes."""
+        return any(q.known for q in self.quantities)
 
     @property
     def places(self) -> float:

@@ -27,6 +27,7 @@ from grounded.trial import Trial, stretches
 SHORT = 1e-6  # [s], a step that shows the rates
 FAST = 0.2  # of the largest speed: below it a course means little
 OWN = 200  # logged samples that show how a model's own position follows its velocity
+COPIED = 1e-3  # of a velocity: digits of a log, less than any sensor of its own differs by
 AGREE = 0.9  # length of the mean of unit vectors that point the same way
 TURNED_AWAY = np.deg2rad(20)  # what no side slip makes
 OFF = 0.03  # of a scale, beyond both of its brackets
@@ -97,6 +98,26 @@ def own_lag(model: Model, relation: Integral, trials: Sequence[Trial]) -> float:
     size = float(changed @ changed)
     late = float(moved @ changed) / size * dt if size > 0 else 0.0
     return late if np.isfinite(late) and abs(late) < dt else 0.0
+
+
+def differenced(model: Model, relation: Integral, trials: Sequence[Trial]) -> bool:
+    """Whether the velocity was computed from its position's samples: its change over a step.
+
+    Not where the model itself moves the position by just that velocity.
+    """
+    dt, rests, sizes = trials[0].dt, np.zeros(2), np.zeros(2)
+    for piece in pieces(trials, (relation.i, relation.j)):
+        moved = np.diff(piece[:, 0])[:, None]
+        wrapped(moved, [model.angle_mask[relation.i]])
+        w = relation.c * piece[:, 1]
+        for k, known in enumerate((w[1:], w[:-1])):  # at the end of the step, at its start
+            rests[k] += ((moved[:, 0] / dt - known) ** 2).sum()
+            sizes[k] += (known**2).sum()
+    copies = (rests < COPIED**2 * sizes) & (sizes > 0)
+    if not copies.any():
+        return False
+    late = (0.5 if copies[0] else -0.5) * dt
+    return abs(own_lag(model, relation, trials) - late) > 0.25 * dt
 
 
 def over_steps(w: Array) -> Array:

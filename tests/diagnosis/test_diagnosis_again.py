@@ -9,14 +9,20 @@ from test_diagnosis import cart
 from grounded import Model, Param, Reward, Task, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses.lookalike import one_thing
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
+from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked, Verdict
+from grounded.diagnosis.validation.decide import SURE
 from grounded.diagnosis.validation.ruler import Ruler, folds
+from grounded.diagnosis.verdict import meaning
 from grounded.effects import Library
+from grounded.effects.actuator import delay_again
+from grounded_trials.workspace.adopting import joined
 
 
 def axis(gain):
@@ -136,3 +142,42 @@ def test_a_floor_from_trials_that_are_merely_alike_says_so():
     found = [diagnose(axis(1.0), some, few) for some in (alike, again)]
     sources = [one.prediction_error[0].floor_from for one in found]
     assert sources == ["alike", "repeats"]
+
+
+LATE = 0.1  # [s], two steps of an axis
+
+
+def late_runs():
+    """Trials of an axis whose commands arrive LATE."""
+    return [
+        replace(run, inputs=np.concatenate([run.inputs[2:], np.zeros((2, 1))])).until(198)
+        for run in runs(1.0, trials=2)
+    ]
+
+
+@pytest.mark.parametrize("adopted", [0.095, 0.104])
+def test_an_adopted_delay_is_made_longer_or_shorter(adopted):
+    model = axis(1.0)
+    data = prepare(model, late_runs(), np.array([adopted]))
+    effect = delay_again(Library().effect("delay:u", model, data.scales), adopted, adopted)
+    predictor, change = Predictor(data), LATE - adopted
+    h = Hypothesis().plus(effect, {"d": change})
+    whole = Predictor(replace(data, latency=np.array([LATE])))
+    assert predictor.received(h) == pytest.approx(whole.received(Hypothesis()))
+    assert min(effect.free[0].grid) < 0 < max(effect.free[0].grid)
+    search = HypothesisSearch(data, [effect])
+    assert search.price(effect, {"d": change}) < SURE  # a tenth of a step is no matter of stamps
+    search.nulls()
+    search.extended(search.exact_null(), 1)
+    (best,) = search.of_size(1)
+    assert best.hypothesis.values[0]["d"] == pytest.approx(change, abs=5e-4)
+    said = meaning(effect, {"d": Estimate(change, 1e-4, unit="s")})
+    assert f"{'less' if change < 0 else 'more'} than adopted" in said and "0.1 " in said
+
+
+def test_adopting_a_change_of_a_delay_replaces_it():
+    made = Made(adopted=({"name": "delay:u", "d": 0.104},))
+    row = Ranked("delay:u", {"d": Estimate(-0.004)}, claimed=True)
+    found = Diagnosis(Verdict("effect", ("delay:u",)), ranking=(row,), made=made)
+    _, effects = joined(found, ["delay:u"], made.adopted, {}, {})
+    assert effects == [{"name": "delay:u", "d": 0.1}]

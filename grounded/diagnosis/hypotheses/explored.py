@@ -29,6 +29,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis, rates_of
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Effect, InputFamily, MediumFamily, ParamFamily, RateFamily
+from grounded.effects.wrap import SURE
 from grounded.filter.tempering import Tempering, tempering
 from grounded.frozen import Array
 
@@ -162,6 +163,8 @@ def price(
     data = predictor.data
     if isinstance(effect.family, ParamFamily):
         return math.log(targets) + _of_parameter(effect, values, data.steps)
+    if effect.known:
+        return _of_change(effect, values, data.steps)
     if values.get(TIMES.get(effect.family.name, ""), math.inf) < BRIEF * data.dt:
         return math.inf
     if any(abs(values.get(q.name, 0.0)) > q.absurd for q in effect.free):
@@ -252,6 +255,13 @@ def _of_parameter(effect: Effect, values: Mapping[str, float], steps: int) -> fl
     value = effect.site.model.params[effect.site.target].value
     size = PARAM_PRIOR * (abs(value) or 1.0)
     return 0.5 * (values.get("d", 0.0) / size) ** 2 + 0.25 * math.log(max(steps, 2)) + 1.0
+
+
+def _of_change(effect: Effect, values: Mapping[str, float], steps: int) -> float:
+    """The same of an effect that was adopted: as uncertain as its numbers that are parameters."""
+    sizes = {q.name: SURE * q.known for q in effect.free if q.known}
+    pulls = sum(0.5 * (values.get(name, 0.0) / size) ** 2 for name, size in sizes.items())
+    return pulls + 0.25 * len(effect.free) * math.log(max(steps, 2)) + 1.0
 
 
 def _mere_offset(predictor: Predictor, effect: Effect, values: Mapping[str, float]) -> bool:

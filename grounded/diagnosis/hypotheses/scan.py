@@ -360,6 +360,7 @@ def apart(effect: Effect, one: dict[str, float], other: dict[str, float]) -> boo
 def faint(effect: Effect, grid: dict[str, float], score: float, gram: float) -> float:
     """How much of the smallest grid value: below it an effect that is absent at zero is linear."""
     (scanned,) = (q for q in effect.free if q.grid)
-    if scanned.start != 0 or grid[scanned.name] > min(scanned.grid) or gram <= 0:
+    least = min(map(abs, scanned.grid))
+    if scanned.start != 0 or abs(grid[scanned.name]) > least or gram <= 0:
         return 1.0
     return float(np.clip(-score / gram, 0.05, 1.0))

@@ -1,4 +1,8 @@
-"""What arrives of the commands behind effects on inputs, and what was held before a trial."""
+"""What arrives of the commands behind effects on inputs, and what was held before a trial.
+
+Delays come last, together with the task's own latency: two shifts by parts of a step, one after the
+other, are not the shift by both.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +13,27 @@ import numpy as np
 from grounded.compile import Named
 from grounded.diagnosis.likelihood.data import Data
 from grounded.effects import Effect, InputFamily, MemoryFamily
-from grounded.effects.memory import settled, shifted
+from grounded.effects.memory import late_inputs, settled
 from grounded.frozen import Array
 
 Acting = Sequence[tuple[Effect, Mapping[str, float]]]
 
 
-def arriving(acting: Acting, data: Data) -> tuple[Array, Array]:
-    """Commands (S, T, m) and what was held before (S, m) behind effects, in their order."""
+def arriving(acting: Acting, data: Data) -> Array:
+    """Commands (S, T, m) behind effects, in their order, and behind all delays."""
+    latency = data.latency.copy()
+    for effect, values in acting:
+        if effect.family.name == "delay":
+            latency[[data.model.input_names.index(n) for n in effect.site.targets]] += values["d"]
+    return late_inputs(*_sent_on(acting, data), np.maximum(latency, 0.0), data.dt)
+
+
+def _sent_on(acting: Acting, data: Data) -> tuple[Array, Array]:
+    """The same before any delay, and what was held before (S, m)."""
     u, held = data.commands, data.held
     for effect, values in acting:
-        u, held = _transformed(effect, values, u, held, data)
+        if effect.family.name != "delay":
+            u, held = _transformed(effect, values, u, held, data)
     return u, held
 
 
@@ -30,7 +44,7 @@ def memories_moved(acting: Acting, data: Data) -> Array:
     Only the begin of a trial is known; zeros elsewhere.
     """
     model, found = data.model, np.zeros((len(data.valid), data.model.n))
-    _, held = arriving(acting, data)
+    _, held = _sent_on(acting, data)
     p = Named("parameter", model.param_names, list(model.values))
     before, after = (
         settled(model, Named("input", model.input_names, list(one.T)), p)
@@ -61,9 +75,6 @@ def _transformed(
             out[:, :, j] = family.effect(u[:, :, j], t[None, :], values)
             before[:, j] = family.effect(held[:, j], 0.0, values)
         elif isinstance(family, MemoryFamily):
-            if family.name == "delay":  # the same as its queue, at once
-                out[:, :, j] = shifted(u[:, :, j], held[:, j], values["d"] / data.dt)
-                continue
             z = family.along(u[:, :, j], held[:, j], values, data.dt)
             out[:, :, j], _ = family.advance(u[:, :, j], (z,), values, data.dt)
     return out, before

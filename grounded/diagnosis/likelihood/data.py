@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from grounded.effects import Scales, scales_of
-from grounded.effects.memory import late_inputs, true_values
+from grounded.effects.memory import true_values
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
@@ -127,10 +127,6 @@ class Data:
         """Per-step values on whole trials (S, T_max, m) -> by run (L, B, m)."""
         flat = np.concatenate([per_step[i, :T] for i, T in enumerate(self.lengths)])
         return np.ascontiguousarray(flat[self.step_at].swapaxes(0, 1))
-
-    def delayed(self, inputs: Array, held: Array) -> Array:
-        """What arrives of (S, T_max, m), `held` (S, m) before, after the latency of the task."""
-        return late_inputs(inputs, held, self.latency, self.dt)
 
 
 def prepare(

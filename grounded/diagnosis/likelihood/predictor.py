@@ -88,7 +88,7 @@ class Predictor(SentOnce):
 
         def found() -> Array:
             data, whole = self.data.in_use, np.zeros_like(self.data.commands)
-            whole[data.used] = data.delayed(*arriving(self.acting(h), data))
+            whole[data.used] = arriving(self.acting(h), data)
             return whole
 
         return self._kept("trials", h, found)

@@ -141,7 +141,8 @@ class Claims:
         off = [blame.index for blame in self.blamed[:2]]
         candidates = search.candidates
         self.alike = () if known.no_cause else lookalikes(self.predictor, best, candidates)
-        self.one_clock = one_clock(self.data.model, best.hypothesis.effects, ruler.names)
+        late = [e for e, values in best.hypothesis.pairs if values.get("d", 0.0) >= 0]
+        self.one_clock = one_clock(self.data.model, late, ruler.names)
         swap(search, best, self.alike)  # what ties is asked of fits that are at their top
         self.like_parameters = (
             of_parameters(self.predictor, self.null, off, candidates) if off else ()

@@ -122,11 +122,12 @@ def _plainest(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool) 
 def _own_numbers(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
     """The fit with a parameter in the place of each effect that ties with its shift, or with all.
 
-    A number that its owner calls uncertain is off sooner than the equations lack something.
+    A number that its owner calls uncertain is off sooner than the equations lack something, and so
+    is an adopted delay.
     """
     h, score = fit.hypothesis, search.score
-    params = {e.name for e in search.candidates if isinstance(e.family, ParamFamily)}
-    for name in _effects(fit) if h.spread == 0 else ():
+    params = {e.name for e in search.candidates if e.known or isinstance(e.family, ParamFamily)}
+    for name in [n for n in _effects(fit) if n not in params] if h.spread == 0 else ():
         rest = {*h.names} - {name}
         sets = {tuple(sorted({*rest, param})) for param in params - rest}
 

@@ -67,7 +67,9 @@ def diagnose_in(
 
     effects = [dict(effect) for effect in workspace.config.model.effects]
     names = [str(effect["name"]) for effect in effects]
-    adopted = {name for name in names if not name.startswith("delay:")}  # whose d is no parameter
+    delays = {
+        n: float(e["d"]) for n, e in zip(names, effects, strict=True) if n.startswith("delay:")
+    }
     library = (library or Library()).without(without)
     planner, used = workspace.planner, _chosen(workspace, trials)
     others = _chosen(workspace, compare) if compare else []
@@ -76,7 +78,8 @@ def diagnose_in(
         library=library,
         max_effects=max_effects,
         hidden=tuple(memory),
-        but=adopted,
+        but={*names} - {*delays},  # whose d is no parameter
+        delays=delays,
         origin=workspace.origin if effects or workspace.config.model.params else None,
     )
     lifted, second = ([planner.lift(trial) for trial in some] for some in (used, others))
