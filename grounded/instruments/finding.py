@@ -62,21 +62,26 @@ def filters_of(findings: Iterable[Finding]) -> dict[str, float]:
     return {f.signal: f.delay_s for f in findings if f.corrected and f.kind == "lag"}
 
 
+def a_mean(name: str, position: str, over: float) -> Finding:
+    """A finding of a velocity that was left out: its position's difference over a time [s]."""
+    text = f"shows a mean over {over:.2g} s, as a difference of {position} does; left out here: "
+    return Finding(name, f"{text}{position} says as much", "smoothed", corrected=True)
+
+
 def in_degrees(name: str, unit: str) -> Finding:
     """A finding of a signal that was put into radians."""
     text, log = f"is in degrees, not in {unit}", f"scale = {1 / DEGREES:.8g}"
     return put_right(name, text, "degrees", log, scale=DEGREES)
 
 
-def why_scaled(size: float, unit: str) -> str:
-    """Why a sensor may show `size` times what another says, as the end of a clause."""
-    for factor, text in (
-        (RPM, f", 60 / (2 pi) times it: it looks to be in rpm; if so, [log] scale = {1 / RPM:.8g}"),
-        (
-            1 / RPM,
-            ", 2 pi / 60 times it: it looks to have been taken for rpm, and converted",
-        ),
-    ):
-        if unit == "rad/s" and abs(size / factor - 1) < ALIKE:
-            return text
-    return "; either may be wrong"
+def scaled(name: str, position: str, size: float, unit: str) -> Finding:
+    """A finding of a velocity that shows `size` times the rate of its position."""
+    text = f"shows {100 * size:.3g} % of the rate of {position}"
+    if unit == "rad/s" and abs(size / RPM - 1) < ALIKE:
+        mend = f"if so, [log] scale = {1 / RPM:.8g}"
+        text = f"{text}, 60 / (2 pi) times it: it looks to be in rpm; {mend}"
+    elif unit == "rad/s" and abs(size * RPM - 1) < ALIKE:
+        text = f"{text}, 2 pi / 60 times it: it looks to have been taken for rpm, and converted"
+    else:
+        text = f"{text}; either may be wrong"
+    return Finding(name, text, "scale", scale=size)

@@ -34,10 +34,11 @@ from grounded.instruments.dead import judge_dead
 from grounded.instruments.finding import (
     DEGREES,
     Finding,
+    a_mean,
     filters_of,
     in_degrees,
     put_right,
-    why_scaled,
+    scaled,
 )
 from grounded.instruments.inputs import judge_inputs
 from grounded.instruments.kinematics import (
@@ -267,10 +268,9 @@ class _Bench:
                 yield from self.late(relation, clear)
             if relation.exact:
                 yield from self.constant(relation)
-            if relation.exact and clear and clear.mean >= SMOOTH * self.dt:
-                yield self.smoothed(relation, clear.mean)
-            elif copied:
-                yield self.smoothed(relation, self.dt)
+            over = clear.mean if clear and clear.mean >= SMOOTH * self.dt else copied * self.dt
+            if relation.exact and over > 0:
+                yield self.smoothed(relation, over)
 
         for relation in logged_behind(self.model, self.shown):  # how late both are is adopted
             lag = lag_of(self.model, relation, self.trials)
@@ -292,9 +292,7 @@ class _Bench:
                 yield self.from_degrees(i)
                 return
         if lag.low > 1 + OFF or lag.high < 1 - OFF:
-            why = why_scaled(size, self.model.states[w])
-            text = f"shows {100 * size:.3g} % of the rate of {q}{why}"
-            yield Finding(w, text, "scale", scale=size)
+            yield scaled(w, q, size, self.model.states[w])
         elif relation.exact and lag.one_size:
             self.refuted |= {f"sensor_scale:{w}", f"sensor_scale:{q}", f"rate_gain:{q}"}
 
@@ -351,15 +349,13 @@ class _Bench:
     def smoothed(self, relation: Integral, over: float) -> Finding:
         """Without a velocity that is a mean over a time [s]: a difference of its position.
 
-        It says no more than the position does, and where something stops it is wrong as long.
-        Moved back by half a step it is a mean over two: an arm's delay came out 1.7 ms off.
+        It says no more than the position does, and where something stops it is wrong as long;
+        moved back by half a step it is a mean over two, and an arm's delay was 1.7 ms off.
         """
         q, w = (self.model.state_names[k] for k in (relation.i, relation.j))
         self.put(relation.j, [np.full_like(x, np.nan) for x in self.column(relation.j)])
         self.shown.remove(relation.j)
-        text = f"shows a mean over {over:.2g} s, as a difference of {q} does; left out here: "
-        text += f"{q} says as much"
-        return Finding(w, text, "smoothed", corrected=True)
+        return a_mean(w, q, over)
 
     def positions(self) -> Iterator[Finding]:
         """Of both positions of a plane that are late together."""
