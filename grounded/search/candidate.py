@@ -54,6 +54,15 @@ class Candidate(Result):
     likely_off: float = 0.0  # of predicted_gain, as trials that were left out say; 0: not known
 
     @property
+    def predicted_run(self) -> Trial:
+        """What the model predicts, as a robot would log it."""
+        made = self.policy
+        names = (made.state_names, made.input_names)
+        return Trial(
+            self.predicted_states, self.predicted_inputs, made.dt, *names, start_inputs=made.past
+        )
+
+    @property
     def grounded(self) -> bool:
         """Whether a model that replays a trial has predicted it: a step along a direction."""
         return bool(self.base) and self.way in ("", "recorded inputs")

@@ -2,19 +2,24 @@
 
 Finite numbers, inputs inside the hard limits, gains within reason, and a PREDICTED run that stays
 inside [safety], widened by the spread that real runs have shown so far. Each objection is a
-sentence that says which limit, where and when.
+sentence that says which limit, where and when. Where the model goes on to after a run, with the
+input that a runner holds then, is no objection: people may stop it; they are told.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from grounded.frozen import Array
+from grounded.rollout import augmented
 from grounded.search.candidate import Candidate, Tried
 from grounded.task import Task
+from grounded.trial import Trial
 
+COASTS = 3.0  # seconds after a run that are looked at
 MAX_GAIN = 1e6  # input units per state unit: beyond it a gain is a numerical accident
 
 
@@ -93,4 +98,61 @@ def _outside(task: Task, candidate: Candidate, stray: Array, i: int) -> str:
         f"{candidate.id} (alpha = {candidate.alpha:g}) is predicted to take {name} to "
         f"{value[t]:.3f}{around} {task.model.states[name]} at t = {t * task.dt:.2f} s, outside "
         f"[safety] {name} = [{task.safety_low[i]:g}, {task.safety_high[i]:g}]"
+    )
+
+
+def coasting(task: Task, run: Trial, held: Array) -> Array:
+    """Where a robot goes after a run by the model, with the input that its runner sends then.
+
+    Args:
+        task: of planning, with the model's memory.
+        run: the run, of its states (T + 1, n).
+        held: the input that is sent after it (m,).
+
+    Returns:
+        States (S + 1, n) from the end of the run on, as far as they are finite.
+    """
+    problem = task.problem(exact=True)
+    steps = math.ceil(COASTS / task.dt)
+    inputs = np.vstack([run.inputs, np.tile(held, (steps, 1))])
+    past = problem.past if run.start_inputs is None else run.start_inputs
+    z = augmented(problem, np.zeros((len(inputs) + 1, task.model.n)), inputs, past)
+    received = problem.queue.effective(z[:-1], inputs)[run.steps :]
+    states = [run.states[-1]]
+    for u in received:
+        after = problem.system.step(states[-1][None], u[None], problem.p, task.dt)[0]
+        if not np.isfinite(after).all():
+            break
+        states.append(after)
+    return np.array(states)
+
+
+def coasts_out(task: Task, plan: Task, run: Trial, held: Array) -> str:
+    """The clause for a robot that leaves [safety] after a run, by the model, or "".
+
+    Args:
+        task: gives [safety].
+        plan: see `coasting`, as are `run` and `held`.
+        run: as predicted, inside [safety].
+        held: the input that is sent after it (m,).
+    """
+    assert task.safety_low is not None and task.safety_high is not None
+    if not np.isfinite([task.safety_low, task.safety_high]).any():
+        return ""
+    states = coasting(plan, run, held)[:, : task.model.n]
+    excess = np.maximum(task.safety_low - states, states - task.safety_high)
+    if not (excess > 0).any():
+        return ""
+    t = int(np.argmax((excess > 0).any(axis=1)))
+    i = int(np.argmax(excess[t]))
+    far = states[int(np.argmax(excess[:, i])), i]
+    (name, unit), inputs = list(task.model.states.items())[i], task.model.inputs.items()
+    sent = ", ".join(
+        f"{one} = {value:.3g} {of}".removesuffix(" 1")
+        for (one, of), value in zip(inputs, held, strict=True)
+    )
+    return (
+        f"its runner holds {sent}, and by the model the robot goes on to {name} = {far:.3g} "
+        f"{unit}, outside [safety] {name} = [{task.safety_low[i]:g}, {task.safety_high[i]:g}] "
+        f"{t * task.dt:.2g} s later: be ready to stop it, or let the target come to rest inside"
     )

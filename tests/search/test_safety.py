@@ -8,7 +8,7 @@ import pytest
 from facts import holds
 from grounded.search.candidate import Tried
 from grounded.search.improve import propose
-from grounded.search.safety import MAX_GAIN, objections, spread
+from grounded.search.safety import MAX_GAIN, coasting, coasts_out, objections, spread
 from grounded.search.standing import SearchOptions
 from grounded.trial import Trial
 from small_tasks import cart_task
@@ -81,3 +81,23 @@ def test_only_steps_that_this_model_has_foretold_say_how_far_runs_stray(made):
         step = replace(made, base="c0001", way=way)
         history = [Tried(step, (ran,), (-1.0,), True)]
         assert spread(task, history, model)[:, 0].max() == pytest.approx(expected)
+
+
+def test_who_coasts_out_of_safety_after_a_run_is_told_when_and_how_far(made):
+    """A car's plan ended at 2.2 m/s in front of a wall: nothing was said, and it hit it."""
+    task, run = cart_task(latency=np.array([0.1])), made.predicted_run
+    states = np.array(run.states)
+    states[-1] = 1.0, 2.0
+    run = replace(run, states=states)
+    moved = coasting(task, run, np.zeros(1))
+    assert (moved[0] == states[-1]).all()
+    assert np.all(np.diff(moved[:, 0]) > 0)  # it rolls on
+    pushed = coasting(cart_task(), run, np.zeros(1))
+    assert run.inputs[-1] != 0 and moved[2, 1] != pushed[2, 1]  # what was sent arrives still
+    bound = np.array([moved[10, 0], np.inf])
+    tight = cart_task(safety_low=-np.full(2, np.inf), safety_high=bound)
+    clause = coasts_out(tight, task, run, np.zeros(1))
+    assert holds(clause, "x", "[safety]", f"{11 * task.dt:.2g} s later", f"{moved[-1, 0]:.3g}")
+    wide = cart_task(safety_low=-np.full(2, np.inf), safety_high=np.array([99.0, np.inf]))
+    assert coasts_out(wide, task, run, np.zeros(1)) == ""
+    assert coasts_out(cart_task(), task, run, np.zeros(1)) == ""

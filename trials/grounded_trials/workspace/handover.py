@@ -258,6 +258,8 @@ class Check:
             yield f"the model was changed since {name} was made; {again}"
         if self.same_task and not self.standing.trials:
             yield from self._untried()
+        if self.same_task and (coasts := self._coasting()):
+            yield coasts
 
     def _became(self) -> Iterator[str]:
         """That it lost, or that its trials were set aside, for a hand that types its name."""
@@ -300,6 +302,16 @@ class Check:
                 f"[safety] holds of the prediction, which no run has tested: {made.id} is to come "
                 f"{told}. The robot may go further: be ready to stop it"
             )
+
+    def _coasting(self) -> str:
+        """Where the robot goes on to after the run, with the input that its runner holds then."""
+        from grounded.search.safety import coasts_out
+
+        made, planner = self.candidate, self.workspace.planner
+        run = planner.lift(made.predicted_run)
+        held = np.clip(made.policy.past, made.policy.low, made.policy.high)
+        out = coasts_out(self.workspace.task, planner.plan, run, held)
+        return f"after {made.id} ends {out}" * bool(out)
 
     @property
     def void(self) -> bool:
