@@ -8,6 +8,7 @@ import os
 import re
 import sys
 import textwrap
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TextIO
@@ -19,6 +20,7 @@ from grounded_trials.wording import MARKS, columns, figure, glued, wrapped
 number = figure
 BARS = "▁▂▃▄▅▆▇█"
 LABEL = 10  # columns of what stands before a text
+EVERY = 30.0  # seconds between words on a long command's stage where there is no terminal
 
 
 # Our own marks in a text, which are no characters: what strangers' files say can't be anything else
@@ -106,13 +108,20 @@ def names_in(text: str | None) -> list[str]:
 
 @contextmanager
 def stages() -> Iterator[Callable[[str], None]]:
-    """A function that shows which stage a long command is in, "" for none; only on a terminal."""
-    live = is_live(sys.stderr)
+    """A function that shows which stage a long command is in, "" for none.
+
+    On a terminal at once, in place; elsewhere, in a log say, a line now and then.
+    """
+    live, told = is_live(sys.stderr), time.monotonic()
 
     def tell(stage: str) -> None:
+        nonlocal told
         if live:
             sys.stderr.write("\r\033[K")
             _write(f"{stage and stage + ' ...'}", sys.stderr, end="")
+        elif stage and time.monotonic() - told > EVERY:
+            told = time.monotonic()
+            _write(f"{stage} ...", sys.stderr)
 
     try:
         yield tell

@@ -2,6 +2,7 @@
 
 import pytest
 
+from grounded_cli import terminal
 from grounded_cli.terminal import field, harmless, names_in, remark, sparkline, table
 
 
@@ -78,3 +79,13 @@ def test_evidence_that_is_not_known_is_a_dash(capsys):
     _effects(Diagnosis(Verdict("several", ("parameter:m",)), ranking=(row,)))
     told = capsys.readouterr().out
     assert "parameter:m" in told and "nan" not in told
+
+
+def test_a_long_command_says_its_stage_in_a_log_too_now_and_then(capsys, monkeypatch):
+    """Eighteen minutes of nothing: a first user believed that it hung."""
+    with terminal.stages() as tell:
+        tell("fitting")
+        monkeypatch.setattr(terminal, "EVERY", -1.0)
+        tell("comparing effects, 40 %")
+        tell("")
+    assert capsys.readouterr().err == "comparing effects, 40 % ...\n"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from grounded import Trial
+from grounded.diagnosis.likelihood import marching
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, losses_of, rates_of
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -70,3 +71,28 @@ def test_all_folds_together_are_each_alone(model, freed):
     assert different >= 0.7 * len(by_family)
     assert met["rate"] > 5
     assert met["loss"] or model is car
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", [car, pendulum], ids=["car", "pendulum"])
+def test_a_compiled_hypothesis_goes_where_its_steps_lead(model, monkeypatch):
+    """A helicopter's log of 3,000 rows was predicted by Python, a millisecond each step."""
+    monkeypatch.setattr(marching, "LONG", 1)
+    data = data_of(model)
+    predictor, compiled, refused = Predictor(data), set(), set()
+    by_family = {e.family.name: e for e in Library().candidates(model, data.scales)}
+    for effect in by_family.values():
+        h = Hypothesis().plus(effect, valued(effect, 0.5))
+        if not (rates_of(h) or losses_of(h)):
+            continue
+        x, u = data.y[0], predictor.received(h)[:, : len(data.y)].transpose(1, 0, 2)
+        path = [x]
+        with np.errstate(all="ignore"):
+            for now in u:
+                path.append(predictor.advance(h, path[-1], now, np.zeros(len(x))))
+            found = marching.marched(predictor, h, x, u)
+        (refused if found is None else compiled).add(effect.family.name)
+        if found is not None:
+            room = {"rtol": 1e-3, "atol": 0.01} if model is car else {"rtol": 1e-9, "atol": 1e-12}
+            np.testing.assert_allclose(found, path, **room, err_msg=effect.name)
+    assert len(compiled) > 3 and "periodic" in refused

@@ -30,6 +30,7 @@ from grounded.diagnosis.likelihood.hypothesis import (
     param_scale,
     rates_of,
 )
+from grounded.diagnosis.likelihood.marching import March
 from grounded.diagnosis.likelihood.moving import moving
 from grounded.diagnosis.likelihood.simulated import Slopes, simulated
 from grounded.effects import (
@@ -63,6 +64,7 @@ class Predictor(SentOnce):
     _inputs: dict[Any, Array] = field(default_factory=dict)
     _steps: dict[bytes, Array] = field(default_factory=dict)
     _loads: dict[Any, Loads] = field(default_factory=dict)
+    marches: dict[tuple[str, ...], March | None] = field(default_factory=dict)
     _taken: Slopes | None = None
 
     @cached_property

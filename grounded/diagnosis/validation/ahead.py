@@ -13,6 +13,7 @@ import numpy as np
 
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, by_row
+from grounded.diagnosis.likelihood.marching import marched
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.frozen import Array
 
@@ -84,7 +85,9 @@ def _marched(
     found = np.empty((len(sent) + 1, *x.shape))
     for h, own in each:
         z = predictor.marched(h, x[own], sent[:, own])
-        if z is None or not (np.abs(z) < FAR).all():
+        if z is not None and not (np.abs(z) < FAR).all():
             return None
-        found[:, own] = z
+        if z is None and (z := marched(predictor, h, x[own], sent[:, own])) is None:
+            return None
+        found[:, own] = np.fmax(np.fmin(z, FAR), -FAR)
     return found
