@@ -106,6 +106,7 @@ def to_grid(
     steps: int | None = None,
     rest: Floats | None = None,
     rates: Sequence[str] = (),
+    past: Floats | None = None,
 ) -> Gridded:
     """Samples signals every dt.
 
@@ -119,6 +120,8 @@ def to_grid(
         steps: at most this many steps.
         rest: (m,) what inputs hold before a run: to begin where `command_steps` says; None: not.
         rates: names of states that are velocities.
+        past: (m,) what inputs hold before their first samples, where a span begins a step sooner
+            or more; None: then the log is refused.
 
     Raises:
         GroundedError: for a gap beyond max_age_s, a clock that jumps, signals on clocks that do
@@ -136,6 +139,9 @@ def to_grid(
     known, until = _extent(samples, states, inputs, dt)
     origin = min(int(s.t[0]) for s in samples.values())
     start, late = _start(span, series, samples, inputs, known, origin)
+    for name, value in zip(inputs, [] if past is None else past, strict=False):
+        if samples[name].t[0] > start + dt * 0.5e9:  # in the first step nothing was sent
+            samples[name] = samples[name].held_from(start - round(dt * 1e9), float(value))
     sent = [samples[name] for name in inputs]
     tracked = [samples[name] for name in states if how[name] == "linear"]
     still = rest is not None and stands_still(tracked, rates, start)

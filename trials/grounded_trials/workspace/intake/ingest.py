@@ -30,6 +30,7 @@ from grounded_trials.workspace.intake.acted_on import sender_of
 from grounded_trials.workspace.intake.earlier_task import OfEarlierTask, of_earlier_task
 from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.intake.ingested import Ingested
+from grounded_trials.workspace.intake.missed_steps import not_sent
 from grounded_trials.workspace.intake.odd_run import odd_run
 from grounded_trials.workspace.intake.other_scale import other_units, units_told
 from grounded_trials.workspace.intake.read_otherwise import misled, pace_of, unit_of
@@ -321,7 +322,10 @@ class _Look:
             if found and elsewhere(self.log, found, own.policy, seen.why):
                 begins = found.seconds + (_sooner(apart, read.log) if apart else 0)
                 note = f"the log begins {begins:.3f} s before {ran} does: it is taken from there"
-                self.read = replace(cut_log(read.log, ran, begins), notes=(note,))
+                cut_there = cut_log(read.log, ran, begins)
+                told = (not_sent(task, ran, found.missed),) if found.missed else ()
+                warnings = (*told, *cut_there.warnings)
+                self.read = replace(cut_there, warnings=warnings, notes=() if told else (note,))
                 cut = apart.cut(ran, found.seconds)[0] if apart else self.read.trial
                 self.whole = interpolate_gaps(cut).trial
                 seen = judged(self.whole)
