@@ -65,6 +65,7 @@ from grounded_trials.workspace.off_target import off_target_of
 from grounded_trials.workspace.proposing import candidate_named, latest_candidates, standing_in
 
 HOLE = 10.0  # usual intervals without a sample
+ASIDE = "set aside"  # the verdict of a run that does not count
 EXACT = 0.1  # of how finely commands are known: a log of what the program saw and sent
 
 
@@ -112,12 +113,12 @@ def ingest_log(
     warnings = (*read.warnings, *warnings_about(workspace, trial, read.last_s))
     if before:
         warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
-    if added.known and added.id in workspace.discarded():
-        warnings = (*warnings, f"{added.id} is set aside: `restore` takes that back")
+    if aside := added.known and added.id in workspace.discarded():
+        warnings = (*warnings, f"{added.id} stays set aside, and does not count: {_undo(added.id)}")
     now = standing_in(workspace) if trial.candidate else None
     history = now.history if now else ()
     tried = next((t for t in history if t.candidate.id == trial.candidate), None)
-    verdict = _verdict(trial, tried, workspace.config.search.repeats)
+    verdict = ASIDE if aside else _verdict(trial, tried, workspace.config.search.repeats)
     if ahead and verdict == "run again":
         now = standing_in(workspace, ahead=True)
     judged = [interpolate_gaps(trial).trial] if trial.candidate else []
@@ -153,8 +154,7 @@ def _by_its_commands(workspace: Folder, path: Path, error: NoneWaits) -> Grounde
 
 def _copied(workspace: Folder, path: Path, read: Read, wanted: str | None) -> Read:
     """The stored trial in place of a file that is a copy of it, or a part."""
-    known = sha256(read.data)[:DIGITS] in workspace.store.digests()
-    if known or (read.log and read.log.stored):
+    if _stored(workspace, read.data) or (read.log and read.log.stored):
         return read
     if (one := same_recording(workspace, path, read.data, read.log)) is None:
         return read
@@ -169,8 +169,8 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     A foreign log without a [log.span] may begin before the run: it is taken from where that fits.
     """
     ran = read.trial.candidate
-    if not ran or sha256(read.data)[:DIGITS] in workspace.store.digests():
-        return read
+    if not ran or (_stored(workspace, read.data) and not (read.log and not read.log.stored)):
+        return read  # but for a log that is set aside: where its run begins is sought anew
     (own, _), candidates = workspace.candidate(ran), _may_have_run(workspace)
     logs = [read.log]
     if read.log and (late := read.log.as_seen):  # its program may have acted on these
@@ -253,6 +253,15 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     )
 
 
+def _undo(identity: str) -> str:
+    return f"`restore {identity}` takes that back"
+
+
+def _stored(workspace: Folder, data: bytes) -> bool:
+    """Whether a file is in the store, be it set aside."""
+    return sha256(data)[:DIGITS] in workspace.store.digests()
+
+
 def _hole(read: Read) -> str:
     """The longest time of which a log tells nothing; "" where its samples never stop for long."""
     longest = max(read.signals, key=lambda one: one.largest_gap_s, default=None)
@@ -325,7 +334,8 @@ class _Look:
                 cut_there = cut_log(read.log, ran, begins)
                 told = (not_sent(task, ran, found.missed),) if found.missed else ()
                 warnings = (*told, *cut_there.warnings)
-                self.read = replace(cut_there, warnings=warnings, notes=() if told else (note,))
+                notes = (*read.notes, *(() if told else (note,)))
+                self.read = replace(cut_there, warnings=warnings, notes=notes)
                 cut = apart.cut(ran, found.seconds)[0] if apart else self.read.trial
                 self.whole = interpolate_gaps(cut).trial
                 seen = judged(self.whole)
