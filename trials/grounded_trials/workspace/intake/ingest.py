@@ -331,11 +331,13 @@ class _Look:
             if found and elsewhere(self.log, found, own.policy, seen.why):
                 begins = found.seconds + (_sooner(apart, read.log) if apart else 0)
                 note = f"the log begins {begins:.3f} s before {ran} does: it is taken from there"
-                cut_there = cut_log(read.log, ran, begins)
-                told = (not_sent(task, ran, found.missed),) if found.missed else ()
-                warnings = (*told, *cut_there.warnings)
-                notes = (*read.notes, *(() if told else (note,)))
-                self.read = replace(cut_there, warnings=warnings, notes=notes)
+                there = cut_log(read.log, ran, begins)
+                warnings, notes = list(there.warnings), list(read.notes)
+                if found.missed:
+                    warnings.insert(0, not_sent(task, ran, found.missed))
+                else:
+                    notes.append(note)
+                self.read = replace(there, warnings=tuple(warnings), notes=tuple(notes))
                 cut = apart.cut(ran, found.seconds)[0] if apart else self.read.trial
                 self.whole = interpolate_gaps(cut).trial
                 seen = judged(self.whole)
@@ -345,8 +347,8 @@ class _Look:
             elif sender.other:
                 seen = replace(seen, why=sender.why, other=sender.other)
             elif (rival := rival_in(self.log, own, candidates, start_of)) is not None:
-                there = judged(rival)  # as it lies where that one fits best
-                told = there if there.other else seen if seen.why else replace(seen, why=there.why)
+                best = judged(rival)  # as it lies where that one fits best
+                told = best if best.other else seen if seen.why else replace(seen, why=best.why)
                 seen = replace(told, ran=seen.ran)
         elif log and read.cut and log.spanned and (seen.why or seen.other) and log.anywhere:
             begins = 1e-9 * (read.cut.start_ns - log.anywhere.whole.origin_ns)
