@@ -20,6 +20,7 @@ from grounded_trials.toml_table import key
 
 FEW = 8  # others that [log] names
 SURE = 1.5  # how much better than the next topic's best a guess must be
+AS_OFTEN = 0.5  # of wheel odometry's rate: a pose that comes so often is taken before its
 LEAST = 2.0  # below this score nothing is proposed
 DRIFT = 2e-4  # of a signal's range: the least deviation that is proposed for it
 SIMULATED_S = 1.0  # header stamps this far from the log's clock are not its time
@@ -230,8 +231,10 @@ def _measured(best: _Candidate, ranked: list[_Candidate]) -> _Candidate | None:
     kind = next((one for one in _POSE if best.field.path.endswith(one)), None)
     if kind is None or not _reckons(best.topic):
         return None
-    poses = (c for c in ranked if c.field.path.endswith(kind) and c.score > best.score - SURE)
-    return next((c for c in poses if c.topic.type.endswith(_POSES)), None)
+    often = AS_OFTEN * best.topic.rate_hz  # a localiser that jumps twice a second shows no motion
+    poses = (c for c in ranked if c.topic.type.endswith(_POSES) and c.topic.rate_hz >= often)
+    fits = (c for c in poses if c.field.path.endswith(kind) and c.score > best.score - SURE)
+    return next(fits, None)
 
 
 def _reckons(topic: TopicReport) -> bool:

@@ -9,7 +9,6 @@ and the commands that were sent are compared with what the policy makes of the s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
