@@ -24,6 +24,7 @@ VERDICTS = {
     "waiting": ": more trials of it are needed ([search] repeats)",
     "in doubt": ": it may be bad luck, the best so far is run once more",
     "probe": ", for the diagnosis: the search leaves it out",
+    "set aside": ": it does not count",
     "run again": ": the candidate counts with the mean of its runs",
 }
 

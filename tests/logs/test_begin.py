@@ -46,6 +46,21 @@ def test_from_a_bag_to_the_first_candidate_in_four_commands(tmp_path, storage):
     assert proposed["candidate"] == "c0001"
 
 
+@pytest.mark.parametrize("seen", ["/car/pose", "/goal_pose"])
+def test_a_pose_that_is_measured_comes_before_wheel_odometry_s(tmp_path, seen):
+    """Motion capture was passed over for the sum of the wheels' own speed."""
+    found = begin(tmp_path / "w", car_bag(tmp_path / "bag", seen=seen))
+    guesses = {one.name: one for one in found.states}
+    assert guesses["v"].path == "/odom.twist.twist.linear.x"
+    for name, place in (("x", "position.x"), ("y", "position.y"), ("psi", "orientation.@rpy.yaw")):
+        wheels, pose = f"/odom.pose.pose.{place}", f"{seen}.pose.{place}"
+        if seen == "/goal_pose":
+            assert guesses[name].path == wheels
+            continue
+        assert guesses[name].path == pose and wheels in guesses[name].others
+        assert any("/odom" in reason for reason in guesses[name].reasons)
+
+
 @pytest.mark.parametrize("names", ["speed turn", "linear angular"])
 def test_a_robot_on_wheels_that_lists_its_joints_drives(tmp_path, names):
     """It was an arm of two wheels, and nothing was mapped to what it is commanded."""

@@ -71,13 +71,14 @@ def bag(folder, topics, messages, storage=StoragePlugin.SQLITE3):
     return folder
 
 
-def car_bag(folder, storage=StoragePlugin.SQLITE3):
-    """A car with a wheelbase of 0.32 m, driven in curves for 8 s."""
+def car_bag(folder, storage=StoragePlugin.SQLITE3, seen=""):
+    """A car with a wheelbase of 0.32 m, driven in curves for 8 s; `seen`: a topic of its pose."""
     topics = {
         "/odom": "nav_msgs/msg/Odometry",
         "/drive": "ackermann_msgs/msg/AckermannDriveStamped",
         "/joint_states": "sensor_msgs/msg/JointState",
     }
+    topics |= {seen: "geometry_msgs/msg/PoseStamped"} if seen else {}
     messages, v, x, y, psi = [], 0.0, 0.0, 0.0, 0.0
     for k in range(800):
         t, steering, speed = START + k * 10**7, 0.3 * np.sin(0.01 * k), 1 + 0.5 * np.sin(0.02 * k)
@@ -85,6 +86,10 @@ def car_bag(folder, storage=StoragePlugin.SQLITE3):
         if k % 5 == 0:
             messages.append(("/drive", t, drive(t, steering, speed)))
         messages.append(("/odom", t, odometry(t, x, y, psi, v, rate)))
+        if seen:
+            pose = odometry(t, x + 0.8, y + 0.6, psi, v, rate).pose.pose
+            stamped = T["geometry_msgs/msg/PoseStamped"](header=header(t), pose=pose)
+            messages.append((seen, t, stamped))
         wheels = np.array([20 * x, 20 * x])
         messages.append(("/joint_states", t, joints(t, ["left", "right"], wheels, wheels, wheels)))
         v, psi = v + DT * (0.9 * speed - v) / 0.35, psi + DT * rate

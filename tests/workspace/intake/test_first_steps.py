@@ -11,6 +11,7 @@ import pytest
 
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
+from grounded_trials.workspace.intake import run_start
 from grounded_trials.workspace.intake.foreign import mapping_of, read_foreign
 from recorded import RATE, record, waiting
 
@@ -51,6 +52,42 @@ def test_a_run_begins_where_most_of_its_commands_are_the_policy_s(w, tmp_path, s
     found = read_foreign(w, log, mapping_of(w, log)).recording.start_of(policy)
     assert found.opens_alike and found.alike == (strange < 3)
     assert found.seconds == pytest.approx(1.0, abs=0.2 / RATE)
+
+
+def unsent(w, path, policy, missed):
+    """The log of a run of which the first steps were never sent, nor anything before."""
+    run(w, path, policy, ())
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    table[: round((1.0 + missed * policy.dt) * RATE), 3] = np.nan
+    np.savetxt(path, table, "%.5f", ",", header="t,x,v,force", comments="")
+    return path
+
+
+@pytest.mark.parametrize("missed", [0, 1, 2])
+def test_a_run_whose_first_steps_were_not_sent_begins_before_its_first_command(w, tmp_path, missed):
+    """A car's driver skipped step 0: all of it was booked a step late, its utility was halved."""
+    policy = w.candidate("c0002")[0].policy
+    found = w.ingest(unsent(w, tmp_path / "a.csv", policy, missed))
+    told = [one for one in found.warnings if "first command is that of step" in one]
+    assert found.candidate == "c0002" and len(told) == bool(missed)
+    assert all(f"step {missed} of c0002" in one for one in told)
+    assert not any("bridged" in one or "seem to be" in one for one in found.warnings)
+    stored = w.trials()[-1]
+    assert int(stored.meta["start_ns"]) * 1e-9 == pytest.approx(1001.0, abs=0.2 / RATE)
+    np.testing.assert_array_equal(stored.trial.inputs[:missed, 0], w.task.past[0])
+    np.testing.assert_array_equal(stored.trial.inputs[missed:, 0] != 0, True)
+
+
+def test_a_log_that_was_stored_a_step_late_is_another_trial_once_that_is_discarded(
+    w, tmp_path, monkeypatch
+):
+    log = unsent(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 1)
+    with monkeypatch.context() as before:
+        before.setattr(run_start, "missed_steps", lambda *_: 0)
+        late = w.ingest(log, candidate="c0002")
+    w.discard(late.trial)
+    found = w.ingest(log)
+    assert found.candidate == "c0002" and found.trial != late.trial and not found.known
 
 
 @pytest.mark.parametrize("said", [False, True])

@@ -14,6 +14,7 @@ from grounded.errors import GroundedError
 from grounded.trial import Trial
 from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import set_aside
 from grounded_trials.workspace.intake.ingest import ingest_log
 from grounded_trials.workspace.proposing import propose_in, standing_in
 from grounded_trials.workspace.running import run_candidate
@@ -107,10 +108,26 @@ def test_a_start_is_far_off_by_what_it_costs(tmp_path):
         moved = np.array(ran.states)
         moved[0] += off * states
         write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
-        warnings = ingest_log(w, tmp_path / "t.mcap", "c0001").warnings
-        told = [one for one in warnings if "the run started with" in one]
+        found = ingest_log(w, tmp_path / "t.mcap", "c0001")
+        told = [one for one in found.warnings if "the run started with" in one]
         assert [one.split()[4] for one in told] == ["x"] * states[0]
-        assert all("%" in one for one in told)
+        set_aside(w, "discard", [found.trial], "")  # or it says how starts scatter
+        w.forget()
+
+
+def test_a_start_is_no_warning_where_earlier_ones_scatter_as_far(w, tmp_path):
+    """A car that was set down to a degree was told of `10 % of a mean step` again and again."""
+    ran, *_ = read_trial(run(w))
+    a_step = np.sqrt(-w.task.utility(ran) / len(ran.states) / 10)
+    told = []
+    for off in (0.7, -0.6, 0.5, -0.7, 3.0):  # of what costs as much as a step
+        moved = np.array(ran.states)
+        moved[0, 0] += off * a_step
+        write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
+        warnings = ingest_log(w, tmp_path / "t.mcap", "c0001").warnings
+        told.append([one for one in warnings if "the run started with" in one])
+    assert [len(one) for one in told] == [1, 1, 0, 0, 1]
+    assert "no need to run it again" in told[0][0] and "`discard t0005`" in told[-1][0]
 
 
 @pytest.mark.parametrize("data", [False, True])

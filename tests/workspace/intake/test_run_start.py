@@ -193,6 +193,24 @@ def test_a_log_that_was_stored_before_is_no_run_of_the_candidate_that_waits_now(
         assert w.ingest(copy).trial == first.trial
 
 
+def test_a_log_whose_trial_was_discarded_is_of_the_candidate_that_it_was_of(w, tmp_path):
+    """It was booked on the one that waited; and one that did not count was `run again`."""
+    first, log = tmp_path / "first.csv", tmp_path / "b.csv"
+    ran = w.ingest(record(w, log, w.candidate("c0002")[0].policy, 0.0))
+    assert w.propose().candidate.id == "c0003"
+    w.discard("t0001", ran.trial)
+    for path, trial, candidate in ((first, "t0001", "c0001"), (log, ran.trial, "c0002")):
+        again = w.ingest(path)
+        assert (again.trial, again.candidate, again.verdict) == (trial, candidate, "set aside")
+        (note,) = [one for one in again.notes if "stored before" in one]
+        assert holds(note, trial, candidate, "--candidate")
+        assert any(f"restore {trial}" in one for one in again.warnings)
+    w.restore("t0001")
+    assert w.ingest(first).verdict == "first"
+    other = w.ingest(log, candidate="c0003")
+    assert other.candidate == "c0003" and any("those of c0002" in one for one in other.warnings)
+
+
 def test_a_damaged_trial_is_replaced_by_its_log_beside_others(w, tmp_path):
     policy = w.candidate("c0002")[0].policy
     logs = [record(w, tmp_path / f"{k}.csv", policy, 0.0, seed=k) for k in range(2)]

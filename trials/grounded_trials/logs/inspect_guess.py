@@ -20,6 +20,7 @@ from grounded_trials.toml_table import key
 
 FEW = 8  # others that [log] names
 SURE = 1.5  # how much better than the next topic's best a guess must be
+AS_OFTEN = 0.5  # of wheel odometry's rate: a pose that comes so often is taken before its
 LEAST = 2.0  # below this score nothing is proposed
 DRIFT = 2e-4  # of a signal's range: the least deviation that is proposed for it
 SIMULATED_S = 1.0  # header stamps this far from the log's clock are not its time
@@ -60,6 +61,11 @@ _COMMANDED = ("ref", "desired", "des", "target", "setpoint", "goal", "cmd", "com
 _COMMAND_TOPIC = re.compile("control|cmd|command|setpoint|ref|target")
 _ANGLES = ("roll", "pitch", "yaw")
 _QUATERNION = tuple(f"{name}.{part}" for name in ("orientation", "rotation") for part in "xyzw")
+_POSE = ("position.x", "position.y", "@rpy.yaw")
+_POSES = ("/PoseStamped", "/PoseWithCovarianceStamped", "/TransformStamped")
+_NO_WHEELS = re.compile(  # what is published as odometry, too
+    "mocap|vicon|optitrack|qualisys|truth|filter|fused|ekf|gps|gnss|slam|lidar|visual|vio"
+)
 _WORD = re.compile(r"[a-z]+")
 
 
@@ -208,9 +214,33 @@ def _choose(
     best = ranked[0]
     value = best.score + homes.get(best.topic.topic, 0.0)
     near = [c for c in ranked[1:] if c.score + homes.get(c.topic.topic, 0.0) > value - SURE]
+    reasons: tuple[str, ...] = ()
+    if (measured := _measured(best, ranked)) is not None:
+        reasons = (
+            f"measured apart from the wheels; {best.topic.topic}'s pose is most likely summed up "
+            "from its own speed, which says nothing more of the motion",
+        )
+        best, near = measured, [best, *(c for c in near if c is not measured)]
     clock = "header" if best.topic.stamped and not is_simulated(log) else "log"
     others = tuple(c.field.path for c in near[:3])
-    return Guess(name, best.field.path, clock, not near, others, best.field)
+    return Guess(name, best.field.path, clock, not near, others, best.field, reasons)
+
+
+def _measured(best: _Candidate, ranked: list[_Candidate]) -> _Candidate | None:
+    """What shows the same place or heading as a pose of wheel odometry, but measures it."""
+    kind = next((one for one in _POSE if best.field.path.endswith(one)), None)
+    if kind is None or not _reckons(best.topic):
+        return None
+    often = AS_OFTEN * best.topic.rate_hz  # a localiser that jumps twice a second shows no motion
+    poses = (c for c in ranked if c.topic.type.endswith(_POSES) and c.topic.rate_hz >= often)
+    fits = (c for c in poses if c.field.path.endswith(kind) and c.score > best.score - SURE)
+    return next(fits, None)
+
+
+def _reckons(topic: TopicReport) -> bool:
+    """Whether a topic's pose is most likely summed up from its own speed."""
+    moves = any(f.path.endswith("twist.linear.x") and f.low != f.high for f in topic.fields)
+    return topic.type.endswith("/Odometry") and moves and not _NO_WHEELS.search(topic.topic.lower())
 
 
 def _rate(candidate: _Candidate) -> float:

@@ -106,6 +106,7 @@ def to_grid(
     steps: int | None = None,
     rest: Floats | None = None,
     rates: Sequence[str] = (),
+    past: Floats | None = None,
 ) -> Gridded:
     """Samples signals every dt.
 
@@ -119,6 +120,8 @@ def to_grid(
         steps: at most this many steps.
         rest: (m,) what inputs hold before a run: to begin where `command_steps` says; None: not.
         rates: names of states that are velocities.
+        past: (m,) what inputs hold before their first samples, where a span begins a step sooner
+            or more; None: then the log is refused.
 
     Raises:
         GroundedError: for a gap beyond max_age_s, a clock that jumps, signals on clocks that do
@@ -136,7 +139,11 @@ def to_grid(
     known, until = _extent(samples, states, inputs, dt)
     origin = min(int(s.t[0]) for s in samples.values())
     start, late = _start(span, series, samples, inputs, known, origin)
-    sent = [samples[name] for name in inputs]
+    whole = dict(samples)
+    for name, value in zip(inputs, [] if past is None else past, strict=False):
+        if samples[name].t[0] > start + dt * 0.5e9:  # in the first step nothing was sent
+            whole[name] = samples[name].held_from(start - round(dt * 1e9), float(value))
+    sent = [whole[name] for name in inputs]
     tracked = [samples[name] for name in states if how[name] == "linear"]
     still = rest is not None and stands_still(tracked, rates, start)
     unknown = rest is not None and not still and in_motion(sent, start, rest)
@@ -149,7 +156,7 @@ def to_grid(
     columns, reports = [], []
     for name in names:
         at = grid if name in states else middle
-        value = samples[name].linear if how[name] == "linear" else samples[name].hold
+        value = whole[name].linear if how[name] == "linear" else whole[name].hold
         columns.append(value(at, dt, start))
         reports.append(report_of(samples[name], series[name], columns[-1], at, start))
     stairs = [staircase(s, start, int(grid[-1]), dt) for s in tracked]

@@ -9,7 +9,7 @@ and what had to be bridged.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -104,6 +104,12 @@ class Samples:
             k = int(np.argmax(age > limits))
             self._refuse(self.t[i[k]], at[k], limits[k], origin)
         return self.y[i]
+
+    def held_from(self, at: int, value: float) -> Samples:
+        """With a value that was held from a time [ns] until the first sample; where it is later."""
+        if at >= self.t[0]:
+            return self
+        return replace(self, t=np.r_[at, self.t], y=np.r_[value, self.y])
 
     def before(self, at: int) -> float:
         """The value in force at a time [ns]; NaN if there is none yet."""

@@ -75,6 +75,7 @@ class ForeignLog:
             steps=task.horizon if candidate else None,
             rest=None if candidate else rest,
             rates=() if candidate else _rates(model),
+            past=self.workspace.task.past if candidate and start is not None else None,
         )
         logged = tuple(one for one in found.reports if one.name in self.series)
         found = replace(found, reports=logged)

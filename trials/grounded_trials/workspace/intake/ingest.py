@@ -30,6 +30,7 @@ from grounded_trials.workspace.intake.acted_on import sender_of
 from grounded_trials.workspace.intake.earlier_task import OfEarlierTask, of_earlier_task
 from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.intake.ingested import Ingested
+from grounded_trials.workspace.intake.missed_steps import not_sent
 from grounded_trials.workspace.intake.odd_run import odd_run
 from grounded_trials.workspace.intake.other_scale import other_units, units_told
 from grounded_trials.workspace.intake.read_otherwise import misled, pace_of, unit_of
@@ -64,6 +65,7 @@ from grounded_trials.workspace.off_target import off_target_of
 from grounded_trials.workspace.proposing import candidate_named, latest_candidates, standing_in
 
 HOLE = 10.0  # usual intervals without a sample
+ASIDE = "set aside"  # the verdict of a run that does not count
 EXACT = 0.1  # of how finely commands are known: a log of what the program saw and sent
 
 
@@ -111,12 +113,12 @@ def ingest_log(
     warnings = (*read.warnings, *warnings_about(workspace, trial, read.last_s))
     if before:
         warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
-    if added.known and added.id in workspace.discarded():
-        warnings = (*warnings, f"{added.id} is set aside: `restore` takes that back")
+    if aside := added.known and added.id in workspace.discarded():
+        warnings = (*warnings, f"{added.id} stays set aside, and does not count: {_undo(added.id)}")
     now = standing_in(workspace) if trial.candidate else None
     history = now.history if now else ()
     tried = next((t for t in history if t.candidate.id == trial.candidate), None)
-    verdict = _verdict(trial, tried, workspace.config.search.repeats)
+    verdict = ASIDE if aside else _verdict(trial, tried, workspace.config.search.repeats)
     if ahead and verdict == "run again":
         now = standing_in(workspace, ahead=True)
     judged = [interpolate_gaps(trial).trial] if trial.candidate else []
@@ -152,8 +154,7 @@ def _by_its_commands(workspace: Folder, path: Path, error: NoneWaits) -> Grounde
 
 def _copied(workspace: Folder, path: Path, read: Read, wanted: str | None) -> Read:
     """The stored trial in place of a file that is a copy of it, or a part."""
-    known = sha256(read.data)[:DIGITS] in workspace.store.digests()
-    if known or (read.log and read.log.stored):
+    if _stored(workspace, read.data) or (read.log and read.log.stored):
         return read
     if (one := same_recording(workspace, path, read.data, read.log)) is None:
         return read
@@ -168,8 +169,8 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     A foreign log without a [log.span] may begin before the run: it is taken from where that fits.
     """
     ran = read.trial.candidate
-    if not ran or sha256(read.data)[:DIGITS] in workspace.store.digests():
-        return read
+    if not ran or (_stored(workspace, read.data) and not (read.log and not read.log.stored)):
+        return read  # but for a log that is set aside: where its run begins is sought anew
     (own, _), candidates = workspace.candidate(ran), _may_have_run(workspace)
     logs = [read.log]
     if read.log and (late := read.log.as_seen):  # its program may have acted on these
@@ -252,6 +253,15 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     )
 
 
+def _undo(identity: str) -> str:
+    return f"`restore {identity}` takes that back"
+
+
+def _stored(workspace: Folder, data: bytes) -> bool:
+    """Whether a file is in the store, be it set aside."""
+    return sha256(data)[:DIGITS] in workspace.store.digests()
+
+
 def _hole(read: Read) -> str:
     """The longest time of which a log tells nothing; "" where its samples never stop for long."""
     longest = max(read.signals, key=lambda one: one.largest_gap_s, default=None)
@@ -321,7 +331,13 @@ class _Look:
             if found and elsewhere(self.log, found, own.policy, seen.why):
                 begins = found.seconds + (_sooner(apart, read.log) if apart else 0)
                 note = f"the log begins {begins:.3f} s before {ran} does: it is taken from there"
-                self.read = replace(cut_log(read.log, ran, begins), notes=(note,))
+                there = cut_log(read.log, ran, begins)
+                warnings, notes = list(there.warnings), list(read.notes)
+                if found.missed:
+                    warnings.insert(0, not_sent(task, ran, found.missed))
+                else:
+                    notes.append(note)
+                self.read = replace(there, warnings=tuple(warnings), notes=tuple(notes))
                 cut = apart.cut(ran, found.seconds)[0] if apart else self.read.trial
                 self.whole = interpolate_gaps(cut).trial
                 seen = judged(self.whole)
@@ -331,8 +347,8 @@ class _Look:
             elif sender.other:
                 seen = replace(seen, why=sender.why, other=sender.other)
             elif (rival := rival_in(self.log, own, candidates, start_of)) is not None:
-                there = judged(rival)  # as it lies where that one fits best
-                told = there if there.other else seen if seen.why else replace(seen, why=there.why)
+                best = judged(rival)  # as it lies where that one fits best
+                told = best if best.other else seen if seen.why else replace(seen, why=best.why)
                 seen = replace(told, ran=seen.ran)
         elif log and read.cut and log.spanned and (seen.why or seen.other) and log.anywhere:
             begins = 1e-9 * (read.cut.start_ns - log.anywhere.whole.origin_ns)

@@ -27,7 +27,7 @@ from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, 
 from grounded_trials.workspace.intake.crossed import crossed
 from grounded_trials.workspace.intake.foreign import ForeignLog, begun, mapping_of, read_foreign
 from grounded_trials.workspace.intake.no_angle import no_angles
-from grounded_trials.workspace.intake.stored_before import refuse_as_another
+from grounded_trials.workspace.intake.stored_before import refuse_as_another, set_aside_of
 from grounded_trials.workspace.proposing import standing_in
 
 
@@ -145,11 +145,15 @@ def read_log_file(workspace: Folder, path: Path, candidate: str | None, data: bo
     log = read_foreign(workspace, path, mapping_of(workspace, path))
     ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
     refuse_as_another(path, log.stored, "" if data else candidate)
+    before = None if data or ran else set_aside_of(workspace, log.source["source_sha256"])
+    if before and before.candidate in workspace.candidate_ids():
+        ran = before.candidate
     chosen = "" if data else ran or _outstanding(workspace, path)
     if chosen:
         refuse_as_another(path, log.stored, chosen)
         _check_candidate(workspace, path, chosen)
-    return cut_log(log, chosen)
+    read = cut_log(log, chosen)
+    return replace(read, notes=(before.told(),)) if before and chosen == ran else read
 
 
 def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read:

@@ -30,6 +30,7 @@ from grounded_trials.logs.command_steps import changes_of, phase_of
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
 from grounded_trials.workspace.intake.acted_on import acted_on
+from grounded_trials.workspace.intake.missed_steps import missed_steps
 from grounded_trials.workspace.intake.who_drove import (
     FINE,
     LEAST,
@@ -65,6 +66,7 @@ class Start:
     opens_alike: bool  # they are at the beginning at least; somebody may have taken over
     between_rows: bool = False  # found below the time between rows, by the feedback
     loose_s: float = 0.0  # it may be off by as much
+    missed: int = 0  # steps of it before the log's first command, which nobody sent
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +80,7 @@ class Recording:
     angles: tuple[str, ...]
     dt: float
     steps: int
+    past: Array  # (m,) what inputs hold before a run
     parts: int
     whole: Gridded
     changes: Array  # when a command was seen to change, seconds after the log's first sample
@@ -94,7 +97,13 @@ class Recording:
         span = Span(start=start)
         try:
             cut = to_grid(
-                self.series, self.dt, *self.names, span, angles=self.angles, steps=self.steps
+                self.series,
+                self.dt,
+                *self.names,
+                span,
+                angles=self.angles,
+                steps=self.steps,
+                past=self.past,
             )
         except GroundedError:
             return None
@@ -117,10 +126,15 @@ class Recording:
             return None
         apart, until = self._apart(policy)
         whole = self._starts(policy, apart)
-        if (surest := self._surest(policy, whole)) is not None:
-            return surest
-        begun = [one for one in self._starts(policy, until) if one.opens_alike]
-        return min(begun or whole, key=lambda one: (not one.alike, one.apart), default=None)
+        if (found := self._surest(policy, whole)) is None:
+            begun = [one for one in self._starts(policy, until) if one.opens_alike]
+            found = min(begun or whole, key=lambda one: (not one.alike, one.apart), default=None)
+        first, _ = self._on_step(policy, self.first)
+        missed = missed_steps(self, policy, first, found.seconds if found else first)
+        if not missed:
+            return found
+        apart_s = found.apart if found else np.inf
+        return Start(first - missed * self.dt, apart_s, True, True, missed=missed)
 
     def _surest(self, policy: Policy, starts: Sequence[Start]) -> Start | None:
         """Of a run's likeliest places, where most of its commands are the policy's; None: nowhere.
@@ -326,6 +340,7 @@ def recording(
         model.angles,
         dt,
         task.horizon,
+        task.past,
         parts,
         whole,
         changes,
@@ -342,7 +357,7 @@ def _bridged(series: Series) -> Series:
 
 def elsewhere(log: Recording, found: Start, policy: Policy, why: str) -> bool:
     """Whether a run begins where it was found, not with the log's first command."""
-    if found.between_rows and found.alike:
+    if found.missed or (found.between_rows and found.alike):
         return True
     if not found.opens_alike or abs(found.seconds - log.first) <= ALIGNED * log.interval:
         return False

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -51,6 +52,32 @@ def refuse_as_another(path: Path, stored: Sequence[StoredTrial], wanted: str | N
 
 def _what(candidate: str | None) -> str:
     return f"a run of {candidate}" if candidate else "data"
+
+
+@dataclass(frozen=True)
+class Aside:
+    """A trial that was made of a log, and is set aside since."""
+
+    id: str
+    candidate: str  # "" for data
+
+    def told(self) -> str:
+        """Whose run the log is, and what says otherwise."""
+        return (
+            f"it was stored before, as {self.id}, {_what(self.candidate)}, which is set aside: it "
+            f"is taken for {_what(self.candidate)} again. --candidate ID says otherwise"
+        )
+
+
+def set_aside_of(workspace: Folder, digest: str) -> Aside | None:
+    """The last trial that was made of a log, by the hash of its bytes, of those set aside."""
+    aside = workspace.discarded()
+    for stored in reversed([one for one in workspace.store.list() if one.id in aside]):
+        with suppress(GroundedError):  # a damaged one tells nothing
+            trial, meta, _ = read_trial(workspace.store.read(stored))
+            if meta.get("source_sha256") == digest:
+                return Aside(stored.id, trial.candidate or "")
+    return None
 
 
 def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> bytes:

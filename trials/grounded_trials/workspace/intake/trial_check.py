@@ -11,18 +11,21 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.errors import GroundedError
+from grounded.frozen import Array
 from grounded.model import Model
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
-from grounded_trials.wording import count, in_digits_apart, percent, with_unit
+from grounded_trials.wording import count, in_digits_apart, with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.estimating import read_estimate
 from grounded_trials.workspace.intake.who_drove import UNLIKE, follows, latest, second_differences
 
 FAR = 0.1  # of a run's mean cost a step: a start this far from s_0 is worth a warning (or of its
 # range in the run, of a state that [reward] does not weigh along the way),
-SURE = 3.0  # if it is so many standard deviations of the sensor's noise off, too
+SURE = 3.0  # if it is so many standard deviations of the sensor's noise off, and of earlier starts
+MUCH = 1.0  # of a mean step's cost: the run's utility is another for it, however starts scatter
+FEWEST = 2  # earlier runs whose starts say how they scatter
 LATEST = 3  # steps by which inputs may be logged late, and are told so
 WHITE = 0.6745 * 6**0.5  # the median of its second differences, in its standard deviations
 TURNS, WIDER = 5.0, 2.0  # of [safety]: beyond it in radians, about inside it in degrees
@@ -86,7 +89,7 @@ def warnings_about(
             f"{task.horizon}: they are not judged"
         )
     whole = whole.until(task.horizon)
-    found += _start(task, whole)
+    found += _start(task, whole, _starts_before(workspace, trial.id))
     found += _inputs(task, whole)
     candidate, _ = workspace.candidate(trial.candidate)
     found += _unsafe(task, whole, candidate)
@@ -138,11 +141,20 @@ def _lacking(task: Task, last_s: float) -> str:
     return f", its last state {1e3 * missing:.3g} ms before the plan's last"
 
 
-def _start(task: Task, trial: Trial) -> list[str]:
+def _starts_before(workspace: Folder, identity: str) -> Array:
+    """How far from s_0 the other runs of this task started, (N, n)."""
+    task = workspace.task
+    runs = [one for one in workspace.task_trials() if one.candidate and one.id != identity]
+    off = [task.model.difference(one.states[0], task.start) for one in runs]
+    return np.array(off).reshape(len(off), task.model.n)
+
+
+def _start(task: Task, trial: Trial, before: Array) -> list[str]:
     """Where a run did not start at s_0, by more than the noise that its sensor shows.
 
     What [reward] weighs along the way counts by what the first state costs beside a mean step of
-    the run, the dearest first; another state by how far the run takes it.
+    the run, the dearest first; another state by how far the run takes it. A robot is never set
+    down twice at one place: as far as the starts `before` (N, n) scatter, nobody can mend it.
     """
     if trial.finite_steps < 0:
         return []
@@ -158,14 +170,23 @@ def _start(task: Task, trial: Trial) -> list[str]:
     with np.errstate(all="ignore"):
         share = np.where(weight > 0, weight * off**2 / usually, np.abs(off) / usual)
     told = (share > FAR) & (np.abs(off) > np.maximum(SURE * noise, 1e-9))
+    if len(before) >= FEWEST:
+        told &= (np.abs(off) > SURE * before.std(axis=0, ddof=1)) | (share > MUCH)
     found = []
     for i in sorted(np.flatnonzero(told), key=lambda i: (weight[i] == 0, -share[i])):
         name, unit = list(task.model.states.items())[i]
         began, start = in_digits_apart(float(trial.states[0, i]), float(task.start[i]))
-        costs = f", which costs {percent(share[i])} of a mean step of the run" * bool(weight[i])
+        turned = f" ({np.rad2deg(off[i]):+.2g} degrees)" if unit == "rad" else ""
+        does = (
+            "its utility is another for it. Set the robot down nearer to the start, `discard "
+            f"{trial.id}` and run it again"
+            if share[i] > MUCH
+            else "it counts as it is, no need to run it again. Set the robot down nearer next time"
+        )
         found.append(
-            f"the run started with {name} = {with_unit(began, unit)}, the task's start is "
-            f"{start}{costs}: the search assumes one start state"
+            f"the run started with {name} = {with_unit(began, unit)}, the task's start is {start}: "
+            f"{with_unit(f'{off[i]:+.2g}', unit)}{turned} off, more than the noise of its log. "
+            f"{does[0].upper()}{does[1:]}"
         )
     return found
 
