@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 )
 @click.option("--probe", is_flag=True, help="Write the most instructive next trial, tie or not.")
 @parallel
-@click.option("--instruments", is_flag=True, help="Judge the sensors alone; takes a second.")
+@click.option("--instruments", is_flag=True, help="Judge the sensors alone; takes some seconds.")
 @in_workspace
 @as_json
 def command(

@@ -307,20 +307,20 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     from grounded.effects import ParamFamily
 
     model, targets = effect.site.model, effect.site.targets
-    words: dict[str, str] = {name: quantity(e) for name, e in params.items()}
+    constants = {q.name: Estimate(q.start, 0.0, None, q.unit) for q in effect.quantities if q.fixed}
+    words = {name: quantity(e) for name, e in {**constants, **params}.items()}
     words.setdefault("s", "s" if len(targets) == 1 else "")
     driven, _, source = effect.site.target.partition("<-")
-    words["log"] = "[log]"
     words["target"] = listed(called(model, n) for n in targets)
     if isinstance(effect.family, ParamFamily):
         words["target"] = effect.site.target
-    words |= {"driven": called(model, driven), "source": called(model, source)}
+    words |= {"log": "[log]", "driven": called(model, driven), "source": called(model, source)}
 
     def filled(found: re.Match[str]) -> str:
         name, percent, more, less = found.groups()
         if percent is None or name not in params:
             return words.get(name, found.group(0))
-        value = 100 * params[name].value
+        value = 100 * effect.family.ratio(name, params[name].value)
         if more is None:
             return f"{number(value)} %"
         return f"{number(abs(value))} % {more if value >= 0 else less}"

@@ -80,6 +80,12 @@ def _curve(site: Site) -> tuple[Quantity, ...]:
     return (sides, Quantity("b", low=-1.8, high=1.8), whole)
 
 
+def _end_to_end(name: str, value: float) -> float:
+    """By how much one end's gain exceeds the other's: a and b are of the gain half way."""
+    half = value if name == "a" else 0.5 * value
+    return (1 + half) / (1 - half) - 1
+
+
 input_bias = InputFamily(
     name="input_bias",
     equation="u_eff = u + b",
@@ -137,8 +143,9 @@ saturation = InputFamily(
 input_curve = InputFamily(
     name="input_curve",
     equation="u_eff = (1 + a sign(u) + b (|u| / U - 1/2)) u",
-    sentence="{target} acts[ {a%more|less} to its positive side, and] {b%more|less} at full "
-    "deflection than near zero",
+    sentence="{target} acts[ {a%more|less} to its positive side than to its negative, and] "
+    "{b%more|less} at {U}, the most in the log, than near zero",
+    ratio=_end_to_end,
     targets=places.inputs,
     quantities=_curve,
     lookalikes=("input_gain", "input_bias", "saturation", "dead_zone"),

@@ -183,6 +183,7 @@ class Family:
         vague: nats that a family pays for naming no mechanism, so that a tie goes to one that does.
         turned: of a gain, the sentence where 1 + g is below zero.
         loose: it names no mechanism, but fits what repeats with a motion, whatever the cause.
+        ratio: what a percentage {g%} tells of the quantity g of some value.
     """
 
     name: str
@@ -194,6 +195,7 @@ class Family:
     vague: float = 0.0
     turned: str = ""
     loose: bool = False
+    ratio: Callable[[str, float], float] = lambda name, value: value
 
     def at(self, site: Site) -> Effect:
         """The effect of this family there, with the quantities that it estimates there."""

@@ -32,6 +32,8 @@ from grounded.effects.family import (
     speed_limit,
 )
 
+PERIODS = 1.5  # that the longest trial has of a wave, at least
+
 
 def _coupling(site: Site) -> tuple[Quantity, ...]:
     target, source = coupled(site)
@@ -39,21 +41,22 @@ def _coupling(site: Site) -> tuple[Quantity, ...]:
 
 
 def _periodic(site: Site) -> tuple[Quantity, ...]:
-    """Frequencies from one period a trial to a fifth of the sampling rate, half a bin apart.
+    """Frequencies from `PERIODS` a trial to a fifth of the sampling rate, half a bin apart.
 
-    What turns less than half a period in the longest trial is an offset and a trend, no wave.
+    What turns less often in the longest trial drifts, as far as anyone can see: half a cosine of
+    54 s stood for a battery that sagged through 30 s. An adopted wave was seen in other data.
     """
-    duration, dt = site.scales.duration, site.scales.dt
-    lowest, highest = 1.0 / duration, min(0.2 / dt, 5.0)
-    bins = max((highest - lowest) * duration, 1.0)
+    scales = site.scales
+    lowest = PERIODS / scales.duration
+    highest = max(min(0.2 / scales.dt, 5.0), lowest)
+    bins = max((highest - lowest) * scales.duration, 1.0)
     count = int(min(max(2 * bins, 4), 40))
     grid = tuple(float(2 * np.pi * f) for f in np.linspace(lowest, highest, count))
+    slowest = grid[0] if scales.high else 0.0
+    fastest = 2 * np.pi * max(0.45 / scales.dt, lowest)
     unit = per(site.unit(site.target))
-    return (
-        Quantity("A", unit),
-        Quantity("B", unit),
-        Quantity("omega", "rad/s", grid, np.pi * lowest, 2 * np.pi * 0.45 / dt, places=bins),
-    )
+    omega = Quantity("omega", "rad/s", grid, slowest, fastest, places=bins)
+    return (Quantity("A", unit), Quantity("B", unit), omega)
 
 
 def _coupling_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:

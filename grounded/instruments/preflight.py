@@ -74,7 +74,7 @@ from grounded.instruments.odd_trial import (
 )
 from grounded.instruments.other_units import judge_units
 from grounded.instruments.rows import kinematic_rows, tied
-from grounded.instruments.single import Signal, judge_signal
+from grounded.instruments.single import judge_signal, signal_of
 from grounded.instruments.swapped import judge_columns
 from grounded.instruments.way import judge_way, rate_agrees
 from grounded.model import Model
@@ -248,8 +248,7 @@ class _Bench:
     def singles(self) -> Iterator[Finding]:
         """Of each sensor by itself."""
         for i in self.shown:
-            name, angle = self.model.state_names[i], bool(self.model.angle_mask[i])
-            signal = Signal(name, self.model.states[name], angle, self.column(i), self.dt)
+            signal = signal_of(self.model, self.trials, i, self.shown)
             findings, after = judge_signal(signal)
             if after is not signal:
                 self.put(i, after.columns)

@@ -10,6 +10,9 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.instruments.finding import Finding
+from grounded.instruments.kinematics import integrals
+from grounded.model import Model
+from grounded.trial import Trial
 
 STUCK = 8  # samples that repeat, before a jump
 JUMP = 3.0  # times the change that follows, after them
@@ -29,6 +32,7 @@ class Signal:
         angle: its differences wrap.
         columns: its samples in each trial (T + 1,), NaN where missing.
         dt: [s].
+        rests: of a velocity: where its position stands still as it says, in each trial (T + 1,).
     """
 
     name: str
@@ -36,14 +40,31 @@ class Signal:
     angle: bool
     columns: Sequence[Array]
     dt: float
+    rests: Sequence[Any] = ()
 
     def without(self, gone: Sequence[Any]) -> Signal:
         """With some samples missing."""
         pairs = zip(self.columns, gone, strict=True)
         return replace(self, columns=[np.where(g, np.nan, x) for x, g in pairs])
 
+    def moving(self) -> list[Any]:
+        """Where it is not known to be at rest, in each trial (T + 1,)."""
+        if len(self.rests):
+            return [~np.asarray(rest) for rest in self.rests]
+        return [np.ones(len(x), bool) for x in self.columns]
+
 
 Found = tuple[Finding, Signal]
+
+
+def signal_of(model: Model, trials: Sequence[Trial], i: int, shown: Sequence[int]) -> Signal:
+    """State i of trials, of whose states `shown` have sensors."""
+    name, dt, rests = model.state_names[i], trials[0].dt, list[Any]()
+    columns = [trial.states[:, i] for trial in trials]
+    for one in integrals(model):
+        if one.j == i and one.i in shown:
+            rests = at_rest([t.states[:, one.i] for t in trials], [one.c * w for w in columns], dt)
+    return Signal(name, model.states[name], bool(model.angle_mask[i]), columns, dt, rests)
 
 
 def judge_signal(signal: Signal) -> tuple[list[Finding], Signal]:
@@ -61,6 +82,24 @@ def runs(x: Array) -> tuple[Any, Any]:
     """Starts and lengths of runs of equal samples in x (T,); NaN equals nothing."""
     edges = np.flatnonzero(np.concatenate([[True], np.diff(x) != 0, [True]]))
     return edges[:-1], np.diff(edges)
+
+
+def at_rest(position: Sequence[Array], velocity: Sequence[Array], dt: float) -> list[Any]:
+    """Where a position (T,) of each trial stays to the last digit, as its velocity (T,) says.
+
+    An encoder stands on one count while a joint sticks, and a filtered difference of it decays to
+    0 and stays: right data. What says in that time more than half a usual change does not rest.
+    """
+    usual, found = _changes(position), []
+    count = float(np.median(usual)) if usual.size else 0.0
+    for q, w in zip(position, velocity, strict=True):
+        rest = np.zeros(len(q), bool)
+        for start, length in zip(*runs(q), strict=True):
+            if length >= STUCK:
+                stay = slice(start, start + length)
+                rest[stay] = np.abs(w[stay]) * length * dt <= 0.5 * count
+        found.append(rest)
+    return found
 
 
 def _changes(columns: Sequence[Array]) -> Any:
@@ -150,15 +189,15 @@ def _stuck(s: Signal) -> Found | None:
     if usual.size < 20:
         return None
     far, gone, longest = 2 * float(np.median(usual)), [], 0
-    for x in s.columns:
+    for x, moves in zip(s.columns, s.moving(), strict=True):
         flat, (starts, lengths) = np.zeros(len(x), bool), runs(x)
         long = lengths >= STUCK
         for start, length in zip(starts[long], lengths[long], strict=True):
             end = start + length
             onward = abs(x[end + 1] - x[end]) if end + 1 < len(x) else np.inf
             jumps = end < len(x) and abs(x[end] - x[start]) > max(far, JUMP * onward)
-            moving = start > 0 and x[start - 1] != x[start]
-            if jumps and moving:
+            moved = start > 0 and x[start - 1] != x[start]
+            if jumps and moved and moves[start:end].sum() >= STUCK:
                 flat[start + 1 : end] = True
                 longest = max(longest, int(length))
         gone.append(flat)
@@ -217,9 +256,9 @@ def _clipped(s: Signal) -> Finding | None:
         return None
     for limit, side in ((values.max(), "above"), (values.min(), "below")):
         stays, samples = 0, 0
-        for x in s.columns:
+        for x, moves in zip(s.columns, s.moving(), strict=True):
             start, length = runs(x)
-            at = (x[start] == limit) & (length >= 3) & (start > 0)
+            at = (x[start] == limit) & (length >= 3) & (start > 0) & moves[start]
             stays, samples = stays + int(at.sum()), samples + int(length[at].sum())
         share = samples / values.size
         if stays >= 3 and share > CLIPPED:

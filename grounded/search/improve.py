@@ -174,8 +174,8 @@ def _ended(
         ending = "too doubtful"
         sentence = (
             f"the model promises {figure(ruinous.predicted_gain)} from a step and is likely to be "
-            f"off by {figure(ruinous.likely_off)}, more than all that {own} cost: no trial is "
-            f"spent on it; another trial of {own}, or a diagnosis, tells more"
+            f"off by more than all that {own} cost: no trial is spent on it; another trial of "
+            f"{own}, or a diagnosis, tells more"
         )
     elif promised and not finite:
         ending = "model diverges"

@@ -250,6 +250,11 @@ def test_sentences_are_english():
         "The throttle gets 5 % weaker every second (a battery that sags)."
     )
     assert said("parameter:k", d=0.1) == "The parameter k should be 1.1 1/s instead of 1."
+    curve = "The throttle acts 40 % less at 1, the most in the log, than near zero."
+    assert said("input_curve:throttle", a=0.0, b=-0.5) == curve  # 0.75 of 1.25
+    assert "50 % more to its positive side than to its negative, and" in (
+        said("input_curve:throttle", a=0.2, b=-0.5)  # 1.2 of 0.8
+    )
     dry, sticky = "0.4 N to dry friction", "0.1 N s/m times the speed v to viscous friction"
     for c, b, told in ((0.4, 0.1, f"{dry} and {sticky}"), (0.4, 0.0, dry), (0.0, 0.1, sticky)):
         assert said("joint_friction:u<-v", c=c, b=b) == f"The input u loses {told}."

@@ -306,6 +306,21 @@ def test_the_docs_show_every_family():
         assert f"({path.name})" in text
 
 
+@pytest.mark.parametrize("duration", [0.1, 6.0, 30.0])
+def test_a_wave_turns_in_the_longest_trial_an_adopted_one_turned_in_another(duration):
+    """Half a cosine, of a period of 54 s, was claimed in logs of 6 to 30 s."""
+    known = {"v": 1.0}
+    seen, any_of = (
+        Library().effect("periodic:v", car, Scales(known, known, {}, 0.05, duration)),
+        Library().effect("periodic:v", car),
+    )
+    (omega,) = (q for q in seen.quantities if q.name == "omega")
+    periods = np.array([omega.low, *omega.grid]) * duration / (2 * np.pi)
+    assert periods.min() >= 1.5 - 1e-9 and omega.low <= min(omega.grid)
+    assert max(omega.grid) <= omega.high
+    assert next(q for q in any_of.quantities if q.name == "omega").low == 0.0
+
+
 def lag_of(dt, duration):
     scales = Scales(dt=dt, duration=duration)
     (tau,) = Library().effect("first_order_lag:steering", car, scales).quantities

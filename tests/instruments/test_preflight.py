@@ -283,6 +283,48 @@ def test_what_stands_still_has_no_dead_sensor():
         assert not any(f.kind == "stuck" for f in preflight(ARM, trials).findings)
 
 
+ENCODER = 2e-3  # rad a count
+
+
+def sticking_joint(seed):
+    """An arm that dry friction holds now and then: an encoder, its filtered difference (T + 1, 2).
+
+    The difference is 0 to the last digit there, as a log with a few digits has it.
+    """
+    rng, q, w = np.random.default_rng(seed), [0.0], [0.0]
+    while len(q) < 600:
+        for speed in (rng.uniform(0.03, 0.4), 0.0):
+            q += list(q[-1] + np.cumsum(np.full(rng.integers(40, 70), speed * DT)))
+    counts = np.round(np.array(q) / ENCODER) * ENCODER
+    for moved in np.diff(counts):
+        w.append(w[-1] + (moved / DT - w[-1]) / 6)
+    return np.column_stack([counts, np.round(w, 3)])
+
+
+def of_joints(fault=lambda y: y):
+    return [
+        Trial(fault(sticking_joint(k)[:400]), np.zeros((399, 1)), DT, ("q", "w"), ("u",))
+        for k in range(3)
+    ]
+
+
+def test_a_velocity_that_is_0_while_its_encoder_stands_still_is_at_rest():
+    """A bench helicopter's dry friction: "sticks to its last value, up to 0.25 s", and cut out."""
+    found = preflight(ARM, of_joints())
+    assert not {f.kind for f in found.findings} & {"stuck", "saturated"}
+    assert all(np.isfinite(t.states).all() for t in found.trials)
+
+
+@pytest.mark.parametrize(("gone", "told"), [([1], ["w"]), ([0, 1], ["q", "w"])])
+def test_a_velocity_that_stays_while_its_encoder_moves_or_says_it_does_is_stuck(gone, told):
+    def held(y):
+        y[1:21, gone] = y[1, gone]  # as it speeds up; both: a log that hangs
+        return y
+
+    found = preflight(ARM, of_joints(held)).findings
+    assert [one.signal for one in found if one.kind == "stuck"] == told
+
+
 def test_coarse_missing_and_clipped_samples_are_stated_and_left():
     def coarse(y):
         y = np.round(y / [0.2, 1e-9]) * [0.2, 1e-9]

@@ -125,6 +125,16 @@ def test_a_parameter_that_was_blamed_is_in_the_model_as_diagnosed_once(cart, tmp
     assert found.since.missing == () and set(found.since.adopted) == set(names)
 
 
+def test_what_an_adopted_curve_does_at_its_end_is_told_with_that_end(cart, tmp_path):
+    """In words its b of 0.4 was 40 %, of the gain half way; the ends are 1.2 and 0.8 of that."""
+    folder = copied(cart, tmp_path / "w")
+    toml = folder / "grounded.toml"
+    curve = 'effects = [{name = "input_curve:force", a = 0.0, b = 0.4, U = 3.5}]'
+    toml.write_text(toml.read_text().replace("[model]\n", f"[model]\n{curve}\n"))
+    (clause,) = grounded("-C", folder, "report", "--json").json["adopted"]["clauses"]
+    assert "50 % more at 3.5" in clause
+
+
 def test_a_gain_that_nobody_measured_is_not_claimed(cart, tmp_path):
     folder = written(copied(cart, tmp_path / "w"))
     assert grounded("-C", folder, "adopt", "viscous_friction:v", "--effect-only").code == 0

@@ -143,8 +143,8 @@ def _clause(entry: Mapping[str, Any], model: Model) -> str:
     name, given = str(entry["name"]), {k: v for k, v in entry.items() if k != "name"}
     try:
         effect = installed_effects().effect(name, model)
-        free = {q.name: q.unit for q in effect.free}
-        values = {q: Estimate(float(v), unit=free[q]) for q, v in given.items() if q in free}
+        units = {q.name: q.unit for q in effect.quantities}
+        values = {q: Estimate(float(v), unit=units[q]) for q, v in given.items() if q in units}
         return meaning(effect, values)
     except (GroundedError, TypeError, ValueError):
         return f"{name} ({', '.join(f'{k} = {v}' for k, v in given.items())})"

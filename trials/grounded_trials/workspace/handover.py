@@ -240,12 +240,15 @@ class Check:
         made, name = self.candidate, self.candidate.id
         if made.doubtful and not self._trials(name):
             best = self.standing.incumbent
+            cost = made.predicted_gain - made.predicted_utility  # of its base
+            off = f"{made.likely_off:.3g}"  # a model that is off by more than that knows no size
+            off = f"more than all that {made.base} costs" if made.likely_off > cost > 0 else off
             stop = ""
             if best and made.predicted_gain < LITTLE * abs(best.utility):
                 stop = f". You may stop here, with {best.candidate.id}, the best so far"
             yield (
                 f"{name} may well lose: it promises {made.predicted_gain:.3g} over {made.base}, "
-                f"and its model is likely to be off by {made.likely_off:.3g} there, as it was for "
+                f"and its model is likely to be off by {off} there, as it was for "
                 f"earlier trials{stop}"
             )
         yield from self._became()
