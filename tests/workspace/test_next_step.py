@@ -497,6 +497,16 @@ def test_no_line_for_utilities_that_nothing_has(tmp_path):
     assert not re.search(r"^utility *$", out, re.M)
 
 
+def test_who_adopts_a_scale_is_told_whose_speed_the_target_means(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    params = {"k": {"value": 0.04, "std": 0.001, "unit": "1"}}
+    row = {**DIAGNOSIS["ranking"][0], "effect": "sensor_scale:v", "params": params}
+    verdict = {"kind": "effect", "effects": ["sensor_scale:v"], "sentence": "Scaled."}
+    diagnosed(folder, verdict=verdict, ranking=[row], indistinguishable=[])
+    done = grounded("-C", folder, "adopt", "sensor_scale:v")
+    assert done.code == 0 and holds(done.err, "4 % more", "target", "[log.state.v] scale")
+
+
 def test_a_delay_more_than_the_adopted_one_is_open_until_it_is_adopted(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     then = {"name": "delay:force", "d": 0.01}
