@@ -28,6 +28,11 @@ BIASED = (
     "target was not measured by it, they are off by that. Add it there, or take it out of what is "
     "read, [log.state.{state}] offset = {off:.3g}, and in the robot's program"
 )
+SCALED = (
+    "the target and [task] start, and how far off the target {state} is said to be, are of {state} "
+    "as its sensor reads it, {by:.3g} % {more} than it is: for the true one scale what is read, "
+    "[log.state.{state}] scale, and in the robot's program"
+)
 REMEASURE = "nothing has measured the model as it is now yet: `grounded diagnose` does"
 
 
@@ -67,6 +72,9 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
             high = with_unit(f"{abs(effect['b']):.3g}", units[state])
             low = "low" if effect["b"] < 0 else "high"
             remark("note", BIASED.format(state=state, by=f"{high} too {low}", off=-effect["b"]))
+        if family == "sensor_scale" and effect["name"] in effects:
+            more, by = "more" if effect["k"] > 0 else "less", 100 * abs(effect["k"])
+            remark("note", SCALED.format(state=state, by=by, more=more))
     if not done.claimed:
         remark("note", f"{effects[0]} {UNCLAIMED}")
     if done.beside:

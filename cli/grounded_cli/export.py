@@ -56,7 +56,8 @@ def command(
     (t0007) is written as a bag, csv or npz.
 
     `best` names the best candidate so far. One that must not be run any more (see `grounded run`)
-    is refused; one of an earlier task is not, if it keeps today's [limits] and [safety].
+    is refused; one that was run in an earlier task is not, if it keeps today's [limits] and
+    [safety].
     """
     named = Path(output or "").suffix.lstrip(".").lower()
     run = candidate.startswith("t") or form == "bag"

@@ -13,8 +13,11 @@ from grounded_cli.options import as_json, in_workspace, next_line, open_workspac
 from grounded_cli.terminal import field, number, progress, remark, sentence, show, show_json, table
 
 if TYPE_CHECKING:
+    from grounded.search.candidate import Tried
+    from grounded_trials import Workspace
     from grounded_trials.workspace.intake.ingested import Ingested
 
+AGAIN = "run again"  # a verdict
 # what a verdict means for the search
 VERDICTS = {
     "first": ": what the search improves on",
@@ -25,7 +28,7 @@ VERDICTS = {
     "in doubt": ": it may be bad luck, the best so far is run once more",
     "probe": ", for the diagnosis: the search leaves it out",
     "set aside": ": it does not count",
-    "run again": ": the candidate counts with the mean of its runs",
+    AGAIN: ": the candidate counts with the mean of its runs",
 }
 
 
@@ -50,7 +53,7 @@ def command(files: tuple[str, ...], candidate: str | None, data: bool, json_: bo
         with progress(f"reading {name}"):
             done.append(workspace.ingest(name, candidate=candidate, data=data))
         if not json_:
-            _tell(name, done[-1])
+            _tell(name, done[-1], _best(workspace, done[-1]))
     if json_:
         show_json({"trials": [one.to_json() for one in done]})
     else:
@@ -78,7 +81,7 @@ def following(log: str, candidate: str | None, json_: bool) -> None:
     if json_:
         show_json(done.to_json())
         return
-    _tell(log, done.taken)
+    _tell(log, done.taken, done.proposed.standing.incumbent)
     show("")
     tell_proposed(workspace, done.proposed, last=done.exported is None)
     if done.exported is not None:
@@ -88,7 +91,16 @@ def following(log: str, candidate: str | None, json_: bool) -> None:
         show(f"\ncopy both to the robot, run {ran}, record a log, then\n{then}")
 
 
-def _tell(name: str, one: Ingested) -> None:
+def _best(workspace: Workspace, one: Ingested) -> Tried | None:
+    """Who is best with a log that may have changed it without being better itself."""
+    if one.verdict != AGAIN:
+        return None
+    from grounded_trials.workspace.proposing import standing_in
+
+    return standing_in(workspace).incumbent
+
+
+def _tell(name: str, one: Ingested, best: Tried | None) -> None:
     for warning in one.warnings:
         remark("warning", f"{name}: {warning}")
     for note in one.notes:
@@ -100,6 +112,8 @@ def _tell(name: str, one: Ingested) -> None:
     else:
         meaning = _earlier(one) or VERDICTS.get(one.verdict, "")
         text = f"utility {number(one.utility)}, {one.verdict}{meaning}"
+        if one.verdict == AGAIN and best is not None and best.candidate.id != one.candidate:
+            text += f"; the best is now {best.candidate.id}, {number(best.utility)}"
         show(field(one.candidate, text, "  "))
     if one.off_target:
         show(field("off target", "; ".join(each.summary() for each in one.off_target), "  "))

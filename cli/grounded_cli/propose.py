@@ -87,7 +87,7 @@ def _so_far(candidate: Candidate, best: Tried, task: Task) -> str:
 
     The model's own run of it starts at s_0: what that is worth is known where its runs began
     elsewhere by more than their sensors' noise, and so is the scatter of its runs once something
-    near it was repeated. What is left, the model does not replay.
+    near it was repeated. What is left, the model does not replay. What is told adds up.
     """
     from grounded_trials.workspace.off_target import began_elsewhere
 
@@ -102,19 +102,22 @@ def _so_far(candidate: Candidate, best: Tried, task: Task) -> str:
         return text
     elsewhere, why = began_elsewhere(task, best.trials), []
     start = same - candidate.base_as_run if elsewhere else 0.0
-    rest = same - start - best.utility
     if abs(start) > told:
         where = f"elsewhere than [task] start in {listed(elsewhere)}"
-        why.append(f"{_signed(start)} because its runs began {where}")
-    if abs(rest) > told and math.isfinite(best.standard_error):
+        why.append(f"{_dearer(start)} because its runs began {where}")
+    else:
+        start = 0.0
+    rest, known = same - start - best.utility, math.isfinite(best.standard_error)
+    if abs(rest) > told and (known or why):
         within = abs(rest) <= LUCKY * best.standard_error
-        known = "within the scatter of its runs" if within else "more than its runs scatter"
-        why.append(f"{_signed(rest)} that it does not explain, {known}")
-    return f"{text}: {' and '.join(why)}" if why else text
+        lucky = "within the scatter of its runs" if within else "more than its runs scatter"
+        unknown = "and how far its runs scatter is not known"
+        why.append(f"{_dearer(rest)} that it does not explain, {lucky if known else unknown}")
+    return f"{text}: the model's run costs {', and '.join(why)}" if why else text
 
 
-def _signed(gain: float) -> str:
-    return f"{number(abs(gain))} {'more' if gain > 0 else 'less'}"
+def _dearer(gain: float) -> str:
+    return f"{number(abs(gain))} {'less' if gain > 0 else 'more'}"
 
 
 def _what(candidate: Candidate, standing: Standing, task: Task) -> str:

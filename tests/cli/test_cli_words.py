@@ -2,13 +2,17 @@
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from cli import grounded, process
 from facts import holds
 from grounded.result import listed
+from grounded_cli.ingest import _tell
+from grounded_trials.workspace.intake.ingested import Ingested
 from reported import cart, copied
 from workspaces import CONFIG, MODEL, make
 
@@ -190,6 +194,16 @@ def test_the_best_one_is_run_again_by_that_name(cart, tmp_path):
     empty = make(tmp_path / "empty").folder
     refused = grounded("-C", empty, "run", "best")
     assert refused.code == 1 and holds(refused.err, "best")
+
+
+def test_a_rerun_says_who_is_best_now_where_it_is_another(capsys):
+    """A car's next step went out from c0003 after c0001 was run again, without a word."""
+    one = Ingested("t0009", "", False, "c0001", -0.1273, None, (), (), verdict="run again")
+    best = SimpleNamespace(candidate=SimpleNamespace(id="c0003"), utility=-0.1143)
+    _tell("q5", one, best)
+    assert re.search(r"best is now c0003,\s+-0\.1143", capsys.readouterr().out)
+    _tell("q5", replace(one, candidate="c0003"), best)
+    assert "best" not in capsys.readouterr().out
 
 
 def test_a_range_is_rounded_to_what_a_person_measures():

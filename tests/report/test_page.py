@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import NextCommand
 from grounded_trials.report.findings import Improved, improvements_in, utility_terms
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
 from grounded_trials.report.page.tables import UNKNOWN
 from grounded_trials.workspace.folder import Folder, Lost
+from grounded_trials.workspace.next_step import Since
 from grounded_trials.workspace.off_target import tracking_error
 from page_browser import unpacked
 from reported import DIAGNOSIS, car, cart, many_flights
@@ -80,7 +81,7 @@ def test_page_shows_what_the_issue_lists(cart):
     html = page(gather(Folder(cart)))
     text = "".join(_parsed(html).text)
     for words in (
-        "What improved",
+        "What the runs changed",  # at the end the distance is worse
         "Why the model was wrong",
         "What to run next",
         "Utility of each candidate",
@@ -136,6 +137,43 @@ def test_what_improved_is_said_in_the_units_of_the_states(car):
     assert re.fullmatch(r"[\d.]+ (m|cm|mm) → [\d.]+ (cm|mm)", found[0].text)
     assert found[0].after < found[0].before
     assert {"rad", "m/s"} <= {one.unit for one in found}
+
+
+def test_nothing_is_said_to_improve_that_did_not(car):
+    """A car's page said "What improved" over "9 trials, 0 improvements"."""
+
+    def heading(findings):
+        found = re.search('id="improved"><h2>(.*?)</h2>', page(findings))
+        assert found is not None
+        return found[1]
+
+    findings = gather(Folder(car))
+    now, runs = findings.standing, findings.runs
+    assert heading(findings) == "What improved"
+    first = now.history[0]
+    assert "Nothing" in heading(replace(findings, standing=replace(now, incumbent=first)))
+    none = replace(now, incumbent=first, history=(first,))
+    assert heading(replace(findings, standing=none)) == "What the runs gave"
+    best = findings.best
+    assert best is not None
+    states = best.trial.states.copy()
+    states[:, findings.task.model.state_names.index("v")] += 2.0
+    worse = [replace(r, trial=replace(r.trial, states=states)) for r in runs]
+    runs = tuple(
+        b if a.candidate is best.candidate else a for a, b in zip(runs, worse, strict=True)
+    )
+    assert heading(replace(findings, runs=runs)) == "What the runs changed"
+
+
+def test_a_diagnosis_that_is_not_the_last_word_says_no_next_trial(cart):
+    """A car's page said "adopt them" nine runs after all of them had been adopted."""
+    findings = gather(Folder(cart))
+    assert "a fast run and a slow one" in page(findings)
+    assert findings.diagnosis is not None
+    made = Made(trials=("t0001",))
+    findings = replace(findings, diagnosis=replace(findings.diagnosis, made=made))
+    for since in (Since(newer=9), Since(changed=True), Since(adopted=("viscous_friction:v",))):
+        assert "a fast run and a slow one" not in page(replace(findings, since=since))
 
 
 def test_what_reads_the_same_before_and_after_is_not_told_first(car):

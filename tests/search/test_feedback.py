@@ -200,7 +200,14 @@ def test_what_the_incumbent_lost_by_its_start_is_known(noisy):
 @pytest.mark.parametrize(
     ("as_run", "error", "parts", "never"),
     [
-        (-9.0, 0.1, ("1.000", "start"), ("scatter",)),
+        (-9.0, 0.1, ("costs 1.000 less because", "start"), ("scatter", "explain")),
+        # a car's line told 0.003 of the 0.129 that its two figures differ by
+        (
+            -7.5,
+            np.nan,
+            ("costs 0.5000 more because", "1.500 less that it does not", "not known"),
+            (),
+        ),
         (-8.0, 0.6, ("within the scatter",), ("start",)),
         (-8.0, 0.1, ("more than its runs scatter",), ("start",)),
         (-8.0, np.nan, (), ("scatter", "start")),  # one run: nobody knows
@@ -256,4 +263,4 @@ def test_the_noise_of_a_first_row_is_no_start_elsewhere():
     best = SimpleNamespace(candidate=SimpleNamespace(id="c0001"), utility=-10.0, standard_error=0.1)
     best.trials = [begun(task, noise=0.02)]
     text = _so_far(made, best, task)
-    assert "began" not in text and "2.000 more that it does not explain" in text
+    assert "began" not in text and "2.000 less that it does not explain" in text

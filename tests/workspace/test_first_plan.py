@@ -48,6 +48,46 @@ def test_what_holds_the_start_is_told_of_an_adopted_model_with_all_that_is_given
     assert told(dead, given) == ""  # once
 
 
+def test_a_plan_that_begins_from_no_input_is_not_handed_out_before_it_was_said(tmp_path):
+    """A helicopter's `next:` was to export a plan from 0 V, which a note said to mend first."""
+    (tmp_path / "lifted.py").write_text(LIFTED)
+    w = Workspace.create(tmp_path / "w", model=tmp_path / "lifted.py")
+    w.target({"h": np.linspace(1.0, 1.5, 101)})
+    file = w.folder / "grounded.toml"
+    text = file.read_text().replace("[limits]", "[limits]\nthrust = [0, 1]\nturn = [-9, 9]")
+    text = re.sub(r"(?ms)^\[system\].*?(?=^\[|\Z)", "", text)
+    file.write_text(re.sub(r"(?m)^start = .*$", "start = { h = 1 }", text))
+    first = Workspace(w.folder).propose()
+    assert "counts as held" in " ".join(first.proposal.notes) and first.then.verb == "propose"
+    again = Workspace(w.folder).propose()  # it is right as it is
+    assert again.candidate.id == first.candidate.id and again.then.verb == "export"
+
+
+def test_what_held_a_robot_as_its_log_began_is_written(tmp_path):
+    """A helicopter's log began with 2 s of hover at 7.96 V, and its plans with 0 V."""
+    (tmp_path / "lifted.py").write_text(LIFTED)
+    t = np.arange(0, 10, 0.02)
+    thrust = np.where(t < 2, 0.4905, 0.4905 + 0.2 * np.sin(2 * t))
+    v = np.where(t < 2, 0, 0.5 * np.sin(t))
+
+    def start(h, v, thrust):
+        rows = np.column_stack([t, h, v, 0 * t, thrust, np.where(t < 2, 0, np.sin(t))])
+        names = "t,h,v,q,thrust,turn"
+        np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header=names, comments="")
+        folder = tmp_path / f"w{len(list(tmp_path.iterdir()))}"
+        begin(folder, tmp_path / "log.csv", model=tmp_path / "lifted.py")
+        return tomllib.loads((folder / "grounded.toml").read_text())["task"]["start"]
+
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(len(t))
+    rising = np.cumsum(v) * 0.02
+    assert start(rising + noise, v + noise, thrust) == {"thrust": 0.4905, "turn": 0.0}
+    high = start(5 + rising, v, thrust)
+    assert high == {"h": 5.0, "thrust": 0.4905, "turn": 0.0}
+    assert start(rising, v + 0.4, thrust) == {}  # it flies on
+    assert start(rising, v, thrust + 0.01 * np.sin(t)) == {}
+    assert start(rising, v, thrust - 0.4905) == {}  # nothing has to hold it
+
+
 LINK = """
 import numpy as np
 from grounded import Model

@@ -120,8 +120,11 @@ def test_another_target_makes_it_void_too(w, tmp_path):
     assert caught.value.then.verb == "propose"
     (note,) = w.propose().proposal.notes
     assert holds(note, "c0001", "void", "task", "c0002")
-    exported = w.export("c0001", tmp_path / "c.json")  # the limits hold
-    assert "another task" in exported.notes[0]
+    with pytest.raises(GroundedError, match=holding("c0001", "another task", "not run")) as caught:
+        w.export("c0001", tmp_path / "c.json")  # though the limits hold: its log was c0002's once
+    assert caught.value.then.verb == "propose" and not (tmp_path / "c.json").exists()
+    exported = w.export("c0001", tmp_path / "c.json", anyway=True)
+    assert "another task" in exported.overridden[0]
 
 
 def test_a_best_of_an_earlier_task_is_exported_only_inside_the_limits(ran, tmp_path):
@@ -328,7 +331,7 @@ def test_anyway_says_what_it_overrides_before_the_robot_moves(w, tmp_path):
     assert ran.trial_file.is_file() and len(told) == len(ran.overridden) == 2
     assert "[limits] force" in told[0] and "task" in told[1]
     exported = w.export("c0001", tmp_path / "c.json", anyway=True)
-    assert len(exported.overridden) == 1 and exported.file.is_file()
+    assert len(exported.overridden) == 2 and exported.file.is_file()
 
 
 def test_the_commands_refuse_and_warn_on_stderr(w, tmp_path):

@@ -26,9 +26,9 @@ from grounded_trials.store.documents import write_document
 from grounded_trials.wording import folded, rendered
 from grounded_trials.workspace.adopting import diagnosed_again
 from grounded_trials.workspace.config import set_in_model
-from grounded_trials.workspace.diagnosing import _in_vain
+from grounded_trials.workspace.diagnosing import _in_vain, read_diagnosis
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.next_step import DIAGNOSE, after_diagnosis, since_diagnosis
+from grounded_trials.workspace.next_step import DIAGNOSE, EXPORT, after_diagnosis, since_diagnosis
 from grounded_trials.workspace.proposing import standing_in
 from recorded import LOGGED, record
 from reported import DIAGNOSIS, cart, copied
@@ -497,6 +497,16 @@ def test_no_line_for_utilities_that_nothing_has(tmp_path):
     assert not re.search(r"^utility *$", out, re.M)
 
 
+def test_who_adopts_a_scale_is_told_whose_speed_the_target_means(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    params = {"k": {"value": 0.04, "std": 0.001, "unit": "1"}}
+    row = {**DIAGNOSIS["ranking"][0], "effect": "sensor_scale:v", "params": params}
+    verdict = {"kind": "effect", "effects": ["sensor_scale:v"], "sentence": "Scaled."}
+    diagnosed(folder, verdict=verdict, ranking=[row], indistinguishable=[])
+    done = grounded("-C", folder, "adopt", "sensor_scale:v")
+    assert done.code == 0 and holds(done.err, "4 % more", "target", "[log.state.v] scale")
+
+
 def test_a_delay_more_than_the_adopted_one_is_open_until_it_is_adopted(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     then = {"name": "delay:force", "d": 0.01}
@@ -530,6 +540,25 @@ def test_after_a_verdict_of_none_a_search_that_has_ended_is_exported(cart, tmp_p
     made = replace(Made(), params=dict(w.config.model.params))
     ended = w.status().standing.phase in ("converged", "stopped")
     assert ended and after_diagnosis(w, replace(found, made=made)).verb == "export"
+
+
+def test_after_an_unknown_verdict_a_search_that_has_ended_says_so_and_what_is_left(
+    cart, tmp_path, monkeypatch
+):
+    """A car's diagnosis ended in a report, whose next command was the same diagnosis."""
+    w = Workspace(copied(cart, tmp_path / "w"))
+    unknown = {"kind": "unknown", "effects": [], "sentence": "A gap remains."}
+    left = {"channel": "v", "error": 0.02, "floor": 0.01, "horizon_s": 1.0, "error_unit": "m/s"}
+    document = {**DIAGNOSIS, "verdict": unknown, "leftover": [left], "indistinguishable": []}
+    found = Diagnosis.from_json({**document, "next_trial": "Run another."})
+    monkeypatch.setattr("grounded.diagnosis.diagnose.diagnose", lambda *_, **__: found)
+    monkeypatch.setattr("grounded_trials.workspace.diagnosing._probe", lambda *_, **__: ("", ""))
+    done, best = w.diagnose(), w.status().standing.incumbent
+    assert done.then == EXPORT == w.status().then and best is not None
+    assert best.candidate.id in done.next_trial and "0.020 m/s" in done.next_trial
+    assert done.next_trial.endswith("Run another.")
+    kept = read_diagnosis(w.reports)
+    assert kept is not None and kept.next_trial == "Run another."  # of the search nothing is kept
 
 
 def test_a_result_says_what_follows_it_without_the_command_line(cart, tmp_path):

@@ -100,6 +100,12 @@ class Findings:
         return rendered(self.then)
 
     @property
+    def next_trial(self) -> str:
+        """What the last diagnosis asks for; "" once it is not the last word, see `Since`."""
+        fresh = self.diagnosis is not None and not self.since.sentence
+        return self.diagnosis.next_trial if self.diagnosis is not None and fresh else ""
+
+    @property
     def crude(self) -> Planner:
         """The task with the crude model."""
         return Planner(self.task, self.task)

@@ -30,7 +30,7 @@ from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.stated_units import Stated
 from grounded_trials.logs.unnamed import from_the_rest
 from grounded_trials.starting.examples import fresh_folder
-from grounded_trials.starting.first_toml import write_first
+from grounded_trials.starting.first_toml import held_first, write_first
 from grounded_trials.starting.interval import interval_of
 from grounded_trials.starting.kinds import KINDS, Joints, called_input, kind_in, moving, skeleton
 from grounded_trials.store.store import write_atomically
@@ -38,6 +38,7 @@ from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.model_file import load_module, model_in
 
+NONE: Mapping[str, Array] = {}  # no input was read
 WRITTEN = (FILE, "model.py", "target.csv")
 SLOWEST = 0.5  # [Hz] rows of a robot's log: slower ones have times in another unit
 HORIZON = 200  # steps of a target that is a recorded run, at most
@@ -192,9 +193,9 @@ def _begin(
         }
     table = mapping_toml(states, inputs, simulated=is_simulated(report))
 
-    def write(columns: Mapping[str, Array], rows: int) -> None:
-        name = Path(log).name
-        write_first(folder, found, (step, whose), columns, rows, ranges, table, why, name)
+    def write(columns: Mapping[str, Array], rows: int, sent: Mapping[str, Array] = NONE) -> None:
+        name, held = Path(log).name, held_first(found, columns, sent, step, ranges)
+        write_first(folder, found, (step, whose), columns, rows, ranges, table, why, name, held)
 
     write({found.state_names[0]: np.zeros(2)}, 1)
     target, horizon, more = _recorded(folder, files, found, states, step, write)
@@ -317,7 +318,7 @@ def _recorded(
     model: Model,
     states: Sequence[Guess],
     dt: float,
-    write: Callable[[Mapping[str, Array], int], None],
+    write: Callable[..., None],
 ) -> tuple[str, int, tuple[str, ...]]:
     """target.csv from the run in the log; where that can't be sampled, a target to be replaced."""
     here = Folder(folder)
@@ -332,5 +333,5 @@ def _recorded(
         return "zeros, to be replaced", HORIZON, (f"the run can't be sampled yet: {error}",)
     columns = dict(zip(measured, found.states.T, strict=True))
     horizon = len(found.states) - 1
-    write(columns, horizon)
+    write(columns, horizon, dict(zip(mapping.inputs, found.inputs.T, strict=True)))
     return f"the run in the log, its first {horizon * dt:g} s", horizon, found.warnings

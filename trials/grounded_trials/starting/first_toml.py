@@ -6,6 +6,8 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded_trials.store.store import write_atomically
@@ -13,6 +15,9 @@ from grounded_trials.toml_table import key
 from grounded_trials.workspace.config import FILE, OFFERED
 from grounded_trials.workspace.off_target import position_names
 from grounded_trials.workspace.task_file import change_weight, equal_weights, write_target
+
+STOOD = 0.5  # [s] at the begin of a log
+STILL = 0.05  # of how far, or how fast, a state goes later in the log: it stands
 
 
 def write_first(
@@ -25,6 +30,7 @@ def write_first(
     table: str,
     why: str,
     log: str,
+    held: Mapping[str, float],
 ) -> None:
     """Writes both.
 
@@ -38,6 +44,7 @@ def write_first(
         table: [log], as text.
         why: what says which kind of robot it is.
         log: the file's name.
+        held: where the robot stood at the log's begin, and the inputs that held it; may be {}.
     """
     dt, whose = grid
     write_target(folder / "target.csv", dt, dict(columns))
@@ -58,7 +65,8 @@ def write_first(
         f"dt = {dt:g}                     # [s] control interval{whose}",
         f"horizon = {horizon}                 # steps",
         'target = "target.csv"         # `grounded target` draws another; no column: free',
-        "start = { }",
+        f"start = {_inline(held) if held else '{ }'}"
+        + "  # what held it where it stood in the log's first rows" * bool(held),
         "feedback = true               # false: open loop",
         "latency = { }                 # [s] transport delay of inputs: `fit --latency` finds it",
         "",
@@ -89,6 +97,49 @@ def write_first(
         "",
     ]
     write_atomically(folder / FILE, "\n".join(lines).encode())
+
+
+def held_first(
+    model: Model,
+    columns: Mapping[str, Array],
+    sent: Mapping[str, Array],
+    dt: float,
+    ranges: Mapping[str, tuple[float, float] | None],
+) -> dict[str, float]:
+    """Where a robot stands as a log begins, and the constant inputs, other than 0, that hold it.
+
+    {} where it moves, where an input changes, or where nothing has to hold it: then the input
+    counts as 0 before a run, which is also what is sent after one. Without a speed among the
+    states nothing tells a robot that stands from one that goes on slowly.
+
+    Args:
+        model: whose states and inputs they are.
+        columns: states, by name (H + 1,).
+        sent: inputs, by name (H,).
+        dt: control interval [s].
+        ranges: lowest and highest value of each signal in the whole log.
+    """
+    steps = round(STOOD / dt)
+    speeds = {name for name, unit in model.states.items() if unit.endswith("/s")}
+    whole = set(sent) == set(model.inputs) and set(columns) == set(model.states)
+    if not speeds or not whole or steps < 2:
+        return {}
+    first = {name: values[:steps] for name, values in {**columns, **sent}.items()}
+    if not all(len(v) == steps and np.isfinite(v).all() for v in first.values()):
+        return {}
+    if any(np.ptp(first[name]) for name in sent) or not any(first[name][0] for name in sent):
+        return {}
+    found = {}
+    for name in columns:
+        low, high = ranges[name] or (0.0, 0.0)
+        most = max(abs(low), abs(high)) if name in speeds else high - low
+        at = float(first[name].mean())
+        off = abs(at if name in speeds else first[name][-1] - first[name][0])
+        if off > STILL * most:
+            return {}
+        if name not in speeds and abs(at) > STILL * most:
+            found[name] = at
+    return found | {name: float(first[name][0]) for name in sent}
 
 
 def _inline(values: Mapping[str, float]) -> str:

@@ -62,8 +62,8 @@ def diagnose_in(
     from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
     from grounded.effects import Library
     from grounded_trials.workspace.adopting import diagnosed_again
-    from grounded_trials.workspace.next_step import after_diagnosis
-    from grounded_trials.workspace.proposing import to_run
+    from grounded_trials.workspace.next_step import EXPORT, REPORT, after_diagnosis, nothing_to_do
+    from grounded_trials.workspace.proposing import candidate_named, to_run
 
     effects = [dict(effect) for effect in workspace.config.model.effects]
     names = [str(effect["name"]) for effect in effects]
@@ -111,10 +111,15 @@ def diagnose_in(
         run = f" ({identity}: `{rendered(to_run(workspace, identity, identity))}`)"
         run *= bool(identity)
         found = replace(found, next_trial=f"{words}{run}", probe=identity)
-    if undo := _in_vain(workspace, found):
+    undo = _in_vain(workspace, found)
+    if undo:
         found = replace(found, next_trial=f"{undo} {found.next_trial}")
     _keep(workspace, found)  # with what is said of the next trial
-    return replace(found, then=after_diagnosis(workspace, found))
+    then = REPORT if undo else after_diagnosis(workspace, found)
+    if then == EXPORT and found.kind != "none":
+        words = nothing_to_do(found, candidate_named(workspace, "best"))
+        found = replace(found, next_trial=words)
+    return replace(found, then=then)
 
 
 def _as_known(workspace: Folder, ranking: Sequence[Ranked], made: Made) -> tuple[Ranked, ...]:

@@ -321,7 +321,8 @@ def held_before(workspace: Folder, again: bool = False) -> list[str]:
         f"at the start {held} counts as held, under which {states[k]} changes at once, by "
         f"{with_unit(f'{rate[k]:.3g}', units[states[k]])} a second; the plan begins from there, "
         "and after its end the runner holds that input again. If the robot stands until then, give "
-        f"{FILE}'s [task] what holds it: start = {{ {told} }}"
+        f"{FILE}'s [task] what holds it, and propose again (if not, propose again as it is): "
+        f"start = {{ {told} }}"
     ]
 
 

@@ -5,7 +5,7 @@ changed since a candidate was proposed, so nothing of that day is believed:
 
     the file      it holds the candidate it is named after, as it was proposed (never overridden)
     the robot     state and input names (never overridden), units, dt
-    the task      the task hash; another task's candidate is only exported
+    the task      the task hash; another task's candidate is only exported, and if a trial ran it
     [limits]      the policy's own limits, what it sends and holds, inside today's
     the model     a candidate that no trial ran is void once the model was changed
     [safety]      the predicted run, predicted again where the model was changed
@@ -84,7 +84,7 @@ def checked_candidate(
         workspace: whose model, task, [limits] and [safety] must hold.
         identity: c0003.
         anyway: hand it over all the same; what speaks against it is in `overridden`.
-        other_task: a candidate of another task will do, such as the best of an earlier one.
+        other_task: a candidate of another task that was run there will do, such as its best.
         now: where the search stands, where that is known.
 
     Raises:
@@ -226,10 +226,10 @@ class Check:
                 if unit != own[name]:
                     yield f"it has {name} in {unit}, the model of today in {own[name]}"
         yield from outside_limits(self.workspace.task, made.policy)
-        if not self.same_task and not self.other_task:
+        if not self.same_task and not (self.other_task and self._ever_ran):
             yield (
                 "it was made for another task (other target, reward, limits, start, feedback or "
-                "horizon)"
+                f"horizon){', and was not run in that one' * self.other_task}"
             )
         elif self.void:
             yield "it was not run and is void: the model was changed since it was made"
@@ -331,6 +331,10 @@ class Check:
         """Whether the run can be predicted in the task of today: it has the same time grid."""
         policy, task = self.candidate.policy, self.workspace.task
         return policy.horizon == task.horizon and abs(policy.dt - task.dt) <= 1e-9
+
+    @property
+    def _ever_ran(self) -> bool:
+        return any(one.trial.candidate == self.candidate.id for one in self.trials)
 
     def _trials(self, identity: str) -> list[Trial]:
         found = [t.trial for t in self.trials if t.trial.candidate == identity]

@@ -22,8 +22,10 @@ from grounded_trials.workspace.proposing import standing_in, status_of, to_run
 PROPOSE = NextCommand("propose")
 DIAGNOSE = NextCommand("diagnose")
 EXPORT = NextCommand("export", ("best", "--runner"))
+REPORT = NextCommand("report", ("--html",))
 TARGET = NextCommand("target", ("SHAPE",))
 SHORT = 0.1  # of a control step: a filter that makes no difference
+LEFT = 2  # states that are told of what is left
 SAME = 1e-6  # of a value: what writing it in eight digits may take
 
 
@@ -109,12 +111,28 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
             return follow
         if found.probe:
             return to_run(workspace, found.probe, found.probe)
-        if found.kind != "none" or not workspace.config.task.target:
-            return NextCommand("report", ("--html",))
+        settled = found.kind in ("none", "unknown") or found.contested  # nothing to decide on
+        if not settled or not workspace.config.task.target:
+            return REPORT
     now = _standing_ahead(workspace)
     if found.no_cause:
         return another_trial(workspace, now)
     return next_command(workspace, now, found, usable_ids(workspace))
+
+
+def nothing_to_do(found: Diagnosis, best: str) -> str:
+    """That a search is over though something is left: what that is, and what would tell more.
+
+    Args:
+        found: of the model and the trials that there are; nothing that it claims helps.
+        best: the candidate that the search ended with.
+    """
+    left = ", ".join(one.sentence() for one in found.leftover[:LEFT])
+    return (
+        f"None is needed to have the manoeuvre: the search has ended, with {best}. "
+        + f"No known effect explains what is left: {left}. " * bool(left)
+        + f"To learn more: {found.next_trial}"
+    )
 
 
 def _standing_ahead(workspace: Folder) -> Standing:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from grounded.search.standing import Standing
     from grounded_trials.workspace.next_step import Since
 
+PROPOSE = NextCommand("propose")
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Proposed(Result):
@@ -120,10 +122,11 @@ def propose_in(workspace: Folder) -> Proposed:
     if candidate is None:
         then = status_of(workspace, proposal.standing).then
         if held:
-            then = NextCommand("propose")  # once [task] start is as the note says
+            then = PROPOSE  # once [task] start is as the note says
         return Proposed(proposal, None, then)
     path = workspace.candidate_path(candidate.id)
-    return Proposed(proposal, path, to_run(workspace, candidate.id))
+    # what holds the robot is to be said first: asked again, it is handed out as it is
+    return Proposed(proposal, path, PROPOSE if held else to_run(workspace, candidate.id))
 
 
 def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
@@ -320,7 +323,7 @@ def candidate_named(workspace: Folder, name: str | None, now: Standing | None = 
             raise GroundedError(
                 "no candidate is waiting to be run: `propose` makes the next one, or says that "
                 "the search has ended; name a candidate to run it again",
-                NextCommand("propose"),
+                PROPOSE,
             )
         return waiting.id
     if name != "best":

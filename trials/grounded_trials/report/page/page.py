@@ -32,7 +32,7 @@ from grounded_trials.report.figures.runs import (
     input_figure,
     state_figure,
 )
-from grounded_trials.report.findings import Findings, improvements_in, utility_terms
+from grounded_trials.report.findings import Findings, compared, improvements_in, utility_terms
 from grounded_trials.report.page.diagnosed import gap_section
 from grounded_trials.report.page.tables import (
     Block,
@@ -80,6 +80,7 @@ def page(findings: Findings, watched: int = 0) -> str:
         findings=findings,
         about=_about(findings),
         tiles=_tiles(findings),
+        changed=_heading(findings),
         improved=_improved(findings),
         why=_why(findings),
         sections=[(title, blocks) for title, blocks in _sections(findings) if blocks],
@@ -189,6 +190,17 @@ def _about(findings: Findings) -> str:
         f"{task.model.name}: {task.horizon} steps of {task.dt:g} s ({task.horizon * task.dt:g} s), "
         f"{'closed loop' if task.feedback else 'open loop'}; {findings.method}"
     )
+
+
+def _heading(findings: Findings) -> str:
+    """What the rows below it show: an improvement is only what is better in all of them."""
+    runs, tried = compared(findings), [one for one in findings.history if one.trials]
+    if len(runs) < 2:
+        alone = len(tried) < 2 or findings.first is None
+        return "What the runs gave" if alone else "Nothing improved on the first run"
+    rows = improvements_in(findings)
+    worse = any(one.after > one.before and not one.is_same for one in rows)
+    return "What the runs changed" if worse else "What improved"
 
 
 def _improved(findings: Findings) -> list[tuple[str, str]]:
