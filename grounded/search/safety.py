@@ -19,7 +19,7 @@ from grounded.search.candidate import Candidate, Tried
 from grounded.task import Task
 from grounded.trial import Trial
 
-COASTS = 3.0  # seconds after a run that are looked at
+COASTS = 2.0  # seconds after a run that are looked at
 MAX_GAIN = 1e6  # input units per state unit: beyond it a gain is a numerical accident
 
 

@@ -184,7 +184,7 @@ def test_weights_that_were_made_of_the_limits_seen_follow_those_that_are_given(t
         given = f"[limits]\nforce = [{low}, {high}]\n"
         file.write_text(re.sub(r"(?ms)^\[limits\].*?\n(?=\n)", given, file.read_text()))
         notes = Workspace(folder).propose().proposal.notes
-        return [note for note in notes if "input_change" in note and "init" in note]
+        return [note for note in notes if "input_change" in note and "[limits]" in note]
 
     (note,) = [n for n in Workspace(folder).propose().proposal.notes if "happened" in n]
     assert holds(note, "r.csv", "[limits]", "`target`")
