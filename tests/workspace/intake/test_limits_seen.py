@@ -13,6 +13,7 @@ from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.where_to_mend import where_to_mend
+from recorded import record, waiting
 from workspaces import CONFIG, make
 
 NARROW = CONFIG.replace("force = [-5.0, 5.0]", "force = [0.0, 1.17]")
@@ -120,3 +121,22 @@ def test_an_angle_far_beyond_safety_that_degrees_would_explain_is_told(tmp_path,
     found = [one for one in w.ingest(tmp_path / "d.mcap", data=True).warnings if "degrees" in one]
     assert len(found) == said
     assert all("[log.state.theta] scale = 0.01745329" in one for one in found)
+
+
+@pytest.mark.parametrize("rolls", [0.0, 0.4])
+def test_a_robot_that_leaves_safety_after_its_run_is_seen_to(tmp_path, rolls):
+    """A car stood in the wall a second after its run, and the log of it was "first"."""
+    w = waiting(tmp_path)
+    policy, file = w.candidate("c0002")[0].policy, tmp_path / "t.csv"
+    record(w, file, policy, 1.0, after=1.5)
+    table = np.loadtxt(file, delimiter=",", skiprows=1)
+    beyond = table[:, 0] - table[0, 0] - 1.0 - policy.horizon * policy.dt
+    most = table[beyond <= 0.1, 1].max()
+    table[beyond > 0, 1] = np.minimum(table[beyond > 0, 1], most)
+    table[:, 1] += rolls * np.clip(beyond - 0.1, 0.0, None)
+    np.savetxt(file, table, "%.5f", ",", header="t,x,v,force", comments="")
+    config = w.folder / "grounded.toml"
+    config.write_text(f"{config.read_text()}\n[safety]\nx = [-9.0, {most + 0.1:.3f}]\n")
+    told = [one for one in Workspace(w.folder).ingest(file).warnings if "after its end" in one]
+    assert len(told) == (rolls > 0)
+    assert not told or holds(told[0], "[safety] x = [-9,", "m.")

@@ -19,6 +19,7 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import listed
 from grounded.search.candidate import Candidate, Tried
+from grounded.search.safety import COASTS
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of
@@ -58,7 +59,12 @@ from grounded_trials.workspace.intake.stored_before import (
     same_recording,
     what_repeats,
 )
-from grounded_trials.workspace.intake.trial_check import dead_sensors, mistaken_in, warnings_about
+from grounded_trials.workspace.intake.trial_check import (
+    dead_sensors,
+    left_afterwards,
+    mistaken_in,
+    warnings_about,
+)
 from grounded_trials.workspace.intake.who_drove import OTHERS, Following, suspicion
 from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of
@@ -111,6 +117,8 @@ def ingest_log(
     workspace.forget_trials()
     trial = replace(read.trial, id=added.id)
     warnings = (*read.warnings, *warnings_about(workspace, trial, read.last_s))
+    if whole := _whole(read, workspace.task):
+        warnings = (*warnings, *left_afterwards(workspace.task, whole))
     if before:
         warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
     if aside := added.known and added.id in workspace.discarded():
@@ -150,6 +158,15 @@ def _by_its_commands(workspace: Folder, path: Path, error: NoneWaits) -> Grounde
     except GroundedError as refused:
         return GroundedError(str(error), refused.then)
     return error
+
+
+def _whole(read: Read, task: Task) -> Trial | None:
+    """A foreign log of a run with the seconds that follow it, None for others."""
+    log = read.log.recording if read.log else None
+    if log is None or read.cut is None or not read.trial.candidate:
+        return None
+    more = replace(log, steps=task.horizon + math.ceil(COASTS / task.dt))
+    return more.trial_from(1e-9 * (read.cut.start_ns - log.whole.origin_ns))
 
 
 def _copied(workspace: Folder, path: Path, read: Read, wanted: str | None) -> Read:

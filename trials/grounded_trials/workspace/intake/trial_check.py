@@ -211,6 +211,24 @@ def _unsafe(task: Task, trial: Trial, ran: Candidate) -> list[str]:
     return found
 
 
+def left_afterwards(task: Task, whole: Trial) -> list[str]:
+    """Where a robot left [safety] after a run that stayed inside, as far as its log goes on."""
+    assert task.safety_low is not None and task.safety_high is not None
+    states = whole.states[: whole.finite_steps + 1]
+    out = np.maximum(task.safety_low - states, states - task.safety_high)
+    if (out[: task.horizon + 1] > 0).any() or not (out > 0).any():
+        return []
+    t, i = np.unravel_index(int(np.argmax(out)), out.shape)
+    first = int(np.argmax((out > 0).any(axis=1))) - task.horizon
+    name, unit = list(task.model.states.items())[int(i)]
+    low, high = task.safety_low[i], task.safety_high[i]
+    return [
+        f"{first * whole.dt:.2g} s after its end the robot left [safety] {name} = [{low:g}, "
+        f"{high:g}]: {name} was {with_unit(f'{states[t, i]:.3g}', unit)}. Stop it in time, or let "
+        "the target come to rest inside"
+    ]
+
+
 def _inputs(task: Task, trial: Trial) -> list[str]:
     if not trial.steps:
         return []
