@@ -21,6 +21,7 @@ from grounded_trials.logs.inspect_log import inspect_log
 from grounded_trials.logs.recover import recover_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
 from grounded_trials.store.trial_file import read_trial, trial_bytes
+from pace import slowness
 
 QUICK = ("JSON, nested lists",)
 
@@ -46,7 +47,7 @@ def test_a_trial_in_many_small_chunks_is_read_in_linear_time() -> None:
     data = trial_bytes(trial, {})
     began = time.process_time()
     assert read_trial(data)[0].steps == steps
-    assert time.process_time() - began < 2.0  # 0.15 here; 0.1 took 30 s
+    assert time.process_time() - began < 2.0 * slowness()  # 0.15 here; 0.1 took 30 s
 
 
 def test_an_idl_definition_of_a_megabyte_is_read_in_linear_time(tmp_path: Path) -> None:
@@ -59,7 +60,7 @@ def test_an_idl_definition_of_a_megabyte_is_read_in_linear_time(tmp_path: Path) 
     began = time.process_time()
     with pytest.raises(GroundedError) as refused:
         read_signals(path, {"x": SignalSpec("/t.x", clock="log")})
-    assert time.process_time() - began < 1.0 and len(str(refused.value)) < 2000
+    assert time.process_time() - began < slowness() and len(str(refused.value)) < 2000
 
 
 def test_a_budget_counts_time_and_memory(monkeypatch: pytest.MonkeyPatch) -> None:

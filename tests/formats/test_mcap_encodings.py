@@ -32,6 +32,7 @@ from grounded_trials.formats.messages import (
 from grounded_trials.formats.path_walk import bind, evaluate
 from grounded_trials.formats.protobuf import protobuf_messages
 from grounded_trials.formats.schemas import parse_protobuf, parse_ros
+from pace import slowness
 from path_reference import follow
 
 Root = Callable[[bytes, Any, Any], Node]
@@ -314,7 +315,7 @@ def test_a_hostile_idl_definition_takes_no_longer_than_it_is_long(what: str) -> 
     start = time.process_time()
     with pytest.raises(BadSchema):
         parse_idl(HOSTILE[what], "M")
-    assert time.process_time() - start < 10
+    assert time.process_time() - start < 10 * slowness()
 
 
 def test_constants_may_refer_to_constants_and_sequences_to_sequences() -> None:

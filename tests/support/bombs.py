@@ -24,6 +24,7 @@ from grounded.trial import Trial
 from grounded_trials.formats.mcap_records import CHUNK
 from grounded_trials.formats.mcap_walk import MAGIC
 from grounded_trials.store.trial_file import trial_bytes
+from pace import slowness
 
 DEEP = 12  # modules inside modules
 BREAK = "=" * 80 + "\n"
@@ -249,11 +250,15 @@ class Cost:
 
     @property
     def wrong(self) -> str:
-        """Why this is no clean end, "" where it is: no traceback, 5 s (1 s a MB), 500 MB."""
+        """Why this is no clean end, "" where it is: no traceback, 500 MB, and in time.
+
+        In time is what a budget allows (3 s, and 1 s a MB) and 2 s to start and to end.
+        """
         if "Traceback" in self.text or self.exit not in (0, 1, 3):
             return f"exit {self.exit}: {self.text[-300:]}"
-        allowed = max(5.0, self.size_mb)
-        over = self.cpu_s > allowed or self.peak_mb > 500 or len(self.text) > 20_000
+        allowed = 5.0 + self.size_mb
+        slow = self.cpu_s > allowed and self.cpu_s > allowed * slowness()
+        over = slow or self.peak_mb > 500 or len(self.text) > 20_000
         took = f"{self.cpu_s:.1f} s, {self.peak_mb:.0f} MB, {len(self.text)} letters"
         return took if over else ""
 
