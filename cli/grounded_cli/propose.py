@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 MOST = 3  # target states whose range is told
 LAST = 3  # predictions whose misses are told
 LUCKY = 2.0  # standard errors
+NOISY = 0.1  # of a promised cost: how much of noise in its log is told
 ASTRAY = 10.0  # times what a run cost: a model that gives it so much does not replay it
 UNLIKE = 0.2  # of a promised gain: how much luckier a trial is than the model says, to be told
 
@@ -67,13 +68,23 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
     if ran:
         show(field("why", standing.sentence, "  "))
     show(field("what", _what(candidate, standing, workspace.task), "  "))
-    show(field("predicted", f"utility {number(candidate.predicted_utility)}", "  "))
+    show(field("predicted", _predicted(proposed), "  "))
     if standing.incumbent is not None:
         show(field("so far", _so_far(candidate, standing.incumbent, workspace.task), "  "))
     show(field("trust", _trust(candidate, standing, workspace), "  "))
     show_extent(candidate, workspace.task)
     if last:
         show(f"\n{next_line(proposed.then)}")
+
+
+def _predicted(proposed: Proposed) -> str:
+    """The promise, and what a log of it is likely to show where sensors' noise costs much."""
+    assert proposed.candidate is not None
+    promised, cost = proposed.candidate.predicted_utility, proposed.noise_cost
+    text = f"utility {number(promised)}"
+    if not cost > NOISY * abs(promised):
+        return text
+    return f"{text}; about {number(promised - cost)} in its log, where sensors' noise counts, too"
 
 
 def _otherwise(candidate: Candidate, best: Tried) -> bool:
@@ -226,10 +237,12 @@ def _trust(candidate: Candidate, standing: Standing, workspace: Workspace) -> st
 def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) -> str:
     """By how much the last predictions missed, beside the gain that this one promises."""
     last = sorted(same, key=lambda tried: max(trial.id for trial in tried.trials))[-LAST:]
-    missed = [abs(one.candidate.predicted_utility - one.utility) for one in last]
-    promised, real = last[-1].candidate.predicted_utility, last[-1].utility
+    promises = [one.candidate.predicted_utility - one.noise_cost for one in last]
+    missed = [abs(promise - one.utility) for promise, one in zip(promises, last, strict=True)]
     if len(missed) == 1:
-        text = f"the last prediction was {number(promised)}, the real run gave {number(real)}"
+        noise = " with its sensors' noise" if last[-1].noise_cost > NOISY * -promises[-1] else ""
+        promised, real = number(promises[-1]), number(last[-1].utility)
+        text = f"the last prediction was {promised}{noise}, the real run gave {real}"
     else:
         told = [number(off) if math.isfinite(off) else "a crash" for off in missed]
         text = f"the last {len(told)} predictions missed by {', '.join(told[:-1])} and {told[-1]}"

@@ -118,6 +118,7 @@ class Tried(Result):
     accepted: bool | None  # None: not decided, trials are missing
     in_doubt: bool = False  # its own trials are there: the incumbent's are missing
     pieces: Array | None = None  # (runs, PIECES) of its utilities, see `scatter`; if repeated
+    noise_cost: float = 0.0  # of sensors, that its prediction leaves out: no trial was in its model
     deviation: float = float("nan")  # of a single run, as repeats near it tell (`scatter`)
 
     @cached_property

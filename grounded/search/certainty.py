@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.scatter import Repeats, by_pieces, with_errors
+from grounded.search.scatter import Repeats, by_pieces, noise_cost, white_noise, with_errors
 from grounded.task import Task
 from grounded.trial import Trial, scattered
 
@@ -51,7 +51,8 @@ def judged(
         better = incumbent is None or float(np.mean(utilities)) > incumbent.utility
         accepted = better and not failed
         pieces = by_pieces(task, own) if len(own) > 1 and np.isfinite(utilities).all() else None
-        tried = Tried(candidate, own, utilities, accepted, pieces=pieces)
+        cost = 0.0 if candidate.grounded else cost_of_noise(task, candidate, own)
+        tried = Tried(candidate, own, utilities, accepted, pieces=pieces, noise_cost=cost)
         if accepted:
             iteration += incumbent is not None
             incumbent, losses = tried, 0
@@ -70,6 +71,14 @@ def judged(
     told = with_errors(history)
     best = next((t for t in told if incumbent and t.candidate is incumbent.candidate), None)
     return told, best, iteration
+
+
+def cost_of_noise(task: Task, candidate: Candidate, trials: Sequence[Trial]) -> float:
+    """What the noise in a candidate's own logs costs in the mean; 0 without a log."""
+    if not trials:
+        return 0.0
+    noise = np.sqrt(np.mean([white_noise(trial.states) ** 2 for trial in trials], axis=0))
+    return noise_cost(task, candidate.policy, noise)
 
 
 def repeated_exactly(trials: Sequence[Trial]) -> bool:

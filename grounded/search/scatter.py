@@ -1,4 +1,4 @@
-"""How far the utilities of runs of one policy scatter: one number for all that is said of luck.
+"""What noise does to utilities: how far those of runs of one policy scatter, and what it costs.
 
 Two runs whose utilities happen to agree give a spread near zero, and few candidates are run more
 than twice. So what is known is pooled:
@@ -14,6 +14,9 @@ nu is the number of repeats. mu is what the parts add: the effective degrees of 
 Bulletin 2, 1946), less nu, and at most PIECES - 1, so that many repeats outweigh the assumption
 that parts scatter independently of each other. This is a conjugate prior on the variance (Gelman
 et al., *Bayesian Data Analysis*, 2013, section 2.6); Student's t has nu + mu degrees of freedom.
+
+Sensors' noise also lowers every utility, since logged states are judged: a model that has seen no
+trial promises a run without it (`noise_cost`).
 """
 
 from __future__ import annotations
@@ -25,11 +28,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.frozen import Array
+from grounded.policy import Policy
 from grounded.search.candidate import Tried
 from grounded.task import Task
 from grounded.trial import Trial
 
 PIECES = 4  # of a run
+MEDIAN = 0.6745  # standard deviations that half of all normal numbers lie within
+ORDERS = (2, 3, 4, 5)  # of differences
 FAR = 2.0  # times the cost of a candidate: others scatter otherwise
 
 
@@ -54,6 +60,41 @@ def by_pieces(task: Task, trials: Sequence[Trial]) -> Array:
     """What each of PIECES parts of each run is worth (runs, PIECES); rows sum to the utilities."""
     worth = [task.rewards(trial) for trial in trials]
     return np.array([[part.sum() for part in np.array_split(r, PIECES)] for r in worth])
+
+
+def white_noise(states: Array) -> Array:
+    """The white noise of each sensor (n,) by differences of states (H + 1, n); 0 of none.
+
+    The k-th differences of white noise have (2k)! / k!^2 times its variance; those of a motion that
+    is smooth over k samples vanish, so that the least of several orders has the least motion in it.
+    """
+    found = np.full(states.shape[1], np.inf)
+    for order in ORDERS:
+        for j, column in enumerate(np.abs(np.diff(states, n=order, axis=0)).T):
+            known = column[np.isfinite(column)]
+            white = MEDIAN * math.sqrt(math.comb(2 * order, order))
+            found[j] = min(found[j], np.median(known) / white if len(known) else np.inf)
+    return np.where(np.isfinite(found), found, 0.0)
+
+
+def noise_cost(task: Task, policy: Policy, noise: Array) -> float:
+    """What sensors' noise takes from the utility of a logged run in the mean; >= 0.
+
+    The noise itself, where states are weighed, and the inputs that the gains make of it. What those
+    inputs move is left out: the robot is slow beside white noise.
+
+    Args:
+        task: whose reward judges the log.
+        policy: that is run.
+        noise: standard deviations of the sensors' white noise, (n,), in the states' units.
+    """
+    reward, steps = task.reward, task.horizon
+    cost = float(noise**2 @ ((steps + 1) * reward.state + reward.terminal))
+    if policy.gain is None:
+        return cost
+    moved = policy.gain[:, :, : task.model.n] ** 2 @ noise**2  # (H, m): variances of inputs
+    changes = moved + np.vstack([np.zeros_like(moved[:1]), moved[:-1]])
+    return cost + float((moved @ reward.input + changes @ reward.input_change).sum())
 
 
 class Repeats:

@@ -10,8 +10,8 @@ from grounded.plant import Noise, Plant
 from grounded.search.candidate import Tried
 from grounded.search.certainty import error_between, in_doubt
 from grounded.search.improve import propose
-from grounded.search.scatter import PIECES, Repeats, by_pieces, with_errors
-from grounded.search.standing import SearchOptions
+from grounded.search.scatter import PIECES, Repeats, by_pieces, noise_cost, with_errors
+from grounded.search.standing import SearchOptions, standing
 from small_tasks import cart_task, drive, other
 
 
@@ -78,3 +78,22 @@ def test_pieces_sum_to_the_utility():
     found = by_pieces(task, ran)
     assert found.shape == (3, PIECES)
     np.testing.assert_allclose(found.sum(axis=1), [task.utility(one) for one in ran])
+
+
+def test_what_noise_in_a_log_costs_is_no_doubt_in_the_model():
+    """Seen: -0.14 promised and -12.5 in the log, most of it noise of what the reward weighs."""
+    task = cart_task()
+    proposal = propose(task, [], [], SearchOptions())
+    policy, noise = proposal.candidate.policy, np.array([0.1, 0.1])
+    seen = Noise(measurement={"x": 0.1, "v": 0.1})
+    plant = Plant(task.model, noise=seen)
+    clean = task.utility(drive(task, Plant(task.model), proposal.candidate))
+    runs = [drive(task, plant, proposal.candidate, seed) for seed in range(40)]
+    lost = clean - np.mean([task.utility(run) for run in runs])
+    assert lost > -clean
+    assert noise_cost(task, policy, noise) == pytest.approx(lost, rel=0.15)
+    made = proposal.candidate
+    now = standing(task, [made], runs[:1], SearchOptions(), made.model)
+    told = now.history[0].noise_cost
+    assert 0.3 < told / lost < 1.4  # from 41 rows of one log
+    assert not now.doubt

@@ -16,6 +16,7 @@ import numpy as np
 from grounded.errors import NextCommand
 from grounded.model import is_clock
 from grounded.result import listed, measured, percent
+from grounded.search.scatter import white_noise
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import step_rewards
@@ -26,7 +27,6 @@ from grounded_trials.workspace.off_target import (
     tracked,
     tracking_error,
     weighed_groups,
-    white_noise,
 )
 from grounded_trials.workspace.task_file import limited_changes, seen_in
 

@@ -6,7 +6,6 @@ rms and its largest error; what it weighs at the end, and what is to be reached,
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,14 +14,13 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Document, measured
+from grounded.search.scatter import white_noise
 from grounded.task import Task
 from grounded.trial import Trial
 
 FEW = 2  # groups of states that are told: positions and angles before their rates, then by cost
 MOST = 0.5  # of the cost of being off: what makes more of it is told, too
-MEDIAN = 0.6745  # standard deviations that half of all normal numbers lie within
 NOTHING = 1e-9  # in a state's unit, or of its value: no difference at all
-ORDERS = (2, 3, 4, 5)  # of differences
 CHANCE = 3.0  # standard deviations of a sensor's noise that one row may be off by
 REST = 0.1  # of the mean step of a target: one that moves less in the last step is at rest
 
@@ -152,21 +150,6 @@ def tracked(task: Task) -> list[int]:
 def tracking_error(task: Task, trial: Trial) -> Array:
     """s_t - target_t, (T + 1, n), angles wrapped; NaN where there is no target."""
     return task.model.difference(trial.states, task.target[: trial.steps + 1])
-
-
-def white_noise(states: Array) -> Array:
-    """The white noise of each sensor (n,) by differences of states (H + 1, n); 0 of none.
-
-    The k-th differences of white noise have (2k)! / k!^2 times its variance; those of a motion that
-    is smooth over k samples vanish, so that the least of several orders has the least motion in it.
-    """
-    found = np.full(states.shape[1], np.inf)
-    for order in ORDERS:
-        for j, column in enumerate(np.abs(np.diff(states, n=order, axis=0)).T):
-            known = column[np.isfinite(column)]
-            white = MEDIAN * math.sqrt(math.comb(2 * order, order))
-            found[j] = min(found[j], np.median(known) / white if len(known) else np.inf)
-    return np.where(np.isfinite(found), found, 0.0)
 
 
 def began_elsewhere(task: Task, trials: Sequence[Trial]) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
+from grounded.search.scatter import noise_cost
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.handover import Void, checked_candidate, outside_limits
@@ -34,6 +35,7 @@ class Proposed(Result):
     proposal: Proposal
     file: Path | None  # the candidate's; None: the search has ended
     then: NextCommand
+    noise_cost: float = 0.0  # of sensors in a log of it, beyond its predicted utility
 
     @property
     def candidate(self) -> Candidate | None:
@@ -51,7 +53,8 @@ class Proposed(Result):
 
     def to_json(self) -> dict[str, Any]:
         """The document of `propose --json`; candidate is null when the search has ended."""
-        return self.proposal.to_json() | {"file": str(self.file) if self.file else None}
+        found = self.proposal.to_json() | {"file": str(self.file) if self.file else None}
+        return found | {"noise_cost": self.noise_cost}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -126,7 +129,13 @@ def propose_in(workspace: Folder) -> Proposed:
         return Proposed(proposal, None, then)
     path = workspace.candidate_path(candidate.id)
     # what holds the robot is to be said first: asked again, it is handed out as it is
-    return Proposed(proposal, path, PROPOSE if held else to_run(workspace, candidate.id))
+    then = PROPOSE if held else to_run(workspace, candidate.id)
+    cost = 0.0
+    if not candidate.grounded:  # else the model replays a log, its noise with it
+        from grounded_trials.workspace.first_plan import sensor_noise
+
+        cost = noise_cost(workspace.task, candidate.policy, sensor_noise(workspace))
+    return Proposed(proposal, path, then, cost)
 
 
 def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
