@@ -11,7 +11,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, losses_of, rates_of
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.ahead import missed
-from grounded.effects import Library
+from grounded.effects import Library, wrap
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
 
@@ -96,3 +96,17 @@ def test_a_compiled_hypothesis_goes_where_its_steps_lead(model, monkeypatch):
             room = {"rtol": 1e-3, "atol": 0.01} if model is car else {"rtol": 1e-9, "atol": 1e-12}
             np.testing.assert_allclose(found, path, **room, err_msg=effect.name)
     assert len(compiled) > 3 and "periodic" in refused
+
+
+def test_a_compiled_hypothesis_joins_what_was_adopted_before(monkeypatch):
+    """Seen: KeyError 'first_order_lag_volt_tau': what joins a model goes before its memory."""
+    monkeypatch.setattr(marching, "LONG", 1)
+    late = wrap(Library().effect("first_order_lag:torque", pendulum), {"tau": 0.08}, DT)
+    data = data_of(late)
+    predictor = Predictor(data)
+    effect = next(e for e in Library().candidates(late, data.scales) if e.family.name == "stiction")
+    h = Hypothesis().plus(effect, valued(effect, 0.5))
+    x, u = data.y[0], predictor.received(h)[:, : len(data.y)].transpose(1, 0, 2)
+    found = marching.marched(predictor, h, x, u)
+    assert found is not None
+    np.testing.assert_allclose(found[1], predictor.advance(h, x, u[0], np.zeros(len(x))))

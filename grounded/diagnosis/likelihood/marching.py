@@ -35,17 +35,17 @@ class March:
     """The compiled step of a model with effects, and where their numbers go."""
 
     system: System
-    names: tuple[str, ...]  # of its parameters, the model's own first
+    names: tuple[str, ...]  # of its parameters: what joins goes before what was adopted
 
     def __call__(self, predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Array:
         """States (T + 1, M, n) from x (M, n) through u (T, M, m)."""
-        p, own = predictor.params(h), dict[str, float]()
+        own = dict(zip(predictor.data.model.param_names, predictor.params(h), strict=True))
         for effect, values in h.pairs:
             whole = effect.complete(values)
             own |= {param_name(effect.name, name): value for name, value in whole.items()}
-        more = [own[name] for name in self.names[len(p) :]]
         march = getattr(self.system, "march")  # noqa: B009
-        return np.asarray(march(x, u, np.append(p, more), predictor.data.dt))
+        p = np.array([own[name] for name in self.names])
+        return np.asarray(march(x, u, p, predictor.data.dt))
 
 
 def marched(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Array | None:
