@@ -49,10 +49,11 @@ def _per_acceleration(site: Site) -> str:
 
 
 def has_viscous(model: Model, tau: str, w: str) -> bool:
-    """Whether the model's parameters are the viscous part already: k w d f / d tau = d f / d p.
+    """Whether uncertain parameters are the viscous part already: k w d f / d tau = d f / d p.
 
     One of them, or what uncertain ones do together: a motor's gain K and time constant T in
-    w' = (K u - w) / T make any viscous friction, and data could not tell it from them.
+    w' = (K u - w) / T make any viscous friction, and data could not tell it from them. A constant (a
+    back-EMF from the data sheet) is none: it stays as it is, and what is missing beside it is found.
     """
     uncertain = [i for i, p in enumerate(model.params.values()) if p.spread > 0]
     dt, (x, u) = places.probe(model, 1e-4), places.samples(model, 8 * (1 + len(uncertain)))
@@ -60,8 +61,10 @@ def has_viscous(model: Model, tau: str, w: str) -> bool:
     speed = x[:, model.state_names.index(w)]
     ours = (f_u[:, :, model.input_names.index(tau)] * speed[:, None]).reshape(-1)
     theirs = f_p.reshape(len(ours), -1)
-    known = [i for i in range(theirs.shape[1]) if theirs[:, i].any()]
-    sets = [[i] for i in known] + [[i for i in uncertain if i in known]]
+    known = [i for i in uncertain if theirs[:, i].any()]
+    if not known:
+        return False
+    sets = [[i] for i in known] + [known]
     axes = [np.linalg.qr(theirs[:, some])[0] for some in sets]
     alike = max(float(np.sum((each.T @ ours) ** 2)) for each in axes)
     return bool(alike > ALIKE**2 * float(np.sum(ours**2)) > 0)
