@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -40,6 +41,7 @@ class Stages:
     usual: int
     began: float = field(default_factory=time.monotonic)
     count: int = 0
+    left: float = math.inf  # seconds, as last guessed
     so_far: str = "nothing was found yet"  # the answer, for Ctrl-C
 
     def __call__(self, stage: str) -> None:
@@ -49,5 +51,6 @@ class Stages:
             return
         share = self.count / max(self.usual, 1.1 * self.count)
         left = (time.monotonic() - self.began) * (1 - share) / share
-        about = f", about {left:.0f} s left" if self.count > 10 else ""
+        shrinks, self.left = left < self.left, left  # where the end recedes, nobody knows when
+        about = f", about {left:.0f} s left" if self.count > 10 and shrinks else ""
         self.tell(f"{stage}, {100 * share:.0f} % done{about}")

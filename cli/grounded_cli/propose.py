@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded.result import listed
-from grounded.search.candidate import LITTLE
+from grounded.search.candidate import LITTLE, UNLIKE
 from grounded.search.step_size import Step
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import LABEL, field, number, progress, remark, show, show_json
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 
 MOST = 3  # target states whose range is told
+ENDS = 8  # states whose values at the end are told: a table of more says nothing
 LAST = 3  # predictions whose misses are told
 LUCKY = 2.0  # standard errors
 NOISY = 0.1  # of a promised cost: how much of noise in its log is told
-ASTRAY = 10.0  # times what a run cost: a model that gives it so much does not replay it
-UNLIKE = 0.2  # of a promised gain: how much luckier a trial is than the model says, to be told
+ASTRAY = 3.0  # times what a run cost: a model that gives it so much does not replay it
 
 
 @click.command("propose")
@@ -89,8 +89,7 @@ def _predicted(proposed: Proposed) -> str:
 
 def _otherwise(candidate: Candidate, best: Tried) -> bool:
     """Whether the model gives the best one, on which this one is based, clearly something else."""
-    off = abs(candidate.expected_of_base - best.utility)
-    return candidate.base == best.candidate.id and off > UNLIKE * abs(candidate.predicted_gain)
+    return candidate.base == best.candidate.id and candidate.unlike(best.utility)
 
 
 def _so_far(candidate: Candidate, best: Tried, task: Task) -> str:
@@ -179,7 +178,23 @@ def _extent(candidate: Candidate, task: Task) -> list[tuple[str, str]]:
         limits = f", limits {ends}" * (high < float("inf"))
         values = candidate.predicted_inputs[:, i]
         rows.append((name, with_unit(_span(values.min(), values.max()), unit) + limits))
+    if text := _end(candidate, task):
+        rows.append(("at the end", text))
     return rows
+
+
+def _end(candidate: Candidate, task: Task) -> str:
+    """Where the predicted run ends, of a task that is to get somewhere; "" of others."""
+    from grounded_trials.workspace.off_target import reaches
+
+    model, last, aim = task.model, candidate.predicted_states[-1], task.target[-1]
+    if not (task.reward.terminal.any() or reaches(task)) or model.n > ENDS:
+        return ""
+    told = []
+    for name, value, wanted in zip(model.state_names, last, aim, strict=True):
+        to = f" (target {number(wanted)})" * math.isfinite(wanted)
+        told.append(f"{with_unit(f'{name} {number(value)}', model.states[name])}{to}")
+    return ", ".join(told)
 
 
 def _told(task: Task) -> list[str]:
@@ -249,9 +264,7 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     best, tried = standing.incumbent, {one.candidate.id for one in standing.history}
     if best is None or candidate.id in tried or not math.isfinite(missed[-1]):
         return text
-    gain = candidate.predicted_gain
-    if not _otherwise(candidate, best) or gain > -best.utility:  # no utility is above 0
-        gain = candidate.predicted_utility - best.utility
+    gain = candidate.promised_over(best)
     if not gain > 0:
         return text
     promise = f"{text}; this one promises a gain of {number(gain)}"

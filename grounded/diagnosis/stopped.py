@@ -28,5 +28,5 @@ def wider(known: Mapping[str, Estimate]) -> str:
     return (
         f"{listed(names)} went as far as {its} std {'lets' if one else 'let'} {it}, and the data "
         f"ask for more: if {each} known less well than that, widen {its} std in the model file, or "
-        "give bounds instead, and diagnose again before you adopt anything."
+        "give bounds instead, and diagnose again; else adopt what is claimed."
     )

@@ -227,10 +227,14 @@ def next_trial(
     if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names):
         return "Nothing is tied: give the model a parameter for a load, then diagnose again."
     if ended:
-        return "Nothing is tied, but the parameters are at their bounds: are the sensors right?"
+        return (
+            "None helps before this: parameters ended at their bounds and the data ask for more. "
+            "Where one may lie beyond, widen its bounds in the model file; else another, which "
+            "the model has as a constant, may be off: give it bounds. Then diagnose again."
+        )
     if _own_numbers(claims, adopted):
-        return "Nothing is tied: fit the model's parameters."
-    return f"Nothing is tied: adopt {_it(claims)}."
+        return "None is needed to tell causes apart: fit the model's parameters."
+    return "None is needed to tell causes apart: adopt what is claimed."
 
 
 REPEAT = "run another trial and diagnose again before you adopt anything"
@@ -325,9 +329,9 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
             return f"{number(value)} %"
         return f"{number(abs(value))} % {more if value >= 0 else less}"
 
-    told = {name for name, e in params.items() if e.value != 0}
+    told = {n for n, e in params.items() if e.value != 0 and not abs(e.value) <= e.std}
 
-    def kept(found: re.Match[str]) -> str:  # of quantities that are estimated and not zero
+    def kept(found: re.Match[str]) -> str:  # of quantities that are estimated and not about zero
         parts = found[1].split(" & ")
         known = [p for p in parts if {*re.findall(r"\{(\w)[%}]", p)} <= told]
         return listed(known or (parts[1:] and parts[:1]))

@@ -52,8 +52,8 @@ def has_viscous(model: Model, tau: str, w: str) -> bool:
     """Whether uncertain parameters are the viscous part already: k w d f / d tau = d f / d p.
 
     One of them, or what uncertain ones do together: a motor's gain K and time constant T in
-    w' = (K u - w) / T make any viscous friction, and data could not tell it from them. A constant (a
-    back-EMF from the data sheet) is none: it stays as it is, and what is missing beside it is found.
+    w' = (K u - w) / T make any viscous friction, and data could not tell it from them. A constant
+    (a back-EMF from the data sheet) is none: it stays as it is, and what it lacks is found.
     """
     uncertain = [i for i, p in enumerate(model.params.values()) if p.spread > 0]
     dt, (x, u) = places.probe(model, 1e-4), places.samples(model, 8 * (1 + len(uncertain)))

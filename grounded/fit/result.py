@@ -90,8 +90,11 @@ class Fit(Result):
 
     @property
     def helps(self) -> bool:
-        """Whether held-out time is predicted better than before; True where none was held out."""
-        return _change(self.before, self.after) < 0
+        """Whether held-out time is predicted better by more than a tie's TIE.
+
+        True where none was held out.
+        """
+        return _change(self.before, self.after) < -TIE
 
     @property
     def worse(self) -> bool:
@@ -170,7 +173,7 @@ def report(
     )
 
 
-TIE = 0.01  # of held-out errors: as much more says nothing, the values come from all of the time
+TIE = 0.01  # of held-out errors: as much more, or less, says nothing
 
 
 def _change(before: PredictionError | None, after: PredictionError | None) -> float:

@@ -27,6 +27,7 @@ Slopes = Literal[
 ]
 
 LITTLE = 0.1  # of the best one's cost: a doubtful promise below it is no reason to go on
+UNLIKE = 0.2  # of a promised gain: how much luckier a trial is than the model says, to be told
 
 if TYPE_CHECKING:
     from grounded.figures.figure import Figure
@@ -84,6 +85,36 @@ class Candidate(Result):
         Noise and a start that was off make a trial luckier or less so; the gain leaves them out.
         """
         return self.predicted_utility - self.predicted_gain
+
+    def unlike(self, utility: float) -> bool:
+        """Whether the model gives its base clearly something else than it was worth in truth."""
+        return abs(self.expected_of_base - utility) > UNLIKE * abs(self.predicted_gain)
+
+    def promised_over(self, best: Tried) -> float:
+        """What it promises over the best so far: one number for all who tell it.
+
+        By the model alone where that gives its base clearly something else than the runs were
+        worth, unless it promises more than can be had: no utility is above 0.
+        """
+        own = best.candidate.id == self.base and self.predicted_gain <= -best.utility
+        if own and self.unlike(best.utility):
+            return self.predicted_gain
+        return self.predicted_utility - best.utility
+
+    def doubt(self, best: Tried | None) -> str:
+        """Why one that is `doubtful` may well lose, a sentence."""
+        gain = self.predicted_gain if best is None else self.promised_over(best)
+        over = self.base if best is None else best.candidate.id
+        cost = self.predicted_gain - self.predicted_utility  # of its base
+        off = f"{self.likely_off:.3g}"  # a model that is off by more than that knows no size
+        off = f"more than all that {self.base} costs" if self.likely_off > cost > 0 else off
+        stop = ""
+        if best and self.predicted_gain < LITTLE * abs(best.utility):
+            stop = f". You may stop here, with {best.candidate.id}, the best so far"
+        return (
+            f"{self.id} may well lose: it promises {gain:.3g} over {over}, and its model is likely "
+            f"to be off by {off} there, as it was for earlier trials{stop}"
+        )
 
     def summary(self) -> str:
         """Its name, its step and what the model predicts."""

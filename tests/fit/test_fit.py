@@ -406,6 +406,8 @@ def test_a_fit_that_predicts_no_better_is_not_recommended():
     assert worse.worse and not worse.helps
     tied = fitted((0.01, 0.02), (0.01005, 0.02))
     assert not tied.worse and not tied.helps
+    hardly = fitted((0.00267, 0.02), (0.00266, 0.02))  # `next: fit --apply`, again and again
+    assert not hardly.worse and not hardly.helps
     better = fitted((0.0111, 0.0382), (0.00694, 0.0281))
     assert better.helps and not better.worse
     assert not found.worse and found.helps  # nothing was held out

@@ -115,9 +115,7 @@ def test_numbers_that_are_wrong_are_fitted(cart, tmp_path):
     assert last(grounded("-C", folder, "status")) == "grounded fit"
 
 
-@pytest.mark.parametrize(
-    ("part", "then"), [(0.9, "adopt viscous_friction:v"), (1.0, "diagnose --instruments")]
-)
+@pytest.mark.parametrize(("part", "then"), [(0.9, "adopt viscous_friction:v"), (1.0, "diagnose")])
 def test_what_is_calibrated_to_its_bound_is_not_to_be_adopted(cart, tmp_path, part, then):
     folder = copied(cart, tmp_path / "w")
     high = Workspace(folder).base_model.params["mass"].high

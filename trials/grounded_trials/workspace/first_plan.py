@@ -42,6 +42,8 @@ HELD = 0.8  # of a plan's steps: an input is at a limit nearly all the time
 SHORT = 0.25  # of the way to where a target ends: the plan does not get there
 MISSED = 0.1  # of the way that a target asks for: the plan falls short
 SHAKEN = 0.05  # of what [limits] allow an input, else of what a plan uses of it
+PIECES = 10  # of a plan, in each of which that is asked
+SOMEWHERE = 1.5  # times what noise does over the whole plan: a piece that stands out
 FARTHEST = 1e4  # in its unit: how far a state that nobody gave may be from where it starts
 UNGIVEN = 3  # states, whose values at the start are asked for: of more nobody has thought
 STILL = 1e-3  # of the rates under the held input: under another one the robot stands
@@ -231,19 +233,24 @@ def _shaken(workspace: Folder, first: Candidate) -> list[str]:
         return []
     noise = sensor_noise(workspace)
     parts = gain[:, :, : task.model.n] ** 2 * noise**2  # (H, m, n)
-    rms = np.sqrt(parts.sum(axis=2).mean(axis=0))
+    pieces = np.array_split(parts, min(PIECES, len(parts)))  # gains grow towards an end
+    each = np.sqrt([piece.sum(axis=2).mean(axis=0) for piece in pieces])  # (pieces, m)
+    rms, overall = each.max(axis=0), np.sqrt(parts.sum(axis=2).mean(axis=0))
     planned = np.ptp(first.predicted_inputs, axis=0)
     given = np.isfinite(task.high - task.low)
     allowed = np.where(given, np.nan_to_num(task.high - task.low, posinf=0.0), planned)
     for j, (name, unit) in enumerate(task.model.inputs.items()):
         if not rms[j] > SHAKEN * allowed[j] > 0:
             continue
-        k = int(np.argmax(parts[:, j].mean(axis=0)))
+        at = int(np.argmax(each[:, j]))
+        k = int(np.argmax(pieces[at][:, j].mean(axis=0)))
         state, its = list(task.model.states.items())[k]
+        when = sum(len(piece) for piece in pieces[:at]) * task.dt
+        where = f" from {when:.3g} s on" * bool(rms[j] > SOMEWHERE * overall[j])
         found.append(
-            f"the sensors' noise moves {name} by {measured(rms[j], unit)} rms through the gains, "
-            f"most of it that of {state} ({measured(noise[k], its)}): for a calmer {name} give "
-            f"[reward] input_change of {name} more weight"
+            f"the sensors' noise moves {name} by {measured(rms[j], unit)} rms{where} through the "
+            f"gains, most of it that of {state} ({measured(noise[k], its)}): for a calmer {name} "
+            f"give [reward] input_change of {name} more weight"
         )
     return found
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
-from grounded.search.candidate import LITTLE, Candidate
+from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.store.store import Stored
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from grounded.search.standing import Standing
 
 NEAREST = 2  # bounds of [safety] that are told: those nearest beside how far the run goes
+NEAR = 0.25  # of how far a state goes: what else is no nearer than a run may be off
 NEARER = 0.01  # of how far a state goes: a run that comes nearer to a bound than where it starts
 AGREES = 1e-6  # of an input's size: how well a policy repeats its own predicted inputs
 
@@ -239,18 +240,7 @@ class Check:
         """What a person should know of it, though nothing speaks against it."""
         made, name = self.candidate, self.candidate.id
         if made.doubtful and not self._trials(name):
-            best = self.standing.incumbent
-            cost = made.predicted_gain - made.predicted_utility  # of its base
-            off = f"{made.likely_off:.3g}"  # a model that is off by more than that knows no size
-            off = f"more than all that {made.base} costs" if made.likely_off > cost > 0 else off
-            stop = ""
-            if best and made.predicted_gain < LITTLE * abs(best.utility):
-                stop = f". You may stop here, with {best.candidate.id}, the best so far"
-            yield (
-                f"{name} may well lose: it promises {made.predicted_gain:.3g} over {made.base}, "
-                f"and its model is likely to be off by {off} there, as it was for "
-                f"earlier trials{stop}"
-            )
+            yield made.doubt(self.standing.incumbent)
         yield from self._became()
         if "sha256" not in self.meta:
             yield f"{name} was written by an older version: its file has no checksum of its own"
@@ -295,7 +285,11 @@ class Check:
             far = max(np.ptp(values), 1e-12)
             for side, room in (("lower", values - low), ("upper", high - values)):
                 t = int(np.argmin(room))
-                if np.isfinite(room[t]) and room[0] - room[t] > NEARER * far:
+                if (
+                    np.isfinite(room[t])
+                    and room[0] - room[t] > NEARER * far
+                    and room[t] < NEAR * far
+                ):
                     left = with_unit(f"{room[t]:.3g}", unit)
                     told = f"within {left} of the {side} bound of {name} (at {t * task.dt:.4g} s)"
                     near.append((room[t] / far, told))

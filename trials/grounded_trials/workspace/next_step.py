@@ -180,7 +180,7 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     params = workspace.base_model.params
     known = {n: e.value for n, e in diagnosis.parameters.items() if n in params}
     if all_at_bounds(params, {n: known[n] for n in diagnosis.verdict.parameters if n in known}):
-        return NextCommand("diagnose", ("--instruments",))  # they ask for more than can be
+        return DIAGNOSE  # once their bounds are wider, as it says: they ask for more than can be
     own = {f"parameter:{name}" for name in params}
     if own.issuperset(new):
         if not fitted_in_vain(workspace):
