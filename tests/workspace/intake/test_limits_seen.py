@@ -124,6 +124,22 @@ def test_an_angle_far_beyond_safety_that_degrees_would_explain_is_told(tmp_path,
 
 
 @pytest.mark.parametrize("rolls", [0.0, 0.4])
+def test_a_robot_that_moves_on_after_its_run_did_not_come_to_rest(tmp_path, rolls):
+    """An arm was 0.02 mrad off at the end of its run, and 93 mrad a second later."""
+    w = waiting(tmp_path)
+    policy, file = w.candidate("c0002")[0].policy, tmp_path / "t.csv"
+    record(w, file, policy, 1.0, after=1.5)
+    table = np.loadtxt(file, delimiter=",", skiprows=1)
+    beyond = table[:, 0] - table[0, 0] - 1.0 - policy.horizon * policy.dt
+    end = table[beyond <= 0, 1][-1]
+    table[beyond > 0, 1] = end + rolls * beyond[beyond > 0]
+    np.savetxt(file, table, "%.5f", ",", header="t,x,v,force", comments="")
+    told = [one for one in Workspace(w.folder).ingest(file).warnings if "after the run" in one]
+    assert len(told) == (rolls > 0)
+    assert not told or holds(told[0], "60 cm from its target", "--hold")
+
+
+@pytest.mark.parametrize("rolls", [0.0, 0.4])
 def test_a_robot_that_leaves_safety_after_its_run_is_seen_to(tmp_path, rolls):
     """A car stood in the wall a second after its run, and the log of it was "first"."""
     w = waiting(tmp_path)

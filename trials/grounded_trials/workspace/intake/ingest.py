@@ -60,8 +60,8 @@ from grounded_trials.workspace.intake.stored_before import (
     what_repeats,
 )
 from grounded_trials.workspace.intake.trial_check import (
+    afterwards,
     dead_sensors,
-    left_afterwards,
     mistaken_in,
     warnings_about,
 )
@@ -118,7 +118,7 @@ def ingest_log(
     trial = replace(read.trial, id=added.id)
     warnings = (*read.warnings, *warnings_about(workspace, trial, read.last_s))
     if whole := _whole(read, workspace.task):
-        warnings = (*warnings, *left_afterwards(workspace.task, whole))
+        warnings = (*warnings, *afterwards(workspace.task, whole))
     if before:
         warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
     if aside := added.known and added.id in workspace.discarded():

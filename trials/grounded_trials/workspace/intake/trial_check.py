@@ -13,6 +13,7 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.result import measured
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
@@ -20,6 +21,7 @@ from grounded_trials.wording import count, in_digits_apart, with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.estimating import read_estimate
 from grounded_trials.workspace.intake.who_drove import UNLIKE, follows, latest, second_differences
+from grounded_trials.workspace.off_target import reaches, weighed_groups
 
 FAR = 0.1  # of a run's mean cost a step: a start this far from s_0 is worth a warning (or of its
 # range in the run, of a state that [reward] does not weigh along the way),
@@ -28,6 +30,7 @@ MUCH = 1.0  # of a mean step's cost: the run's utility is another for it, howeve
 FEWEST = 2  # earlier runs whose starts say how they scatter
 LATEST = 3  # steps by which inputs may be logged late, and are told so
 WHITE = 0.6745 * 6**0.5  # the median of its second differences, in its standard deviations
+AFTER, AWAY = 2.0, 0.02  # [s] after a run; of its way: how much farther off then is told
 TURNS, WIDER = 5.0, 2.0  # of [safety]: beyond it in radians, about inside it in degrees
 WIDEN = "no plan will ask for that; widen them if the robot may get it"
 
@@ -211,8 +214,40 @@ def _unsafe(task: Task, trial: Trial, ran: Candidate) -> list[str]:
     return found
 
 
-def left_afterwards(task: Task, whole: Trial) -> list[str]:
-    """Where a robot left [safety] after a run that stayed inside, as far as its log goes on."""
+def afterwards(task: Task, whole: Trial) -> list[str]:
+    """What a robot did after a run, as far as its log goes on: left [safety], or moved on."""
+    return _left_afterwards(task, whole) or _moved_on(task, whole)
+
+
+def _moved_on(task: Task, whole: Trial) -> list[str]:
+    """How far a robot that was to get somewhere is from there once the run is over.
+
+    Where the same inputs are held after the run: what somebody drove is another matter.
+    """
+    end, last = task.horizon, min(whole.finite_steps, task.horizon + round(AFTER / task.dt))
+    groups = weighed_groups(task) if reaches(task) else []
+    held = whole.inputs[end:last]
+    if not groups or last <= end + 1 or np.ptp(held[1:], axis=0).any():
+        return []
+    names, what = groups[0]
+    states = [task.model.state_names.index(name) for name in names]
+    off = task.model.difference(whole.states[: last + 1], task.target[-1])[:, states]
+    far = np.linalg.norm(off, axis=1)
+    way = np.linalg.norm(np.ptp(np.vstack([task.start, task.target])[:, states], axis=0))
+    worst = end + int(np.argmax(far[end:]))
+    if not far[worst] > max(AWAY * way, 2 * far[end]):
+        return []
+    unit = task.model.states[names[0]]
+    return [
+        f"{(worst - end) * task.dt:.2g} s after the run {what} was {measured(far[worst], unit)} "
+        f"from its target, at its end {measured(far[end], unit)}: [reward] judges the run alone. "
+        "For a robot that stays there let the target hold still at its end (target --hold), or "
+        "weigh the end's rates ([reward] terminal)"
+    ]
+
+
+def _left_afterwards(task: Task, whole: Trial) -> list[str]:
+    """Where a robot left [safety] after a run that stayed inside."""
     assert task.safety_low is not None and task.safety_high is not None
     states = whole.states[: whole.finite_steps + 1]
     out = np.maximum(task.safety_low - states, states - task.safety_high)
