@@ -39,11 +39,11 @@ class OneClock:
 
     def sentence(self) -> str:
         """What a person should know of it."""
-        commands = "Commands" if self.whole else f"Commands of {_and(self.inputs)}"
+        commands = "the commands" if self.whole else f"the commands of {_and(self.inputs)}"
         sensors = "all sensors" if self.whole else f"the sensors of {_and(self.states)}"
         return (
-            f"{commands} or {sensors} late by as much: no run tells which; plans are the same, but "
-            "late sensors show where the robot was."
+            f"A delay of {commands} and one of {sensors} look alike in any log: plans are the "
+            "same for both, and of late sensors a log shows where the robot was that long ago."
         )
 
 

@@ -159,7 +159,8 @@ def instrument_lines(findings: Iterable[Finding]) -> list[str]:
     lines = []
     for one in findings:
         done = "; corrected here" * (one.corrected and one.kind != "smoothed")
-        more = f", in [log]: {one.log}" * bool(one.log) + f"; {one.advice}" * bool(one.advice)
+        more = f", for good by {one.log} in its table of [log]" * bool(one.log)
+        more += f"; {one.advice}" * bool(one.advice)
         lines.append(f"{one.signal}: {one.finding}{done}{more}")
     return lines
 
