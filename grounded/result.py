@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 SCALED = ("m", "rad", "s")  # units, and their rates, of which thousandths have a name
 SMALL = 1e-3  # below which they are used
+FIXED = 1e-4  # from which on values that are compared are written without a power of ten
 # what reading a document of another shape may raise
 MALFORMED = (ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError)
 
@@ -49,7 +50,7 @@ def percent(share: float) -> str:
     """A share as a percentage; a tenth of a percent where it is small or nearly all."""
     if math.isnan(share):
         return "-"
-    value = 100 * share
+    value = 100 * share if abs(share) >= 5e-4 or share > 0 else 0.0
     if 0 < value < 0.05 or 99.95 <= value < 100:
         return "< 0.1 %" if value < 50 else "> 99.9 %"
     return f"{value:.0f} %" if 10 <= value <= 90 else f"{value:.1f} %"
@@ -62,12 +63,32 @@ def number(value: float) -> str:
 
 def measured(value: float, unit: str) -> str:
     """An error in two digits: in cm, mm, mrad ... where it is small in its own unit."""
+    return _told(value, *_scale(value, unit))
+
+
+def measured_alike(values: Sequence[float], unit: str) -> list[str]:
+    """Errors that are compared, as `measured` tells one, all in one unit: that of their middle."""
+    known = [v for v in values if 0 < v < math.inf]
+    middle = math.exp(sum(map(math.log, known)) / len(known)) if known else 0.0
+    in_mm = unit == "m" and known and min(known) < SMALL and max(known) < 1.0
+    scale = (1e3, "mm") if in_mm and middle >= SMALL else _scale(middle, unit)
+    return [_told(value, *scale, FIXED) for value in values]
+
+
+def _scale(value: float, unit: str) -> tuple[float, str]:
+    """By how much to multiply errors of this size, and in what unit they are then."""
     if unit == "m" and SMALL <= value < 1.0:
-        value, unit = 100 * value, "cm"
-    elif unit.startswith(SCALED) and 0 < value < SMALL:
+        return 100.0, "cm"
+    if unit.startswith(SCALED) and 0 < value < SMALL:
         step = 1 if value >= 1e-5 else 2
-        value, unit = value * 1e3**step, "-mµ"[step] + unit
-    shape = ",.0f" if 9.95 <= value < 1e6 else "#.2g" if SMALL <= value < 1e6 else ".1e"
+        return 1e3**step, "-mµ"[step] + unit
+    return 1.0, unit
+
+
+def _told(value: float, scale: float, unit: str, least: float = SMALL) -> str:
+    """Two digits of a value in its unit, without a power of ten from `least` on."""
+    value *= scale
+    shape = ",.0f" if 9.95 <= value < 1e6 else "#.2g" if least <= value < 1e6 else ".1e"
     text = "-" if math.isnan(value) else f"{value:{shape}}" if value else "0"
     return text if unit == "1" else f"{text} {unit}".rstrip()
 

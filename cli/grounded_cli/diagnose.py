@@ -207,7 +207,7 @@ def _places(found: Diagnosis) -> None:
     channels = [
         (c.name, percent(c.share), with_unit(number(c.rms, 3), c.unit))
         for c in where.channels
-        if c.share >= 0.005
+        if c.share >= 0.005  # NaN: the gap is noise
     ]
     if channels:
         show("\n" + table(channels, ("where", "share of the gap", "rms")))
@@ -217,7 +217,7 @@ def _places(found: Diagnosis) -> None:
         )
     for region in where.regions[:3]:
         share, time = percent(region.share), percent(region.occupancy)
-        show(field("", f"{region.when}: {share} of the gap in {time} of the time"))
+        show(field("", f"{region.told}: {share} of the gap in {time} of the time"))
 
 
 def _effects(found: Diagnosis) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from grounded.result import Document, measured, number
+from grounded.result import Document, measured_alike, number
 
 ABOVE = 1.3  # times the noise floor: what is left is stated
 SURE = 3.0  # standard deviations of the floor: it is compared in each channel, at each horizon
@@ -19,7 +19,7 @@ class ChannelShare(Document):
     """A state's part of the gap, the rms of its prediction error and of its noise alone."""
 
     name: str
-    share: float  # 0 to 1
+    share: float  # 0 to 1; NaN where the gap is no more than noise
     rms: float
     unit: str = ""
     noise: float = math.nan
@@ -41,6 +41,12 @@ class Region(Document):
     when: str
     share: float = math.nan
     occupancy: float = math.nan
+    unit: str = field(metadata=BRIEF, default="")
+
+    @property
+    def told(self) -> str:
+        """With its unit: `v > 0.5 m/s`."""
+        return self.when if self.unit == "1" else f"{self.when} {self.unit}".rstrip()
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,18 +75,27 @@ class Split(Document):
     """What the error a while ahead is made of: of all states in units of their noise, and of each.
 
     The irreducible part comes from "repeats" of a candidate, trials "alike", or the "noise"; of
-    a noise of which only a bound is known it is "at most" so large.
+    a noise of which only a bound is known it is "at most" so large. NaN: the noise is not known.
+    `irreducible_unsure`: standard deviation of the logarithm of a noise from few repeats.
     """
 
     horizon_s: float
     whole: Parts = field(metadata={"key": "all"})
     channels: tuple[ChannelParts, ...] = ()
     irreducible_from: str = "noise"
+    irreducible_unsure: float = field(metadata=BRIEF, default=0.0)
+
+    def may_be_noise(self, parts: Parts | ChannelParts) -> bool:
+        """Whether what is unexplained is no more than the doubt in what noise leaves."""
+        left, bound = parts.unexplained + parts.irreducible, self.irreducible_from == "at most"
+        return not bound and left <= doubt_of(self.irreducible_unsure) ** 2 * parts.irreducible
 
 
 @dataclass(frozen=True, eq=False)
 class Where(Document):
     """Where the gap lies, and what is left of it: the largest shares first.
+
+    Where nothing is named or left, no channel has a share and no time or region is given.
 
     split: by horizon (one_step, horizon, whole_run).
     whiteness: by state, the chance that white noise leaves what is left of it (a p-value).
@@ -258,18 +273,43 @@ class Remainder(Document):
 
     def sentence(self) -> str:
         """One clause."""
-        where = "" if self.region is None else f", mostly where {self.region.when}"
+        where = "" if self.region is None else f", mostly where {self.region.told}"
         if not math.isfinite(self.error):
             return f"{self.channel} is off by {number(self.size)} {self.unit} rms{where}"
-        off, ahead = measured(self.error, self.error_unit), f"{number(self.horizon_s)} s ahead"
-        noise = noise_of(self.error, self.floor, self.error_unit, at_most=self.floor_at_most)
-        return f"{self.channel} is still off by {off} {ahead}{noise}{where}"
+        ahead, name = f"{number(self.horizon_s)} s ahead", self.channel
+        errors, unit = [self.error], self.error_unit
+        if not self.above and math.isfinite(self.size):
+            [off, _] = beside_noise(errors, self.floor, unit, at_most=self.floor_at_most)
+            return (
+                f"the rate of {name} lacks {number(self.size)} {self.unit} rms{where}: that lasts, "
+                f"as noise does not, though {name} is off by {off} {ahead}, which may all be noise"
+            )
+        [off, noise] = beside_noise(errors, self.floor, unit, at_most=self.floor_at_most)
+        return f"{name} is still off by {off} {ahead}{noise}{where}"
 
 
-def noise_of(error: float, floor: float, unit: str, *, at_most: bool) -> str:
-    """`" (noise: 0.1 rad)"` beside an error; a mere bound is told as one."""
+def doubt_of(unsure: float) -> float:
+    """The factor within which noise is known: by how much an error exceeds it without a cause.
+
+    Args:
+        unsure: standard deviation of its logarithm, `RulerRow.floor_unsure`.
+    """
+    return max(ABOVE, math.exp(SURE * unsure))
+
+
+def beside_noise(errors: Sequence[float], floor: float, unit: str, *, at_most: bool) -> list[str]:
+    """Errors as text in one unit, then `" (noise: 0.1 rad)"`; a mere bound is told as one.
+
+    Args:
+        errors: the first is the one that noise is told beside.
+        floor: what noise alone leaves; none is told of what is not known.
+        unit: of all of them.
+        at_most: `floor` is a bound.
+    """
     if not 0 < floor < math.inf:
-        return ""
-    if at_most and error <= ABOVE * floor:
-        return " (noise: at most that, only repeated trials tell)"
-    return f" (noise: {'at most ' * at_most}{measured(floor, unit)})"
+        return [*measured_alike(errors, unit), ""]
+    if at_most and errors[0] <= ABOVE * floor:
+        bound = " (noise: at most that, only repeated trials tell)"
+        return [*measured_alike(errors, unit), bound]
+    *told, noise = measured_alike([*errors, floor], unit)
+    return [*told, f" (noise: {'at most ' * at_most}{noise})"]

@@ -10,9 +10,10 @@ import numpy as np
 from grounded.diagnosis.error_report import Credit, RulerRow, furthest
 from grounded.diagnosis.report import Diagnosis
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
-from grounded.result import measured, number, percent
+from grounded.result import measured, measured_alike, number, percent
 
 MOST = 12
+APART = 0.01  # of errors: curves that differ by less lie on each other
 SHOWS = 1.02  # times the error without a cause, from which on bars show its worth
 CREDIT_S = 1.0  # how far ahead an effect's worth is measured
 MODELS = {  # keys of a prediction error: role, name
@@ -28,6 +29,25 @@ def models(error: RulerRow) -> dict[str, tuple[str, str]]:
     """`MODELS`, with the noise called a bound where it is one."""
     bound = {"noise_floor": ("other", "noise, at most")}
     return MODELS | bound if error.floor_at_most else MODELS
+
+
+def _told_apart(errors: Sequence[RulerRow]) -> dict[str, tuple[str, str]]:
+    """`models`, those whose errors are the same everywhere as one: `model = as diagnosed`."""
+    found: dict[str, tuple[str, str]] = {}
+    for key, (role, name) in models(errors[0]).items():
+        alike = (other for other in found if all(_same(e, key, other) for e in errors))
+        other = next(alike, "")
+        if other and key != "noise_floor":
+            name = f"{found.pop(other)[1]} = {name}"
+        found[key] = role, name
+    return found
+
+
+def _same(error: RulerRow, one: str, other: str) -> bool:
+    """Whether two columns can't be told apart in a picture."""
+    a, b = getattr(error, one), getattr(error, other)
+    known = [n for n in a if n in b and math.isfinite(a[n]) and math.isfinite(b[n])]
+    return bool(known) and all(math.isclose(a[n], b[n], rel_tol=APART) for n in known)
 
 
 def gap_figures(diagnosis: Diagnosis) -> list[Figure]:
@@ -63,7 +83,7 @@ def _over_horizons(errors: Sequence[RulerRow]) -> list[Panel | Bars]:
     ahead = np.array([error.horizon_s for error in errors])
     for channel, unit in units.items():
         curves = []
-        for key, (role, name) in models(errors[0]).items():
+        for key, (role, name) in _told_apart(errors).items():
             values = [getattr(e, key).get(channel, math.nan) for e in errors]
             if np.isfinite(values).any():
                 curves.append(Curve(ahead, np.array(values, float), role, name, 2.0))
@@ -82,10 +102,16 @@ def _by_channel(error: RulerRow) -> list[Panel | Bars]:
         for key, (role, name) in models(error).items():
             value = getattr(error, key).get(channel, math.nan)
             if math.isfinite(value):
-                bars.append(Bar(name, value, measured(value, unit), role))
+                bars.append((name, value, role))
         if bars:
-            panels.append(Bars(f"{channel}, {error.horizon_s:g} s ahead", tuple(bars)))
+            panels.append(Bars(f"{channel}, {error.horizon_s:g} s ahead", _in_unit(bars, unit)))
     return panels
+
+
+def _in_unit(bars: Sequence[tuple[str, float, str]], unit: str) -> tuple[Bar, ...]:
+    """Bars of (name, error, role) whose texts have one unit."""
+    texts = measured_alike([value for _, value, _ in bars], unit)
+    return tuple(Bar(n, v, text, role) for (n, v, role), text in zip(bars, texts, strict=True))
 
 
 def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
@@ -175,7 +201,7 @@ def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars
     rows += [(MODELS["with_effects"], error.with_effects)]
     rows += [(models(error)["noise_floor"], error.noise_floor)]
     found = [(look, math.hypot(*(v[n] for n in names))) for look, v in rows if set(names) <= set(v)]
-    bars = tuple(Bar(n, v, measured(v, unit), role) for (role, n), v in found if math.isfinite(v))
+    bars = _in_unit([(n, v, role) for (role, n), v in found if math.isfinite(v)], unit)
     if not bars:  # of a state that was never measured
         return []
     title = what.removeprefix("the ").capitalize() if len(names) > 1 else what
@@ -201,9 +227,13 @@ def _improved(error: RulerRow) -> list[str]:
 def where_figure(diagnosis: Diagnosis) -> Figure | None:
     """Shares of the gap by channel, time and region, and the evidence for each effect."""
     where = diagnosis.where
-    by_channel = [(c.name, c.share, f", {measured(c.rms, c.unit)}") for c in where.channels]
+    by_channel = [
+        (c.name, c.share, f", {measured(c.rms, c.unit)}")
+        for c in where.channels
+        if math.isfinite(c.share)
+    ]
     by_time = [(f"{t.start:g} to {t.end:g} s", t.share, "") for t in where.times]
-    by_region = [(r.when, r.share, f", {percent(r.occupancy)} of the time") for r in where.regions]
+    by_region = [(r.told, r.share, f", {percent(r.occupancy)} of the time") for r in where.regions]
     panels = [
         Bars(f"Share of the gap by {word}", _shares(shares, role))
         for word, shares, role in (
@@ -219,10 +249,14 @@ def where_figure(diagnosis: Diagnosis) -> Figure | None:
         return None
     caption = (
         "Evidence is the gain in log-likelihood less its price. Blue: what it loses without a "
-        "claimed effect, from 3 nats on. Grey: what an effect would gain alone, in their place. "
-        f"Beside a channel's share: by how much the model misses it{_ahead(diagnosis)}."
+        "claimed effect, from 3 nats on. Grey: what an effect would gain alone, in their place."
     )
-    return Figure("gap", "Where the gap lies", caption, tuple(panels))
+    if by_channel:
+        more = f"Beside a channel's share: by how much the model misses it{_ahead(diagnosis)}."
+        caption = f"{caption} {more}"
+    located = by_channel or by_time or by_region
+    title = "Where the gap lies" if located else "What was weighed"
+    return Figure("gap", title, caption, tuple(panels))
 
 
 def _ahead(diagnosis: Diagnosis) -> str:

@@ -128,7 +128,7 @@ class Unconfirmed(Document):
             made = f"{few} of {all_}" if few < all_ else f"all {all_}"
             rest = f"or whatever else repeats with the motion of {made} trials"
             return f"unconfirmed: {self.meaning}, {rest}"
-        where = "" if self.region is None else f", mostly where {self.region.when}"
+        where = "" if self.region is None else f", mostly where {self.region.told}"
         start, end = number(self.start), number(self.end)
         when = (
             f"trial {self.trial}, {f'{start} to {end}' if start != end else f'at {end}'} s{where}"

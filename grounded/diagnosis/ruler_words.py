@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.error_report import ABOVE, SURE, RulerRow, furthest, noise_of
-from grounded.result import listed, measured, number
+from grounded.diagnosis.error_report import RulerRow, beside_noise, doubt_of, furthest
+from grounded.result import listed, measured_alike, number
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Agreement
@@ -29,11 +29,8 @@ def improvement(rows: Sequence[RulerRow]) -> str:
     for row in sorted(shown, key=lambda row: row is not first):
         gains = _gains(row)
         best = sorted((n for n in gains if gains[n] > SHOWS), key=lambda n: -gains[n])
-        parts = [
-            f"{name} by {_measured(row, name, row.with_effects[name])} instead of "
-            f"{_measured(row, name, row.crude[name])}{_noise(row, name, row.with_effects[name])}"
-            for name in best[: NAMED - 1]
-        ]
+        told = [(name, *_told(row, name, "with_effects", "crude")) for name in best[: NAMED - 1]]
+        parts = [f"{name} by {now} instead of {then}{noise}" for name, now, then, noise in told]
         if parts:
             return f"{_ahead(row)} miss {listed(parts)}."
     return f"{_ahead(first)} hardly change." if first else ""
@@ -73,7 +70,8 @@ def worsened(rows: Sequence[RulerRow]) -> str:
     ratio, row, name = _lost_most(rows)
     if row is None or not (ratio > 1 + SHOWS or outweighed(rows)):
         return ""
-    now, then = (_measured(row, name, errors[name]) for errors in (row.with_effects, row.crude))
+    values = [row.with_effects[name], row.crude[name]]
+    now, then = measured_alike(values, row.unit_by_channel[name])
     text = f"{_ahead(row)} miss {name} by {now} instead of {then}: that is worse"
     return f"{text}." if outweighed(rows) else f"{text}, though over all states they gain."
 
@@ -119,8 +117,49 @@ def floor(row: RulerRow | None) -> str:
         return ""
     if not (name := most_off(row)):
         return ""
-    ahead, error = f"{number(row.horizon_s)} s ahead", row.with_effects[name]
-    return f": {ahead} it misses {name} by {_measured(row, name, error)}{_noise(row, name, error)}"
+    error, noise = _told(row, name, "with_effects")
+    return f": {_when(row)} it misses {name} by {error}{noise}"
+
+
+def explained(rows: Sequence[RulerRow]) -> str:
+    """That the model explains the data, and how far: down to the noise, or as far as that is known.
+
+    For what leaves nothing above the noise (`rest`).
+    """
+    row = furthest(rows)
+    name = "" if row is None else most_off(row)
+    known = row is None or row.noise_floor.get(name, math.nan) > 0
+    if doubt := in_doubt(rows):
+        return f"The model explains the data as far as their noise is known: {doubt}."
+    return f"The model explains the data{' down to the noise' * known}{floor(row)}."
+
+
+def in_doubt(rows: Sequence[RulerRow]) -> str:
+    """What is off by more than noise, but not by more than the doubt in that; "": nothing."""
+    times, _, name, row = max(_ratios(rows), key=lambda one: one[0], default=(0.0, 0.0, "", None))
+    if row is None or not doubt_of(0.0) < times <= doubt_of(row.floor_unsure):
+        return ""
+    values = [row.with_effects[name], row.noise_floor[name]]
+    error, noise = measured_alike(values, row.unit_by_channel[name])
+    few = f"which so few repeats tell only to a factor of {doubt_of(row.floor_unsure):.2g}"
+    return f"{_when(row)} {name} is off by {error}, {times:.2g} times its noise of {noise}, {few}"
+
+
+def _ratios(rows: Sequence[RulerRow]) -> list[tuple[float, float, str, RulerRow]]:
+    """How many times its noise a state is off, its share of the first error, its name, where."""
+    return [
+        (
+            row.with_effects[name] / noise,
+            row.with_effects[name] / max((row.outset or row.crude)[name], 1e-300),
+            name,
+            row,
+        )
+        for row in rows
+        if not row.drowned
+        for name, noise in row.noise_floor.items()
+        if noise > 0 and math.isfinite(row.with_effects.get(name, math.nan))
+        if row.tells(name, "with_effects")
+    ]
 
 
 def most_off(row: RulerRow) -> str:
@@ -138,21 +177,11 @@ def open_noise(rows: Sequence[RulerRow]) -> str:
 
 def rest(rows: Sequence[RulerRow]) -> str:
     """What is left above the noise where no leftover is stated, and why none is; "": nothing."""
-    found = [
-        (
-            row.with_effects[name] / noise,
-            row.with_effects[name] / max((row.outset or row.crude)[name], 1e-300),
-            (name, _when(row)),
-        )
-        for row in rows
-        if not row.drowned
-        for name, noise in row.noise_floor.items()
-        if noise > 0 and math.isfinite(row.with_effects[name]) and row.tells(name, "with_effects")
-        if row.with_effects[name] > noise * max(ABOVE, math.exp(SURE * row.floor_unsure))
-    ]
+    found = [one for one in _ratios(rows) if one[0] > doubt_of(one[3].floor_unsure)]
     if not found:
         return ""
-    times, share, (name, when) = max(found)
+    times, share, name, row = max(found, key=lambda one: one[:3])
+    when = _when(row)
     least = "at least " * rows[0].floor_at_most
     text = f"the state {name} is still off by {least}{times:.2g} times the noise {when}"
     if share < MATTERS:
@@ -166,10 +195,8 @@ def _when(row: RulerRow) -> str:
     return "over whole trials" if row.whole_trial else f"{number(row.horizon_s)} s ahead"
 
 
-def _measured(row: RulerRow, name: str, value: float) -> str:
-    return measured(value, row.unit_by_channel[name])
-
-
-def _noise(row: RulerRow, name: str, error: float) -> str:
-    value, unit = row.noise_floor.get(name, math.nan), row.unit_by_channel[name]
-    return noise_of(error, value, unit, at_most=row.floor_at_most)
+def _told(row: RulerRow, name: str, *columns: str) -> list[str]:
+    """A state's errors in these columns and the noise beside the first, in one unit."""
+    errors = [getattr(row, column)[name] for column in columns]
+    noise, unit = row.noise_floor.get(name, math.nan), row.unit_by_channel[name]
+    return beside_noise(errors, noise, unit, at_most=row.floor_at_most)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, furthest, runaway
 from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
-from grounded.diagnosis.ruler_words import floor, improvement, rest, worsened
+from grounded.diagnosis.ruler_words import explained, floor, improvement, rest, worsened
 from grounded.diagnosis.stopped import ENDED, wider
 from grounded.model import Model, all_at_bounds
 from grounded.result import listed, number, percent
@@ -74,7 +74,7 @@ def verdict(
             what = "No known effect explains what is left, and it is no white noise"
             return _said("unknown", f"{what}{floor(row)}.", *once)
         else:
-            text = f"The model explains the data down to the noise{floor(row)}."
+            text = explained(rows)
         return _said("none", text, *once)
     causes = _causes(claims, ranking, credit, given or {})
     several = len(causes) > 1
@@ -213,7 +213,7 @@ def next_trial(
         why = (unrepeatable or {}).get(one.trial)
         if why is None:
             return f"Repeat trial {one.trial}: hardly another one shows {one.effect}."
-        there = "" if one.region is None else f" that goes where {one.region.when}"
+        there = "" if one.region is None else f" that goes where {one.region.told}"
         better = f"run a gentler one{there}" if why == LOST else f"record another one{there}"
         return f"Hardly a trial but {one.trial} shows {one.effect}, and that one {why}: {better}."
     if not claims.names and look:

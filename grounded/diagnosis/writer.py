@@ -108,11 +108,12 @@ class Writer:
         off, region = open_noise(rows), None
         if remainder:
             off, region = remainder[0].channel, remainder[0].region
-        when = region.when if region else ""
+        when = region.told if region else ""
         look = another_look(self.task, self.trials, off, when) if off else ""
         named = [row.effect for row in ranking if row.claimed]
         seen = unconfirmed(self.claims, self.decision.doubtful, groups)
         told = {one.effect for one in seen}.union(*groups)
+        located = bool(named or remainder)  # else the gap is noise: shares of it tell nothing
         ranking = marked(ranking, {one.name for one in self.decision.doubtful} - told)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         worse = contested(rows, agreement, named)
@@ -136,9 +137,11 @@ class Writer:
         return Diagnosis(
             verdict=said,
             where=Where(
-                channels=self.channels(gain, rows),
-                times=tuple(by_time(gain.sum(axis=-1), data)),
-                regions=tuple(by_region(gain.sum(axis=-1), predictor, self.best)),
+                channels=self.channels(gain if located else np.full_like(gain, np.nan), rows),
+                times=tuple(by_time(gain.sum(axis=-1), data)) if located else (),
+                regions=tuple(by_region(gain.sum(axis=-1), predictor, self.best))
+                if located
+                else (),
                 split=measured.split(),
                 whiteness=measured.whiteness,
                 tempering=self.search.tempering.factor,
@@ -193,7 +196,7 @@ class Writer:
         return {} if self.task is None else unrepeatable(self.task, self.trials)
 
     def channels(self, gain: Any, rows: Sequence[RulerRow]) -> tuple[ChannelShare, ...]:
-        """Each state's part of the gap, with the ruler's errors a second ahead."""
+        """Each state's part of the gap, NaN of NaN, with the ruler's errors a second ahead."""
         excess = np.maximum(gain.sum(axis=(0, 1)), 0.0)
         share = excess / max(float(excess.sum()), 1e-12)
         ahead = furthest(rows) or rows[0]
@@ -207,7 +210,7 @@ class Writer:
             )
             for i, name in self.shown
         ]
-        return tuple(sorted(found, key=lambda one: -one.share))
+        return tuple(sorted(found, key=lambda one: -np.nan_to_num(one.share)))
 
     def by_channel(self, before: Any, after: Any, spread: Any) -> dict[str, Change]:
         """The gap of each state, noise-normalised."""

@@ -42,6 +42,7 @@ DASHES = {
 }
 TYPESET = {"^2": "²", "^3": "³", "->": "→", "+-": "±"}
 LEAST = 1e-12  # a range below which differences are rounding
+FEW = 300  # dots up to which each is drawn large
 LETTER = 0.045  # of a bar's text, as a share of the longest bar
 FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # by which deviations are enlarged
 
@@ -78,7 +79,8 @@ class Curve:
     shade: Array | None = None
     shade_name: str = ""
     trial: str = ""
-    style: str = "line"  # line, points, or ghost: not drawn, for the animation alone
+    style: str = "line"  # line, steps (each y holds until the next x), points,
+    # or ghost: not drawn, for the animation alone
     motion: Motion | None = None
 
     def spread(self, axis: int) -> list[Array]:
@@ -138,6 +140,7 @@ class Panel:
     loss: bool = False
     log: bool = False
     whole: bool = False  # x counts
+    x_ticks: tuple[tuple[float, str], ...] = ()  # where on x what is written; () leaves it open
     y_range: tuple[float, float] | None = None
     note: str = ""  # inside, top right
     kind: str = ""  # time: x is the time of a run; path: where a run was

@@ -16,6 +16,7 @@ from grounded.errors import needs
 from grounded.figures.figure import (
     COLOURS,
     DASHES,
+    FEW,
     Bars,
     Curve,
     Dot,
@@ -63,6 +64,9 @@ def plotted(panel: Panel | Bars, axis: str = "") -> dict[str, Any]:
     up: dict[str, Any] = {"title": {"text": panel.y_name}, "range": [low, high]}
     if panel.whole:
         across |= {"tickformat": "d", "dtick": max(1, round((right - left) / 8))}
+    if panel.x_ticks:
+        at, labels = zip(*panel.x_ticks, strict=True)
+        across |= {"tickvals": list(at), "ticktext": list(labels)}
     if panel.log:
         for each in (across, up):
             ticks = log_ticks(*each["range"])
@@ -114,7 +118,11 @@ def _curve(panel: Panel, curve: Curve) -> dict[str, Any]:
     if not curve.name:
         trace |= {"hoverinfo": "skip", "hovertemplate": ""}
     if curve.style == "points":
-        trace |= {"mode": "markers", "marker": {"color": f"@{curve.role}/0.4", "size": 4}}
+        look = ("0.7", 6) if len(curve.x) <= FEW else ("0.4", 4)
+        trace |= {"mode": "markers", "marker": {"color": f"@{curve.role}/{look[0]}"}}
+        trace["marker"]["size"] = look[1]
+    if curve.style == "steps":
+        trace["line"]["shape"] = "hv"
     if curve.style == "ghost":
         trace |= {"visible": False}
     if curve.shade is not None:

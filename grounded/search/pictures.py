@@ -15,6 +15,12 @@ from grounded.search.standing import Standing
 
 STEEP = 8.0  # worst over best utility from which on the axis is logarithmic
 MOST = 300  # candidates that are drawn
+TICKS = 8  # candidates that an axis names
+OPEN = {  # verdicts of candidates that are neither better nor worse
+    "waiting": "waiting for its trial",
+    "in doubt": "in doubt",
+    "no trial": "without a trial",
+}
 NEAR = 4  # candidates from which on the better half has a panel of its own
 
 
@@ -32,10 +38,11 @@ def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
     number = {t.candidate.id: k + 1 for k, t in enumerate(now.history)}
     whole = _utility(now, tried, number, optimum)
     near = (_near(whole),) if whole.loss and len(tried) > NEAR else ()
-    panels = (whole, *near, _steps(shown, number))
+    panels = (whole, *near, _steps(now, shown, number))
     key = [
         Key("best", "first or better", "disc"),
         Key("other", "no better", "ring"),
+        *_undecided([now.verdict(t) for t in shown]),
         Key("predicted", "predicted by the model", "dash"),
         Key("best", "best so far"),
     ]
@@ -91,6 +98,7 @@ def _utility(
         x_name="candidate",
         y_name="utility",
         curves=_record(now.history, number),
+        x_ticks=_named(now.history, number),
         dots=tuple(dots),
         rules=tuple(rules),
         bands=tuple(bands),
@@ -123,7 +131,7 @@ def _dots(tried: Tried, at: int, became: str) -> list[Dot]:
         note += f", ± {figure(error, 2)} over {len(tried.trials)} trials"
     if not math.isfinite(tried.utility):
         return [Dot(at, math.nan, "model", f"{note}: the run failed", "cross")]
-    shape, role = ("disc", "best") if tried.accepted else ("ring", "other")
+    shape, role = _look(tried, became)
     dots = [Dot(at, tried.utility, role, note, shape, error if math.isfinite(error) else 0.0)]
     if math.isfinite(candidate.predicted_utility):
         dots.insert(0, Dot(at, candidate.predicted_utility, "predicted", note, "dash"))
@@ -144,11 +152,30 @@ def _record(tried: Sequence[Tried], number: dict[str, int]) -> tuple[Curve, ...]
     return (Curve(x, np.repeat(values, 2), "best", "", 1.2),)
 
 
-def _steps(shown: list[Tried], number: dict[str, int]) -> Panel:
+def _named(shown: Sequence[Tried], number: dict[str, int]) -> tuple[tuple[float, str], ...]:
+    """Ids on the axis: all, or every so many."""
+    kept = shown[:: -(-len(shown) // TICKS)]
+    return tuple((float(number[t.candidate.id]), t.candidate.id) for t in kept)
+
+
+def _look(tried: Tried, verdict: str) -> tuple[str, str]:
+    """(shape, role) of a candidate's mark."""
+    if verdict in OPEN:
+        return "ring", "predicted"
+    return ("disc", "best") if tried.accepted else ("ring", "other")
+
+
+def _undecided(verdicts: Sequence[str]) -> list[Key]:
+    """The entry of the legend for candidates that were not decided on; none without one."""
+    names = [words for verdict, words in OPEN.items() if verdict in verdicts]
+    return [Key("predicted", " or ".join(names), "ring")] if names else []
+
+
+def _steps(now: Standing, shown: list[Tried], number: dict[str, int]) -> Panel:
     dots = []
     for t in shown:
         c = t.candidate
-        shape, role = ("disc", "best") if t.accepted else ("ring", "other")
+        shape, role = _look(t, now.verdict(t))
         note = f"{c.id}: α = {c.alpha:g}, damping {figure(c.damping, 2)}"
         dots.append(Dot(number[c.id], math.log2(max(c.alpha, 2.0**-30)), role, note, shape))
     low = min(d.y for d in dots)
@@ -156,6 +183,7 @@ def _steps(shown: list[Tried], number: dict[str, int]) -> Panel:
         title="Step size: log₂ α (0: the whole step, −1: half of it)",
         x_name="candidate",
         y_name="log₂ α",
+        x_ticks=_named(shown, number),
         dots=tuple(dots),
         whole=True,
         y_range=(min(low, -1.0) - 0.4, 0.6),

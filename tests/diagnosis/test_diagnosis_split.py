@@ -7,8 +7,10 @@ import pytest
 from test_diagnosis import DT, cart
 
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.error_report import Split
 from grounded.diagnosis.likelihood.noise import DOF, NoiseModel, Structure
-from grounded.diagnosis.validation.split import shares
+from grounded.diagnosis.pictures import where_figure
+from grounded.diagnosis.validation.split import shares, split
 from grounded.effects import Library
 from grounded.task import Task
 from grounded.utility import Reward
@@ -56,6 +58,9 @@ def test_an_effect_that_is_found_explains_the_error():
     assert tuple(split) == HORIZONS
     for row in split.values():
         for one in (row["all"], *row["channels"]):
+            if row is split["whole_run"]:  # nothing was repeated
+                assert parts(one)[1:] == [None, None] and 0 <= parts(one)[0] <= 1
+                continue
             assert sum(parts(one)) == pytest.approx(1)
             assert min(parts(one)) >= 0
     assert split["horizon"]["all"]["explained"] > 0.98
@@ -75,6 +80,10 @@ def test_without_an_effect_the_error_is_noise():
     assert row.whole.irreducible > 0.85
     assert row.irreducible_from == "noise"
     assert found.utility_prediction is None
+    where = found.to_json()["where"]  # shares of noise would differ from day to day
+    assert found.kind == "none" and where["times"] == where["regions"] == []
+    assert {c["share"] for c in where["channels"]} == {None}
+    assert where_figure(found) is None or "channel" not in str(where_figure(found).panels[0].title)
 
 
 def test_what_no_effect_explains_stays_unexplained_and_is_not_white():
@@ -93,6 +102,18 @@ def test_repeats_of_a_candidate_tell_the_noise():
     row = diagnose(model, same).where.split["horizon"]
     assert row.irreducible_from == "repeats"
     assert row.whole.irreducible > 0.7
+
+
+def test_of_a_noise_that_is_not_known_no_share_is_told():
+    before, after = np.array([1.0, 2.0]), np.array([0.5, 2.0])
+    row = split(3.4, {"x": "m", "v": "m/s"}, before, after, np.array([0.2, np.nan]), "repeats", 1.0)
+    assert row.whole.explained == pytest.approx((1 - 0.25 + 0) / 2)
+    assert np.isnan([row.whole.unexplained, row.whole.irreducible]).all()
+    x, v = row.channels
+    assert x.unexplained + x.irreducible == pytest.approx(0.25) and v.explained == 0
+    assert np.isnan([v.unexplained, v.irreducible]).all() and not row.may_be_noise(v)
+    assert row.may_be_noise(x) and not replace(row, irreducible_unsure=0.1).may_be_noise(x)
+    assert Split.from_json(row.to_json()) == row
 
 
 def test_shares_are_of_what_there_was():

@@ -12,7 +12,9 @@ from grounded.diagnosis.error_report import Credit, Region, Remainder, RulerRow,
 from grounded.diagnosis.report import Agreement, Estimate, Ranked, Unconfirmed
 from grounded.diagnosis.ruler_words import (
     contested,
+    explained,
     improvement,
+    in_doubt,
     open_noise,
     outweighed,
     rest,
@@ -120,7 +122,7 @@ def test_a_slow_plant_is_spoken_of_by_whole_trials():
     second = row({"x": 0.02}, {"x": 0.017})
     whole = row({"x": 5.0}, {"x": 0.3}, whole_trial=True, horizon_s=3600.0)
     assert telling((second, whole)) is whole
-    assert holds(improvement((second, whole)), "30 cm", "5.0 m")
+    assert holds(improvement((second, whole)), "0.30 m", "5.0 m")
     quick = row({"x": 0.2}, {"x": 0.08})
     assert telling((quick, whole)) is quick and "8.0 cm" in improvement((quick, whole))
     assert telling((whole,)) is None and telling(()) is None
@@ -153,6 +155,29 @@ def test_down_to_the_noise_is_said_at_the_floor_alone():
     above = said({"x": 0.17, "v": 0.1})
     assert "1.7 times" in above and "down to the noise" not in above
     assert "1 %" in said({"x": 0.17, "v": 0.1}, outset={"x": 17.0, "v": 9.0})
+
+
+def test_what_noise_of_few_repeats_does_not_tell_is_no_explanation_down_to_the_noise():
+    """x was off by 1.8 times a noise known to a factor of 3.4: "down to the noise", the page said,
+    and 53 % unexplained."""
+    rows = (row({"x": 0.31, "v": 0.1}, {"x": 1.6e-3, "v": 0.1}, {"x": 9.1e-4, "v": 0.1}),)
+    few = (replace(rows[0], floor_unsure=0.41),)
+    assert "1.8 times" in rest(rows) and not in_doubt(rows) and not rest(few)
+    said = explained(few)
+    assert "down to the noise" not in said
+    assert holds(said, "1.6 mm", "0.91 mm", "1.8 times", "factor of 3.4")
+    assert "down to the noise" not in explained((row({"x": 0.1}, {"x": 0.1}, {"x": math.nan}),))
+
+
+def test_a_leftover_within_the_noise_is_stated_by_what_tells_it_from_noise():
+    left = Remainder("v", 0.031, "m/s^2", 12.0, Region("|w| > 0.66", 0.8, 0.3, "rad/s"))
+    within = replace(left, error=0.0041, floor=0.004, horizon_s=1.0, error_unit="m/s")
+    for one in (within, replace(within, floor_at_most=True)):
+        said = one.sentence()
+        assert holds(said, "0.031 m/s^2", "|w| > 0.66 rad/s", "may all be noise")
+        assert "at most that" not in said
+    above = replace(within, error=0.041).sentence()
+    assert holds(above, "0.041 m/s", "noise: 0.0040 m/s") and "may all be" not in above
 
 
 def test_a_share_in_a_sentence_is_the_share_of_the_table():

@@ -152,3 +152,15 @@ def test_a_mujoco_model_looks_as_its_file_says():
     assert seen is not None
     rod = seen.lines(0)[2][0]  # after the cart's two rings
     np.testing.assert_allclose(np.sort(rod, axis=0), ends[:, [0, 2]], atol=1e-9)
+
+
+def test_a_carriage_is_no_wider_than_its_way_and_what_hangs_from_it_is_no_tip():
+    """A crane's trolley was drawn 0.43 m wide beside 1.5 m of travel."""
+
+    def half(size):
+        return body_of(cart_pole.model, scene_of(cart_pole.model), size).parts[-1].size[0]
+
+    assert half(0.05) == pytest.approx(0.05) and half(0.05) < half(10.0) == half(20.0)
+    assert _body(cart_pole.model).watched == "the tip" == _body(pendulum.model).watched
+    crane = replace(cart_pole.model, roles={"rail": "x", "hanging": ("theta",)})
+    assert "load" in _body(crane).watched

@@ -14,10 +14,12 @@ import pytest
 
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import NextCommand
+from grounded.model import Param
 from grounded_trials.report.findings import Improved, improvements_in, utility_terms
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
-from grounded_trials.report.page.tables import UNKNOWN
+from grounded_trials.report.page.tables import UNKNOWN, parameter_table
+from grounded_trials.report.report_text import report_text
 from grounded_trials.workspace.folder import Folder, Lost
 from grounded_trials.workspace.next_step import Since
 from grounded_trials.workspace.off_target import tracking_error
@@ -100,7 +102,7 @@ def test_page_shows_what_the_issue_lists(cart):
         "0.290 to 0.330",  # the 95 % interval, which is not symmetric
         "explains 90\xa0%",
         "a fast run and a slow one",
-        "grounded adopt viscous_friction:v",
+        " adopt viscous_friction:v",
         "N s/m",
         "1.400 (1.36 to 1.44)",
         "x\xa0>\xa00.2",
@@ -269,7 +271,48 @@ def test_a_browser_breaks_no_quantity(cart, whole):
 
 
 def test_page_without_a_diagnosis_names_the_command(car):
-    assert "grounded diagnose" in page(gather(Folder(car)))
+    assert "grounded diagnose" in page(replace(gather(Folder(car)), folder=None))
+
+
+def test_commands_name_the_workspace_as_it_was_named(car):
+    findings = replace(gather(Folder(car)), folder="my robot")
+    text = page(findings)
+    assert "<code>grounded diagnose" not in text
+    assert text.count("grounded -C &#39;my robot&#39; diagnose") >= 2
+    assert f"grounded -C &#39;my robot&#39; {findings.then.verb}" in text
+
+
+def test_a_parameter_without_bounds_is_a_constant(cart):
+    findings = gather(Folder(cart))
+    model = findings.task.model
+    name, other = list(model.params)[:2]
+    params = {name: Param(1.0, "kg"), other: Param(1.0, "kg", std=0.1)}
+    task = findings.task.with_model(replace(model, params=dict(model.params) | params))
+    (block,) = parameter_table(replace(findings, task=task))
+    bounds = {row[0]: row[-1] for row in block.rows}
+    assert bounds[name] == "constant" and bounds[other] == "none"
+
+
+def test_trials_of_another_task_are_told_beside_those_that_count(cart):
+    findings = replace(gather(Folder(cart)), uncounted=("t0091", "t0092"))
+    for text in (page(findings), report_text(findings, lambda rows, header: "", lambda v: "")):
+        assert "t0091 to t0092 count as data alone" in " ".join(text.split())
+
+
+def test_the_noise_of_whole_runs_is_not_told_where_it_is_not_known(cart):
+    split = DIAGNOSIS["where"]["split"]
+    parts = {"explained": 0.0, "unexplained": 0.53, "irreducible": 0.47}
+    horizon = split["horizon"] | {"all": parts, "irreducible_unsure": 0.41}
+    unknown = split["whole_run"] | {"all": {"explained": 0.0}}
+    where = {"split": {"horizon": horizon, "whole_run": unknown}}
+    document = DIAGNOSIS | {"where": DIAGNOSIS["where"] | where}
+    findings = replace(gather(Folder(cart)), diagnosis=Diagnosis.from_json(document))
+    text = page(findings)
+    body = re.search(r'<table id="split".*?</table>', text, re.DOTALL)[0]
+    assert re.findall(r"<td>(.*?)</td>", body) == [
+        *("1 s", "0.0 %", "≤ 53 %", "≥ 47 %"),
+        *("whole run (2 s)", "0.0 %", "-", "-"),
+    ]
 
 
 def test_page_is_the_same_every_time(cart):

@@ -41,12 +41,13 @@ from grounded.model import Model
 from grounded.models import pendulum
 from grounded.rollout import simulate
 from grounded.search.first_policy import first_policy
+from grounded.search.pictures import search_figure
 from grounded.search.planner import Planner
 from grounded.trial import Trial
-from grounded_trials.report.figures.gap import forecast_figures, residual_figures
+from grounded_trials.report.figures.gap import _binned, forecast_figures, residual_figures
 from grounded_trials.report.figures.paths import path_figure
 from grounded_trials.report.figures.png import _bars, png
-from grounded_trials.report.figures.runs import all_figures, error_figure
+from grounded_trials.report.figures.runs import all_figures, error_figure, input_figure
 from grounded_trials.report.forecast import forecast, forecast_error
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.layouts import foxglove_layout
@@ -397,6 +398,54 @@ def test_the_residual_is_drawn_over_what_tells_most_of_it(cart):
     assert added.min() <= line.y.min() <= line.y.max() <= added.max()
     assert all(len(panel.bands) == 1 for panel in rest.panels)
     assert all(np.abs(c.y).max() <= 1.0 for panel in rest.panels for c in panel.curves)
+
+
+def test_a_line_of_means_goes_from_the_least_to_the_largest():
+    x = np.concatenate([np.linspace(0.0, 1.0, 80), [2.0, 6.3]])
+    at, mean = _binned(x, 2 * x)
+    assert at[0] < 0.1 and at[-1] == 6.3 and (np.diff(at) > 0).all()
+    np.testing.assert_allclose(mean, 2 * at)
+    at, mean = _binned(np.ones(9), np.arange(9.0))
+    assert at.tolist() == [1.0] and mean.tolist() == [4.0]
+
+
+def test_held_commands_are_drawn_as_steps(cart):
+    findings = gather(Folder(cart))
+    (panel,) = input_figure(findings).panels
+    for curve in panel.curves:
+        assert curve.style == "steps" and len(curve.y) == findings.task.horizon + 1
+        assert curve.y[-1] == curve.y[-2]
+    assert {t["line"]["shape"] for t in plotted(panel)["data"]} == {"hv"}
+
+
+def test_models_that_predict_alike_are_one_curve():
+    def row(seconds, **more):
+        errors = {"outset": 1.0, "crude": 0.5, "calibrated": 0.5, "with_effects": 0.5} | more
+        columns = {key: {"x": seconds * value} for key, value in errors.items()}
+        return RulerRow(seconds, unit_by_channel={"x": "m"}, **columns)
+
+    def named(*rows):
+        found = accuracy_figure(Diagnosis(Verdict("none"), prediction_error=rows))
+        return [curve.name for curve in found.panels[0].curves]
+
+    assert named(row(0.5), row(1.0)) == ["model.py", "model = calibrated = as diagnosed"]
+    apart = row(1.0, with_effects=0.4)
+    assert named(row(0.5), apart) == ["model.py", "model = calibrated", "as diagnosed"]
+
+
+def test_candidates_are_named_on_the_axis_and_one_that_waits_is_no_worse():
+    findings = many_flights(20)
+    now = findings.standing
+    last = replace(now.history[-1], trials=(), utilities=(), accepted=None)
+    waiting = replace(now, history=(*now.history[:-1], last), outstanding=last.candidate)
+    figure = search_figure(waiting)
+    steps = figure.panels[-1]
+    at, names = zip(*steps.x_ticks, strict=True)
+    assert len(names) <= 8 and names[0] == "c0001" and at[0] == 1.0
+    assert plotted(steps)["layout"]["xaxis"]["ticktext"] == list(names)
+    assert steps.dots[-1].role == "predicted" and steps.dots[-1].shape == "ring"
+    assert any("waiting" in key.name for key in figure.key)
+    assert not any("waiting" in key.name for key in search_figure(now).key)
 
 
 def _linear(colour):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from grounded.diagnosis.report import Diagnosis, Verdict
-from grounded.result import measured
+from grounded.result import measured, measured_alike
 from grounded_trials.report.diagnosis_words import verdict_lines
 from grounded_trials.report.three_lines import gained_most, three_lines
 from reported import DIAGNOSIS
@@ -107,3 +107,21 @@ def test_each_of_several_causes_stands_on_a_line_of_its_own(diagnosis):
     assert len(causes) == len(CAUSES) and others == ["What is left."]
     old = Verdict("effect", sentence="Friction slows v.")
     assert verdict_lines(replace(diagnosis, verdict=old)) == ([], ["Friction slows v."])
+
+
+@pytest.mark.parametrize(
+    ("values", "unit", "texts"),
+    [
+        ((1.6e-4, 1.6e-3), "m", ["0.16 mm", "1.6 mm"]),  # it was 0.16 mm -> 0.16 cm
+        ((1.6e-3, 9.1e-4), "m", ["1.6 mm", "0.91 mm"]),
+        ((8.2e-4, 0.045), "m", ["0.82 mm", "45 mm"]),
+        ((1.75, 0.012), "m", ["175 cm", "1.2 cm"]),
+        ((0.31, 1.6e-3), "m", ["31 cm", "0.16 cm"]),
+        ((1.2e-3, 7.3e-4), "rad", ["1.2 mrad", "0.73 mrad"]),
+        ((0.12, 5.8e-4), "rad", ["0.12 rad", "0.00058 rad"]),
+        ((0.2, 0.0), "m", ["20 cm", "0 cm"]),
+        ((0.17,), "m", ["17 cm"]),
+    ],
+)
+def test_errors_that_are_compared_have_one_unit(values, unit, texts):
+    assert measured_alike(values, unit) == texts

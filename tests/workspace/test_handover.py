@@ -363,3 +363,12 @@ def test_an_open_loop_policy_must_send_and_hold_what_is_allowed(w):
     (found,) = outside_limits(w.task, replace(policy, feedforward=0 * sent, past=np.array([-6.0])))
     assert found == "it holds force at -6, outside [limits] force = [-5, 5] N"
     assert not list(outside_limits(w.task, replace(policy, feedforward=0 * sent)))
+
+
+def test_runs_of_another_task_are_told_once_as_data(ran):
+    """`status` and the page counted 6 trials beside a diagnosis of 9, and said nothing of three."""
+    assert not [note for note in ran.status().notes if "data alone" in note]
+    names = [trial.id for trial in ran.task_trials()]
+    configure(ran, CONFIG.replace(LIMITS, NARROW))
+    (note,) = [note for note in ran.status().notes if "data alone" in note]
+    assert names[0] in note and names[-1] in note

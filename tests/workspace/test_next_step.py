@@ -247,7 +247,8 @@ def test_what_a_fresh_diagnosis_claims_is_adopted_while_a_candidate_waits(tmp_pa
         assert last(grounded("-C", folder, command)) == "grounded adopt viscous_friction:v"
     found = gather(Folder(folder))
     assert found.standing.phase == "await-trial"
-    assert found.next_command == "grounded adopt viscous_friction:v"
+    assert rendered(found.then) == "grounded adopt viscous_friction:v"
+    assert found.next_command == rendered(found.then, str(folder))
     assert grounded("-C", folder, "learn", "--trials", 1).code == 0  # a later trial outdates it
     assert "adopt" not in last(grounded("-C", folder, "status"))
 

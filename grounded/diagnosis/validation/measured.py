@@ -258,8 +258,11 @@ class Measured:
         before, after = self.rms(self.decision.crude), self.rms(self.best)
         carried = "at most" if self.at_most else "noise"
         source = carried if self.source == "short horizon" else self.source
+        unsure = self.unsure[:, 0]
         return {
-            key: split(seconds[k], self.units, before[k], after[k], self.floor[k], source)
+            key: split(
+                seconds[k], self.units, before[k], after[k], self.floor[k], source, unsure[k]
+            )
             for key, k in rows.items()
         }
 

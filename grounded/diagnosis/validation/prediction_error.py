@@ -161,13 +161,14 @@ def by_region(gain: Array, predictor: Predictor, fit: Fitted, most: int = 3) -> 
     shown = [(i, n) for i, n in enumerate(model.state_names) if i not in data.hidden]
     signals += [(n, fit.track[:-1, :, i]) for i, n in shown]
     signals.append(("t", data.time))
+    units = {**model.states, **model.inputs, "t": "s"}
     whole = max(float(gain.sum()), 1e-12)
     valid = data.valid.T > 0
     found = []
     for name, signal in signals:
         best = _stump(name, signal, gain, valid, whole)
         if best is not None:
-            found.append(best)
+            found.append(replace(best, unit=units[name]))
     found.sort(key=lambda region: -(region.share - region.occupancy))
     return found[:most]
 

@@ -35,6 +35,7 @@ def split(
     after: Array,
     floor: Array,
     source: str,
+    unsure: float = 0.0,
 ) -> Split:
     """The parts of the error at one horizon.
 
@@ -43,15 +44,20 @@ def split(
         units: of the channels, in order.
         before: rms error of the crude model (n,).
         after: as diagnosed (n,).
-        floor: of noise alone (n,).
+        floor: of noise alone (n,); NaN where it is not known.
         source: what the floor is from.
+        unsure: standard deviation of the floor's logarithm.
     """
+    unknown = np.isnan(floor) & ~np.isnan(before)
     squares = [np.nan_to_num(rms) ** 2 for rms in (before, after, floor)]
     each = shares(*squares)
-    scale = 1 / np.maximum(squares[2], 1e-9 * np.maximum(squares[0], 1e-300))
+    each[1:, unknown] = np.nan
+    unit = squares[0] if unknown.any() else squares[2]  # of each state's errors
+    scale = 1 / np.maximum(unit, 1e-9 * np.maximum(squares[0], 1e-300))
     whole = shares(*(np.asarray((scale * part).sum()) for part in squares))
+    whole[1:] += np.nan if unknown.any() else 0.0
     channels = tuple(
         ChannelParts(name, unit, float(np.nan_to_num(before[i])), *map(float, each[:, i]))
         for i, (name, unit) in enumerate(units.items())
     )
-    return Split(horizon_s, Parts(*map(float, whole)), channels, source)
+    return Split(horizon_s, Parts(*map(float, whole)), channels, source, unsure)

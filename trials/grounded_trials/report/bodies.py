@@ -38,7 +38,7 @@ AIRCRAFT = (
 ZEROS = {"hanging": (-np.pi / 2, 1), "upright": (np.pi / 2, -1), "level": (0.0, 1)}
 LENGTH = 0.07  # of the paths' size: a body that has no length of its own
 SLIM = 0.06  # of a link's length: its radius
-CARRIAGE = (0.25, 0.12, 0.1)  # of the links' length: half its edges
+CARRIAGE = (0.25, 0.12, 0.1)  # of the links' length: half its edges, where it travels far
 
 
 def body_in(findings: Findings) -> Body:
@@ -66,7 +66,9 @@ def body_of(model: Model, scene: Scene, size: float) -> Body:
             lengths = _lengths(model, len(angles))
             unit = "m" if all(lengths) else ""
             drawn = tuple(length or 1.0 for length in lengths)
-            return Links(angles, drawn, zero, sign, unit, _columns(model, "rail"))
+            rail = _columns(model, "rail")
+            wide = min(CARRIAGE[0] * sum(drawn), size) if unit else CARRIAGE[0] * sum(drawn)
+            return Links(angles, drawn, zero, sign, unit, rail, wide)
     if not scene.spatial and (height := _columns(model, "altitude")):
         return Cabin(height[0], size, list(model.states.values())[height[0]])
     return Vehicle(scene, size)
@@ -132,7 +134,13 @@ class Links:
     sign: int
     unit: str
     rail: tuple[int, ...] = ()  # a state, or none
-    watched = "the tip"
+    wide: float = CARRIAGE[0]  # of the carriage, half
+
+    @property
+    def watched(self) -> str:
+        """The end of the last link."""
+        hangs = self.rail and (self.zero, self.sign) == ZEROS["hanging"]
+        return "the load, the end of what hangs" if hangs else "the tip"
 
     @property
     def parts(self) -> Sequence[Part]:
@@ -141,7 +149,7 @@ class Links:
             Part(f"link{i}", "capsule", (SLIM * max(self.lengths), length))
             for i, length in enumerate(self.lengths, 1)
         ]
-        size = tuple(sum(self.lengths) * part for part in CARRIAGE)
+        size = tuple(self.wide / CARRIAGE[0] * part for part in CARRIAGE)
         return links + [Part("carriage", "box", size)] * bool(self.rail)
 
     def poses(self, states: Array) -> list[Pose]:

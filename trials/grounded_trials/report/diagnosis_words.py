@@ -168,10 +168,11 @@ def instrument_lines(findings: Iterable[Finding]) -> list[str]:
 def gap_sentence(gap: Gap) -> str:
     """The gap before and after, and what it is measured in."""
     held = "held out" if gap.held_out else "not held out, too few trials"
+    low = ", below 1: predictions miss less than that" * (gap.after < gap.floor)
     return (
-        f"{figure(gap.before, 3)} before, {figure(gap.after, 3)} after, noise floor "
-        f"{figure(gap.floor, 3)} ({gap.horizon_s:g} s ahead, {held}; in units of the noise that "
-        "this diagnosis estimates: figures of two diagnoses don't compare)"
+        f"{figure(gap.before, 3)} before, {figure(gap.after, 3)} after, in units of what the noise "
+        f"that this diagnosis estimates makes of predictions {gap.horizon_s:g} s ahead "
+        f"({held}){low}; figures of two diagnoses don't compare"
     )
 
 
@@ -223,7 +224,7 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
         for value in (found.before, found.after)
     )
     whole = count(found.trials, "whole trial")
-    how = "replayed without the feedback that they had, " * found.feedback
+    how = "open loop, without the feedback that holds a run to its path, " * found.feedback
     text = f"{how}the model misses the utility of {whole} {without}"
     if diagnosis.effects:
         text += f", the diagnosed one {better}"

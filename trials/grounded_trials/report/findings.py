@@ -16,7 +16,7 @@ from grounded.diagnosis.report import Diagnosis
 from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.result import measured
+from grounded.result import measured_alike
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.planner import Planner
 from grounded.search.standing import Standing
@@ -90,14 +90,15 @@ class Findings:
     since: Since = field(default_factory=Since)  # the diagnosis
     settled: Settled | None = None  # what was adopted, and what it gained
     discarded: tuple[str, ...] = ()  # trials that were set aside
+    uncounted: tuple[str, ...] = ()  # of this model, that ran another task or a probe: data alone
     left_runs: int = 0  # that are counted, but not read: there are too many to show
     left_logs: int = 0
     folder: str | None = None  # as the user named it, None where it is the current one
 
     @property
     def next_command(self) -> str:
-        """What to type next, in the workspace's own folder."""
-        return rendered(self.then)
+        """What to type next, where the workspace was named."""
+        return rendered(self.then, self.folder)
 
     @property
     def next_trial(self) -> str:
@@ -197,13 +198,13 @@ class Improved:
 
     @property
     def text(self) -> str:
-        """`17 cm → 0.5 cm`: lengths in mm or cm where they are small."""
-        return " → ".join(measured(value, self.unit) for value in self._known)
+        """`17 cm → 0.5 cm`: lengths in mm or cm where they are small, both in one unit."""
+        return " → ".join(measured_alike(self._known, self.unit))
 
     @property
     def is_same(self) -> bool:
         """Whether both read the same, as they are told."""
-        return len({measured(value, self.unit) for value in (self.before, self.after)}) == 1
+        return len(set(measured_alike((self.before, self.after), self.unit))) == 1
 
     @property
     def _known(self) -> list[float]:

@@ -28,7 +28,7 @@ from grounded_trials.workspace.adopted import Better, better_model
 from grounded_trials.workspace.diagnosing import LEAST_STEPS, read_diagnosis
 from grounded_trials.workspace.folder import Contents, Folder, Lost
 from grounded_trials.workspace.next_step import Since, next_command, since_diagnosis
-from grounded_trials.workspace.proposing import standing_in
+from grounded_trials.workspace.proposing import standing_in, uncounted
 
 MOST = 200  # runs that are read; of more, the latest and those of what is compared
 LOGS = 50  # that are read, the latest
@@ -71,6 +71,7 @@ def gather(workspace: Folder) -> Findings:
         since=since,
         settled=settled_in(workspace, diagnosis, since),
         discarded=tuple(workspace.discarded()),
+        uncounted=tuple(uncounted(workspace, contents.trials, now)),
         left_runs=len(own) - len(shown),
         left_logs=len(data) - len(logs),
         folder=workspace.address,

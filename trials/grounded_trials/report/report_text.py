@@ -37,6 +37,7 @@ from grounded_trials.wording import (
     wrapped,
 )
 from grounded_trials.workspace.next_step import DIAGNOSE
+from grounded_trials.workspace.proposing import not_counted
 
 ROWS, SPARED = 12, 3  # candidates in the table; more than so many others are counted
 ITERATIONS = 5  # of the bias
@@ -79,6 +80,7 @@ def _head(findings: Findings) -> str:
     )
     if findings.logs:
         text += f", {count(len(findings.logs) + findings.left_logs, 'log')} of data"
+    text += "".join(f"; {words}" for words in not_counted(findings.uncounted))
     if findings.discarded:
         text += f", set aside: {', '.join(findings.discarded)}"
     if findings.effects:

@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping
 
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.ruler_words import open_noise, rest, telling, worsened
+from grounded.diagnosis.ruler_words import in_doubt, open_noise, rest, telling, worsened
 from grounded.diagnosis.verdict import told_apart
-from grounded.result import listed, measured
+from grounded.result import listed, measured_alike
 from grounded.task import Task
 from grounded_trials.wording import count, shown
 from grounded_trials.workspace.off_target import weighed_groups
@@ -69,7 +69,7 @@ def gained(
     for names, what in _improved(after, first, task):
         unit = shown(row.unit_by_channel[names[0]])
         told = (after,) if now == before else (after, first)
-        ends = (measured(_together(errors, names), unit) for errors in told)
+        ends = measured_alike([_together(errors, names) for errors in told], unit)
         parts.append(f"{what} by {' instead of '.join(ends)}")
     held = "" if row.held_out != "no" else ", not held out"
     ahead = f"{'Over whole trials' if row.whole_trial else f'{row.horizon_s:.3g} s ahead'}{held}"
@@ -108,7 +108,7 @@ def still_open(diagnosis: Diagnosis) -> str:
     rows = diagnosis.prediction_error
     if not found and (name := open_noise(rows)):
         found.append(f"only repeated trials tell how much of what is left in {name} is noise")
-    nothing = "nothing is left above the noise"
+    nothing = in_doubt(rows) or "nothing is left above the noise"
     if worsened(rows):  # which is said elsewhere
         nothing = "it is open why predictions get worse with it there"
     text = "; ".join(found) or rest(rows) or nothing

@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded.errors import NextCommand
 from grounded.model import is_clock
-from grounded.result import listed, measured, percent
+from grounded.result import listed, measured, measured_alike, percent
 from grounded.search.scatter import white_noise
 from grounded.task import Task
 from grounded.trial import Trial
@@ -218,9 +218,10 @@ def _falls_short(task: Task, first: Candidate) -> list[str]:
     off, far = float(np.linalg.norm(left)), float(np.linalg.norm(np.ptp(way, axis=0)))
     if not off > SHORT * far > 0:
         return []
+    short, way_told = measured_alike([off, far], unit)
     return [
-        f"the plan ends {measured(off, unit)} from where the target does, which takes {what} "
-        f"over {measured(far, unit)}: by [reward] it is not worth more, or the model does not get "
+        f"the plan ends {short} from where the target does, which takes {what} "
+        f"over {way_told}: by [reward] it is not worth more, or the model does not get "
         "there in that time. Weigh inputs and their changes less, draw a slower target, or look at "
         "model.py"
     ]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.result import Result, measured
+from grounded.result import Result, measured_alike
 from grounded.trial import Trial
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.workspace.adopting import settled
@@ -96,8 +96,10 @@ def _worse(found: Fit) -> str:
     i = int(np.argmax(np.where(known, now / np.where(known, was, 1.0), -np.inf)))
     name, when = before.names[i], f"{before.horizon_s:g} s ahead" if far else "one step ahead"
     unit = found.model.states.get(name, "")
-    return f"{text} ({name} {when}: off by {measured(now[i], unit)} instead of " + (
-        f"{measured(was[i], unit)}); values that must differ that much stand in for something else"
+    off, then = measured_alike([now[i], was[i]], unit)
+    return (
+        f"{text} ({name} {when}: off by {off} instead of {then}); values that must differ that "
+        "much stand in for something else"
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.result import Document, measured
+from grounded.result import Document, measured_alike
 from grounded.search.scatter import white_noise
 from grounded.task import Task
 from grounded.trial import Trial
@@ -49,11 +49,11 @@ class OffTarget(Document):
     def summary(self) -> str:
         """`position 2.1 mm rms, 7.3 mm at most (at 7.95 s)`."""
         told = []
+        rms, most, end = measured_alike([self.rms, self.most, self.end], self.unit)
         if np.isfinite(self.rms):
-            most = f"{measured(self.most, self.unit)} at most (at {self.at_s:.4g} s)"
-            told += [f"{measured(self.rms, self.unit)} rms", most]
+            told += [f"{rms} rms", f"{most} at most (at {self.at_s:.4g} s)"]
         if np.isfinite(self.end):
-            told.append(f"{measured(self.end, self.unit)} at the end")
+            told.append(f"{end} at the end")
         return f"{self.what} {', '.join(told)}"
 
 

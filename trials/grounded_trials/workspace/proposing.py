@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
 from grounded.search.scatter import noise_cost
-from grounded_trials.wording import rendered
+from grounded_trials.wording import ranges, rendered
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.handover import Void, checked_candidate, outside_limits
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
     from grounded.search.making import Proposal
     from grounded.search.standing import Standing
+    from grounded_trials.workspace.identity import StoredTrial
     from grounded_trials.workspace.next_step import Since
 
 PROPOSE = NextCommand("propose")
@@ -289,7 +290,11 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
         next_command(workspace, standing, found, usable),
         again_best(workspace, standing),
         since.sentence if since else "",
-        (*notes, *_namesakes(workspace)),
+        (
+            *notes,
+            *_namesakes(workspace),
+            *not_counted(uncounted(workspace, workspace.trials(), standing)),
+        ),
         workspace.discarded(),
         off_target_of(workspace.task, standing.incumbent.trials if standing.incumbent else ()),
         found,
@@ -303,6 +308,29 @@ def again_best(workspace: Folder, now: Standing) -> NextCommand:
         return NextCommand("run", ("best",))
     best = now.incumbent.candidate.id if now.incumbent else "best"  # another one may be, by then
     return NextCommand("ingest", ("LOG", "--candidate", best))
+
+
+def uncounted(workspace: Folder, trials: Sequence[StoredTrial], now: Standing) -> list[str]:
+    """Trials of this model whose candidates are none of the search's: of another task, or probes.
+
+    Namesakes are told of by themselves.
+    """
+    own = {tried.candidate.id for tried in now.history}
+    ran = [t for t in trials if t.trial.candidate and workspace.fits(t.trial)]
+    return [
+        t.stored.id for t in ran if "~" not in t.trial.candidate and t.trial.candidate not in own
+    ]
+
+
+def not_counted(names: Sequence[str]) -> list[str]:
+    """What these trials are good for, in a sentence; nothing of none."""
+    if not names:
+        return []
+    one, ran = len(names) < 2, "candidates of another task, or probes"
+    return [
+        f"{ranges(names)} {'counts' if one else 'count'} as data alone, for fit and diagnose: "
+        f"{'it' if one else 'they'} ran {ran}"
+    ]
 
 
 def _namesakes(workspace: Folder) -> list[str]:

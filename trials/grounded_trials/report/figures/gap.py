@@ -133,11 +133,20 @@ def residual_figures(findings: Findings) -> list[Figure]:
     caption = f"Each dot is a step of {name}: what must be added to the {findings.plain}."
     if explained is not None and better is not None:
         caption += f" The line is what the model {better.name} adds."
-    same = "Within the band the residual can't be told from white noise."
+    same = (
+        f"Of what the model misses of {name} from one measured state to the next. A sensor's noise "
+        "is in two such steps, with opposite signs: alone it takes the first lag to -0.5, where "
+        "all of it is noise. Beyond the first, white noise stays within the band."
+    )
+    if findings.diagnosis is not None and findings.diagnosis.where.whiteness:
+        same += (
+            ' The test in "Is there a pattern in the rest?" is made of other residuals: those of '
+            "the filter that allows for the sensors' noise, over all trials of the diagnosis."
+        )
     return [
         Figure("residual", "What the model lacks", caption, tuple(over), legend(over)),
         Figure(
-            "autocorrelation", "Is the rest noise?", same, tuple(rest),
+            "autocorrelation", "What is left from step to step", same, tuple(rest),
             (*legend(rest), Key("other", "white noise, 95 %", "band")),
         ),
     ]  # fmt: skip
@@ -146,7 +155,8 @@ def residual_figures(findings: Findings) -> list[Figure]:
 def _channels(findings: Findings, states: Array, residual: Array) -> list[int]:
     """The states that the diagnosis blames, or else those with the largest residual."""
     names, diagnosis = findings.task.model.state_names, findings.diagnosis
-    blamed = [c.name for c in diagnosis.where.channels] if diagnosis is not None else []
+    found = diagnosis.where.channels if diagnosis is not None else ()
+    blamed = [c.name for c in found if c.share > 0]
     known = [names.index(name) for name in blamed if name in names]
     spread = np.std(states, axis=0) + 1e-9
     sizes = np.where(np.ptp(residual, axis=0) > 0, np.std(residual, axis=0) / spread, -1.0)
@@ -203,9 +213,13 @@ def _told(x: Array, y: Array) -> float:
 
 
 def _binned(x: Array, y: Array) -> tuple[Array, Array]:
-    """Means of x and y in bins of x that hold equally many."""
-    order = np.argsort(x, kind="stable")
-    parts = [p for p in np.array_split(order, _bins(x)) if len(p)]
+    """Means of x and y in bins of x: equally full ones where x is often, equally wide ones beyond.
+
+    So a line through them goes from the least x to the largest.
+    """
+    edges = np.union1d(_edges(x), np.linspace(x.min(), x.max(), _bins(x) + 1))
+    which = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, max(len(edges) - 2, 0))
+    parts = [which == k for k in np.unique(which)]
     return np.array([x[p].mean() for p in parts]), np.array([y[p].mean() for p in parts])
 
 
@@ -222,6 +236,7 @@ def _autocorrelation(
     if explained is not None:
         left = float(np.std(explained[:, state]) / (np.std(residual[:, state]) or 1.0))
         note = f"{percent(left)} of its size is left"
+    note += "; " * bool(note) + "sensor noise alone: −0.5 at the first lag"
     for values, role, name in shown_:
         y = values[:, state] - values[:, state].mean()
         power = float(y @ y) or 1.0

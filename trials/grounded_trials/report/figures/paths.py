@@ -203,5 +203,5 @@ def _shaded(findings: Findings, view: View) -> list[Panel]:
     (x, y), (a, b) = view.place(states).T, view.place(target).T
     path = Curve(x, y, "other", "", 1.0, times, far, name)
     wanted = Curve(a, b, "desired", "desired", 1.0)
-    title = f"Where {run.label} is off"
+    title = f"How far {body.watched.partition(',')[0]} is off, {run.label}"
     return [Panel(title, *view.names, (path, wanted), equal=True, kind="path")]

@@ -12,6 +12,7 @@ from grounded.errors import needs
 from grounded.figures.figure import (
     COLOURS,
     DASHES,
+    FEW,
     Bars,
     Curve,
     Dot,
@@ -129,6 +130,8 @@ def _panel(axes: Any, panel: Panel) -> None:
         from matplotlib.ticker import MaxNLocator
 
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    if panel.x_ticks:
+        axes.set_xticks(*zip(*panel.x_ticks, strict=True))
     if panel.loss:
         ticks = loss_ticks(*up)
         axes.set_yticks(panel.height(np.array(ticks)), [f"{v:g}" for v in ticks])
@@ -143,9 +146,12 @@ def _curve(axes: Any, panel: Panel, curve: Curve) -> None:
     if curve.style == "ghost":
         return
     if curve.style == "points":
-        axes.plot(curve.x, y, ".", color=_colour(curve.role), ms=2.5, alpha=0.4, mew=0)
+        few = len(curve.x) <= FEW
+        look: dict[str, Any] = {"ms": 5.0, "alpha": 0.7} if few else {"ms": 2.5, "alpha": 0.4}
+        axes.plot(curve.x, y, ".", color=_colour(curve.role), mew=0, **look)
         return
-    axes.plot(curve.x, y, **_line(curve.role, curve.width))
+    how = "steps-post" if curve.style == "steps" else "default"
+    axes.plot(curve.x, y, drawstyle=how, **_line(curve.role, curve.width))
     if curve.motion is not None and curve.trial and curve.role != "other":
         for row in np.linspace(0, len(curve.motion.times) - 1, POSES).astype(int):
             for line, thick in curve.motion.lines(row):

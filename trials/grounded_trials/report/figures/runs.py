@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -102,8 +103,7 @@ def input_figure(findings: Findings) -> Figure | None:
         return None
     for j, (name, unit) in enumerate(task.model.inputs.items()):
         curves = [
-            _over_time(run.trial.inputs[:, j], task.dt, role, name_of(role, run), 1.5)
-            for role, run in shown
+            _held(run.trial.inputs[:, j], task.dt, role, name_of(role, run)) for role, run in shown
         ]
         limits = [float(v) for v in (task.low[j], task.high[j]) if np.isfinite(v)]
         panels.append(_timed(name, unit, curves, limits))
@@ -140,6 +140,12 @@ def bias_figure(findings: Findings) -> Figure | None:
 def _over_time(values: Array, dt: float, role: str, name: str, width: float = 1.5) -> Curve:
     times: Array = np.arange(len(values), dtype=np.float64) * dt
     return Curve(times, values, role, name, width)
+
+
+def _held(values: Array, dt: float, role: str, name: str) -> Curve:
+    """Commands as they are sent: each is held for a step, the last one too."""
+    curve = _over_time(np.append(values, values[-1:]), dt, role, name)
+    return replace(curve, style="steps")
 
 
 def _crashes(findings: Findings, state: int) -> list[Dot]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from grounded.diagnosis.error_report import ChannelParts, Parts, Split
+from grounded.diagnosis.error_report import ChannelParts, Parts, Split, doubt_of
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
 from grounded.diagnosis.report import Diagnosis, TrialValue
 from grounded.diagnosis.verdict import told_apart
@@ -41,7 +41,7 @@ def gap_section(findings: Findings) -> list[Block]:
     lacking = [b for each in residual_figures(findings) for b in drawn(each, title=True)]
     if diagnosis is None:
         words = "Not diagnosed yet. This says where the model is wrong, and what makes it so:"
-        command = Block("command", rendered(DIAGNOSE), "c-diagnose")
+        command = Block("command", rendered(DIAGNOSE, findings.folder), "c-diagnose")
         return [Block("text", words), command, *ahead, *forecast_table(findings), *lacking]
     causes, others = verdict_lines(diagnosis)
     shown = so_far(diagnosis, findings.since, findings.settled)
@@ -128,9 +128,9 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
         for key, words in HORIZONS.items()
         if (one := splits.get(key)) is not None
     }
-    rows = [(words, *_shares(splits[key].whole)) for key, words in named.items()]
+    rows = [(words, *_shares(splits[key], splits[key].whole)) for key, words in named.items()]
     main = "horizon" if "horizon" in named else next(iter(named))
-    by_state = [(parts.name, *_shares(parts)) for parts in splits[main].channels]
+    by_state = [(parts.name, *_shares(splits[main], parts)) for parts in splits[main].channels]
     known = {"repeats": "repeated trials", "alike": "trials whose commands agree to 2 %"}
     known["at most"] = "what one step leaves, and is at most that: no trial was repeated"
     source = known.get(splits[main].irreducible_from, "the estimated noise")
@@ -139,6 +139,11 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
         "were held out, unexplained what they leave above the noise; how large the noise is comes "
         f"from {source}."
     )
+    if any("≤" in cell for row in [*rows, *by_state] for cell in row):
+        words += (
+            f" ≤ and ≥: errors of up to {_doubts(splits)} times the noise, as it is known here, "
+            "are not told from it: what is unexplained may be noise too."
+        )
     each = table("split-states", ("state", *header[1:]), by_state)
     return [
         Block("heading", "What the error is made of"),
@@ -148,10 +153,20 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     ]
 
 
-def _shares(parts: Parts | ChannelParts) -> tuple[str, str, str]:
+def _shares(split: Split, parts: Parts | ChannelParts) -> tuple[str, str, str]:
     shares = (parts.explained, parts.unexplained, parts.irreducible)
     explained, unexplained, noise = map(percent, shares)
+    if parts.unexplained > 0 and split.may_be_noise(parts):
+        return explained, f"≤ {unexplained}", f"≥ {noise}"
     return explained, unexplained, noise
+
+
+def _doubts(splits: Mapping[str, Split]) -> str:
+    """Up to how many times the noise errors may be noise: 1.3, more where repeats are few."""
+    known = [one for one in splits.values() if one.whole.irreducible > 0]
+    factors = [doubt_of(one.irreducible_unsure) for one in known]
+    ends = dict.fromkeys(f"{factor:.2g}" for factor in (min(factors), max(factors)))
+    return " to ".join(ends)
 
 
 def _rest(diagnosis: Diagnosis) -> list[Block]:
@@ -165,7 +180,11 @@ def _rest(diagnosis: Diagnosis) -> list[Block]:
     ]
     return [
         Block("heading", "Is there a pattern in the rest?"),
-        Block("text", f"White noise (Ljung-Box, p >= {WHITE:g}) is what no model could predict."),
+        Block(
+            "text",
+            f"White noise (Ljung-Box, p >= {WHITE:g}) is what no model could predict. Tested is "
+            "what a filter that allows for the sensors' noise leaves of all trials.",
+        ),
         table("whiteness", ("state", "p (white noise)", "what is left "), rows),
     ]
 

@@ -45,7 +45,9 @@ from grounded_trials.report.page.tables import (
 )
 from grounded_trials.report.settled import told
 from grounded_trials.report.three_lines import gained_most
-from grounded_trials.wording import count, figure, glued
+from grounded_trials.wording import count, figure, glued, rendered
+from grounded_trials.workspace.next_step import DIAGNOSE
+from grounded_trials.workspace.proposing import not_counted
 
 OPEN = 12  # candidates whose table is open
 
@@ -82,6 +84,7 @@ def page(findings: Findings, watched: int = 0) -> str:
         tiles=_tiles(findings),
         changed=_heading(findings),
         improved=_improved(findings),
+        diagnose=rendered(DIAGNOSE, findings.folder),
         why=_why(findings),
         sections=[(title, blocks) for title, blocks in _sections(findings) if blocks],
         style=_own("page.css") + _roles(),
@@ -226,6 +229,7 @@ def _tiles(findings: Findings) -> list[str]:
         found.append(f"{count(now.trials, 'trial')}, {count(now.iteration, 'improvement')}")
     if logs:
         found.append(f"{count(logs, 'log')} of data")
+    found += not_counted(findings.uncounted)
     if findings.optimum is not None:
         found.append(f"optimum of the real system {figure(findings.optimum)}")
     for left, shown, kind in (

@@ -91,7 +91,10 @@ def candidate_table(findings: Findings) -> list[Block]:
     strong = {k for k, t in enumerate(kept) if best and t.candidate is best.candidate}
     made = table("candidates", list(rows[0]), [list(cells.values()) for cells in rows], strong)
     words = f"{left} candidates between them are left out; this shows all:"
-    more = [Block("text", words), Block("command", rendered(NextCommand("status")), "c-status")]
+    more = [
+        Block("text", words),
+        Block("command", rendered(NextCommand("status"), findings.folder), "c-status"),
+    ]
     why = legend("", [t.candidate.iteration for t in kept])
     return [made, *[Block("soft", f"{why}.")] * bool(why), *more * bool(left)]
 
@@ -164,7 +167,7 @@ def leftover_table(diagnosis: Diagnosis) -> list[Block]:
         (
             left.channel,
             with_unit(figure(left.size, 3), left.unit),
-            "-" if left.region is None else left.region.when,
+            "-" if left.region is None else left.region.told,
             "-" if left.region is None else percent(left.region.share),
             figure(left.evidence, 3),
         )
@@ -183,8 +186,8 @@ def parameter_table(findings: Findings) -> list[Block]:
     estimated = _estimated(findings.diagnosis)
     rows = []
     for name, param in findings.task.model.params.items():
-        free = param.low is None and param.high is None
-        limits = "free" if free else _range(param.low, param.high)
+        bounded = param.low is not None or param.high is not None
+        limits = _range(param.low, param.high) if bounded else "none" if param.std else "constant"
         found = _interval(estimated[name]) if name in estimated else "-"
         written = figure(findings.nominal.get(name))
         rows.append((name, written, figure(param.value), found, shown(param.unit), limits))
