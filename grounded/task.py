@@ -141,9 +141,9 @@ class Task:
             if weighted[i] and bad.any():
                 raise GroundedError(
                     f"[reward] weighs state '{name}', but the target has no value for it at "
-                    f"step {int(np.argmax(bad))}: add the column '{name}' to the target (where "
-                    "only `terminal` weighs it, the last value counts, the others may be anything) "
-                    "or drop the weight"
+                    f"step {int(np.argmax(bad))}: add the column '{name}' to the target (a "
+                    f"line has one with `--to {name}=0`; where only `terminal` weighs it, the last "
+                    "value counts, the others may be anything) or drop the weight"
                 )
         if not np.isfinite(self.start).all():
             raise GroundedError(f"task: the start state must be finite, got {self.start.tolist()}")

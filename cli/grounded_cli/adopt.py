@@ -33,6 +33,10 @@ SCALED = (
     "as its sensor reads it, {by:.3g} % {more} than it is: for the true one scale what is read, "
     "[log.state.{state}] scale, and in the robot's program"
 )
+DRAW = (
+    "draw the manoeuvre first (`grounded target --help`), or propose all the same to have that "
+    "drive repeated"
+)
 REMEASURE = "nothing has measured the model as it is now yet: `grounded diagnose` does"
 
 
@@ -92,6 +96,8 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
         remark("note", done.stopped)
     if done.left:
         remark("note", REMEASURE)
+    if done.logged:
+        remark("note", f"target.csv is still {done.logged}, the drive that was logged: {DRAW}")
     show(f"\n{next_line(done.then)}")
 
 

@@ -11,12 +11,15 @@ from grounded.result import listed
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, progress, remark, sentence, show, show_json, table
+from grounded_trials.wording import with_unit
 
 if TYPE_CHECKING:
+    from grounded.model import Model
     from grounded.search.candidate import Tried
     from grounded_trials import Workspace
     from grounded_trials.workspace.intake.ingested import Ingested
 
+CLOCKS = {"header": "header stamps", "log": "log times", "publish": "publish times"}
 AGAIN = "run again"  # a verdict
 # what a verdict means for the search
 VERDICTS = {
@@ -53,7 +56,7 @@ def command(files: tuple[str, ...], candidate: str | None, data: bool, json_: bo
         with progress(f"reading {name}"):
             done.append(workspace.ingest(name, candidate=candidate, data=data))
         if not json_:
-            _tell(name, done[-1], _best(workspace, done[-1]))
+            _tell(name, done[-1], _best(workspace, done[-1]), workspace.base_model)
     if json_:
         show_json({"trials": [one.to_json() for one in done]})
     else:
@@ -81,9 +84,11 @@ def following(log: str, candidate: str | None, json_: bool) -> None:
     if json_:
         show_json(done.to_json())
         return
-    _tell(log, done.taken, done.proposed.standing.incumbent)
+    _tell(log, done.taken, done.proposed.standing.incumbent, workspace.base_model)
     show("")
     tell_proposed(workspace, done.proposed, last=done.exported is None)
+    for path in done.removed:
+        remark("note", f"{path} is deleted: {path.stem} was not run and is void")
     if done.exported is not None:
         show(field("files", f"{done.exported.file}, {done.exported.runner}", "  "))
         then = next_line(NextCommand("next", ("LOG",)))
@@ -100,7 +105,7 @@ def _best(workspace: Workspace, one: Ingested) -> Tried | None:
     return standing_in(workspace).incumbent
 
 
-def _tell(name: str, one: Ingested, best: Tried | None) -> None:
+def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
     for warning in one.warnings:
         remark("warning", f"{name}: {warning}")
     for note in one.notes:
@@ -118,6 +123,7 @@ def _tell(name: str, one: Ingested, best: Tried | None) -> None:
     if one.off_target:
         show(field("off target", "; ".join(each.summary() for each in one.off_target), "  "))
     if one.signals:
+        units = {**model.states, **model.inputs}
         rows = [
             (
                 s.name,
@@ -126,12 +132,19 @@ def _tell(name: str, one: Ingested, best: Tried | None) -> None:
                 f"{1e3 * s.largest_gap_s:.0f}",
                 "-" if s.skew_s is None else f"{1e3 * s.skew_s:.1f}",
                 str(s.bridged),
-                f"{s.low:.3g} .. {s.high:.3g}",
+                with_unit(f"{s.low:.3g} .. {s.high:.3g}", units[s.name]),
             )
             for s in one.signals
         ]
         header = ("signal", "Hz", "jitter ms", "gap ms", "skew ms", "bridged", "range")
         show(table(rows, header))
+        own = {
+            clock: f" ({', '.join(s.name for s in one.signals if s.clock == clock)})"
+            for clock in dict.fromkeys(s.clock for s in one.signals)
+        }
+        clocks = listed(CLOCKS[clock] + names * (len(own) > 1) for clock, names in own.items())
+        skewed = "; skew: stamp minus log time, below 0 where it was recorded after its stamp"
+        sentence(f"  Hz, jitter, gap: by {clocks}{skewed * any(s.skew_s for s in one.signals)}")
 
 
 def _earlier(one: Ingested) -> str:

@@ -36,7 +36,8 @@ FEW = 8  # numbers of a log that are named for one that is missing
 @click.option("--blank", is_flag=True, help="No log yet: a workspace of --model, to fill in.")
 @click.option(
     "--kind",
-    help="Of the model skeleton: car, rover, differential, balance, drone, arm, pendulum, generic.",
+    help="Of the model skeleton: car, rover, differential, balance, drone, arm, pendulum, crane, "
+    "generic.",
 )
 @click.option("--inputs", metavar="A,B,...", help="Columns that are inputs (kind generic).")
 @click.option(

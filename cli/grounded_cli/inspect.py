@@ -60,7 +60,7 @@ def command(log: str, json_: bool) -> None:
 def _tell(topic: TopicReport) -> None:
     show(f"\n{topic.topic}  {topic.type} ({topic.encoding})")
     rate = (
-        f", {topic.rate_hz:.1f} Hz, jitter {1e3 * topic.jitter_s:.1f} ms, largest gap "
+        f", {topic.rate_hz:.1f} Hz by log times, jitter {1e3 * topic.jitter_s:.1f} ms, largest gap "
         f"{topic.largest_gap_s:.3f} s"
     )
     show(f"  {count(topic.messages, 'message')}{rate * (topic.messages > 1)}")
@@ -112,7 +112,7 @@ def _next(found: Inspected) -> str:
 
     if found.log_table:
         return f"# next: put this table into grounded.toml, then: {typed(found.then)}"
-    line = next_line(found.then, "WORKSPACE" if found.then.verb == "inspect" else None)
+    line = next_line(found.then)
     if found.format != TRIAL or found.report.damage:
         return line
     stored = "is stored already, and " * found.stored

@@ -15,6 +15,7 @@ from grounded_trials.wording import with_unit
 
 if TYPE_CHECKING:
     from grounded.frozen import Array
+    from grounded.model import Model
     from grounded_trials import Workspace
 
 SECONDS = 5.0  # of a step or a swing-up
@@ -107,7 +108,7 @@ def command(
         text = with_unit(f"{number(low)} to {number(high)}", model.states[name])
         show(field(name, text, "  "))
     if free:
-        show(field("free", _free(free, reward), "  "))
+        show(field("free", _free(free, reward, _rest_of(model, free) * (shape == "line")), "  "))
     for kind, by in (
         ("state", "1 for an error as large as a range here, a position's smaller one"),
         ("input_change", "0.04 / (range of [limits])^2"),
@@ -133,13 +134,25 @@ def command(
     show(f"\n{next_line(NextCommand('propose'))}")
 
 
-def _free(names: list[str], reward: dict[str, dict[str, float]]) -> str:
-    """What it means for states that the target has no column for them."""
+def _rest_of(model: Model, free: list[str]) -> str:
+    """The free state whose column has its rate come along, else the first one."""
+    from grounded_trials.logs.inspect_pairs import velocities
+
+    return next((name for name in free if name in velocities(model)), free[0])
+
+
+def _free(names: list[str], reward: dict[str, dict[str, float]], rest: str) -> str:
+    """What it means for states that the target has no column for them.
+
+    `rest`: the one to bring to rest; "" where the shape has no way to say so.
+    """
     weighed = [n for n in names if any(reward.get(k, {}).get(n) for k in ("state", "terminal"))]
     it = "them" if len(names) > 1 else "it"
     text = f"{listed(names)}: no column in the target, so nothing asks where a run takes {it}"
     if weighed:
         text += f"; the weight of {listed(weighed)} in [reward] counts for nothing"
+    if rest:
+        text += f". `--to {rest}=0`, beside the others, asks for rest there"
     return text
 
 

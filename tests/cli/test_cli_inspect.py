@@ -68,4 +68,4 @@ def test_outside_a_workspace_one_is_asked_for(tmp_path):
     log = data("dart_small_car", "dart_4_sept_random_driving_slow_ros2.mcap")
     done = grounded("-C", tmp_path, "inspect", log)
     assert done.err == ("note: no [log] table is guessed outside a workspace (-C DIR names one)\n")
-    assert "next: grounded -C WORKSPACE inspect" in done.out
+    assert "grounded init DIR --from" in done.out and "by log times" in done.out

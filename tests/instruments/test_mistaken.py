@@ -175,6 +175,33 @@ def test_exchanged_joints_with_their_velocities_are_named_in_one_run():
     assert told is not None and holds(described(arm, told), "t1 and t2")
 
 
+def crane(L=0.85, kF=27.0, rub=0.75):
+    """A trolley with a load: a position in m and an angle, each with its own velocity."""
+
+    def rates(s, a, p):
+        sn, cs = np.sin(s.th), np.cos(s.th)
+        pull = 2 * sn * (p.L * s.w**2 + 9.81 * cs)
+        acc = (p.kF * a.volt - 3 * s.v - 6 * rub * np.tanh(s.v / 0.05) + pull) / (6 + 2 * sn**2)
+        return {"x": s.v, "v": acc, "th": s.w, "w": -(acc * cs + 9.81 * sn) / p.L}
+
+    return Model(
+        states={"x": "m", "v": "m/s", "th": "rad", "w": "rad/s"},
+        inputs={"volt": "V"},
+        params={"L": Param(L, "m", 0.5, 1.6), "kF": Param(kF, "N/V", 10.0, 40.0)},
+        angles=("th",),
+        derivative=rates,
+    )
+
+
+def test_positions_in_unlike_units_are_exchanged_with_their_velocities_too():
+    """The log of a crane whose trolley and load were exchanged had a confident, wrong verdict."""
+    crude, joints = crane(1.0, 25.0, 0.0), Mistake(states=((0, 2), (1, 3)))
+    trial = driven(crane(), dt=0.04)
+    assert mistaken(crude, [trial], every(crude)) is None
+    told = mistaken(crude, [joints.mended(trial)], every(crude))
+    assert told is not None and told.mistake == joints
+
+
 def ball(rub=0.0, tilt=0.0, lag=0.05, linkage=0.1):
     """A ball that rolls on a beam which a servo tilts."""
 

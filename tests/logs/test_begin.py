@@ -19,6 +19,7 @@ from grounded_trials.logs.joint_names import from_base
 from grounded_trials.starting.begin import begin
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, path_target
+from grounded_trials.workspace.exporting import void_exports
 from grounded_trials.workspace.task_file import equal_weights, read_target
 from ros_bags import arm_bag, car_bag, commanded_arm_bag, rover_bag
 from shared_data import data
@@ -707,6 +708,21 @@ def test_next_ingests_proposes_and_exports(tmp_path):
     found = json.loads(done.out)
     assert found["trials"][0]["candidate"] == "c0001" and found["propose"]["candidate"] == "c0002"
     assert (tmp_path / "w/c0002.npz").exists() and (tmp_path / "w/grounded_runner.py").exists()
+    assert found["removed"] == []
+
+
+def test_an_export_of_a_void_candidate_is_found_where_nobody_changed_it(tmp_path):
+    """After a change of the task a file for the robot stayed beside the new ones."""
+    w = Workspace(workspaces.make(tmp_path / "w").folder)
+    made = w.propose().candidate.id
+    for form in ("npz", "csv"):
+        w.export(made, w.folder / f"{made}.{form}")
+    assert void_exports(w) == ()
+    w.target({"x": np.linspace(0, 0.3, 21)})
+    changed = w.folder / f"{made}.csv"
+    changed.write_text(changed.read_text() + "# mine\n")
+    assert void_exports(w) == (w.folder / f"{made}.npz",)
+    assert void_exports(w, made) == ()
 
 
 def test_a_target_on_another_grid_is_brought_to_it_by_the_command_that_the_error_names(tmp_path):

@@ -183,3 +183,42 @@ def _arm_acceleration(q, w, u):
     push = turning * (2 * w[0] * w[1] + w[1] ** 2) - fall - 7.26 * np.sin(q[0]) - 0.35 * w[0]
     pull = -turning * w[0] ** 2 - fall - 0.12 * w[1]
     return np.linalg.solve(mass, u + np.array([push, pull]))
+
+
+STORE.register(
+    get_types_from_msg(
+        "std_msgs/Header header\nfloat64 angle\nfloat64 rate", "crane_msgs/msg/SwingState"
+    )
+)
+STORE.register(
+    get_types_from_msg("std_msgs/Header header\nfloat64 voltage", "crane_msgs/msg/MotorVoltage")
+)
+
+
+def crane_bag(folder, joint="trolley", load="/sway/state"):
+    """A gantry crane driven by hand for 16 s; `joint`: its name, `load`: the topic of its swing."""
+    swing, volt = "crane_msgs/msg/SwingState", "crane_msgs/msg/MotorVoltage"
+    topics = {
+        "/joint_states": "sensor_msgs/msg/JointState",
+        load: swing,
+        "/motor/command": volt,
+    }
+    messages, x, v, th, w, u = [], 0.0, 0.0, 0.0, 0.0, 0.0
+    rng = np.random.default_rng(1)
+    for k in range(1600):
+        t = START + k * 10**7
+        if k % 4 == 0:
+            u = float(np.round(4 * np.sin(0.011 * k) * np.cos(0.0037 * k) - 1.5 * x, 2))
+            messages.append(("/motor/command", t, T[volt](header=header(t), voltage=u)))
+        if k % 2 == 0:
+            angle, rate = th + 1e-3 * rng.normal(), w + 8e-3 * rng.normal()
+            messages.append((load, t, T[swing](header=header(t), angle=angle, rate=rate)))
+        q, qd = np.array([x + 2e-4 * rng.normal()]), np.array([v + 4e-3 * rng.normal()])
+        messages.append(("/joint_states", t, joints(t, [joint], q, qd, np.zeros(0))))
+        for _ in range(5):
+            push = 5.4 * u - 4.0 * v - 3.0 * np.tanh(v / 0.02)
+            swings = 2.0 * np.sin(th) * (0.85 * w**2 + 9.81 * np.cos(th))
+            a = (push + swings) / (6.0 + 2.0 * np.sin(th) ** 2)
+            x, v = x + DT / 5 * v, v + DT / 5 * a
+            th, w = th + DT / 5 * w, w - DT / 5 * (a * np.cos(th) + 9.81 * np.sin(th)) / 0.85
+    return bag(folder, topics, messages)

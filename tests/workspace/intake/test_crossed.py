@@ -92,6 +92,15 @@ def test_two_numbers_of_a_twist_in_each_others_unit_are_exchanged(columns, odd):
     assert all(holds(text, "linear", "angular", "exchanged", "units") for text in found)
 
 
+@pytest.mark.parametrize(("path", "scale"), [("/sway.angle", 1), ("/sway.angle", 0.2), ("/t.x", 1)])
+def test_a_length_that_is_read_from_an_angle_is_told(path, scale):
+    boat = Model(states={"p": "m"}, inputs={"u": "1"}, derivative=lambda s, a, p: {"p": a.u})
+    mapping = LogMapping({"p": SignalSpec(path, scale=scale)}, {"u": SignalSpec("/c.u")})
+    found = crossed(boat, mapping)
+    assert len(found) == (path == "/sway.angle" and scale == 1)
+    assert all(holds(text, "p", path) for text in found)
+
+
 def test_an_input_in_the_column_of_a_state_is_told_at_ingest(tmp_path):
     """The program was said to be another controller, or the data were taken without a word."""
     w = Workspace(make(tmp_path / "w", config=LOGGED).folder)

@@ -7,7 +7,8 @@ its rivals with the log's own samples:
 - units: what a ROS type measures, against the unit that the model states;
 - derivatives: where the model says dq/dt = w, the samples of w must follow those of q. Their slope
   tells degrees (57.3) and signs (-1);
-- steps: of the rivals for an input, the one with which the model's steps fit the log clearly best.
+- steps: of the rivals for an input, and of positions with their rates that no name tells apart,
+  those with which the model's steps fit the log clearly best.
 
 Every guess that is changed or confirmed says by what; where the numbers can't decide it stays
 unsure.
@@ -24,6 +25,7 @@ import numpy as np
 from grounded.model import Model
 from grounded.result import listed
 from grounded_trials.logs.following import follows
+from grounded_trials.logs.inspect_groups import by_groups
 from grounded_trials.logs.inspect_guess import SIMULATED_S, Guess
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.inspect_pairs import (
@@ -35,16 +37,8 @@ from grounded_trials.logs.inspect_pairs import (
     velocities,
 )
 from grounded_trials.logs.inspect_steps import by_steps
-from grounded_trials.logs.joint_names import JOINT_UNITS, in_order, joint_names, of_joint
-from grounded_trials.logs.stated_units import Stated, factor_between
-
-UNITS = (  # what the end of a path measures, in ROS's conventions (REP 103)
-    (r"(position|translation)\.[xyz]$", "m"),
-    (r"@rpy\.\w+$|steering_angle$", "rad"),
-    (r"angular_velocity\.[xyz]$|angular\.[xyz]$|steering_angle_velocity$", "rad/s"),
-    (r"linear_acceleration\.[xyz]$|accel\.linear\.[xyz]$", "m/s^2"),
-    (r"linear\.[xyz]$|drive\.speed$", "m/s"),
-)
+from grounded_trials.logs.joint_names import in_order, joint_names, joint_units, of_joint
+from grounded_trials.logs.stated_units import Stated, factor_between, unit_of
 
 
 def weigh(
@@ -70,8 +64,10 @@ def weigh(
         name: of_joint(guess, units[name], joints, log, sent=name in model.inputs)
         for name, guess in guesses.items()
     }
+    unnamed = {name for name in model.state_names if not guesses[name].path}
     guesses |= in_order(guesses, units, joints, log)
-    guesses = {name: _unit(guess, units[name]) for name, guess in guesses.items()}
+    measured = joint_units(joints)
+    guesses = {name: _unit(guess, units[name], measured) for name, guess in guesses.items()}
     guesses |= _by_unit(guesses, model)
     guesses |= _speed_asked(guesses, model, log)
     turning = [guesses[name] for name in model.state_names if units[name] in ("rad", "deg")]
@@ -81,23 +77,16 @@ def weigh(
     guesses |= _speed(guesses, model, signals)
     pairs = [(q, w) for q, w in velocities(model).items() if q in guesses and w in guesses]
     for pair in sorted(pairs, key=lambda qw: not any(guesses[name].path for name in qw)):
-        guesses |= paired(guesses, pair, signals, units, log)
+        guesses |= paired(guesses, pair, signals, units, log, measured)
     for pair in pairs:
-        guesses |= agreed(guesses, pair, signals, units, log)
+        guesses |= agreed(guesses, pair, signals, units, log, measured)
+    bare = [pair for pair in pairs if unnamed.issuperset(pair)]
+    guesses |= by_groups(model, guesses, bare, signals, measured)
     guesses |= by_steps(model, guesses, signals)
     guesses |= _taken_by_inputs(guesses, model)
     guesses = {name: _as_logged(guess, log) for name, guess in guesses.items()}
     guesses = {name: as_stated(stated, units[name], guess) for name, guess in guesses.items()}
     return tuple(guesses[g.name] for g in states), tuple(guesses[g.name] for g in inputs)
-
-
-def unit_of(path: str, joint: bool = True) -> str:
-    """The unit that a path's number has by ROS's conventions, "" where there is none."""
-    for pattern, unit in UNITS:
-        if re.search(pattern, path):
-            return unit
-    found = re.search(r"\.(position|velocity|effort)\[\d+\]$", path)
-    return JOINT_UNITS[found[1]] if found and joint else ""
 
 
 def as_stated(stated: Stated, wanted: str, guess: Guess) -> Guess:
@@ -136,16 +125,16 @@ def _as_logged(guess: Guess, log: LogReport) -> Guess:
     return replace(guess, clock=guess.clock or "log")
 
 
-def _unit(guess: Guess, unit: str) -> Guess:
-    known = unit_of(guess.path)
+def _unit(guess: Guess, unit: str, joints: Mapping[str, str]) -> Guess:
+    known = unit_of(guess.path, joints)
     if not known or unit in ("", "1"):
         return guess
-    others = tuple(path for path in guess.others if unit_of(path) in ("", unit))
+    others = tuple(path for path in guess.others if unit_of(path, joints) in ("", unit))
     if known == unit and others != guess.others:  # rivals of another unit are none
         guess = replace(guess, others=others, sure=not others)
     if known == unit:
         return replace(guess, reasons=(*guess.reasons, f"its unit is {unit}"))
-    fits = [path for path in guess.others if unit_of(path) == unit]
+    fits = [path for path in guess.others if unit_of(path, joints) == unit]
     if fits:
         rest = tuple(p for p in guess.others if p != fits[0])
         why = f"its unit is {unit}, that of {guess.path} {known}"

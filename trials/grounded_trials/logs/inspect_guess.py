@@ -26,6 +26,7 @@ DRIFT = 2e-4  # of a signal's range: the least deviation that is proposed for it
 SIMULATED_S = 1.0  # header stamps this far from the log's clock are not its time
 
 _YAW = ("@rpy.yaw", "yaw", "heading", "theta", "psi")
+_TURN = ("@rpy.pitch", "@rpy.yaw", "theta", "angle", "pitch")
 _MEANINGS: dict[str, tuple[str, ...]] = {
     "x": ("position.x", "translation.x", "x", "north", "northing", "east", "easting"),
     "y": ("position.y", "translation.y", "y", "east", "easting", "north", "northing"),
@@ -33,7 +34,8 @@ _MEANINGS: dict[str, tuple[str, ...]] = {
     "psi": _YAW,
     "yaw": _YAW,
     "heading": _YAW,
-    "theta": ("@rpy.pitch", "@rpy.yaw", "theta", "angle", "pitch"),
+    "theta": _TURN,
+    "th": _TURN,
     "pitch": ("@rpy.pitch", "pitch", "theta", "tilt", "lean"),
     "pitch_rate": ("angular.y", "angular_velocity.y", "pitch_rate", "pitch_velocity"),
     "phi": ("@rpy.roll", "roll", "phi"),

@@ -22,7 +22,7 @@ from grounded_trials.logs.inspect_guess import SIMULATED_S, Guess
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.samples import Samples, tidy
 from grounded_trials.logs.signals import Series, SignalSpec, read_signals
-from grounded_trials.logs.stated_units import Stated, factor_between
+from grounded_trials.logs.stated_units import LENGTHS, Stated, factor_between, may_be
 
 SLOPE = 0.01
 FOLLOWS = 0.8  # correlation of a rate with the derivative of its position
@@ -45,8 +45,12 @@ def paired(
     signals: Signals,
     units: Mapping[str, str],
     log: LogReport,
+    joints: Mapping[str, str],
 ) -> dict[str, Guess]:
-    """A position and its rate; what no name gives is sought among the numbers nobody has taken."""
+    """A position and its rate; what no name gives is sought among the numbers nobody has taken.
+
+    `joints`: units of joints' numbers by their paths; what is in another unit is no state's.
+    """
     taken = {guess.path for guess in guesses.values()}
     free = [f.path for t in log.topics for f in t.fields if f.low != f.high and f.path not in taken]
     own = {name: guesses[name] for name in pair}
@@ -56,9 +60,8 @@ def paired(
         return found if len(found) != 1 else _elsewhere(found, own, pair, free, signals, units)
     if not 0 < len(free) <= FEW or not any(guess.path for guess in guesses.values()):
         return {}
-    tried = {
-        name: replace(own[name], others=tuple(free)) if name in bare else own[name] for name in pair
-    }
+    fits = {name: tuple(p for p in free if may_be(p, units[name], joints)) for name in bare}
+    tried = {name: replace(one, others=fits.get(name, one.others)) for name, one in own.items()}
     signals.read(free)
     found = _derivative(tried[pair[0]], tried[pair[1]], signals, units)
     if len(found) < 2:
@@ -131,7 +134,7 @@ def _derivative(q: Guess, w: Guess, signals: Signals, units: Mapping[str, str]) 
         if scale in (DEGREE, -DEGREE):  # the position is in degrees
             found_q = replace(found_q, scale=1 / DEGREE, sure=False)
             scale /= DEGREE
-        found_w = replace(found_w, scale=scale, sure=found_w.sure or fits)
+        found_w = replace(found_w, scale=scale, sure=found_w.sure or (fits and found_q.sure))
     elif abs(abs(logged.slope) - 1) < SAME and bool(stated.unit(a)) != bool(stated.unit(b)):
         why += ", as large as it is logged: both are taken to be in one unit"
         if stated.unit(a):
@@ -151,11 +154,13 @@ def agreed(
     signals: Signals,
     units: Mapping[str, str],
     log: LogReport,
+    joints: Mapping[str, str],
 ) -> dict[str, Guess]:
     """A position and its rate that are sure without a name: all that the log says agrees.
 
     The position's is the only number in a unit of its kind, the rate's follows its derivative in
-    that unit, and neither of them fits any other number so.
+    that unit, and neither of them fits any other number so. A joint that is called a slide has it
+    in metres.
     """
     stated, (q, w) = signals.stated, (guesses[name] for name in pair)
     fields = [f.path for t in log.topics for f in t.fields if f.low != f.high]
@@ -163,7 +168,8 @@ def agreed(
         return {}
 
     def of_its_kind(path: str) -> bool:
-        said = stated.unit(path)
+        slide = joints.get(path, "")
+        said = stated.unit(path) or slide * (slide in LENGTHS)
         return bool(said) and factor_between(said, units[q.name]) is not None
 
     if [path for path in fields if of_its_kind(path)] != [q.path]:
@@ -191,7 +197,12 @@ def rates_among(log: LogReport, paths: Sequence[str]) -> dict[str, tuple[str, fl
 
     Only where one unit or a power of ten of it lies between them; each is one pair's at most.
     """
-    signals, found = Signals(log, (), (), Stated.by(log.files)), []
+    return rates_in(Signals(log, (), (), Stated.by(log.files)), paths)
+
+
+def rates_in(signals: Signals, paths: Sequence[str]) -> dict[str, tuple[str, float]]:
+    """The same, with samples that may have been read."""
+    found = []
     signals.read(paths)
     for a, b in permutations(paths, 2):
         gridded = signals.grid((a, b))

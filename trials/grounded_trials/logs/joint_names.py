@@ -15,13 +15,23 @@ from grounded_trials.formats.mcap_records import Channel, Messages
 from grounded_trials.logs.inspect_guess import Guess
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.log_files import log_records
+from grounded_trials.logs.stated_units import SLIDING, TURNING
 
-JOINT_UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
 LIMB = ("base", "waist", "torso", "shoulder", "upper", "elbow", "fore", "wrist", "hand", "finger")
 LEG = ("hip", "thigh", "knee", "shin", "ankle", "foot", "toe")
 WITHIN = ("yaw", "pan", "lift", "pitch", "flex", "roll")  # of the joints of one part
 SIDES = ("left", "right", "front", "rear")  # of several limbs
 ROLLS = re.compile("wheel|caster|track|rotor|prop|crank|spindle")  # turns on and on
+SLIDES = {  # words of a joint that is a slide: its numbers are in m
+    *("trolley", "cart", "carriage", "slide", "slider", "rail", "prismatic", "linear"),
+    *("gantry", "lift", "elevator", "telescope"),
+}
+TURNS = {  # words of one that turns all the same: a shoulder's lift, a pole on a cart
+    *LIMB,
+    *LEG,
+    *("yaw", "pan", "pitch", "flex", "roll", "tilt", "wheel", "hinge", "revolute", "rotation"),
+    *("pole", "pendulum", "swing", "sway", "angle", "theta"),
+} - {"base", "torso"}
 FULL_TURNS, DEGREES = 4 * math.pi, 720.0  # of a joint: what spans more; its most, in degrees
 
 
@@ -43,6 +53,35 @@ def joint_names(log: LogReport) -> dict[str, tuple[str, ...]]:
                     if channel is not None and channel.topic in wanted:
                         found[channel.topic] |= _names_in(record.of(identity), channel.encoding)
     return {topic: names.pop() for topic, names in found.items() if len(names) == 1}
+
+
+def slides(joint: str) -> bool:
+    """Whether a joint is called like one that slides: a trolley, a rail, a lift."""
+    words = _words(joint)
+    return bool(words & SLIDES) and not words & TURNS
+
+
+def joint_units(joints: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """The units of joints' numbers by their paths, "" for a joint that its name doesn't explain.
+
+    Radians where it turns, metres where it slides.
+
+    Args:
+        joints: see `joint_names`.
+    """
+    none = dict.fromkeys(TURNING, "")
+    return {
+        f"{topic}.{kind}[{i}]": unit
+        for topic, names in joints.items()
+        for i, joint in enumerate(names)
+        for kind, unit in (
+            SLIDING if slides(joint) else TURNING if _words(joint) & TURNS else none
+        ).items()
+    }
+
+
+def _words(joint: str) -> set[str]:
+    return {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", joint)}
 
 
 def _names_in(batch: Messages, encoding: str) -> set[tuple[str, ...]]:
@@ -101,7 +140,8 @@ def of_joint(
         for i, joint in enumerate(names):
             if not _holds(guess.name, joint):
                 continue
-            kind = next((k for k, u in JOINT_UNITS.items() if u == unit), None)
+            measured = SLIDING if slides(joint) else TURNING
+            kind = next((k for k, u in measured.items() if u == unit), None)
             kind = kind or ("position" if unit in ("m", "1") else None)
             path = f"{topic}.{kind}[{i}]"
             commanded = _commands(log, len(names)) if sent and kind == "effort" else []
@@ -155,25 +195,32 @@ def in_order(
     joints: Mapping[str, tuple[str, ...]],
     log: LogReport,
 ) -> dict[str, Guess]:
-    """As many names of a unit as there are joints, none of them found: taken from the base on."""
+    """As many names of a unit as there are joints, none of them found: taken from the base on.
+
+    Joints that slide have states in m, those that turn in rad.
+    """
     found: dict[str, Guess] = {}
     if len(joints) != 1:
         return found
     topic, names = next(iter(joints.items()))
     order, there = from_base(names), _there(log)
-    for kind, unit in JOINT_UNITS.items():
+    kinds = ((k, u, slide) for slide in (False, True) for k, u in (TURNING, SLIDING)[slide].items())
+    for kind, unit, slide in kinds:
+        some = [joint for joint in order if slides(joint) is slide]
         those = [name for name, guess in guesses.items() if units[name] == unit]
-        if len(those) != len(names) or any(guesses[name].path for name in those):
+        if len(those) != len(some) or any(guesses[name].path for name in those):
             continue
         commanded = _commands(log, len(names)) if kind == "effort" else []
-        own = [next((j for j in names if _holds(name, j)), "") for name in those]
-        for name, joint in zip(those, own if set(own) == set(names) else order, strict=True):
+        own = [next((j for j in some if _holds(name, j)), "") for name in those]
+        for name, joint in zip(those, own if set(own) == set(some) else some, strict=True):
             at = order.index(joint)
             paths = [f"{command}[{at}]" for command in commanded]
             paths += [path] if (path := f"{topic}.{kind}[{names.index(joint)}]") in there else []
             if not paths:
                 continue
             why = f"in the order of the joints from the base, {at} is '{joint}'"
+            if len(some) == 1:
+                why = f"'{joint}' is the only joint{' that slides' * slide}"
             why = f"no name says it; {why}" if commanded else why
             rest = [f"{c}[{i}]" for c in commanded for i in range(len(names)) if i != at]
             others = (*paths[1:], *rest)

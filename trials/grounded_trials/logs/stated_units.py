@@ -1,8 +1,13 @@
-"""Units that a log writes beside its numbers, `x [mm]` or `x_mm`, against those of the model.
+"""Units of a log's numbers against those of the model: stated, or by ROS's conventions.
 
-What a CSV's first row says in brackets is no guess, and the end of a name hardly one: where either
-names a multiple of the model's unit, [log] gets the factor between the two. Units that are no
-multiples of each other say nothing.
+What a CSV's first row says in brackets, `x [mm]`, is no guess, and the end of a name hardly one:
+where either names a multiple of the model's unit, [log] gets the factor between the two. Units that
+are no multiples of each other say nothing.
+
+What ROS's messages measure their names say (REP 103: metres, radians, seconds). A JointState's
+position is in radians where the joint turns and in metres where it slides, which the joint's name
+may say: `joint_units` of joint_names.py. A field `angle` is an angle in any message, if not surely
+one in radians: it is no length.
 """
 
 from __future__ import annotations
@@ -49,6 +54,17 @@ _ROLES = re.compile(  # what a command is to its robot: its unit may stand befor
 )
 _SHORT = ("s", "V", "A", "N")  # may be part of a name as well: `vel_N`
 _NUMBER = re.compile(r"(?:\.(?:data|value))?(?:\[-?\d+\])*\"?$")  # what follows a number's name
+TURNING = {"position": "rad", "velocity": "rad/s", "effort": "N m"}  # of a joint
+SLIDING = {"position": "m", "velocity": "m/s", "effort": "N"}
+UNITS = (  # what the end of a path measures
+    (r"(position|translation)\.[xyz]$", "m"),
+    (r"@rpy\.\w+$|steering_angle$", "rad"),
+    (r"angular_velocity\.[xyz]$|angular\.[xyz]$|steering_angle_velocity$", "rad/s"),
+    (r"linear_acceleration\.[xyz]$|accel\.linear\.[xyz]$", "m/s^2"),
+    (r"linear\.[xyz]$|drive\.speed$", "m/s"),
+)
+ANGLE = re.compile(r"(^|[._/])(angle|angular_position|swing|tilt|pitch|roll|yaw|heading)$")
+LENGTHS = ("m", "m/s")
 
 
 @dataclass(frozen=True)
@@ -135,3 +151,38 @@ def _in_base(unit: str) -> tuple[Counter[str], float]:
             for base, count in inner.items():
                 powers[base] += sign * count
     return Counter({base: n for base, n in powers.items() if n and base != "1"}), size
+
+
+def unit_of(path: str, joints: Mapping[str, str] | None = None) -> str:
+    """The unit of a path's number, "" where no convention gives one.
+
+    Args:
+        path: of a message.
+        joints: units of joints' numbers by their paths, where the joints' names are known.
+    """
+    if joints and path in joints:
+        return joints[path]
+    for pattern, unit in UNITS:
+        if re.search(pattern, path):
+            return unit
+    found = re.search(r"\.(position|velocity|effort)\[\d+\]$", path)
+    return TURNING[found[1]] if found else ""
+
+
+def is_angle(path: str) -> bool:
+    """Whether a number is called an angle, of whichever unit."""
+    return bool(ANGLE.search(path.lower()))
+
+
+def may_be(path: str, unit: str, joints: Mapping[str, str] | None = None) -> bool:
+    """Whether a number may be a state in some unit: an angle is no length, nor a slide a turn.
+
+    Args:
+        path: of a message.
+        unit: of the state.
+        joints: see `unit_of`.
+    """
+    if unit in LENGTHS and is_angle(path):
+        return False
+    known = unit_of(path, joints)
+    return not (known and unit not in ("", "1")) or factor_between(known, unit) is not None

@@ -10,17 +10,20 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from grounded_trials.logs.inspect_evidence import as_stated, unit_of
+from grounded_trials.logs.inspect_evidence import as_stated
 from grounded_trials.logs.inspect_guess import Guess
 from grounded_trials.logs.inspect_log import LogReport
-from grounded_trials.logs.stated_units import Stated, factor_between
+from grounded_trials.logs.stated_units import Stated, factor_between, may_be, unit_of
 
 PARTS = re.compile("covariance|layout")  # of messages: no robot's numbers
 MOST = 20  # numbers of the log to choose from
 
 
 def from_the_rest(
-    guesses: Sequence[Guess], units: Mapping[str, str], log: LogReport
+    guesses: Sequence[Guess],
+    units: Mapping[str, str],
+    log: LogReport,
+    joints: Mapping[str, str] | None = None,
 ) -> tuple[Guess, ...]:
     """The guesses, where those without a path get what the rest of the log may be to them.
 
@@ -28,6 +31,7 @@ def from_the_rest(
         guesses: of states and inputs.
         units: of the model, by their names.
         log: that was looked through.
+        joints: units of joints' numbers by their paths, see `joint_units`.
     """
     stated, taken = Stated.by(log.files), {guess.path for guess in guesses}
     moving = [f.path for t in log.topics for f in t.fields if f.low != f.high]
@@ -46,8 +50,11 @@ def from_the_rest(
             one = _by_unit(guess, alone[name], log)
             found.append(as_stated(stated, units[name], one))
         elif name in fits:
-            may = ("", units[name])  # by ROS's conventions
-            unsaid = [path for path in left if not stated.unit(path) and unit_of(path) in may]
+
+            def named(path: str, unit: str = units[name]) -> bool:  # by ROS's conventions
+                return unit_of(path, joints) in ("", unit) and may_be(path, unit, joints)
+
+            unsaid = [path for path in left if not stated.unit(path) and named(path)]
             rest = tuple(p for p in fits[name] or unsaid if p not in alone.values())
             found.append(replace(guess, others=rest[:MOST]))
         else:

@@ -24,7 +24,7 @@ from grounded_trials.logs.inspect_evidence import as_stated, weigh
 from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated, mapping_toml
 from grounded_trials.logs.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.inspect_pairs import velocities
-from grounded_trials.logs.joint_names import joint_names, wide_joints
+from grounded_trials.logs.joint_names import joint_names, joint_units, wide_joints
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.stated_units import Stated
@@ -176,7 +176,7 @@ def _begin(
         )
         notes = (*notes, *_left_out(report, found))
     units = {**found.states, **found.inputs}
-    both = from_the_rest((*states, *inputs), units, report)
+    both = from_the_rest((*states, *inputs), units, report, joint_units(joints))
     states, inputs = both[: found.n], both[found.n :]
     if ask is not None:
         said = Stated.by(files)

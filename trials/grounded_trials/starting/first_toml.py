@@ -85,7 +85,7 @@ def write_first(
         "[limits]" + "                      # put in what your robot may get" * (not limits),
         *limits,
         *[
-            "# SEEN in the log, and 0: put in what your robot may get, then delete these two lines",
+            "# SEEN in the log: put in what your robot may get, then delete these two lines",
             f"seen_in = {json.dumps(log, ensure_ascii=False)}",
         ]
         * bool(limits),

@@ -8,6 +8,7 @@ be that interval itself; a test signal that steps once a second says nothing of 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from grounded.frozen import Array
 from grounded_trials.logs.inspect_guess import Guess
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.signals import Series, SignalSpec, read_signals
+from grounded_trials.starting.kinds import COMMANDED
 
 RATES = (1000, 500, 400, 250, 200, 125, 120, 100, 60, 50, 40, 30, 25, 20, 15, 10, 5, 2)  # [Hz]
 STEPS = tuple(float(f"{1 / rate:.6g}") for rate in RATES)  # [s], as it is written
@@ -43,6 +45,7 @@ def interval_of(
         inputs: where its commands are.
         states: where its states are.
     """
+    inputs = _commanded(inputs)
     for guesses, whose in ((inputs, "log's commands"), (states, "log's states")):
         rates = [
             t.rate_hz for g in guesses if (t := _topic(report, g)) is not None and t.rate_hz > 0
@@ -132,6 +135,14 @@ def _in_phase(gaps: Array, rows: float) -> float | None:
             found[step] = float(np.median(turns))
     best = max(found, key=found.__getitem__, default=None)
     return best if best is not None and found[best] >= IN_STEP else None
+
+
+def _commanded(inputs: Sequence[Guess]) -> tuple[Guess, ...]:
+    """The inputs; one that was not found at what is called a command among its rivals."""
+    rivals = [next((p for p in g.others if COMMANDED.search(p.lower())), "") for g in inputs]
+    return tuple(
+        g if g.path else replace(g, path=path) for g, path in zip(inputs, rivals, strict=True)
+    )
 
 
 def _topic(report: LogReport, guess: Guess) -> Any:

@@ -13,11 +13,12 @@ from dataclasses import replace
 from grounded.errors import GroundedError, nearest
 from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
 from grounded_trials.logs.inspect_pairs import rates_among
-from grounded_trials.logs.joint_names import from_base
+from grounded_trials.logs.joint_names import from_base, slides
 from grounded_trials.logs.stated_units import factor_between, unit_in_name
 from grounded_trials.starting.skeletons import (
     BALANCE,
     CAR,
+    CRANE,
     DIFFERENTIAL,
     DRONE,
     PENDULUM,
@@ -43,6 +44,7 @@ SENSED = re.compile(
 )
 PITCHES, ROLLS_ON = {"pitch", "tilt", "lean"}, {"x", "v", "position", "speed", "velocity", "wheel"}
 FLIES = {"roll", "yaw", "z", "thrust", "altitude", "elevator", "rudder", "steering", "psi"}
+SWINGS = re.compile(r"angle|swing|sway|pendulum|pole|theta|tilt")  # what hangs from a trolley
 FLYING = re.compile(
     r"(^|[/_])(cf\d*|crazyflie|quad(rotor|copter)?|drone|uav|mavros|copter)([/_]|$)"
 )
@@ -130,7 +132,7 @@ def _word(path: str) -> str:
     return name if name.isidentifier() else f"s_{name}"
 
 
-KINDS = ("car", "rover", "differential", "balance", "drone", "arm", "pendulum", "generic")
+KINDS = ("car", "rover", "differential", "balance", "drone", "arm", "pendulum", "crane", "generic")
 
 
 def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
@@ -138,7 +140,9 @@ def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
     steered = next((t.topic for t in log.topics if "Ackermann" in t.type), None)
     if steered is not None:
         return "car", f"{steered} holds Ackermann commands"
-    if joints := of_arms(joints):
+    if hung := _hung(log, joints):
+        return "crane", hung
+    if joints := _turning(of_arms(joints)):
         where, names = next(iter(joints.items()))
         kind = "arm" if len(names) > 1 else "pendulum"
         return kind, f"{where} has {len(names)} joints: {', '.join(names[:6])}"
@@ -172,6 +176,40 @@ def of_arms(joints: Joints) -> Joints:
         for topic, names in joints.items()
         if not all("wheel" in name.lower() for name in names)
     }
+
+
+def _turning(joints: Joints) -> Joints:
+    """Topics of joints that do not all slide: a slide alone is neither an arm nor a pendulum."""
+    return {topic: names for topic, names in joints.items() if not all(map(slides, names))}
+
+
+def _hung(log: LogReport, joints: Joints) -> str:
+    """What says that something swings on a trolley, a load or a pole; "" where nothing does."""
+    own = [(topic, names) for topic, names in joints.items() if sum(map(slides, names)) == 1]
+    driving = ("/Odometry", "/Twist", "/TwistStamped")
+    if not own or any(t.type.endswith(driving) for t in log.topics):
+        return ""
+    (topic, names), found = own[0], moving(log)
+    slide, others = next(filter(slides, names)), [name for name in names if not slides(name)]
+    if len(others) == 1:
+        return f"{topic} has '{slide}', which slides, and '{others[0]}'"
+    angles = [n for n, one in found.items() if SWINGS.search(n) and not called_input(n, one.path)]
+    if others or not angles:
+        return ""
+    return f"{topic} has '{slide}', which slides, and {found[angles[0]].path} is an angle"
+
+
+def _crane(log: LogReport, units: Units) -> Skeleton:
+    """The crane with its command's own name, in volts or without a unit where that is no force."""
+    found = moving(log)
+    sent = [name for name, one in found.items() if called_input(name, one.path)]
+    if len(sent) != 1 or sent[0] in CRANE.inputs:
+        return CRANE
+    unit = "V" if _in_volts(sent[0], found[sent[0]].path, units) else "1"
+    gain = CRANE.params["gain"].replace("m/s^2/N", "m/s^2" + "/V" * (unit == "V"))
+    before = [line.replace("a.force", f"a.{sent[0]}") for line in CRANE.before]
+    params = {**CRANE.params, "gain": gain}
+    return replace(CRANE, inputs={sent[0]: unit}, before=before, params=params)
 
 
 def _both_sides(log: LogReport) -> tuple[str, ...]:
@@ -260,6 +298,8 @@ def skeleton(
             for line in DIFFERENTIAL.lines
         ]
         return replace(DIFFERENTIAL, inputs=dict.fromkeys(both, "1"), lines=lines)
+    if kind == "crane":
+        return _crane(log, units or {})
     if kind == "balance" and (command := _balancing(log)):
         return _driven_by(command, _in_volts(command, moving(log)[command].path, units or {}))
     fixed = {one.kind: one for one in (CAR, ROVER, DIFFERENTIAL, BALANCE, DRONE, PENDULUM)}

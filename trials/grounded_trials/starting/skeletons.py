@@ -206,6 +206,34 @@ BALANCE = Skeleton(
 )
 
 
+CRANE = Skeleton(
+    "crane",
+    "A trolley on a rail, a load below it at x + L sin(theta): theta = 0 hanging down",
+    {"x": "m", "v": "m/s", "theta": "rad", "omega": "rad/s"},
+    {"force": "N"},
+    {
+        "gain": '0.5, "m/s^2/N", 0.001, 100.0',  # of the trolley alone
+        "damping": '0.5, "1/s", 0.0, 50.0',
+        "ratio": '0.3, "1", 0.0, 10.0',
+        "L": '1.0, "m", 0.05, 20.0',
+        "g": '9.81, "m/s^2"',  # -9.81: a pole on a cart, theta = 0 upright
+    },
+    (
+        '"x": s.v',
+        '"v": acc',
+        '"theta": s.omega',
+        '"omega": -(acc * cs + p.g * sn) / p.L',
+    ),
+    ("theta",),
+    {"rail": "x", "hanging": ("theta",)},
+    before=(
+        "sn, cs = np.sin(s.theta), np.cos(s.theta)",
+        "pull = p.ratio * sn * (p.L * s.omega**2 + p.g * cs)  # of the load; ratio: to the trolley",
+        "acc = (p.gain * a.force - p.damping * s.v + pull) / (1 + p.ratio * sn**2)",
+    ),
+)
+
+
 def arm(joints: Sequence[str]) -> Skeleton:
     """An arm whose joints don't feel each other, named after them, in order from the base."""
     short = [re.sub(r"_?joint_?", "", joint) or joint for joint in joints]

@@ -47,6 +47,7 @@ class Adopted(Result):
     then: NextCommand = PROPOSE
     beside: tuple[str, ...] = ()  # adopted before from the same diagnosis, fitted in their place
     left: Mapping[str, Left] = field(default_factory=dict)  # by name
+    logged: str = ""  # the trial whose drive target.csv still is, where it ran no candidate
     stopped: str = ""  # what to do about parameters that went as far as they may
 
     def summary(self) -> str:
@@ -92,6 +93,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     claim was fitted in place of those, without them.
     """
     from grounded_trials.workspace.adopted import in_order
+    from grounded_trials.workspace.next_step import TARGET, logged_target
 
     found = read_diagnosis(workspace.reports)
     if found is None:
@@ -115,10 +117,13 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     write_document(workspace.reports / KEPT, {"adoptions": [*earlier, step], "undone": []})
     fitted = {*names, *before, *(found.effects if claimed else ()), *found.filters}
     beside = (str(effect["name"]) for effect in adopted)
+    logged = logged_target(workspace) if not workspace.candidate_ids() else ""
     return Adopted(
         tuple(adopted),
         own,
         claimed,
+        then=TARGET if logged else PROPOSE,
+        logged=logged,
         beside=tuple(n for n in beside if n not in fitted),
         left=left_behind(found) if parameters and physics and claimed else {},
         stopped=wider(found.parameters) if parameters and physics and claimed else "",

@@ -25,7 +25,7 @@ from grounded.policy import Policy, to_arrays
 from grounded.result import Result
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.handover import checked_candidate
+from grounded_trials.workspace.handover import Check, checked_candidate, intact
 from grounded_trials.workspace.proposing import candidate_named, standing_in
 
 RUNNER = "grounded_runner.py"
@@ -83,6 +83,26 @@ def export_candidate(
     waiting = handed.check.standing.outstanding
     how = () if waiting and waiting.id == identity else ("--candidate", identity)
     return Exported(identity, path, form, program, handed.notes, handed.overridden, how)
+
+
+def void_exports(workspace: Folder, but: str = "") -> tuple[Path, ...]:
+    """Files in the workspace's folder that hold a candidate which must not be run any more.
+
+    Only those that are byte for byte what `export` or `next` wrote, of one that no trial ran.
+
+    Args:
+        workspace: in whose folder `next` writes.
+        but: the candidate that was just handed over.
+    """
+    ran = {stored.trial.candidate for stored in workspace.whole_trials()}
+    names = [name for name in workspace.candidate_ids() if name not in {but, *ran}]
+    found = []
+    for path in (workspace.folder / f"{name}.{form}" for name in names for form in _encoders()):
+        if path.is_file() and is_export(workspace, path.stem, path):
+            made, meta = intact(workspace.candidate_bytes(path.stem), path.stem)
+            if tuple(Check(workspace, made, meta, False, None).reasons()):
+                found.append(path)
+    return tuple(found)
 
 
 def is_export(workspace: Folder, identity: str, path: Path) -> bool:

@@ -22,6 +22,7 @@ class Inspected(Result):
     report: LogReport
     log_table: str  # TOML; "" where none is guessed
     why_none: str = ""  # why no table is guessed for a log that needs one
+    outside: bool = False  # of any workspace
     ran_nothing: bool = False  # no candidate was proposed yet that it could have run
     odd: tuple[str, ...] = ()  # what the workspace's [log] reads as what it is not
 
@@ -45,6 +46,8 @@ class Inspected(Result):
         if self.stored:
             return NextCommand("report")
         if self.format != TRIAL and not self.log_table:
+            if self.outside:
+                return NextCommand("init", ("DIR", "--from", self.log))
             return NextCommand("inspect", (self.log,))
         return NextCommand("ingest", (*["--data"] * self.ran_nothing, self.log))
 
@@ -80,7 +83,7 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     """
     from grounded_trials.logs.inspect_evidence import weigh
     from grounded_trials.logs.inspect_guess import guess_mapping, is_simulated, mapping_toml
-    from grounded_trials.logs.joint_names import joint_names, wide_joints
+    from grounded_trials.logs.joint_names import joint_names, joint_units, wide_joints
     from grounded_trials.logs.log_table import log_mapping
     from grounded_trials.logs.unnamed import from_the_rest
     from grounded_trials.workspace.intake.no_angle import no_angles
@@ -93,13 +96,15 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     except GroundedError as error:
         here = (workspace.folder / FILE).exists()
         why = f": {error}" if here else " outside a workspace (-C DIR names one)"
-        return Inspected(str(log), report, "", why)
+        return Inspected(str(log), report, "", why, outside=not here)
     states, inputs = guess_mapping(report, model.state_names, model.input_names)
-    states, inputs = weigh(report, model, states, inputs)
-    both = from_the_rest((*states, *inputs), {**model.states, **model.inputs}, report)
+    joints = joint_names(report)
+    states, inputs = weigh(report, model, states, inputs, joints)
+    units = {**model.states, **model.inputs}
+    both = from_the_rest((*states, *inputs), units, report, joint_units(joints))
     states, inputs = both[: model.n], both[model.n :]
     table = mapping_toml(states, inputs, simulated=is_simulated(report))
     mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
     odd = tuple(f"{name} {said}" for name, said in no_angles(model, mapping).items())
-    odd += wide_joints(states, model.states, joint_names(report), report)
+    odd += wide_joints(states, model.states, joints, report)
     return Inspected(str(log), report, table, ran_nothing=not workspace.candidate_ids(), odd=odd)

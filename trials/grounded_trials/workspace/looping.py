@@ -10,7 +10,7 @@ from typing import Any
 from grounded.errors import NextCommand
 from grounded.result import Result
 from grounded.search.candidate import Candidate
-from grounded_trials.workspace.exporting import Exported, export_candidate
+from grounded_trials.workspace.exporting import Exported, export_candidate, void_exports
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.ingest import ingest_log
 from grounded_trials.workspace.intake.ingested import Ingested
@@ -30,6 +30,7 @@ class NextRun(Result):
     taken: Ingested
     proposed: Proposed
     exported: Exported | None
+    removed: tuple[Path, ...] = ()  # files of candidates that are void now, as `next` wrote them
 
     def summary(self) -> str:
         """What was taken in, and what comes next."""
@@ -42,6 +43,7 @@ class NextRun(Result):
             "trials": [self.taken.to_json()],
             "propose": self.proposed.to_json(),
             "export": None if self.exported is None else self.exported.to_json(),
+            "removed": [str(path) for path in self.removed],
         }
 
 
@@ -82,4 +84,8 @@ def next_in(workspace: Folder, log: Path, candidate: str | None, *, runner: bool
         name, form = proposed.candidate.id, "npz" if runner else "json"
         file = workspace.folder / f"{name}.{form}"
         exported = export_candidate(workspace, name, form, file, runner=runner)
-    return NextRun(taken, proposed, exported)
+    name = "" if proposed.candidate is None else proposed.candidate.id
+    removed = void_exports(workspace, name)
+    for path in removed:
+        path.unlink()
+    return NextRun(taken, proposed, exported, removed)

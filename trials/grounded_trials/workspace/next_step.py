@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import GroundedError, NextCommand
@@ -24,6 +26,7 @@ DIAGNOSE = NextCommand("diagnose")
 EXPORT = NextCommand("export", ("best", "--runner"))
 REPORT = NextCommand("report", ("--html",))
 TARGET = NextCommand("target", ("SHAPE",))
+WRITTEN = 1e-3  # of what a target asks for: its digits in a file
 SHORT = 0.1  # of a control step: a filter that makes no difference
 LEFT = 2  # states that are told of what is left
 SAME = 1e-6  # of a value: what writing it in eight digits may take
@@ -97,6 +100,26 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
         return next_command(workspace, now, found, usable_ids(workspace))
     goes_on = now.phase in ("propose", "await-trial") and not now.doubt
     return PROPOSE if goes_on else status_of(workspace, now).then
+
+
+def logged_target(workspace: Folder) -> str:
+    """The log whose drive target.csv still is, as `init --from` wrote it; "" where it is another.
+
+    It is one that ran no candidate, and the target is what its states did, row by row.
+    """
+    if not workspace.config.task.target:
+        return ""
+    task = workspace.task
+    asked = np.isfinite(task.target).any(axis=0)
+    for stored in workspace.whole_trials():
+        trial, rows = stored.trial, len(task.target)
+        if trial.candidate or trial.steps + 1 < rows or trial.dt != task.dt:
+            continue
+        off = np.abs(trial.states[:rows, asked] - task.target[:, asked])
+        moved = np.ptp(task.target[:, asked], axis=0).max(initial=0.0)
+        if moved > 0 and off.size and np.nanmax(off) < WRITTEN * moved:
+            return trial.id or stored.stored.id
+    return ""
 
 
 def _none_stood(now: Standing) -> bool:

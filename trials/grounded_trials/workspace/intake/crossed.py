@@ -12,9 +12,8 @@ from collections.abc import Mapping
 from itertools import combinations
 
 from grounded.model import Model
-from grounded_trials.logs.inspect_evidence import unit_of
 from grounded_trials.logs.log_table import LogMapping
-from grounded_trials.logs.stated_units import bare_command
+from grounded_trials.logs.stated_units import LENGTHS, bare_command, is_angle, unit_of
 from grounded_trials.workspace.config import FILE
 
 UNNAMED = ("data", "value")  # what a number is called that its topic names
@@ -29,13 +28,19 @@ def crossed(model: Model, mapping: LogMapping) -> tuple[str, ...]:
     """
     paths = {name: one.path for name, one in {**mapping.states, **mapping.inputs}.items()}
     units = {**model.states, **model.inputs}
+    angles = [n for n, s in mapping.states.items() if is_angle(s.path) and s.scale == 1]
+    lengths = [name for name in angles if units[name] in LENGTHS]
     axes = model.roles.get("position", ())  # north may be the x of one and the y of another
     by = {
         (a, b): "units" if _of_the_other(a, b, paths, units) else "names"
         for a, b in combinations(paths, 2)
         if _of_the_other(a, b, paths, units) or _crossed(a, b, paths)
     }
-    return tuple(
+    no_lengths = tuple(
+        f"{n} [{units[n]}] is read from {paths[n]}, by its name an angle: see {FILE}'s [log]"
+        for n in lengths
+    )
+    return no_lengths + tuple(
         f"{a} is read from {paths[a]} and {b} from {paths[b]}: by their {what} they are exchanged "
         f"in {FILE}'s [log]"
         for (a, b), what in by.items()
