@@ -13,6 +13,12 @@ ENDED = {  # by `Estimate.stopped`
     "prior": ("as far as its std lets it go: the data ask for more",),
 }
 
+AT_BOUNDS = (  # said of the next trial where all that moved are there
+    "None helps before this: parameters ended at their bounds and the data ask for more. Where one "
+    "may lie beyond, widen its bounds in the model file; else another, which the model has as a "
+    "constant, may be off: give it bounds. Then diagnose again."
+)
+
 
 def wider(known: Mapping[str, Estimate]) -> str:
     """What to do about those whose prior stopped them, a sentence; "" where it stopped none.

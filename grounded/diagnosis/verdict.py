@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, furthest, runaway
 from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
 from grounded.diagnosis.ruler_words import explained, floor, improvement, rest, worsened
-from grounded.diagnosis.stopped import ENDED, wider
+from grounded.diagnosis.stopped import AT_BOUNDS, ENDED, wider
 from grounded.model import Model, all_at_bounds
 from grounded.result import listed, number, percent
 
@@ -227,11 +227,7 @@ def next_trial(
     if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names):
         return "Nothing is tied: give the model a parameter for a load, then diagnose again."
     if ended:
-        return (
-            "None helps before this: parameters ended at their bounds and the data ask for more. "
-            "Where one may lie beyond, widen its bounds in the model file; else another, which "
-            "the model has as a constant, may be off: give it bounds. Then diagnose again."
-        )
+        return AT_BOUNDS
     if _own_numbers(claims, adopted):
         return "None is needed to tell causes apart: fit the model's parameters."
     return "None is needed to tell causes apart: adopt what is claimed."
