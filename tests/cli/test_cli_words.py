@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+import small_tasks
 from cli import grounded, process
 from facts import holds
 from grounded.result import listed
@@ -200,9 +201,9 @@ def test_a_rerun_says_who_is_best_now_where_it_is_another(capsys):
     """A car's next step went out from c0003 after c0001 was run again, without a word."""
     one = Ingested("t0009", "", False, "c0001", -0.1273, None, (), (), verdict="run again")
     best = SimpleNamespace(candidate=SimpleNamespace(id="c0003"), utility=-0.1143)
-    _tell("q5", one, best)
+    _tell("q5", one, best, small_tasks.cart)
     assert re.search(r"best is now c0003,\s+-0\.1143", capsys.readouterr().out)
-    _tell("q5", replace(one, candidate="c0003"), best)
+    _tell("q5", replace(one, candidate="c0003"), best, small_tasks.cart)
     assert "best" not in capsys.readouterr().out
 
 

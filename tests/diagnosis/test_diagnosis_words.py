@@ -75,8 +75,8 @@ def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt
     assert contested((short,), (unlike,), ("delay:u",))
     claims = _claiming(Library().effect("coulomb_friction:v", cart_task().model))
     said = {worse: next_trial(claims, "", (), worse=worse) for worse in (False, True)}
-    assert said[False].endswith("adopt it.")
-    assert "worse" in said[True] and not said[True].endswith("adopt it.")
+    assert said[False].endswith("adopt what is claimed.")
+    assert "worse" in said[True] and not said[True].endswith("adopt what is claimed.")
     assert "adopt" not in next_trial(claims, "", (), further=True)
 
 
@@ -97,7 +97,9 @@ def test_numbers_of_the_model_are_fitted_those_of_adopted_effects_adopted():
         return next_trial(claims, "", (), adopted=("viscous_friction:v",))
 
     assert "fit" in said("mass") and "adopt" not in said("mass")
-    assert said(*names).endswith("adopt them.") and said(names[1]).endswith("adopt it.")
+    assert said(*names).endswith("adopt what is claimed.") and said(names[1]).endswith(
+        "adopt what is claimed."
+    )
     one = _claiming(Library().effect("parameter:mass", cart_task().model))
     assert next_trial(one, "", ()) == said("mass")
 

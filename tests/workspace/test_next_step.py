@@ -608,7 +608,7 @@ def test_who_is_told_that_a_candidate_may_lose_is_told_where_to_stop(tmp_path, m
     monkeypatch.setattr(Candidate, "doubtful", property(lambda made: bool(made.base)))
     done = grounded("-C", folder, "propose")
     assert "c0002 may well lose" in " ".join(done.err.split()) and "stop here" not in done.err
-    monkeypatch.setattr("grounded_trials.workspace.handover.LITTLE", 10.0)
+    monkeypatch.setattr("grounded.search.candidate.LITTLE", 10.0)
     done = grounded("-C", folder, "propose")
     assert holds(" ".join(done.err.split()), "c0002 may well lose", "stop here, with c0001")
     assert "stop here" not in done.out and last(done) == "grounded run"
