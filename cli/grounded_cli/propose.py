@@ -30,6 +30,7 @@ ENDS = 8  # states whose values at the end are told: a table of more says nothin
 LAST = 3  # predictions whose misses are told
 LUCKY = 2.0  # standard errors
 NOISY = 0.1  # of a promised cost: how much of noise in its log is told
+MUCH = 0.2  # of what the best one costs: sensors' noise that is told
 ASTRAY = 3.0  # times what a run cost: a model that gives it so much does not replay it
 
 
@@ -101,7 +102,7 @@ def _so_far(candidate: Candidate, best: Tried, task: Task) -> str:
     """
     from grounded_trials.workspace.off_target import began_elsewhere
 
-    text = f"{number(best.utility)} by {best.candidate.id}"
+    text = f"{number(best.utility)} by {best.candidate.id}{noise_share(best)}"
     if not _otherwise(candidate, best):
         return text
     same, told = candidate.expected_of_base, UNLIKE * abs(candidate.predicted_gain)
@@ -124,6 +125,13 @@ def _so_far(candidate: Candidate, best: Tried, task: Task) -> str:
         unknown = "and how far its runs scatter is not known"
         why.append(f"{_dearer(rest)} that it does not explain, {lucky if known else unknown}")
     return f"{text}: the model's run costs {', and '.join(why)}" if why else text
+
+
+def noise_share(best: Tried) -> str:
+    """How much of what the best one costs no policy takes away, where it is much; else ""."""
+    if not best.noise_cost > MUCH * -best.utility:
+        return ""
+    return f", about {number(min(best.noise_cost, -best.utility))} of it noise of the sensors"
 
 
 def _dearer(gain: float) -> str:
@@ -252,10 +260,11 @@ def _trust(candidate: Candidate, standing: Standing, workspace: Workspace) -> st
 def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) -> str:
     """By how much the last predictions missed, beside the gain that this one promises."""
     last = sorted(same, key=lambda tried: max(trial.id for trial in tried.trials))[-LAST:]
-    promises = [one.candidate.predicted_utility - one.noise_cost for one in last]
+    promises = [one.promised for one in last]
     missed = [abs(promise - one.utility) for promise, one in zip(promises, last, strict=True)]
     if len(missed) == 1:
-        noise = " with its sensors' noise" if last[-1].noise_cost > NOISY * -promises[-1] else ""
+        left_out = last[-1].candidate.predicted_utility - promises[-1]
+        noise = " with its sensors' noise" * (left_out > NOISY * -promises[-1])
         promised, real = number(promises[-1]), number(last[-1].utility)
         text = f"the last prediction was {promised}{noise}, the real run gave {real}"
     else:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
+from grounded_cli.propose import noise_share
 from grounded_cli.terminal import field, number, progress, remark, show, show_json, sparkline, table
 from grounded_trials.wording import count, legend, rendered, wrapped
 
@@ -79,7 +80,7 @@ def summary(status: Status) -> str:
     if standing.incumbent is not None:
         best = standing.incumbent
         text = f"{best.candidate.id}, utility {number(best.utility)}{_gained(standing)}"
-        lines.append(field("best", text))
+        lines.append(field("best", text + noise_share(best)))
     if status.off_target:
         lines.append(field("off target", "; ".join(one.summary() for one in status.off_target)))
     again = f"run the best one again: `{rendered(status.again)}`"

@@ -149,13 +149,19 @@ class Tried(Result):
     accepted: bool | None  # None: not decided, trials are missing
     in_doubt: bool = False  # its own trials are there: the incumbent's are missing
     pieces: Array | None = None  # (runs, PIECES) of its utilities, see `scatter`; if repeated
-    noise_cost: float = 0.0  # of sensors, that its prediction leaves out: no trial was in its model
+    noise_cost: float = 0.0  # of sensors, in its logs; of the best, and where `promised` needs it
     deviation: float = float("nan")  # of a single run, as repeats near it tell (`scatter`)
 
     @cached_property
     def utility(self) -> float:
         """Mean utility of the trials; nan without a trial, -inf when one of them failed."""
         return float(np.mean(self.utilities)) if self.utilities else float("nan")
+
+    @property
+    def promised(self) -> float:
+        """The predicted utility of its logs: with sensors' noise, which a replayed trial has."""
+        noise = 0.0 if self.candidate.grounded else self.noise_cost
+        return self.candidate.predicted_utility - noise
 
     @cached_property
     def standard_error(self) -> float:
@@ -194,6 +200,7 @@ class Tried(Result):
         return self.candidate.to_json() | document(
             utility=self.utility,
             standard_error=self.standard_error,
+            noise_cost=self.noise_cost,
             trials=[trial.id for trial in self.trials],
             accepted=self.accepted,
             verdict=self.verdict(),

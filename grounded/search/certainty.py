@@ -68,6 +68,10 @@ def judged(
             ):
                 tried = replace(tried, accepted=None, in_doubt=True)
         history.append(tried)
+    if incumbent is not None and incumbent.candidate.grounded:
+        at = next(i for i, t in enumerate(history) if t.candidate is incumbent.candidate)
+        cost = cost_of_noise(task, incumbent.candidate, incumbent.trials)
+        history[at] = replace(history[at], noise_cost=cost)
     told = with_errors(history)
     best = next((t for t in told if incumbent and t.candidate is incumbent.candidate), None)
     return told, best, iteration

@@ -318,7 +318,7 @@ def _suspicion(history: tuple[Tried, ...], incumbent: Tried, model: str) -> str:
 
 def wild(tried: Tried) -> bool:
     """Whether a model's own policy did so much worse than promised that its bias says little."""
-    predicted = tried.candidate.predicted_utility - tried.noise_cost
+    predicted = tried.promised
     worse = predicted - tried.utility > WILD * max(abs(predicted), 1e-9)
     return bool(tried.utilities) and not tried.candidate.base and worse
 

@@ -97,3 +97,4 @@ def test_what_noise_in_a_log_costs_is_no_doubt_in_the_model():
     told = now.history[0].noise_cost
     assert 0.3 < told / lost < 1.4  # from 41 rows of one log
     assert not now.doubt
+    assert now.incumbent.promised == pytest.approx(made.predicted_utility - told)
