@@ -18,6 +18,7 @@ from grounded.trial import Trial, scattered
 if TYPE_CHECKING:
     from grounded.search.standing import SearchOptions
 
+FAR = 1e100  # in its unit: "noise" of a run that flew off
 FEW = 4.0  # degrees of freedom, with which two standard errors are no certainty
 
 
@@ -81,7 +82,8 @@ def cost_of_noise(task: Task, candidate: Candidate, trials: Sequence[Trial]) -> 
     """What the noise in a candidate's own logs costs in the mean; 0 without a log."""
     if not trials:
         return 0.0
-    noise = np.sqrt(np.mean([white_noise(trial.states) ** 2 for trial in trials], axis=0))
+    each = np.minimum([white_noise(trial.states) for trial in trials], FAR)
+    noise = np.sqrt(np.mean(each**2, axis=0))
     return noise_cost(task, candidate.policy, noise)
 
 

@@ -39,7 +39,7 @@ def test_a_delay_of_every_command_is_one_of_every_sensor(model):
 def test_a_part_that_hangs_on_nothing_else_is_late_by_itself():
     (one,) = found(AXES, "delay:G")
     assert one.like == "sensor_delay:y+vy" and not one.whole
-    assert holds(one.sentence(), "Commands of G", "sensors of y and vy")
+    assert holds(one.sentence(), "commands of G", "sensors of y and vy")
     (hidden,) = found(AXES, "delay:G", shown=("x", "vx", "y"))
     assert hidden.states == ("y",)
     (back,) = found(AXES, "sensor_delay:y", shown=("x", "vx", "y"))

@@ -217,23 +217,30 @@ def test_what_the_incumbent_lost_by_its_start_is_known(noisy):
 def test_of_what_the_model_gives_otherwise_only_known_reasons_are_told(as_run, error, parts, never):
     from grounded_cli.propose import _so_far
 
-    made = SimpleNamespace(
-        base="c0001", expected_of_base=-8.0, predicted_gain=1.0, base_as_run=as_run
-    )
+    made = promise("c0001", -8.0, 1.0, as_run)
     task = cart_task()
     best = SimpleNamespace(
-        candidate=SimpleNamespace(id="c0001"), utility=-9.0, standard_error=error
+        candidate=SimpleNamespace(id="c0001"), utility=-9.0, standard_error=error, noise_cost=0.0
     )
     best.trials = [begun(task, off=0.02)]
     text = _so_far(made, best, task)
     assert "-8.000" in text and "luck" not in text
     assert all(part in text for part in parts) and not any(word in text for word in never)
-    made.expected_of_base = -766.0
+    made = promise("c0001", -766.0, 1.0, as_run)
     told = _so_far(made, best, task)
     assert "does not replay" in told and "scatter" not in told
-    made.expected_of_base = -8.0
-    near = SimpleNamespace(candidate=best.candidate, utility=-8.1, standard_error=error)
+    made = promise("c0001", -8.0, 1.0, as_run)
+    near = SimpleNamespace(**vars(best) | {"utility": -8.1})
     assert "same model" not in _so_far(made, near, task)
+
+
+def promise(base, of_base, gain, as_run):
+    """A candidate by what its model gives its base, what it promises, and its base's run."""
+    return Candidate(
+        *("c0002", None, 1, 1.0, base, "m", None, None, of_base + gain),
+        predicted_gain=gain,
+        base_as_run=as_run,
+    )
 
 
 def begun(task, off=0.0, noise=0.0, seed=0):
@@ -257,10 +264,10 @@ def test_the_noise_of_a_first_row_is_no_start_elsewhere():
     assert began_elsewhere(task, rows) == ()
     shifted = [begun(task, off=0.02, noise=0.02, seed=seed) for seed in range(40)]
     assert began_elsewhere(task, shifted) == ("x",)  # the mean of many is known better
-    made = SimpleNamespace(
-        base="c0001", expected_of_base=-8.0, predicted_gain=0.5, base_as_run=-10.0
+    made = promise("c0001", -8.0, 0.5, -10.0)
+    best = SimpleNamespace(
+        candidate=SimpleNamespace(id="c0001"), utility=-10.0, standard_error=0.1, noise_cost=0.0
     )
-    best = SimpleNamespace(candidate=SimpleNamespace(id="c0001"), utility=-10.0, standard_error=0.1)
     best.trials = [begun(task, noise=0.02)]
     text = _so_far(made, best, task)
     assert "began" not in text and "2.000 less that it does not explain" in text

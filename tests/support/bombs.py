@@ -252,11 +252,11 @@ class Cost:
     def wrong(self) -> str:
         """Why this is no clean end, "" where it is: no traceback, 500 MB, and in time.
 
-        In time is what a budget allows (3 s, and 1 s a MB) and 2 s to start and to end.
+        In time is what a budget allows (3 s, and 1 s a MB) and 4 s to start and to end.
         """
         if "Traceback" in self.text or self.exit not in (0, 1, 3):
             return f"exit {self.exit}: {self.text[-300:]}"
-        allowed = 5.0 + self.size_mb
+        allowed = 7.0 + self.size_mb
         slow = self.cpu_s > allowed and self.cpu_s > allowed * slowness()
         over = slow or self.peak_mb > 500 or len(self.text) > 20_000
         took = f"{self.cpu_s:.1f} s, {self.peak_mb:.0f} MB, {len(self.text)} letters"

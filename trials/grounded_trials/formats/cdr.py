@@ -135,6 +135,7 @@ class _CdrNode(Node):
         node = replace(self, type=part)
         if isinstance(part, Struct):
             for inner in _parts(part.fields, self.coding):
+                step()
                 node = node._at(node._after(inner))
             return node.pos
         assert isinstance(part, Text | Array)
