@@ -22,7 +22,6 @@ from grounded.errors import GroundedError
 from grounded.trusted import TRUST, check_own, suspicion
 from grounded_cli.terminal import harmless, show, show_json, style, table
 from grounded_trials.store.store import Store, write_atomically
-from pace import slowness
 from workspaces import make
 
 EVIL = "\x1b]0;title\x07\x1b[8m\x9b2J\u202e\u200b\r"
@@ -75,7 +74,7 @@ def test_what_is_no_file_is_refused_at_once(what: str, name: str, folder: Path) 
     words = ["ingest", str(path)] if name == "log.mcap" else ["propose"]
     done = process("-C", str(folder), *words)
     assert done.code == 1 and "Traceback" not in done.err and name in done.err, done.err
-    assert time.monotonic() - began < 10 * slowness()
+    assert time.monotonic() - began < 60  # by the clock: a busy machine starts a process in ten
 
 
 def test_a_link_is_no_stored_file(tmp_path: Path) -> None:
