@@ -52,8 +52,7 @@ def judged(
         better = incumbent is None or float(np.mean(utilities)) > incumbent.utility
         accepted = better and not failed
         pieces = by_pieces(task, own) if len(own) > 1 and np.isfinite(utilities).all() else None
-        cost = 0.0 if candidate.grounded else cost_of_noise(task, candidate, own)
-        tried = Tried(candidate, own, utilities, accepted, pieces=pieces, noise_cost=cost)
+        tried = Tried(candidate, own, utilities, accepted, pieces=pieces)
         if accepted:
             iteration += incumbent is not None
             incumbent, losses = tried, 0
@@ -69,22 +68,22 @@ def judged(
             ):
                 tried = replace(tried, accepted=None, in_doubt=True)
         history.append(tried)
-    if incumbent is not None and incumbent.candidate.grounded:
-        at = next(i for i, t in enumerate(history) if t.candidate is incumbent.candidate)
-        cost = cost_of_noise(task, incumbent.candidate, incumbent.trials)
-        history[at] = replace(history[at], noise_cost=cost)
-    told = with_errors(history)
-    best = next((t for t in told if incumbent and t.candidate is incumbent.candidate), None)
+    best_one = incumbent and incumbent.candidate
+    asked = [t.candidate is best_one or not t.candidate.grounded for t in history]
+    told = with_errors(
+        [_with_noise(task, t) if ask else t for ask, t in zip(asked, history, strict=True)]
+    )
+    best = next((t for t in told if t.candidate is best_one), None)
     return told, best, iteration
 
 
-def cost_of_noise(task: Task, candidate: Candidate, trials: Sequence[Trial]) -> float:
-    """What the noise in a candidate's own logs costs in the mean; 0 without a log."""
-    if not trials:
-        return 0.0
-    each = np.minimum([white_noise(trial.states) for trial in trials], FAR)
+def _with_noise(task: Task, tried: Tried) -> Tried:
+    """The same with what the noise in its own logs costs in the mean; without a log as it is."""
+    if not tried.trials:
+        return tried
+    each = np.minimum([white_noise(trial.states) for trial in tried.trials], FAR)
     noise = np.sqrt(np.mean(each**2, axis=0))
-    return noise_cost(task, candidate.policy, noise)
+    return replace(tried, noise_cost=noise_cost(task, tried.candidate.policy, noise))
 
 
 def repeated_exactly(trials: Sequence[Trial]) -> bool:

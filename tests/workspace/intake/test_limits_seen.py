@@ -123,14 +123,19 @@ def test_an_angle_far_beyond_safety_that_degrees_would_explain_is_told(tmp_path,
     assert all("[log.state.theta] scale = 0.01745329" in one for one in found)
 
 
+def driven_on(w, folder):
+    """A run of c0002 that is logged for 1.5 s longer: file, table, seconds after its end."""
+    policy, file = w.candidate("c0002")[0].policy, folder / "t.csv"
+    record(w, file, policy, 1.0, after=1.5)
+    table = np.loadtxt(file, delimiter=",", skiprows=1)
+    return file, table, table[:, 0] - table[0, 0] - 1.0 - policy.horizon * policy.dt
+
+
 @pytest.mark.parametrize("rolls", [0.0, 0.4])
 def test_a_robot_that_moves_on_after_its_run_did_not_come_to_rest(tmp_path, rolls):
     """An arm was 0.02 mrad off at the end of its run, and 93 mrad a second later."""
     w = waiting(tmp_path)
-    policy, file = w.candidate("c0002")[0].policy, tmp_path / "t.csv"
-    record(w, file, policy, 1.0, after=1.5)
-    table = np.loadtxt(file, delimiter=",", skiprows=1)
-    beyond = table[:, 0] - table[0, 0] - 1.0 - policy.horizon * policy.dt
+    file, table, beyond = driven_on(w, tmp_path)
     end = table[beyond <= 0, 1][-1]
     table[beyond > 0, 1] = end + rolls * beyond[beyond > 0]
     np.savetxt(file, table, "%.5f", ",", header="t,x,v,force", comments="")
@@ -143,10 +148,7 @@ def test_a_robot_that_moves_on_after_its_run_did_not_come_to_rest(tmp_path, roll
 def test_a_robot_that_leaves_safety_after_its_run_is_seen_to(tmp_path, rolls):
     """A car stood in the wall a second after its run, and the log of it was "first"."""
     w = waiting(tmp_path)
-    policy, file = w.candidate("c0002")[0].policy, tmp_path / "t.csv"
-    record(w, file, policy, 1.0, after=1.5)
-    table = np.loadtxt(file, delimiter=",", skiprows=1)
-    beyond = table[:, 0] - table[0, 0] - 1.0 - policy.horizon * policy.dt
+    file, table, beyond = driven_on(w, tmp_path)
     most = table[beyond <= 0.1, 1].max()
     table[beyond > 0, 1] = np.minimum(table[beyond > 0, 1], most)
     table[:, 1] += rolls * np.clip(beyond - 0.1, 0.0, None)

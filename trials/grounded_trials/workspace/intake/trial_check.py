@@ -13,7 +13,7 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.result import measured
+from grounded.result import measured_alike
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
@@ -30,7 +30,7 @@ MUCH = 1.0  # of a mean step's cost: the run's utility is another for it, howeve
 FEWEST = 2  # earlier runs whose starts say how they scatter
 LATEST = 3  # steps by which inputs may be logged late, and are told so
 WHITE = 0.6745 * 6**0.5  # the median of its second differences, in its standard deviations
-AFTER, AWAY = 2.0, 0.02  # [s] after a run; of its way: how much farther off then is told
+AWAY = 0.02  # of its way: how much farther off after a run than at its end is told
 TURNS, WIDER = 5.0, 2.0  # of [safety]: beyond it in radians, about inside it in degrees
 WIDEN = "no plan will ask for that; widen them if the robot may get it"
 
@@ -224,7 +224,7 @@ def _moved_on(task: Task, whole: Trial) -> list[str]:
 
     Where the same inputs are held after the run: what somebody drove is another matter.
     """
-    end, last = task.horizon, min(whole.finite_steps, task.horizon + round(AFTER / task.dt))
+    end, last = task.horizon, whole.finite_steps
     groups = weighed_groups(task) if reaches(task) else []
     held = whole.inputs[end:last]
     if not groups or last <= end + 1 or np.ptp(held[1:], axis=0).any():
@@ -237,12 +237,11 @@ def _moved_on(task: Task, whole: Trial) -> list[str]:
     worst = end + int(np.argmax(far[end:]))
     if not far[worst] > max(AWAY * way, 2 * far[end]):
         return []
-    unit = task.model.states[names[0]]
+    later, then = measured_alike([far[worst], far[end]], task.model.states[names[0]])
     return [
-        f"{(worst - end) * task.dt:.2g} s after the run {what} was {measured(far[worst], unit)} "
-        f"from its target, at its end {measured(far[end], unit)}: [reward] judges the run alone. "
-        "For a robot that stays there let the target hold still at its end (target --hold), or "
-        "weigh the end's rates ([reward] terminal)"
+        f"{(worst - end) * task.dt:.2g} s after the run {what} was {later} from its target, at its "
+        f"end {then}: [reward] judges the run alone. For a robot that stays there let the target "
+        "hold still at its end (target --hold), or weigh the end's rates ([reward] terminal)"
     ]
 
 
