@@ -4,7 +4,8 @@
     python drive.py CANDIDATE TRIAL          what `grounded run` calls
 
 The loop runs at the candidate's own rate on the state that came last, however late; a lost packet
-means that the state is older, never that the loop waits. Ctrl-C sends the kill command.
+means that the state is older, never that the loop waits. Where the computer stops it for longer than a
+step, the last command holds meanwhile. Ctrl-C sends the kill command.
 """
 
 import json
@@ -98,7 +99,8 @@ def drive(dt, action):
             if found is None:
                 break
             send(line, {"t": now, "steering": float(found[0]), "speed": float(found[1])})
-            now += dt
+            late = max(0.0, time.time() - now - dt)
+            now += dt * (1 + late // dt)  # steps that were missed are not made up for
             time.sleep(max(0.0, now - time.time()))
         send(line, {"t": now, "steering": 0.0, "speed": 0.0})
         time.sleep(0.1)

@@ -166,7 +166,10 @@ def suspicion(task: Task, trial: Trial, own: Candidate, others: Sequence[Candida
     elif found.alike:
         return Suspicion(found)
     elif found.until_s >= LEAST * trial.dt:
-        looks = f"up to {found.until_s:.1f} s they are alike: somebody, or something, took over"
+        looks = (
+            f"up to {found.until_s:.1f} s they are alike: then somebody, or something, took over, "
+            "or no new states reached the policy"
+        )
     else:
         looks = "somebody, or another controller, drove"
     name = name if nats > DECISIVE else ""
