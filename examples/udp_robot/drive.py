@@ -4,8 +4,8 @@
     python drive.py CANDIDATE TRIAL          what `grounded run` calls
 
 The loop runs at the candidate's own rate on the state that came last, however late; a lost packet
-means that the state is older, never that the loop waits. Where the computer stops it for longer than a
-step, the last command holds meanwhile. Ctrl-C sends the kill command.
+means that the state is older, never that the loop waits. Where the computer stops it for longer
+than a step, the last command holds meanwhile. Ctrl-C sends the kill command.
 """
 
 import json
