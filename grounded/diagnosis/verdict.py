@@ -78,7 +78,7 @@ def verdict(
         return _said("none", text, *once)
     causes = _causes(claims, ranking, credit, given or {})
     several = len(causes) > 1
-    shares = [f" ({percent(one.share)} of the gain)" * several for one in credit]
+    shares = [f" ({percent(one.share)} of the improvement)" * several for one in credit]
     words = [sentence(map(str.__add__, causes, shares)), improvement(rows), worsened(rows)]
     words += [runaway(rows), wider(claims.parameters())]
     words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed])

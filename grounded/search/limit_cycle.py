@@ -1,4 +1,4 @@
-"""Whether a trial was a limit cycle: feedback that swings the inputs to and fro about the plan."""
+"""Inputs that swing: a trial that was a limit cycle about its plan, a plan that jumps."""
 
 from __future__ import annotations
 
@@ -38,6 +38,11 @@ def between_limits(tried: Tried, task: Task) -> bool:
         if np.any(both & ((at_low | at_high).mean(axis=0) > OFTEN)):
             return True
     return False
+
+
+def jumps(inputs: Array, range_: Array) -> Array:
+    """How often inputs (T, m) go over half their range (m,) or more within one step, (m,)."""
+    return np.asarray((np.abs(np.diff(inputs, axis=0)) > 0.5 * range_).sum(axis=0))
 
 
 def _swings(values: Array, size: float) -> int:

@@ -192,7 +192,8 @@ def test_a_share_in_a_sentence_is_the_share_of_the_table():
     claims.data.model = SimpleNamespace(params={}, param_names=[])
     credit = (Credit(effect.name, 0.926), Credit("calibration", 0.074))
     ranked = (Ranked(effect.name, k, claimed=True),)
-    assert f"{percent(0.074)} of the gain" in verdict(claims, ranked, (), (), (), credit).sentence
+    told = verdict(claims, ranked, (), (), (), credit).sentence
+    assert f"{percent(0.074)} of the improvement" in told
 
 
 def test_neither_a_crash_nor_a_log_by_hand_is_to_be_repeated():

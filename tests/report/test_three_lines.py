@@ -103,7 +103,7 @@ def test_an_error_is_given_in_a_unit_that_fits(value, unit, text):
 def test_each_of_several_causes_stands_on_a_line_of_its_own(diagnosis):
     told = replace(diagnosis.verdict, sentences=("All three.", "What is left."))
     causes, others = verdict_lines(replace(diagnosis, verdict=told))
-    assert causes[1] == f"{CAUSES[1][:1].upper()}{CAUSES[1][1:]} (28 % of the gain)"
+    assert causes[1] == f"{CAUSES[1][:1].upper()}{CAUSES[1][1:]} (28 % of the improvement)"
     assert len(causes) == len(CAUSES) and others == ["What is left."]
     old = Verdict("effect", sentence="Friction slows v.")
     assert verdict_lines(replace(diagnosis, verdict=old)) == ([], ["Friction slows v."])

@@ -250,3 +250,26 @@ def test_a_target_says_what_it_leaves_free(tmp_path):
     assert found["free"] == ["z", "th", "vz"] and {*found["columns"]} == {"x", "vx"}
     ends = [word for name in ("x", "z", "th") for word in ("--to", f"{name}=1")]
     assert "free" not in grounded("-C", folder, "target", "line", *ends).out
+
+
+@pytest.mark.slow
+def test_a_plan_that_throws_an_input_from_end_to_end_says_so_and_what_calms_it(tmp_path):
+    """A car's first plan steered from one limit to the other at each step, without a remark."""
+    (tmp_path / "lifted.py").write_text(LIFTED)
+    w = Workspace.create(tmp_path / "w", model=tmp_path / "lifted.py")
+    wave = 50.0 * np.sign(np.sin(0.3 * np.arange(101) + 0.1))
+    w.target({"h": np.full(101, 1.0), "q": wave})
+    file = w.folder / "grounded.toml"
+    limits = "[limits]\nthrust = [0.1, 1]\nturn = [-200, 200]"
+    start = "start = { h = 1, q = 50, thrust = 0.49, turn = 50 }"
+    text = re.sub(r"(?m)^start = .*$", start, file.read_text().replace("[limits]", limits))
+
+    def told(weight: float) -> list[str]:
+        calm = f"input_change = {{ turn = {weight} }}"
+        changed = re.sub(r"(?m)^input_change = .*$", calm, text)
+        assert calm in changed
+        file.write_text(re.sub(r"(?m)^input = .*$", "input = {}", changed))
+        notes = Workspace(w.folder).propose().proposal.notes
+        return [note for note in notes if "throws turn" in note]
+
+    assert len(told(1e-9)) == 1 and not told(1.0)

@@ -241,6 +241,6 @@ def verdict_lines(diagnosis: Diagnosis) -> tuple[list[str], list[str]]:
         return [], told
     shares = (percent(one.share) for one in diagnosis.credit)
     return [
-        f"{cause[:1].upper()}{cause[1:]} ({share} of the gain)"
+        f"{cause[:1].upper()}{cause[1:]} ({share} of the improvement)"
         for cause, share in zip(causes, shares, strict=True)
     ], told[1:]

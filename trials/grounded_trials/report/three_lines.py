@@ -14,7 +14,7 @@ from grounded_trials.wording import count, shown
 from grounded_trials.workspace.off_target import weighed_groups
 
 CAUSES = 2  # that the first line names
-SMALL = 0.05  # of the gain: a cause below it is only counted
+SMALL = 0.05  # of the improvement: a cause below it is only counted
 FEW = 2  # states in the second line
 
 

@@ -23,11 +23,7 @@ from grounded.utility import step_rewards
 from grounded_trials.wording import rendered, with_unit
 from grounded_trials.workspace.config import FILE, made_changes
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.off_target import (
-    tracked,
-    tracking_error,
-    weighed_groups,
-)
+from grounded_trials.workspace.off_target import tracked, tracking_error, weighed_groups
 from grounded_trials.workspace.task_file import limited_changes, seen_in
 
 if TYPE_CHECKING:
@@ -43,6 +39,7 @@ SHORT = 0.25  # of the way to where a target ends: the plan does not get there
 MISSED = 0.1  # of the way that a target asks for: the plan falls short
 SHAKEN = 0.05  # of what [limits] allow an input, else of what a plan uses of it
 PIECES = 10  # of a plan, in each of which that is asked
+OFTEN = 4  # jumps over half its range: a quick manoeuvre has two or three
 SOMEWHERE = 1.5  # times what noise does over the whole plan: a piece that stands out
 FARTHEST = 1e4  # in its unit: how far a state that nobody gave may be from where it starts
 UNGIVEN = 3  # states, whose values at the start are asked for: of more nobody has thought
@@ -94,7 +91,7 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
     found += _of_other_limits(workspace)
     if first is not None:
         found += _held_back(task, first) or _falls_short(task, first)
-        found += _shaken(workspace, first)
+        found += _thrown(task, first) or _shaken(workspace, first)
     found += held
     loose = _not_held(workspace, proposal.refused) if proposal.refused is not None else []
     found += loose
@@ -224,6 +221,19 @@ def _falls_short(task: Task, first: Candidate) -> list[str]:
         f"over {way_told}: by [reward] it is not worth more, or the model does not get "
         "there in that time. Weigh inputs and their changes less, draw a slower target, or look at "
         "model.py"
+    ]
+
+
+def _thrown(task: Task, first: Candidate) -> list[str]:
+    """Inputs that a plan throws from one end of their [limits] towards the other, often."""
+    from grounded.search.limit_cycle import jumps
+
+    times = jumps(first.predicted_inputs, task.high - task.low)
+    return [
+        f"the plan throws {name} over half its [limits] from one step to the next, "
+        f"{times[j]} times: for a calmer {name} give [reward] input_change of {name} more weight"
+        for j, name in enumerate(task.model.input_names)
+        if times[j] >= OFTEN
     ]
 
 
