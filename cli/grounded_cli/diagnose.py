@@ -150,7 +150,9 @@ def _tell(found: Diagnosis, before: dict[str, float]) -> None:
 
 
 def _held_out(found: Diagnosis) -> str:
-    """How the errors were measured."""
+    """How the errors were measured, and how far ahead they tell something."""
+    from grounded.diagnosis.error_report import furthest
+
     row = found.prediction_error[0]
     by = {
         "trials": "each trial predicted with values from the others",
@@ -166,7 +168,14 @@ def _held_out(found: Diagnosis) -> str:
             "at most what one step leaves, carried on (it isn't white: part of it is the model's "
             "error; repeat a trial)"
         )
-    return f"{by.get(row.held_out, 'not held out')}; noise: {noise.get(row.floor_from, 'unknown')}"
+    told = f"{by.get(row.held_out, 'not held out')}; noise: {noise.get(row.floor_from, 'unknown')}"
+    told_of = furthest(found.prediction_error)
+    if told_of and any(one.drowned for one in found.prediction_error if not one.whole_trial):
+        told += (
+            f"; farther ahead than {told_of.horizon_s:.3g} s noise alone grows beyond all that was "
+            "measured (a robot that falls without its feedback, say): whole trials tell little"
+        )
+    return told
 
 
 def _instruments(findings: Sequence[Finding]) -> None:
@@ -203,6 +212,8 @@ def _verdict(found: Diagnosis) -> str:
 
 
 def _places(found: Diagnosis) -> None:
+    from grounded.diagnosis.error_report import furthest
+
     where = found.where
     channels = [
         (c.name, percent(c.share), with_unit(number(c.rms, 3), c.unit))
@@ -211,9 +222,11 @@ def _places(found: Diagnosis) -> None:
     ]
     if channels:
         show("\n" + table(channels, ("where", "share of the gap", "rms")))
+        row = furthest(found.prediction_error)
+        ahead = f" {row.horizon_s:.3g} s ahead" if row else ""
         _note(
             "share: of the squared errors of single steps, in units of the noise, that causes and "
-            f"leftover make; rms: of the model as it was {found.gap.horizon_s:g} s ahead"
+            f"leftover make; rms: of the model as it was{ahead}"
         )
     for region in where.regions[:3]:
         share, time = percent(region.share), percent(region.occupancy)

@@ -261,6 +261,18 @@ def test_a_forecast_of_a_wrong_model_parts_from_the_trial():
     assert 1e-6 < short < long
 
 
+def test_forecasts_go_no_farther_than_the_diagnosis_could_judge():
+    """Of a robot that falls without its feedback no model tells where it is after a second."""
+    findings = many_flights(2)
+    titles = [figure.title for figure in forecast_figures(findings)]
+    assert findings.ahead_s == 1.0 and all("every 1 s" in title for title in titles)
+    rows = (RulerRow(0.1), RulerRow(0.5), RulerRow(1.0, drowned=True))
+    fallen = replace(findings, diagnosis=Diagnosis(Verdict("none"), prediction_error=rows))
+    titles = [figure.title for figure in forecast_figures(fallen)]
+    assert fallen.ahead_s == 0.5 and all("every 0.5 s" in title for title in titles)
+    assert titles
+
+
 def test_a_forecast_of_a_trial_without_steps_is_none():
     task = pendulum_task(pendulum.model)
     names = (task.model.state_names, task.model.input_names)

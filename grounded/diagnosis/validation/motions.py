@@ -155,8 +155,11 @@ class _Paths:
         self.signal, self.states = _by_trial(data, added), _states(data)
         self.power = [float(_power(one, none=0.0)) for one in self.signal]
         means = np.concatenate([_tenths(one) for one in self.states])
-        self.spread = np.nanvar(means, axis=0)
-        self.moves = self.spread > 1e-9 * np.nanmean(means**2, axis=0)
+        seen = np.isfinite(means).any(axis=0)
+        self.spread = np.full(len(seen), np.nan)  # of what nobody measures
+        self.spread[seen] = np.nanvar(means[:, seen], axis=0)
+        self.moves = np.zeros(len(seen), bool)
+        self.moves[seen] = self.spread[seen] > 1e-9 * np.nanmean(means[:, seen] ** 2, axis=0)
 
     def motions(self) -> Any:
         """Which motion each trial makes, (S,) of int."""

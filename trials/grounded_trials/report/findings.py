@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from grounded.diagnosis.error_report import furthest
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import NextCommand
 from grounded.frozen import Array
@@ -22,6 +23,7 @@ from grounded.search.planner import Planner
 from grounded.search.standing import Standing
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
+from grounded_trials.report.forecast import SECONDS
 from grounded_trials.wording import figure, rendered, shown
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.next_step import Since
@@ -105,6 +107,16 @@ class Findings:
         """What the last diagnosis asks for; "" once it is not the last word, see `Since`."""
         fresh = self.diagnosis is not None and not self.since.sentence
         return self.diagnosis.next_trial if self.diagnosis is not None and fresh else ""
+
+    @property
+    def ahead_s(self) -> float:
+        """How far ahead errors are shown [s]: a second, or as far as the diagnosis judged by.
+
+        What falls over by itself is told by no model a second ahead.
+        """
+        rows = () if self.diagnosis is None else self.diagnosis.prediction_error
+        row = furthest(rows)
+        return SECONDS if row is None else min(SECONDS, row.horizon_s)
 
     @property
     def crude(self) -> Planner:

@@ -24,7 +24,7 @@ from grounded_trials.report.findings import (
     rms,
     selection,
 )
-from grounded_trials.report.forecast import SECONDS, forecast_error
+from grounded_trials.report.forecast import forecast_error
 from grounded_trials.report.settled import so_far
 from grounded_trials.wording import (
     count,
@@ -193,11 +193,12 @@ def _fitting(values: list[str], width: int) -> str:
 
 
 def _logs(findings: Findings, table: Table) -> str:
-    """How far the crude model is off after each second of logs that ran no candidate."""
+    """How far the crude model is off so far ahead (`ahead_s`) in logs that ran no candidate."""
     logs = findings.logs[-ITERATIONS:]
-    columns = [forecast_error(findings.crude, log.trial) for log in logs]
+    ahead = findings.ahead_s
+    columns = [forecast_error(findings.crude, log.trial, ahead) for log in logs]
     rows = by_state(findings.task.model, columns)
-    title = f"data: what the {findings.plain}, set right every {SECONDS:g} s, misses by then, rms\n"
+    title = f"data: what the {findings.plain}, set right every {ahead:.3g} s, misses by then, rms\n"
     return title + table(rows, ("state", "unit", *(log.trial.id for log in logs)))
 
 

@@ -16,7 +16,7 @@ from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.report.diagnosis_words import made_from
 from grounded_trials.report.findings import Findings, Run
-from grounded_trials.report.forecast import SECONDS, forecast
+from grounded_trials.report.forecast import forecast
 from grounded_trials.wording import labelled, per_second, percent, shown
 
 SPAN_S = 30.0  # of a long log that is drawn: the part with the largest errors
@@ -30,14 +30,14 @@ LEAST_STEPS = 30  # of a trial whose residual is drawn
 
 def forecast_figures(findings: Findings) -> list[Figure]:
     """One for a run that the diagnosis didn't see, or else the best; one for the longest logs."""
-    found = []
+    found, ahead = [], f"{findings.ahead_s:.3g} s"
     run = _unseen(findings) or findings.lately
     if run is not None:
-        title = f"The model, set right every {SECONDS:g} s, {run.label}"
+        title = f"The model, set right every {ahead}, {run.label}"
         found.append(_figure(findings, "forecast", title, run.trial))
     longest = sorted(findings.logs, key=lambda log: -log.trial.finite_steps)[:LOGS]
     for log in longest:
-        title = f"The model, set right every {SECONDS:g} s, data {log.trial.id}"
+        title = f"The model, set right every {ahead}, data {log.trial.id}"
         found.append(_figure(findings, f"data-{log.trial.id}", title, log.trial))
     return [figure for figure in found if figure is not None]
 
@@ -55,11 +55,11 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
     if steps < 1:
         return None
     trial, begin = _worst_part(findings, trial)
-    crude = forecast(findings.crude, trial)
+    crude = forecast(findings.crude, trial, findings.ahead_s)
     if crude is None:
         return None
     better = findings.better
-    after = forecast(better.planner, trial) if better is not None else None
+    after = forecast(better.planner, trial, findings.ahead_s) if better is not None else None
     times = np.arange(trial.steps + 1, dtype=np.float64) * trial.dt + begin
     panels = []
     for i, (state, unit) in enumerate(findings.task.model.states.items()):
@@ -77,8 +77,8 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
         panel = Panel(label, "time [s]", y_name, tuple(curves), y_range=bounds, kind="forecast")
         panels.append(panel)
     caption = (
-        f"Every {SECONDS:g} s the model starts from the measured state and gets the inputs that "
-        "were sent: where the lines part, the model is wrong."
+        f"Every {findings.ahead_s:.3g} s the model starts from the measured state and gets the "
+        "inputs that were sent: where the lines part, the model is wrong."
     )
     diagnosis = findings.diagnosis
     if diagnosis is not None and diagnosis.made is not None and better is not None:
@@ -95,13 +95,13 @@ def _worst_part(findings: Findings, trial: Trial) -> tuple[Trial, float]:
     span = round(SPAN_S / trial.dt)
     if whole <= span:
         return _part(trial, 0, whole), 0.0
-    found = forecast(findings.crude, trial)
+    found = forecast(findings.crude, trial, findings.ahead_s)
     assert found is not None
     kept = found.steps[:, -1] >= 0
     ends = found.steps[kept, -1]
     off = findings.task.model.difference(found.states[kept, -1], trial.states[ends])
     size = np.nan_to_num((off / (np.std(trial.states[: whole + 1], axis=0) + 1e-12)) ** 2)
-    windows = max(1, round(SPAN_S / SECONDS))
+    windows = max(1, round(SPAN_S / findings.ahead_s))
     sums = np.convolve(np.minimum(size.sum(axis=1), 100.0), np.ones(windows), mode="valid")
     first = int(found.steps[int(np.argmax(sums)), 0])
     first = max(0, min(first, whole - span))

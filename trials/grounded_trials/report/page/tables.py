@@ -21,7 +21,7 @@ from grounded_trials.report.findings import (
     off_target,
     rms,
 )
-from grounded_trials.report.forecast import SECONDS, forecast_error
+from grounded_trials.report.forecast import forecast_error
 from grounded_trials.wording import figure, legend, percent, rendered, shown, with_unit
 from grounded_trials.workspace.next_step import Since
 
@@ -112,7 +112,7 @@ def error_table(findings: Findings) -> list[Block]:
 
 
 def forecast_table(findings: Findings) -> list[Block]:
-    """Rms error at the end of each second of the best run and every log: not the ruler's."""
+    """Rms error so far ahead (`ahead_s`) in the best run and every log: not the ruler's."""
     run = findings.lately
     trials = ([run.trial] if run is not None else []) + [log.trial for log in findings.logs]
     if not trials:
@@ -121,8 +121,9 @@ def forecast_table(findings: Findings) -> list[Block]:
     if findings.better is not None:
         planners.append((findings.better.name, findings.better.planner))
     names = [f"{t.id or t.candidate}, {words}" for t in trials for words, _ in planners]
-    columns = [forecast_error(planner, t) for t in trials for _, planner in planners]
-    title = Block("heading", f"What the model, set right every {SECONDS:g} s, misses by then, rms")
+    ahead = findings.ahead_s
+    columns = [forecast_error(planner, t, ahead) for t in trials for _, planner in planners]
+    title = Block("heading", f"What the model, set right every {ahead:.3g} s, misses by then, rms")
     rows = by_state(findings.task.model, columns)
     return [title, table("forecasts", ("state", "unit", *names), rows)]
 

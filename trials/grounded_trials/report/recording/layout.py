@@ -14,7 +14,6 @@ from grounded.figures.body import Body
 from grounded.frozen import Array
 from grounded_trials.report.bodies import is_mechanism, reach
 from grounded_trials.report.findings import Findings
-from grounded_trials.report.forecast import SECONDS
 from grounded_trials.report.scene import Scene
 from grounded_trials.wording import labelled, per_second
 
@@ -133,14 +132,16 @@ def _overview(findings: Findings, space: Space) -> Any:
 
 
 def _effects(findings: Findings, space: Space) -> list[Any]:
-    """The best run beside the model set on it every second: without effects, and with them."""
+    """The best run beside the model set on it again and again: without effects, and with them."""
     import rerun.blueprint as rrb
 
     better = findings.better
     if better is None or not (findings.runs or findings.logs):
         return []
     views = [
-        space.view(["/ahead/real/**", f"/ahead/{key}/**"], f"{SECONDS:g} s ahead: {words}")
+        space.view(
+            ["/ahead/real/**", f"/ahead/{key}/**"], f"{findings.ahead_s:.3g} s ahead: {words}"
+        )
         for key, words in (("off", findings.plain), ("on", f"model {better.name}"))
     ]
     units = findings.task.model.states

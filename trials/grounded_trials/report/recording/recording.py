@@ -169,7 +169,7 @@ class _Recorder:
             ("off", self.findings.crude, "model_policy"),
             ("on", self.findings.better.planner, "predicted"),
         ):
-            found = forecast(planner, run.trial)
+            found = forecast(planner, run.trial, self.findings.ahead_s)
             if found is None:
                 continue
             states = found.along(run.trial)
