@@ -1,7 +1,11 @@
 """Words on a terminal: columns, labels and remarks within 80 columns."""
 
+from dataclasses import replace
+
 import pytest
 
+from grounded.diagnosis.error_report import RulerRow
+from grounded.diagnosis.report import Diagnosis, Verdict
 from grounded_cli import terminal
 from grounded_cli.terminal import field, harmless, names_in, remark, sparkline, table
 
@@ -72,7 +76,7 @@ def test_colour_means_something_and_takes_no_room():
 
 
 def test_evidence_that_is_not_known_is_a_dash(capsys):
-    from grounded.diagnosis.report import Diagnosis, Ranked, Verdict
+    from grounded.diagnosis.report import Ranked
     from grounded_cli.diagnose import _effects
 
     row = Ranked("parameter:m", claimed=True)
@@ -89,3 +93,14 @@ def test_a_long_command_says_its_stage_in_a_log_too_now_and_then(capsys, monkeyp
         tell("comparing effects, 40 %")
         tell("")
     assert capsys.readouterr().err == "comparing effects, 40 % ...\n"
+
+
+def test_errors_of_what_falls_over_by_itself_are_said_to_tell_little_farther_ahead():
+    from grounded_cli.diagnose import _held_out
+
+    rows = (RulerRow(0.1), RulerRow(0.5), RulerRow(1.0))
+    assert "0.5 s" not in _held_out(Diagnosis(Verdict("none"), prediction_error=rows))
+    fallen = Diagnosis(
+        Verdict("none"), prediction_error=(*rows[:2], replace(rows[2], drowned=True))
+    )
+    assert "farther ahead than 0.5 s" in _held_out(fallen)
