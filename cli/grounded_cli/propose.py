@@ -31,6 +31,7 @@ LAST = 3  # predictions whose misses are told
 LUCKY = 2.0  # standard errors
 NOISY = 0.1  # of a promised cost: how much of noise in its log is told
 MUCH = 0.2  # of what the best one costs: sensors' noise that is told
+MISSED = 0.5  # of a run's cost: a model off by more doesn't know what is left to gain
 ASTRAY = 3.0  # times what a run cost: a model that gives it so much does not replay it
 
 
@@ -280,7 +281,8 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     if not gain < max(missed[-1], candidate.likely_off):
         return promise
     doubt = f"{promise}, which is no more than such a miss"
-    if candidate.doubtful or not gain < LITTLE * abs(best.utility):  # a note may say so
+    blind = missed[-1] > MISSED * abs(last[-1].utility)
+    if blind or candidate.doubtful or not gain < LITTLE * abs(best.utility):  # a note may say so
         return doubt
     return f"{doubt}: you may stop here, with {best.candidate.id}, the best so far"
 

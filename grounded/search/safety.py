@@ -154,5 +154,6 @@ def coasts_out(task: Task, plan: Task, run: Trial, held: Array) -> str:
     return (
         f"its runner holds {sent}, and by the model the robot goes on to {name} = {far:.3g} "
         f"{unit}, outside [safety] {name} = [{task.safety_low[i]:g}, {task.safety_high[i]:g}] "
-        f"{t * task.dt:.2g} s later: be ready to stop it, or let the target come to rest inside"
+        f"{t * task.dt:.2g} s later: be ready to stop it, go over to a controller that holds it "
+        "once the runner is done, or let the target come to rest inside"
     )

@@ -596,6 +596,11 @@ def test_trust_sets_the_promised_gain_against_the_last_misses(tmp_path):
     assert f"a gain of {gain:.4g}" in _came_true(near, ran[:2], now)
     beyond = replace(made, predicted_gain=1 - best.utility)  # no utility is above 0
     assert f"a gain of {gain:.4g}" in _came_true(beyond, ran[:2], now)
+    few = {"predicted_gain": 0.01 * -best.utility, "predicted_utility": 0.99 * best.utility}
+    few = replace(made, id="c9", likely_off=0.0, **few)
+    for miss, may in ((0.4, True), (0.6, False)):  # a model that is far off tells no end
+        off = replace(ran[1].candidate, predicted_utility=(1 + miss) * ran[1].utility)
+        assert ("stop here" in _came_true(few, [replace(ran[1], candidate=off)], now)) == may
 
 
 def ran_standing(folder, best):
