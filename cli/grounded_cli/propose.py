@@ -264,9 +264,9 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     promises = [one.promised for one in last]
     missed = [abs(promise - one.utility) for promise, one in zip(promises, last, strict=True)]
     if len(missed) == 1:
-        left_out = last[-1].candidate.predicted_utility - promises[-1]
-        noise = " with its sensors' noise" * (left_out > NOISY * -promises[-1])
         promised, real = number(promises[-1]), number(last[-1].utility)
+        said = number(last[-1].candidate.predicted_utility)
+        noise = f" ({said} without its sensors' noise)" * (said != promised)
         text = f"the last prediction was {promised}{noise}, the real run gave {real}"
     else:
         told = [number(off) if math.isfinite(off) else "a crash" for off in missed]
