@@ -67,6 +67,7 @@ def command(
         step_target,
         swing_up,
     )
+    from grounded_trials.workspace.task_file import without_range
 
     workspace = open_workspace()
     model, dt = workspace.base_model, workspace.config.task.dt
@@ -123,11 +124,12 @@ def command(
             bound = least if low < least else most
             goes = with_unit(number(low if low < least else high), model.states[name])
             remark("note", f"{name} goes to {goes}, beyond its bound in [safety], {number(bound)}")
-    moving = {model.states[name] for name, ends in ranges.items() if ends != (0, 0)}
-    if still := [name for name in ranges if model.states[name] not in moving]:
+    if still := without_range(columns, model.states):
+        at = {number(ranges[name][0]) for name in still}
+        stay = f"{'stay' if len(still) > 1 else 'stays'} at {listed(at)}"
         remark(
             "note",
-            f"{listed(still)} {'stay' if len(still) > 1 else 'stays'} at 0 in the target, "
+            f"{listed(still)} {stay if len(at) == 1 else 'stay as they are'} in the target, "
             "which says nothing of what is a small error there: choose the weight in "
             "[reward] state",
         )

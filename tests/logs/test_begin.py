@@ -11,6 +11,7 @@ from rosbags.rosbag2 import StoragePlugin
 
 import workspaces
 from cli import grounded
+from facts import holds
 from grounded.errors import GroundedError
 from grounded.instruments.kinematics import integrals
 from grounded_trials import Workspace
@@ -20,7 +21,7 @@ from grounded_trials.starting.begin import begin
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, path_target
 from grounded_trials.workspace.exporting import void_exports
-from grounded_trials.workspace.task_file import equal_weights, read_target
+from grounded_trials.workspace.task_file import equal_weights, read_target, without_range
 from ros_bags import arm_bag, car_bag, commanded_arm_bag, rover_bag
 from shared_data import data
 
@@ -552,6 +553,26 @@ def test_a_column_that_stays_has_the_range_of_its_unit():
         both = equal_weights({"x": 9 * t, "y": y, "v": t}, units, ("x", "y"))
         assert both["x"] == both["y"] == pytest.approx(as_much**-2)
     assert equal_weights({"x": 5 + 0 * t}, units) == pytest.approx({"x": 0.04})  # a step
+    offset = {"x": 2 * t, "psi": 0.01738 + 0 * t, "y": 0.01 + 0 * t}  # a sensor's: no range
+    by = {"x": 0.25, "psi": 1.0, "y": 0.25}
+    assert equal_weights(offset, units) == pytest.approx(by)
+    assert equal_weights(offset, units, ("x", "y")) == pytest.approx(by)
+    assert without_range(offset, units) == ["psi"]
+    assert without_range({"x": 5 + 0 * t, "v": 0 * t}, units) == ["v"]
+
+
+def test_of_a_target_that_stays_at_a_sensors_offset_the_weight_is_to_be_chosen(tmp_path):
+    grounded("init", tmp_path / "w", "--example", "pendulum")
+    w = Workspace(tmp_path / "w")
+    angle, rate = w.base_model.state_names
+    text = w.config.file.read_text()
+    held = re.sub(r"(?m)^start = .*$", f"start = {{ {angle} = 0.01738 }}", text)
+    assert held != text
+    w.config.file.write_text(held)
+    done = grounded(
+        "-C", w.folder, "target", "line", "--to", f"{angle}=0.01738", "--to", f"{rate}=1"
+    )
+    assert holds(done.err, f"{angle} stays at 0.01738", "choose the weight"), done.err
 
 
 def test_a_path_keeps_to_its_speeds_and_starts_from_rest(tmp_path):

@@ -235,6 +235,30 @@ def test_what_logs_have_shown_is_adopted_before_the_first_candidate(cart, tmp_pa
     assert last(grounded("-C", folder, "status")) == "grounded propose"
 
 
+def test_a_manoeuvre_is_drawn_before_the_first_plan(tmp_path):
+    """After `adopt` came a plan to stand still: target.csv was still zeros, as `init` wrote it."""
+    folder = make(tmp_path / "w").folder
+    zeros = "t,x\n" + "".join(f"{0.05 * k:.10g},0\n" for k in range(41))
+    (folder / "target.csv").write_text(zeros)
+    assert last(grounded("-C", folder, "status")) == "grounded target SHAPE"
+    (folder / "reports").mkdir()
+    diagnosed(folder)
+    done = grounded("-C", folder, "adopt", "viscous_friction:v")
+    assert last(done) == last(grounded("-C", folder, "status")) == "grounded target SHAPE"
+    done = grounded("-C", folder, "adopt", "--undo")
+    assert last(done) == "grounded target SHAPE"
+    diagnosed(folder, verdict={"kind": "none", "effects": [], "sentence": "None."}, ranking=[])
+    none = read_diagnosis(folder / "reports")
+    assert after_diagnosis(Folder(folder), none).verb == "target"
+    config = (folder / "grounded.toml").read_text()
+    start = config.replace("[task]", "[task]\nstart = { x = 0.3 }")
+    (folder / "grounded.toml").write_text(start)  # then zeros ask for something
+    assert last(grounded("-C", folder, "status")) == "grounded propose"
+    (folder / "grounded.toml").write_text(config)
+    assert grounded("-C", folder, "target", "line", "--to", "x=1").code == 0
+    assert last(grounded("-C", folder, "status")) == "grounded propose"
+
+
 def test_what_a_fresh_diagnosis_claims_is_adopted_while_a_candidate_waits(tmp_path):
     """`diagnose` said adopt; status, page and report said run, and never spoke of adopting."""
     folder = make(tmp_path / "w").folder

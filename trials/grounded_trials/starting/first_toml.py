@@ -72,7 +72,7 @@ def write_first(
         "",
         "[reward]                      # quadratic weights: 1 / (range in the target)^2; `target`",
         "                              # sets them anew until you change one; of a column that",
-        "                              # stays at 0: the largest of its unit, else 1",
+        "                              # is constant: the largest of its unit, else 1",
         f"state = {_inline(weights)}",
         "# terminal, of the last step alone: where the run is to END at rest on its target",
         "# (docking, parking) and overshoots, 10 to 100 times state, the speeds' too",

@@ -93,7 +93,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     claim was fitted in place of those, without them.
     """
     from grounded_trials.workspace.adopted import in_order
-    from grounded_trials.workspace.next_step import TARGET, logged_target
+    from grounded_trials.workspace.next_step import logged_target, to_plan
 
     found = read_diagnosis(workspace.reports)
     if found is None:
@@ -122,7 +122,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
         tuple(adopted),
         own,
         claimed,
-        then=TARGET if logged else PROPOSE,
+        then=to_plan(workspace),
         logged=logged,
         beside=tuple(n for n in beside if n not in fitted),
         left=left_behind(found) if parameters and physics and claimed else {},
@@ -157,6 +157,8 @@ def undo_adoption(workspace: Folder) -> Undone:
     Raises:
         GroundedError: if nothing is left to undo, or [model] was changed since.
     """
+    from grounded_trials.workspace.next_step import to_plan
+
     kept, undone = _kept(workspace)
     file, model = workspace.config.file, workspace.config.model
     if not kept:
@@ -177,7 +179,8 @@ def undo_adoption(workspace: Folder) -> Undone:
         )
     set_in_model(file, params=before["params"], effects=before["effects"])
     write_document(workspace.reports / KEPT, {"adoptions": earlier, "undone": [*undone, *names]})
-    return Undone(tuple(names), tuple(before["effects"]), before["params"])
+    now = tuple(before["effects"]), before["params"]
+    return Undone(tuple(names), *now, then=to_plan(workspace))
 
 
 def declined(workspace: Folder) -> tuple[str, ...]:

@@ -66,7 +66,7 @@ def fit_in(
         GroundedError: where it should be applied and predicts held-out time worse than before:
             nothing is written then.
     """
-    from grounded_trials.workspace.next_step import after_fit
+    from grounded_trials.workspace.next_step import after_fit, to_plan
 
     found, seen = fit_trials(workspace, names, latency=latency, engine=engine, progress=progress)
     if not (names or latency):
@@ -80,7 +80,7 @@ def fit_in(
             return Fitted(found, False, seen, after_fit(workspace))
         return Fitted(found, False, seen, NextCommand("fit", (*asked, "--apply")))
     apply_fit(workspace, found)
-    return Fitted(found, True, seen, NextCommand("propose"))
+    return Fitted(found, True, seen, to_plan(workspace))
 
 
 def _worse(found: Fit) -> str:

@@ -7,6 +7,7 @@ about the model and the trials of its day; what was adopted since is no longer m
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,12 +38,43 @@ def next_command(
 ) -> NextCommand:
     """What a person does next, given where the search stands and what was diagnosed.
 
+    Where that is the first plan and nobody has drawn a manoeuvre, that comes before it.
+
     Args:
         workspace: whose model may have changed since the diagnosis.
         now: where its search stands.
         diagnosis: the last one.
         usable: the trials that a diagnosis can use now, in order of arrival.
     """
+    then = _follows(workspace, now, diagnosis, usable)
+    return to_plan(workspace) if then == PROPOSE else then
+
+
+def to_plan(workspace: Folder) -> NextCommand:
+    """A plan; before the first one, to draw the manoeuvre where target.csv has none yet."""
+    with suppress(GroundedError):  # a target that can't be read `propose` tells of
+        return TARGET if undrawn(workspace) else PROPOSE
+    return PROPOSE
+
+
+def undrawn(workspace: Folder) -> bool:
+    """Whether no candidate was made and target.csv is what `init --from` wrote in place of one.
+
+    Zeros of the first state alone where the log could not be sampled yet, from a start at zero.
+    """
+    task = workspace.config.task
+    if not task.target or workspace.candidate_ids():
+        return False
+    first, *others = np.asarray(workspace.task.target, float).T
+    if first.any() or not all(np.isnan(column).all() for column in others):
+        return bool(logged_target(workspace))
+    return not task.start.get(workspace.base_model.state_names[0])
+
+
+def _follows(
+    workspace: Folder, now: Standing, diagnosis: Diagnosis | None, usable: Sequence[str]
+) -> NextCommand:
+    """See `next_command`, whatever target.csv is."""
     since = since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since()
     follow = to_adopt(workspace, diagnosis) if diagnosis and not since.changed else None
     if follow and (not since.newer or _none_stood(now)):
@@ -139,7 +171,8 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
             return REPORT
     now = _standing_ahead(workspace)
     if found.no_cause:
-        return another_trial(workspace, now)
+        then = another_trial(workspace, now)
+        return to_plan(workspace) if then == PROPOSE else then
     return next_command(workspace, now, found, usable_ids(workspace))
 
 

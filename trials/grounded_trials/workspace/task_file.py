@@ -274,9 +274,9 @@ def equal_weights(
 ) -> dict[str, float]:
     """Weights by which an error as large as a column's range, at least LEAST, costs 1.
 
-    A column that is constant has no range: its size counts, as of a step. One that is zero gets the
-    largest range of its unit (a y that stays while x moves), where there is none UNKNOWN: what is
-    small for it nobody has said.
+    A column that is constant has no range: it gets the largest of its unit (a y that stays while x
+    moves), where nothing of its unit moves UNKNOWN: what is small for it nobody has said. Its size
+    counts where that is more, as of a step: an offset of 0.02 says nothing, 5 m does.
 
     Args:
         columns: of the target, by state.
@@ -284,21 +284,35 @@ def equal_weights(
         together: axes of one position: a metre costs the same along each, by the smallest range,
             but of one that is hardly any.
     """
-    ranges = {
-        name: float(np.ptp(values) or np.abs(values).max()) for name, values in columns.items()
-    }
+    ranges = {name: float(np.ptp(values)) for name, values in columns.items()}
     if axes := [own for name, own in ranges.items() if name in together and own > 0]:
         narrow = max(min(axes), NARROW * max(axes))
         ranges |= {name: narrow for name in ranges if name in together}
     size: dict[str, float] = {}
     for name, own in ranges.items():
         unit = units.get(name, "")
-        size[unit] = max(size.get(unit, 0.0), own)
+        size[unit] = max(size.get(unit, 0.0), own or float(np.abs(columns[name]).max()))
+    rest = {*without_range(columns, units)}
     widths = {
-        name: max(own or size[units.get(name, "")] or UNKNOWN, LEAST)
+        name: max(own or (UNKNOWN if name in rest else size[units.get(name, "")]), LEAST)
         for name, own in ranges.items()
     }
     return {name: width**-2 for name, width in widths.items()}
+
+
+def without_range(columns: Mapping[str, Array], units: Mapping[str, str]) -> list[str]:
+    """The states of whose unit no column moves, nor is as large as UNKNOWN: no error is small.
+
+    Args:
+        columns: of a target, by state.
+        units: of the model's states.
+    """
+    told = {
+        units.get(name, "")
+        for name, values in columns.items()
+        if np.ptp(values) > 0 or np.abs(values).max() > UNKNOWN
+    }
+    return [name for name in columns if units.get(name, "") not in told]
 
 
 def change_weight(limits: tuple[float, float] | None, unit: str) -> float:
