@@ -48,6 +48,40 @@ def test_what_holds_the_start_is_told_of_an_adopted_model_with_all_that_is_given
     assert told(dead, given) == ""  # once
 
 
+BALANCED = """
+from grounded import Model
+
+def rate(s, a, p):
+    return {"x": s.v, "th": s.w, "v": a.u, "w": 10 * s.th - a.u}
+
+model = Model(states={"x": "m", "th": "rad", "v": "m/s", "w": "rad/s"}, inputs={"u": "m/s^2"},
+              derivative=rate)
+"""
+
+
+def test_a_start_that_a_target_gives_is_told_for_each_target_where_its_sensor_has_a_bias(tmp_path):
+    """It was told of the first target; of the next, drawn from th = 0 as well, no more."""
+    (tmp_path / "mine.py").write_text(BALANCED)
+    w = Workspace.create(tmp_path / "w", model=tmp_path / "mine.py")
+    file = w.folder / "grounded.toml"
+    text = file.read_text().replace("[limits]", "[limits]\nu = [-3, 3]")
+    bias = 'effects = [{name = "sensor_bias:th", b = 0.0174}]\n[task]'
+    text = re.sub(r"(?m)^start = .*$", "start = { }", text).replace("[task]", bias, 1)
+    file.write_text(text)
+
+    def told() -> str:
+        notes = [n for n in Workspace(w.folder).propose().proposal.notes if "counts as held" in n]
+        return " ".join(notes).partition("start = ")[2]
+
+    for far in (0.1, 0.2):
+        to = {"x": np.linspace(0, far, 41), **{name: np.zeros(41) for name in ("th", "v", "w")}}
+        Workspace(w.folder).target(to)
+        assert told() == "{ th = 0.0174, u = 0 }"
+        assert told() == ""  # once
+    file.write_text(file.read_text().replace("start = { }", "start = { th = 0.0174, u = 0 }"))
+    assert told() == ""
+
+
 def test_a_plan_that_begins_from_no_input_is_not_handed_out_before_it_was_said(tmp_path):
     """A helicopter's `next:` was to export a plan from 0 V, which a note said to mend first."""
     (tmp_path / "lifted.py").write_text(LIFTED)

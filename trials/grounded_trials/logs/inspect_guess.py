@@ -2,20 +2,22 @@
 
 Every number of the log is scored against every name: by the words in its path, by what robots
 usually call such a thing, by the shape of its type, and by whether it moves at all. States that
-lie in one message are preferred to states scattered over many. Where the best is not clearly
+lie in one message are preferred to states scattered over many; what never changes in the log, or is
+of another unit, loses against what does, or is not. Where the best is not clearly
 better than the rest, the table says so and names the rest.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
 from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
-from grounded_trials.logs.stated_units import bare_command, without_unit
+from grounded_trials.logs.stated_units import bare_command, may_be, unit_of, without_unit
 from grounded_trials.toml_table import key
 
 FEW = 8  # others that [log] names
@@ -98,11 +100,22 @@ class _Candidate:
 
 
 def guess_mapping(
-    log: LogReport, states: Sequence[str], inputs: Sequence[str]
+    log: LogReport,
+    states: Sequence[str],
+    inputs: Sequence[str],
+    units: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[tuple[Guess, ...], tuple[Guess, ...]]:
-    """Guesses for the states and for the inputs, in their order."""
+    """Guesses for the states and for the inputs, in their order.
+
+    Args:
+        log: that was looked through.
+        states: names; `inputs` likewise.
+        inputs: see `states`.
+        units: the model's, by name, where they are known.
+    """
     meant = {name: _meanings(log, name, states) for name in states}
     scored = {name: _candidates(log, name, meant[name], is_input=False) for name in states}
+    scored = {name: _of_unit(log, some, units.get(name, "")) for name, some in scored.items()}
     homes = _homes(scored)
     found = tuple(_choose(log, name, scored[name], homes) for name in states)
     taken = {guess.path for guess in found}
@@ -112,20 +125,58 @@ def guess_mapping(
         candidates = [c for c in found_for if c.field.path not in taken]
         guess = _choose(log, name, candidates, {})
         rest.append(guess if guess.path or guess.others else _commands_of(log, guess, taken))
+    if len(rest) == 1:
+        rest = [_only_command(log, rest[0], units.get(rest[0].name, ""))]
     return found, tuple(rest)
+
+
+def _of_unit(log: LogReport, candidates: list[_Candidate], unit: str) -> list[_Candidate]:
+    """A state's candidates without those of another unit, if one that fits is left.
+
+    Where all that its name fits are of another unit, whatever moves in its own is a candidate.
+    """
+    fit = [c for c in candidates if _may_be(c.field.path, unit)]
+    good = [c for c in candidates if c.score >= LEAST]
+    if not good or any(c.score >= LEAST for c in fit):
+        return fit if good else candidates
+    moving = [
+        _Candidate(LEAST, topic, field)
+        for topic in log.topics
+        if not _COMMAND_TOPIC.search(topic.topic.lower())
+        for field in topic.fields
+        if field.low != field.high and unit_of(field.path) == unit
+    ]
+    return moving or candidates
+
+
+def _may_be(path: str, unit: str) -> bool:
+    """Whether a number's unit is none that contradicts; a joint's may be either, see `in_order`."""
+    return path.endswith("]") or may_be(path, unit)
+
+
+def _only_command(log: LogReport, guess: Guess, unit: str) -> Guess:
+    """The one input, at the one command that moves and that is nothing else, where none is named.
+
+    A topic of commands with a second number that moves, or another such topic, leaves it open.
+    """
+    if guess.path or not guess.reasons or len(guess.others) != 1:
+        return guess
+    path = guess.others[0]
+    topic, field = next((t, f) for t in log.topics for f in t.fields if f.path == path)
+    if not _may_be(path, unit):
+        return guess
+    why = ("no name says it; the only command in the log that moves",)
+    clock = _clock(log, topic)
+    return replace(guess, path=path, clock=clock, others=(), field=field, reasons=why)
 
 
 def _commands_of(log: LogReport, guess: Guess, taken: set[str]) -> Guess:
     """An input that nothing is named after, with the numbers of topics that carry commands."""
     commands = [t for t in log.topics if _COMMAND_TOPIC.search(t.topic.lower())]
     moving = [f.path for t in commands for f in t.fields if f.low != f.high]
-    others = tuple(path for path in moving if path not in taken and not _part(path))
+    others = tuple(path for path in moving if path not in taken and not path.endswith(_QUATERNION))
     why = ("no name says it; these are commanded",) if others else ()
     return replace(guess, others=others[:8], reasons=why)
-
-
-def _part(path: str) -> bool:
-    return path.endswith(_QUATERNION)
 
 
 def _meanings(log: LogReport, name: str, states: Sequence[str]) -> tuple[str, ...]:
@@ -213,7 +264,13 @@ def _choose(
     ranked = [c for c in ranked if c.score >= LEAST]
     if not ranked:
         return Guess(name, "", "", False, tuple(c.field.path for c in candidates[:3]))
-    best = ranked[0]
+    still, best = ranked[0], _moving(ranked)
+    if best is not still:
+        why = f"{still.field.path} never changes in this log"
+        rest = tuple(c.field.path for c in ranked if c is not best)[:3]
+        return Guess(
+            name, best.field.path, _clock(log, best.topic), False, rest, best.field, (why,)
+        )
     value = best.score + homes.get(best.topic.topic, 0.0)
     near = [c for c in ranked[1:] if c.score + homes.get(c.topic.topic, 0.0) > value - SURE]
     reasons: tuple[str, ...] = ()
@@ -223,9 +280,28 @@ def _choose(
             "from its own speed, which says nothing more of the motion",
         )
         best, near = measured, [best, *(c for c in near if c is not measured)]
-    clock = "header" if best.topic.stamped and not is_simulated(log) else "log"
     others = tuple(c.field.path for c in near[:3])
+    clock = _clock(log, best.topic)
     return Guess(name, best.field.path, clock, not near, others, best.field, reasons)
+
+
+def _moving(ranked: list[_Candidate]) -> _Candidate:
+    """The best; if that never changes, the best that does and is called so as well."""
+    best = ranked[0]
+    if best.field.low is None or best.field.low != best.field.high:
+        return best
+    moves = (c for c in ranked if c.field.low is not None and c.field.low != c.field.high)
+    return next((c for c in moves if _alike(c.field.path, best.field.path)), best)
+
+
+def _alike(path: str, other: str) -> bool:
+    """Whether two numbers are called the same in their messages, or are surely in one unit."""
+    said = unit_of(path)
+    return path.split(".")[-2:] == other.split(".")[-2:] or said == unit_of(other) != ""
+
+
+def _clock(log: LogReport, topic: TopicReport) -> str:
+    return "header" if topic.stamped and not is_simulated(log) else "log"
 
 
 def _measured(best: _Candidate, ranked: list[_Candidate]) -> _Candidate | None:

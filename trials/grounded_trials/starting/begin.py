@@ -221,7 +221,8 @@ def _matched(
     Where no name fits a position and its rate, any two numbers may be they, of which one follows
     the derivative of the other; the one number that is left is the one input.
     """
-    names = guess_mapping(report, model.state_names, model.input_names)
+    units = {**model.states, **model.inputs}
+    names = guess_mapping(report, model.state_names, model.input_names, units)
     states, inputs = weigh(report, model, *names, joints)
     if not unnamed or any(g.path or g.others for g in states):
         return states, inputs

@@ -305,9 +305,9 @@ def held_before(workspace: Folder, again: bool = False) -> list[str]:
     names, states, n = task.model.input_names, task.model.state_names, base.model.n
     memory = np.arange(task.model.n) >= n  # of adopted effects: it settles
     free = memory.copy()
-    free[:n] = [
-        s not in config.start and np.isnan(x) for s, x in zip(states, base.target[0], strict=False)
-    ]
+    biased = {str(e["name"]).removeprefix("sensor_bias:") for e in workspace.config.model.effects}
+    begun = dict(zip(states, base.target[0], strict=False))  # by no sensor: off by its bias
+    free[:n] = [s not in config.start and (np.isnan(x) or s in biased) for s, x in begun.items()]
     chosen = any(name in config.start for name in names)
     priced = bool(base.reward.input_change.any() or base.latency.any())
     stands = None if (chosen and not again) or not priced else resting(task, memory, loose)

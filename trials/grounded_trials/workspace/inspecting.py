@@ -97,10 +97,10 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
         here = (workspace.folder / FILE).exists()
         why = f": {error}" if here else " outside a workspace (-C DIR names one)"
         return Inspected(str(log), report, "", why, outside=not here)
-    states, inputs = guess_mapping(report, model.state_names, model.input_names)
+    units = {**model.states, **model.inputs}
+    states, inputs = guess_mapping(report, model.state_names, model.input_names, units)
     joints = joint_names(report)
     states, inputs = weigh(report, model, states, inputs, joints)
-    units = {**model.states, **model.inputs}
     both = from_the_rest((*states, *inputs), units, report, joint_units(joints))
     states, inputs = both[: model.n], both[model.n :]
     table = mapping_toml(states, inputs, simulated=is_simulated(report))
