@@ -24,7 +24,7 @@ from grounded.diagnosis.error_report import (
 )
 from grounded.diagnosis.ruler_words import contested
 from grounded.errors import NextCommand
-from grounded.instruments.finding import Finding, filters_of
+from grounded.instruments.finding import Finding, late_effects
 from grounded.result import Document, number
 
 if TYPE_CHECKING:
@@ -344,16 +344,15 @@ class Diagnosis(Document):
             if effect == curve.effect:
                 return dict(curve.quantities)
         row = self.ranked(effect)
-        return self.filters.get(effect, {}) if row is None else row.values
+        return self.late_sensors.get(effect, {}) if row is None else row.values
 
     @property
-    def filters(self) -> dict[str, dict[str, float]]:
-        """The filters of sensors that were found and corrected, as effects by name.
+    def late_sensors(self) -> dict[str, dict[str, float]]:
+        """The filters and delays of sensors that were found and corrected, as effects by name.
 
         The physics was judged without them; what a controller feeds back comes through them.
         """
-        found = filters_of(one for one in self.preflight if not one.log)
-        return {f"sensor_lag:{name}": {"tau": tau} for name, tau in found.items() if tau > 0}
+        return late_effects(self.preflight)
 
     @property
     def known_parameters(self) -> dict[str, Estimate]:

@@ -62,6 +62,20 @@ def filters_of(findings: Iterable[Finding]) -> dict[str, float]:
     return {f.signal: f.delay_s for f in findings if f.corrected and f.kind == "lag"}
 
 
+def late_effects(findings: Iterable[Finding]) -> dict[str, dict[str, float]]:
+    """The filters and delays of sensors that were found and corrected, as effects by name.
+
+    The physics was judged without them; a controller feeds back what comes through them.
+    """
+    found = {}
+    for one in findings:
+        if one.corrected and one.kind == "lag" and one.delay_s > 0 and not one.log:
+            found[f"sensor_lag:{one.signal}"] = {"tau": one.delay_s}
+        elif one.corrected and one.kind == "delay" and one.delay_s > 0:
+            found[f"sensor_delay:{one.signal}"] = {"d": one.delay_s}
+    return found
+
+
 def a_mean(name: str, position: str, over: float) -> Finding:
     """A finding of a velocity that was left out: its position's difference over a time [s]."""
     text = f"shows a mean over {over:.2g} s, as a difference of {position} does; left out here: "

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,45 +22,78 @@ from grounded.trial import Trial
 
 COASTS = 2.0  # seconds after a run that are looked at
 MAX_GAIN = 1e6  # input units per state unit: beyond it a gain is a numerical accident
+MOST = 0.6  # of the squared scatter of repeated runs: one of three that alone is off makes 2 / 3
 
 
-def spread(task: Task, history: Sequence[Tried], model: str) -> Array:
-    """How far real runs strayed from what was expected of them, (H + 1, n); zero before the first.
+@dataclass(frozen=True, eq=False)
+class Strays:
+    """How far real runs strayed from what was expected of them, and which one did most of it.
+
+    Args:
+        size: in units of the states, (H + 1, n).
+        trial: the id of the trial that makes most of that, (H + 1, n); "" where none does.
+        foretold: whether that trial missed its prediction, (H + 1, n); else the runs beside it.
+    """
+
+    size: Array
+    trial: Array
+    foretold: Array
+
+    def clause(self, t: int, i: int) -> str:
+        """Which run the spread of state i at step t comes from, and what to do; "" where none."""
+        if not (one := self.trial[t, i]):
+            return ""
+        what = "its prediction" if self.foretold[t, i] else "the other runs of its candidate"
+        return (
+            f"; +- is how far trial {one} was from {what}: if something disturbed that run, "
+            f"`discard {one}` takes it out"
+        )
+
+
+def spread(task: Task, history: Sequence[Tried], model: str) -> Strays:
+    """How far real runs strayed from what was expected of them; zero before the first.
 
     Two standard deviations between repeated runs of one candidate, or the error of the latest
     prediction that this model, grounded on a trial, made of a step, whichever is larger. What
     another model or a plan of the bare model missed says nothing of the next step.
     """
     found = np.zeros((task.horizon + 1, task.model.n))
+    whose, foretold = np.full(found.shape, "", dtype=object), np.zeros(found.shape, dtype=bool)
     assert task.safety_low is not None and task.safety_high is not None
     if not np.isfinite([task.safety_low, task.safety_high]).any():
-        return found  # nobody asks
+        return Strays(found, whose, foretold)  # nobody asks
     for tried in history:
-        whole = [t.states for t in tried.trials if t.finite_steps == task.horizon]
+        whole = [t for t in tried.trials if t.finite_steps == task.horizon]
         if len(whole) > 1:
-            off = task.model.difference(np.array(whole), np.mean(whole, axis=0))
-            scatter = np.sqrt((off**2).sum(axis=0) / (len(whole) - 1))
-            found = np.maximum(found, 2 * scatter)
+            states = np.array([t.states for t in whole])
+            off = task.model.difference(states, np.mean(states, axis=0)) ** 2
+            scatter = 2 * np.sqrt(off.sum(axis=0) / (len(whole) - 1))
+            ids = np.array([t.id for t in whole], dtype=object)[off.argmax(axis=0)]
+            ids[off.max(axis=0) <= MOST * off.sum(axis=0)] = ""
+            whose = np.where(scatter > found, ids, whose)
+            found = np.maximum(found, scatter)
     grounded = [
-        (tried.candidate.predicted_states, trial.states)
+        (tried.candidate.predicted_states, trial)
         for tried in history
         for trial in tried.trials
         if tried.candidate.grounded and tried.candidate.model == model
         if trial.finite_steps == task.horizon
     ]
     if grounded:
-        predicted, real = grounded[-1]
-        found = np.maximum(found, np.abs(task.model.difference(real, predicted)))
-    return found
+        predicted, last = grounded[-1]
+        missed = np.abs(task.model.difference(last.states, predicted))
+        foretold = missed > found
+        whose, found = np.where(foretold, last.id, whose), np.maximum(found, missed)
+    return Strays(found, whose, foretold)
 
 
-def objections(task: Task, candidate: Candidate, strays: Array | None = None) -> list[str]:
+def objections(task: Task, candidate: Candidate, strays: Strays | None = None) -> list[str]:
     """Why a candidate must not be run; empty when nothing speaks against it.
 
     Args:
         task: gives [safety].
         candidate: with its predicted run.
-        strays: how far real runs strayed so far, (H + 1, n), see `spread`; None: not at all.
+        strays: how far real runs strayed so far, see `spread`; None: not at all.
     """
     policy = candidate.policy
     parts = {"feed-forward": policy.feedforward, "predicted state": candidate.predicted_states}
@@ -73,8 +107,7 @@ def objections(task: Task, candidate: Candidate, strays: Array | None = None) ->
                 f"the {name} of {candidate.id} is not a finite number at t = {t * task.dt:g} s "
                 f"(step {t}): the model diverges there; check it with a shorter horizon"
             ]
-    around = np.zeros_like(candidate.predicted_states) if strays is None else strays
-    found = [_outside(task, candidate, around[:, i], i) for i in range(task.model.n)]
+    found = [_outside(task, candidate, strays, i) for i in range(task.model.n)]
     if policy.gain is not None and np.abs(policy.gain).max() > MAX_GAIN:
         t = int(np.argmax(np.abs(policy.gain).max(axis=(1, 2))))
         found.append(
@@ -84,20 +117,23 @@ def objections(task: Task, candidate: Candidate, strays: Array | None = None) ->
     return [sentence for sentence in found if sentence]
 
 
-def _outside(task: Task, candidate: Candidate, stray: Array, i: int) -> str:
+def _outside(task: Task, candidate: Candidate, strays: Strays | None, i: int) -> str:
     """The sentence for state i leaving [safety] in the predicted run, or ""."""
     assert task.safety_low is not None and task.safety_high is not None
     value = candidate.predicted_states[:, i]
-    excess = np.maximum(task.safety_low[i] - value, value - task.safety_high[i]) + stray
+    stray = np.zeros(len(value)) if strays is None else strays.size[:, i]
+    beyond = np.maximum(task.safety_low[i] - value, value - task.safety_high[i])
+    excess = beyond + stray
     t = int(np.argmax(excess))
     if excess[t] <= 0:
         return ""
     name = task.model.state_names[i]
     around = f" +- {stray[t]:.3f}" * bool(stray[t])
+    why = strays.clause(t, i) if strays is not None and beyond.max() <= 0 else ""
     return (
         f"{candidate.id} (alpha = {candidate.alpha:g}) is predicted to take {name} to "
         f"{value[t]:.3f}{around} {task.model.states[name]} at t = {t * task.dt:.2f} s, outside "
-        f"[safety] {name} = [{task.safety_low[i]:g}, {task.safety_high[i]:g}]"
+        f"[safety] {name} = [{task.safety_low[i]:g}, {task.safety_high[i]:g}]{why}"
     )
 
 

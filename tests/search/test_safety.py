@@ -80,7 +80,32 @@ def test_only_steps_that_this_model_has_foretold_say_how_far_runs_stray(made):
     ]:
         step = replace(made, base="c0001", way=way)
         history = [Tried(step, (ran,), (-1.0,), True)]
-        assert spread(task, history, model)[:, 0].max() == pytest.approx(expected)
+        assert spread(task, history, model).size[:, 0].max() == pytest.approx(expected)
+
+
+def test_the_run_that_most_of_the_spread_comes_from_is_named(made):
+    """A balancer was kicked once: every step was refused for +- 0.6 rad, and nothing said why."""
+    task = cart_task(safety_low=np.full(2, -1.4), safety_high=np.full(2, 1.4))
+    names = task.model.state_names, task.model.input_names
+
+    def ran(off: float, trial: str) -> Trial:
+        states = made.predicted_states + np.array([off, 0.0])
+        return Trial(states, made.predicted_inputs, task.dt, *names, id=trial)
+
+    def told(candidate, *trials) -> str:
+        tried = Tried(candidate, trials, (-1.0,) * len(trials), True)
+        return objections(task, made, spread(task, [tried], made.model))[0]
+
+    step = replace(made, base="c0001", way="")
+    assert holds(told(step, ran(1.4, "t0005")), "+-", "prediction", "`discard t0005`")
+    repeated = ran(0.0, "t0001"), ran(3.0, "t0002"), ran(0.0, "t0003")
+    first = replace(made, base="")
+    assert holds(told(first, *repeated), "other runs", "`discard t0002`")
+    two = told(first, *repeated[:2])  # either may be the one that was disturbed
+    assert "+-" in two and "discard" not in two
+    far = replace(made, predicted_states=made.predicted_states + 2.0)  # the plan itself leaves
+    tried = Tried(step, (ran(1.4, "t0005"),), (-1.0,), True)
+    assert "discard" not in objections(task, far, spread(task, [tried], made.model))[0]
 
 
 def test_who_coasts_out_of_safety_after_a_run_is_told_when_and_how_far(made):

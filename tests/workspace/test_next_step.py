@@ -198,13 +198,54 @@ def test_a_filter_is_adopted_alone_where_nothing_else_was_found(cart, tmp_path):
     assert last(grounded("-C", folder, "status")) == "grounded export best --runner"
 
 
+DELAYED = LAGGING | {"kind": "delay", "log": "delay_s = 0.05"}  # on top of 0.02 s in [log]
+LOG = """
+[log.state]
+x = {{ path = "/csv.x" }}
+v = {{ path = "/csv.v", delay_s = {0} }}
+
+[log.input]
+force = {{ path = "/csv.force" }}
+"""
+
+
+@pytest.mark.parametrize("finding", [DELAYED, DELAYED | {"log": ""}])
+def test_a_delay_of_a_sensor_is_adopted_with_the_physics(cart, tmp_path, finding):
+    """A balancer went from limit to limit: the plan had fresh speeds, its program had not."""
+    folder = copied(cart, tmp_path / "w")
+    diagnosed(folder, preflight=[finding])
+    command = last(grounded("-C", folder, "status"))
+    assert command == "grounded adopt viscous_friction:v sensor_delay:v"
+    done = grounded("-C", folder, *shlex.split(command)[1:], "--json").json
+    assert done["effects"][-1] == {"name": "sensor_delay:v", "d": 0.03} and not done["beside"]
+    assert "v_true" in " ".join(Folder(folder).planner.plan.model.state_names)
+    assert last(grounded("-C", folder, "status")) == "grounded diagnose"
+
+
+@pytest.mark.parametrize(("now", "counted"), [(0.02, False), (0.05, True)])
+def test_a_delay_that_log_takes_out_by_now_does_not_act_twice(cart, tmp_path, now, counted):
+    folder = copied(cart, tmp_path / "w")
+    diagnosed(folder, preflight=[DELAYED])
+    toml = folder / "grounded.toml"
+    toml.write_text(toml.read_text() + LOG.format(now))
+    offered = last(grounded("-C", folder, "status"))
+    assert offered.endswith("viscous_friction:v" if counted else "sensor_delay:v")
+    before = toml.read_text()
+    done = grounded("-C", folder, "adopt", "viscous_friction:v", "sensor_delay:v")
+    assert done.code == (1 if counted else 0)
+    if counted:
+        assert toml.read_text() == before
+        assert holds(" ".join(done.err.split()), "[log.state.v] delay_s = 0.05", "one of both")
+
+
 @pytest.mark.parametrize(
     "finding",
     [
         LAGGING | {"delay_s": 1e-4},  # of a step of 50 ms
         LAGGING | {"corrected": False},
         LAGGING | {"log": "delay_s = 0.03"},
-        LAGGING | {"kind": "delay"},
+        DELAYED | {"delay_s": 1e-4},
+        DELAYED | {"corrected": False},
     ],
 )
 def test_a_filter_that_makes_no_difference_or_is_mended_elsewhere_is_not_adopted(

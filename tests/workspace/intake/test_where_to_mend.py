@@ -66,7 +66,12 @@ def test_a_late_sensor_of_a_foreign_log_is_mended_in_its_table(tmp_path):
     np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header="t,x,v,force", comments="")
     ingest_log(w, tmp_path / "log.csv", data=True)
     one = found_in(w)
-    assert one.log.startswith("delay_s = 0.1") and not one.advice
+    assert one.log.startswith("delay_s = 0.1")
+    # before any candidate ran, a first run swung
+    assert holds(one.advice, "the robot's program", "late", "sensor_delay:v", "in place of delay_s")
+    toml = w.folder / "grounded.toml"
+    toml.write_text(toml.read_text().replace("[task]\n", "[task]\nfeedback = false\n"))
+    assert not found_in(w).advice
 
 
 def test_sensors_that_nothing_is_held_against_are_named_and_not_called_right(tmp_path):

@@ -125,7 +125,7 @@ def _as_claimed(diagnosis: Diagnosis, table: ModelTable) -> bool:
         return False
     made, names = diagnosis.made or Made(), diagnosis.effects
     now = {str(effect["name"]): dict(effect) for effect in table.effects}
-    both = [*names, *(name for name in diagnosis.filters if name in now)]
+    both = [*names, *(name for name in diagnosis.late_sensors if name in now)]
     try:
         known = diagnosis.known_parameters
         own, effects = joined(diagnosis, both, made.adopted, made.nominal, known)

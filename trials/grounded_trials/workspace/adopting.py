@@ -20,6 +20,7 @@ from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.workspace.config import ModelTable, as_toml, set_in_model
 from grounded_trials.workspace.diagnosing import read_diagnosis
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.intake.where_to_mend import in_time_now
 
 Effect = dict[str, Any]  # {"name": "dead_zone:throttle", "c": 0.146}
 AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")
@@ -101,7 +102,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     names = _corrections(found, list(dict.fromkeys(names)))
     before = {} if found.made is None else found.made.effects
     _check(names, found, workspace, before)
-    physics = [name for name in names if name not in found.filters]
+    physics = [name for name in names if name not in found.late_sensors]
     claimed = not physics or _claimed(found, physics)
     calibrated = found.known_parameters if parameters and physics and claimed else {}
     nominal = nominal_values(found, workspace, names)
@@ -115,7 +116,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     after = {"effects": adopted or model.effects, "params": whole if own else model.params}
     step = {"names": names, "before": _written(model), "after": after}
     write_document(workspace.reports / KEPT, {"adoptions": [*earlier, step], "undone": []})
-    fitted = {*names, *before, *(found.effects if claimed else ()), *found.filters}
+    fitted = {*names, *before, *(found.effects if claimed else ()), *found.late_sensors}
     beside = (str(effect["name"]) for effect in adopted)
     logged = logged_target(workspace) if not workspace.candidate_ids() else ""
     return Adopted(
@@ -311,13 +312,23 @@ def _check(
     names: Sequence[str], found: Diagnosis, workspace: Folder, before: Mapping[str, Any]
 ) -> None:
     """Each must have been weighed, and not be adopted since."""
-    known = [row.effect for row in found.ranking] + _curves(found) + [*found.filters]
+    known = [row.effect for row in found.ranking] + _curves(found) + [*found.late_sensors]
     adopted = [e["name"] for e in workspace.config.model.effects if e["name"] not in before]
+    in_log = in_time_now(workspace, found.preflight)
     for name in names:
         if name not in known:
             _check_alike(name, found)
             raise GroundedError(
                 f"'{name}' is not among the effects of the last diagnosis: {nearest(name, known)}"
+            )
+        if name in in_log:
+            _, _, state = name.partition(":")
+            raise GroundedError(
+                f"'{name}': [log.state.{state}] delay_s = {in_log[name]:g} takes that delay out of "
+                "every log that is read now, and the model would have it as well. Expected one of "
+                "both: take delay_s out again, as it was for the trials that were diagnosed, and "
+                "the plan knows what the robot's program gets; or keep delay_s, and let that "
+                "program predict it ahead by as much"
             )
         if name in adopted:
             raise GroundedError(

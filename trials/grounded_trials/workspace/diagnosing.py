@@ -261,7 +261,7 @@ def _probe(
     offer = write or bool(ties)
     why = "none of those tried stays inside [safety], or near where trials have been"
     plan = _near(planner, trials)
-    for room in (0 * strays, strays):
+    for room in (0 * strays.size, strays.size):
         inside = _narrower(plan, room.max(axis=0))
         made = None if inside is None else probe(inside, base, found, trials, library)
         if made is None:

@@ -20,6 +20,7 @@ from grounded.search.standing import LOST, Standing
 from grounded_trials.workspace.diagnosing import diagnosable, read_diagnosis
 from grounded_trials.workspace.fitting import fitted_in_vain
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.intake.where_to_mend import in_time_now
 from grounded_trials.workspace.proposing import standing_in, status_of, to_run
 
 PROPOSE = NextCommand("propose")
@@ -28,7 +29,7 @@ EXPORT = NextCommand("export", ("best", "--runner"))
 REPORT = NextCommand("report", ("--html",))
 TARGET = NextCommand("target", ("SHAPE",))
 WRITTEN = 1e-3  # of what a target asks for: its digits in a file
-SHORT = 0.1  # of a control step: a filter that makes no difference
+SHORT = 0.1  # of a control step: a filter or delay that makes no difference
 LEFT = 2  # states that are told of what is left
 SAME = 1e-6  # of a value: what writing it in eight digits may take
 
@@ -220,14 +221,14 @@ def after_fit(workspace: Folder) -> NextCommand:
 def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     """What to do about what a diagnosis found, None where there is nothing to do.
 
-    Filters of sensors come along where states are fed back: the physics was judged without them,
-    and gains that were made without them swing a robot that has them.
+    Filters and delays of sensors come along where states are fed back: the physics was judged
+    without them, and gains that were made without them swing a robot that has them.
     """
     from grounded_trials.workspace.adopting import declined
 
     new = diagnosis.open(workspace.config.model.effects, workspace.config.model.params)
     undone = {*declined(workspace)}  # whoever did that is not asked to do it again
-    late = tuple(name for name in filters_open(workspace, diagnosis) if name not in undone)
+    late = tuple(name for name in late_open(workspace, diagnosis) if name not in undone)
     claimed = diagnosis.kind in ("effect", "several") and not diagnosis.contested
     if not claimed or {*new} <= undone or _like_a_load(workspace, new):
         return NextCommand("adopt", late) if late else None
@@ -255,15 +256,16 @@ def _like_a_load(workspace: Folder, effects: Sequence[str]) -> bool:
     return like_a_load(workspace.planner.plan.model, effects)
 
 
-def filters_open(workspace: Folder, diagnosis: Diagnosis) -> tuple[str, ...]:
-    """The filters of sensors that a diagnosis found and the model that plans has not."""
+def late_open(workspace: Folder, diagnosis: Diagnosis) -> tuple[str, ...]:
+    """The filters and delays of sensors that a diagnosis found and the model that plans has not."""
     task = workspace.config.task
     if not (task.target and task.feedback):
         return ()
     known = {effect["name"] for effect in workspace.config.model.effects}
+    known |= set(in_time_now(workspace, diagnosis.preflight))
     least = SHORT * task.dt
-    found = diagnosis.filters.items()
-    return tuple(name for name, value in found if name not in known and value["tau"] > least)
+    found = diagnosis.late_sensors.items()
+    return tuple(n for n, own in found if n not in known and max(own.values()) > least)
 
 
 def _with_more(effects: int, made: Made) -> NextCommand:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.instruments.finding import Finding
+from grounded.instruments.finding import Finding, late_effects
 from grounded_trials.logs.log_table import log_mapping
 from grounded_trials.workspace.identity import READ_BY
 from grounded_trials.workspace.intake.no_angle import no_angles
@@ -44,25 +44,28 @@ def where_to_mend(
     """Findings with the whole key of [log], or with advice where it read none of the trials."""
     about = {one.stored.id: one.meta for one in workspace.trials()}
     findings = _at_limits(workspace, used, findings)
+    feedback = workspace.config.task.feedback
     read = [meta for trial in used if "source_sha256" in (meta := about[trial.id])]
     if read:
         model, log = workspace.base_model, workspace.config.log
         mapping = log_mapping(log, model.state_names, model.input_names)
         odd = [Finding(n, said, "mismatch") for n, said in no_angles(model, mapping).items()]
         findings = (*odd, *findings)
-        driven = workspace.config.task.feedback and any(
-            meta.get("kind") == "trial" for meta in read
+        ahead = (
+            "the robot's program gets it late, too, and should predict it ahead by as much, unless "
+            "the plan knows it, by `adopt` of {} in place of delay_s"
         )
-        ahead = "the robot's program gets it late, too, and should predict it ahead by as much"
         return tuple(
             replace(
                 one,
                 log=_whole(one, read[-1]),
-                advice=ahead if driven and one.kind == "delay" and one.corrected else one.advice,
+                advice=ahead.format(f"sensor_delay:{one.signal}")
+                if feedback and one.kind == "delay" and one.corrected
+                else one.advice,
             )
             for one in findings
         )
-    fed = ": the runner's feedback gets it late, too" * workspace.config.task.feedback
+    fed = ": the runner's feedback gets it late, too" * feedback
     late = f"should read it with less delay, or filter it less{fed}"
     mend = {"delay": late, "lag": late, "sign": "should turn its sign"}
     mend["degrees"] = "should write it in the model's unit"
@@ -73,6 +76,27 @@ def where_to_mend(
         else one
         for one in findings
     )
+
+
+def in_time_now(workspace: Folder, findings: Sequence[Finding]) -> dict[str, float]:
+    """What [log] takes out by now of the delays that a diagnosis found, as effects by name [s].
+
+    Args:
+        workspace: whose logs are read from now on.
+        findings: as the diagnosis kept them, with the whole key of [log].
+    """
+    late = [one for one in findings if one.kind == "delay" and "delay_s = " in one.log]
+    if not late:
+        return {}
+    model = workspace.base_model
+    mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
+    states, found = mapping.states if mapping else {}, dict[str, float]()
+    for one in late:
+        whole = float(dict(part.split(" = ") for part in one.log.split(", "))["delay_s"])
+        now = states[one.signal].delay_s if one.signal in states else 0.0
+        if now > whole - one.delay_s / 2:  # it was read with whole - delay_s
+            found |= dict.fromkeys(late_effects([one]), now)
+    return found
 
 
 def _at_limits(
