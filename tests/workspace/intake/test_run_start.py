@@ -6,6 +6,7 @@ Sought by the feed-forward alone, and only for what fitted nobody, starts were m
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,9 +14,12 @@ import pytest
 from cli import grounded
 from facts import holding, holds
 from grounded.errors import GroundedError, NextCommand
+from grounded.policy import Policy
 from grounded_trials import Workspace
+from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.intake import foreign, reading
+from grounded_trials.workspace.intake.run_start import recording
 from recorded import LOGGED, RATE, record, waiting
 from workspaces import make
 
@@ -62,6 +66,72 @@ def test_a_run_on_late_states_is_found_though_the_log_is_corrected_for_them(tmp_
     assert not any("known to" in warning for warning in found.warnings)
     np.testing.assert_allclose(stored.states[:-1, 0], table[k + 12, 1], atol=1e-3)
     np.testing.assert_allclose(stored.states[:-1, 1], table[k, 2], atol=1e-3)
+    assert not before or any("begins 1.000 s before" in note for note in found.notes)  # as logged
+
+
+def test_a_span_begins_at_the_same_command_whatever_delay_s_says(tmp_path):
+    """Put in for a late sensor, it moved the start by as much."""
+    begun = []
+    for delay in ("", "delay_s = 0.12\n"):
+        config = LOGGED.replace('path = "/csv.x"\n', f'path = "/csv.x"\n{delay}')
+        config += "[log.span]\nstart = 1.0\n"
+        w = Workspace(make(tmp_path / f"w{len(begun)}", config=config).folder)
+        policy = w.propose().candidate.policy
+        w.ingest(record(w, tmp_path / "a.csv", policy, 1.0, late=12), candidate="c0001")
+        begun.append(w.trials()[-1].meta["start_ns"])
+    assert begun[0] == begun[1]
+
+
+def test_a_start_where_lively_gains_throw_noise_from_limit_to_limit_is_where_it_is_exact():
+    """Commands at their limits, whatever the noise: the mean was less some rows off."""
+    T, dt, rng, waits = 60, 0.01, np.random.default_rng(4), 100
+    feedforward, gain = rng.normal(0, 0.05, (T, 1)), np.zeros((T, 1, 3))
+    feedforward[:2] = -3
+    gain[2:, 0, :2] = 20, 60
+    names, limit, none = (("x", "v"), ("force",)), np.array([3.0]), np.zeros(1)
+    policy = Policy(
+        feedforward, -limit, limit, dt, *names, (1,), (False,) * 2, none, gain, np.zeros((T, 3))
+    )
+    felt = rng.normal(0, (0.002, 0.06), (waits + T + 50, 2))
+    k = np.clip(np.arange(len(felt)) - waits, 0, T - 1)
+    sent = np.clip(feedforward[k, 0] + (gain[k, 0, :2] * felt).sum(axis=1), -3, 3)
+    sent[:waits], sent[waits + T :] = felt[:waits] @ [20, 1], 0
+
+    def logged(values, late=0):
+        t = late + 10_000_000 * np.arange(len(values))
+        return Series(SignalSpec("/a.b"), t, values, t, len(t), "", True)
+
+    series = {"x": logged(felt[:, 0]), "v": logged(felt[:, 1]), "force": logged(sent, 1_000_000)}
+    model = SimpleNamespace(state_names=names[0], input_names=names[1], angles=())
+    task = SimpleNamespace(model=model, dt=dt, horizon=T, past=none)
+    found = recording(series, task, lambda one: one).start_of(policy)
+    assert found.exact and found.seconds == pytest.approx(waits * dt + 0.001, abs=1e-6)
+
+
+@pytest.mark.parametrize("named", [False, True])
+@pytest.mark.parametrize("fell", [False, True])
+def test_a_run_that_fell_in_a_log_that_goes_on_has_failed_there(tmp_path, fell, named):
+    """Its motors were cut: somebody had taken over, it said, or the floor was scored."""
+    w = waiting(tmp_path, LOGGED + "[safety]\nx = [-5.0, 5.0]\n")
+    policy = w.candidate("c0002")[0].policy
+
+    def cut(table):
+        table[200:, 1] += 20.0 * fell
+        table[200:, 3] = 0.0
+
+    log = edited(record(w, tmp_path / "a.csv", policy, 1.0), cut)
+    wanted = "c0002" if named else None
+    if not fell and not named:
+        with pytest.raises(GroundedError, match="took over"):
+            w.ingest(log)
+        return
+    found = w.ingest(log, candidate=wanted)
+    assert found.candidate == "c0002" and (found.verdict == "crashed") == fell
+    assert any("left [safety]" in one and "not judged" in one for one in found.warnings) == fell
+    steps = w.trials()[-1].trial.steps
+    assert abs(steps - 1.0 / policy.dt) <= 1 if fell else steps == policy.horizon
+    again = w.ingest(log, candidate=wanted)
+    assert again.known and again.trial == found.trial
 
 
 def test_a_log_that_begins_with_the_run_is_taken_as_it_is(w, tmp_path):

@@ -60,7 +60,8 @@ class Crossing:
 class Span:
     """Which part of a log is the trial.
 
-    A number counts in seconds from the first sample of any signal (from 1e8 on it is a stamp).
+    A number counts in seconds from the first sample of any signal (from 1e8 on it is a stamp), by
+    its stamp: a delay_s of a sensor moves its samples, not the count.
     "first-input": when every input has been sent for the first time. No end: as long as every
     state is known and the inputs are sent.
     """
@@ -86,7 +87,7 @@ class Gridded:
     inputs: Floats  # (T, m)
     start_inputs: Floats | None  # (m,) held before t = 0; None where the log does not say
     start_ns: int  # t = 0 on the signals' clock [ns]
-    origin_ns: int  # the first sample of any signal, likewise
+    origin_ns: int  # the first sample of any signal by its stamp, likewise
     late_s: float  # the start was moved by this much, because a state was not known yet
     moved_s: float  # and by this much more, to where the commands change
     row_s: float  # by how much commands may be logged late: rows repeat them beside the states
@@ -137,7 +138,7 @@ def to_grid(
         if how[name] == "linear":
             samples[name].check_linear(dt)
     known, until = _extent(samples, states, inputs, dt)
-    origin = min(int(s.t[0]) for s in samples.values())
+    origin = min(s.first_stamp for s in samples.values())
     start, late = _start(span, series, samples, inputs, known, origin)
     whole = dict(samples)
     for name, value in zip(inputs, [] if past is None else past, strict=False):

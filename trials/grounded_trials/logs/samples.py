@@ -50,6 +50,12 @@ class Samples:
         """Median time between samples [s]; infinite for one sample."""
         return float(np.median(np.diff(self.t))) * 1e-9 if len(self.t) > 1 else np.inf
 
+    @property
+    def first_stamp(self) -> int:
+        """When the first sample was stamped, on the clock that a delay_s may put it on [ns]."""
+        sensor = 0 < self.spec.delay_s <= MIXED_S  # else it bridges two clocks
+        return int(self.t[0]) + round(self.spec.delay_s * 1e9) * sensor
+
     def max_gap(self, dt: float) -> float:
         """How far apart two samples may be for what lies between to be believed [s]."""
         if self.spec.max_age_s is not None:

@@ -19,11 +19,13 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
+from grounded.trial import Trial
 from grounded_trials.formats.messages import Ints
 from grounded_trials.logs.samples import Samples, tidy
 from grounded_trials.workspace.intake.who_drove import (
     FINE,
     LEAST,
+    SAME,
     WINDOWS,
     Following,
     follows,
@@ -256,6 +258,22 @@ def sender_of(
         f"{name}. Was the robot given {own.id}?"
     )
     return Sender(mine, name, why)
+
+
+def rival_in(
+    log: Recording,
+    own: Candidate,
+    candidates: Sequence[Candidate],
+    start_of: Callable[[Candidate], Start | None],
+) -> Trial | None:
+    """The log from where another candidate fits it much better than the own one anywhere."""
+    found = start_of(own)
+    best, bound = None, SAME * found.apart if found and found.alike else np.inf
+    for one in candidates:
+        start = start_of(one) if one.id != own.id else None
+        if start is not None and start.alike and start.apart < bound:
+            best, bound = log.trial_from(start.seconds), start.apart
+    return best
 
 
 def _one(mine: ActedOn, fit: ActedOn) -> bool:

@@ -27,8 +27,9 @@ from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.store.store import DIGITS
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
-from grounded_trials.workspace.intake.acted_on import sender_of
+from grounded_trials.workspace.intake.acted_on import rival_in, sender_of
 from grounded_trials.workspace.intake.earlier_task import OfEarlierTask, of_earlier_task
+from grounded_trials.workspace.intake.fell import fall_in, who_fell
 from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.intake.missed_steps import not_sent
@@ -39,6 +40,7 @@ from grounded_trials.workspace.intake.reading import (
     NoneWaits,
     Read,
     cut_log,
+    cut_short,
     misread,
     read_log_file,
     read_own_trial,
@@ -49,7 +51,6 @@ from grounded_trials.workspace.intake.run_start import (
     Start,
     elsewhere,
     loosely,
-    rival_in,
 )
 from grounded_trials.workspace.intake.stored_before import (
     as_stored,
@@ -70,7 +71,6 @@ from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of
 from grounded_trials.workspace.proposing import candidate_named, latest_candidates, standing_in
 
-HOLE = 10.0  # usual intervals without a sample
 ASIDE = "set aside"  # the verdict of a run that does not count
 EXACT = 0.1  # of how finely commands are known: a log of what the program saw and sent
 
@@ -161,9 +161,9 @@ def _by_its_commands(workspace: Folder, path: Path, error: NoneWaits) -> Grounde
 
 
 def _whole(read: Read, task: Task) -> Trial | None:
-    """A foreign log of a run with the seconds that follow it, None for others."""
+    """A foreign log of a whole run with the seconds that follow it, None for others."""
     log = read.log.recording if read.log else None
-    if log is None or read.cut is None or not read.trial.candidate:
+    if log is None or read.cut is None or read.trial.steps < task.horizon:
         return None
     more = replace(log, steps=task.horizon + math.ceil(COASTS / task.dt))
     return more.trial_from(1e-9 * (read.cut.start_ns - log.whole.origin_ns))
@@ -199,9 +199,11 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     read, log, found, whole, seen = look.read, look.log, look.found, look.whole, look.suspicion
     if found and found.alike and found.loose_s > LOOSE * workspace.task.dt:
         read = replace(read, warnings=(*read.warnings, loosely(found.loose_s, ran)))
-    if read.log and any(one.trial.candidate == ran for one in read.log.stored):
-        return read  # it was believed when it came; what was made of it since is like it
     why, other = seen.why, seen.other
+    fell, stored = look.fell, read.log.stored if read.log else ()
+    if before := [one.trial.steps for one in stored if one.trial.candidate == ran]:
+        # it was believed when it came; what was made of it since is like it
+        return cut_short(read, fell.steps) if fell and fell.steps in before else read
     units, by = other_units(workspace.task, whole, own, seen.ran)
     units = () if other else units
     if not why and not units:
@@ -211,6 +213,8 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         units = ()
     elif log and not units and not other:
         units, by = unit_of(log, workspace.task, own.policy)
+    if fell and not (units or slow or misled(log, workspace.task, own.policy)):
+        return replace(cut_short(read, fell.steps), warnings=(*read.warnings, fell.told))
     pace = slow and (
         f"a second of its stamps is {slow:g} s of the run (a recording played at another rate?): "
         f"correct the stamps, times {slow:g}, and ingest it again"
@@ -255,7 +259,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             f" Or {listed(guessed)}, which [estimate] finds here, {_is(guessed)} not what "
             "its program steered by: have it log its own, and map that in [log] too."
         )
-    said += _hole(read)
+    said += read.hole
     if other:
         raise GroundedError(
             f"{said} Take it in with --candidate {other}, with --candidate {ran} all the same, or "
@@ -277,17 +281,6 @@ def _undo(identity: str) -> str:
 def _stored(workspace: Folder, data: bytes) -> bool:
     """Whether a file is in the store, be it set aside."""
     return sha256(data)[:DIGITS] in workspace.store.digests()
-
-
-def _hole(read: Read) -> str:
-    """The longest time of which a log tells nothing; "" where its samples never stop for long."""
-    longest = max(read.signals, key=lambda one: one.largest_gap_s, default=None)
-    if longest is None or not longest.largest_gap_s * longest.rate_hz > HOLE:
-        return ""
-    return (
-        f" It has no sample of {longest.name} for {longest.largest_gap_s:.2g} s, from "
-        f"{longest.largest_gap_at_s:.2f} s on: that may be why."
-    )
 
 
 def _is(names: Sequence[str]) -> str:
@@ -372,6 +365,12 @@ class _Look:
             given = Start(begins, 0.0, alike=True, opens_alike=True)
             if sender_of(log.anywhere, own, [], lambda _: given).sure:
                 seen = replace(seen, why="", other="")
+        doubted = read.log and seen.why and not seen.other
+        self.fell = fall_in(task, ran, self.read.trial, seen.ran) if doubted else None
+        if self.fell and self.log:
+            first, steps = self.found.seconds if self.found else self.log.first, self.fell.steps
+            if name := who_fell(self.log, own, candidates, start_of, first + steps * task.dt):
+                self.fell, seen = None, replace(seen, other=name)
         self.suspicion = seen
 
     @property

@@ -30,6 +30,8 @@ from grounded_trials.workspace.intake.no_angle import no_angles
 from grounded_trials.workspace.intake.stored_before import refuse_as_another, set_aside_of
 from grounded_trials.workspace.proposing import standing_in
 
+HOLE = 10.0  # usual intervals without a sample
+
 
 @dataclass(frozen=True, eq=False)
 class Read:
@@ -46,6 +48,17 @@ class Read:
     log: ForeignLog | None = None
     cut: Gridded | None = None  # of a foreign log: how it was sampled
     last_s: float = math.nan  # its last sample of every state, since the start; of a foreign log
+
+    @property
+    def hole(self) -> str:
+        """The longest time of which a log tells nothing; "" where its samples never stop."""
+        longest = max(self.signals, key=lambda one: one.largest_gap_s, default=None)
+        if longest is None or not longest.largest_gap_s * longest.rate_hz > HOLE:
+            return ""
+        return (
+            f" It has no sample of {longest.name} for {longest.largest_gap_s:.2g} s, from "
+            f"{longest.largest_gap_at_s:.2f} s on: that may be why."
+        )
 
 
 def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: bool) -> Read:
@@ -178,6 +191,15 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
         cut=found,
         last_s=(found.last_ns - found.start_ns) * 1e-9,
     )
+
+
+def cut_short(read: Read, steps: int) -> Read:
+    """A run in a foreign log up to so many steps, as it is where the log is no longer."""
+    if read.log is None or read.cut is None or read.trial.steps <= steps:
+        return read
+    trial, workspace = read.trial.until(steps), read.log.workspace
+    about = _about(workspace, trial.candidate) | read.log.source
+    return replace(read, trial=trial, data=_encode(workspace, trial, about, read.cut.start_ns))
 
 
 def misread(log: ForeignLog) -> tuple[str, ...]:

@@ -23,7 +23,6 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.logs.command_steps import changes_of, phase_of
@@ -40,6 +39,7 @@ from grounded_trials.workspace.intake.who_drove import (
 )
 
 TRIED = 5  # instants at which the commands fit best
+BESIDE = 4  # steps from the best of them, within which the commands may be the policy's exactly
 HELD = 3.5  # steps: what changes no sooner may begin a run
 FINEST = 8  # parts of a step, between which the start is sought
 QUIET_S = 1.0  # without a change of commands, before a run that the log does not have whole
@@ -67,6 +67,7 @@ class Start:
     between_rows: bool = False  # found below the time between rows, by the feedback
     loose_s: float = 0.0  # it may be off by as much
     missed: int = 0  # steps of it before the log's first command, which nobody sent
+    exact: bool = False  # most commands are the policy's to the last digits, none somebody else's
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +130,7 @@ class Recording:
         if (found := self._surest(policy, whole)) is None:
             begun = [one for one in self._starts(policy, until) if one.opens_alike]
             found = min(begun or whole, key=lambda one: (not one.alike, one.apart), default=None)
+        found = found and self._exactly(policy, found)
         first, _ = self._on_step(policy, self.first)
         missed = missed_steps(self, policy, first, found.seconds if found else first)
         if not missed:
@@ -154,11 +156,27 @@ class Recording:
         told = [(fit, one) for fit, one in fits if fit is not None and fit.told.sum() >= LEAST]
         fit, best = min(told, key=lambda pair: pair[0].left, default=(None, likeliest))
         if fit is not None and fit.throughout:
-            return replace(best, alike=True, opens_alike=True)
+            return replace(best, alike=True, opens_alike=True, exact=True)
         usual = next((other.left for other, one in told if one is likeliest), np.inf)
         if fit is not None and alike and fit.left < SAME * usual:
             return replace(best, opens_alike=True)
         return likeliest if alike else None
+
+    def _exactly(self, policy: Policy, found: Start) -> Start:
+        """A start moved by some steps to where the commands are the policy's exactly, if they are.
+
+        Where lively gains throw noise from limit to limit, a mean may be less some rows off.
+        """
+        here = acted_on(self, policy, found.seconds) if found.opens_alike else None
+        if policy.gain is None or here is None or here.exact:
+            return found
+        for steps in sorted(range(-BESIDE, BESIDE + 1), key=abs)[1:]:
+            at = found.seconds + steps * self.dt
+            fit = acted_on(self, policy, at)
+            if fit is not None and fit.throughout:
+                apart = self.apart_at(policy, at)
+                return replace(found, seconds=at, apart=apart, alike=True, exact=True)
+        return found
 
     def _starts(self, policy: Policy, apart: Array) -> list[Start]:
         """The likeliest places, by how little differs from each instant on."""
@@ -361,7 +379,7 @@ def elsewhere(log: Recording, found: Start, policy: Policy, why: str) -> bool:
         return True
     if not found.opens_alike or abs(found.seconds - log.first) <= ALIGNED * log.interval:
         return False
-    return bool(why) or found.apart < CLEARLY * log.apart_at(policy, log.first)
+    return bool(why) or found.exact or found.apart < CLEARLY * log.apart_at(policy, log.first)
 
 
 def loosely(seconds: float, ran: str) -> str:
@@ -372,19 +390,3 @@ def loosely(seconds: float, ran: str) -> str:
         "tell. Log the states that the controller used (no velocities that were differentiated or "
         "filtered afterwards), or the time at which it sent each command"
     )
-
-
-def rival_in(
-    log: Recording,
-    own: Candidate,
-    candidates: Sequence[Candidate],
-    start_of: Callable[[Candidate], Start | None],
-) -> Trial | None:
-    """The log from where another candidate fits it much better than the own one anywhere."""
-    found = start_of(own)
-    best, bound = None, SAME * found.apart if found and found.alike else np.inf
-    for one in candidates:
-        start = start_of(one) if one.id != own.id else None
-        if start is not None and start.alike and start.apart < bound:
-            best, bound = log.trial_from(start.seconds), start.apart
-    return best
