@@ -108,6 +108,7 @@ def test_a_start_where_lively_gains_throw_noise_from_limit_to_limit_is_where_it_
     assert found.exact and found.seconds == pytest.approx(waits * dt + 0.001, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("named", [False, True])
 @pytest.mark.parametrize("fell", [False, True])
 def test_a_run_that_fell_in_a_log_that_goes_on_has_failed_there(tmp_path, fell, named):
