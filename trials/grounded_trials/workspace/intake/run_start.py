@@ -39,7 +39,7 @@ from grounded_trials.workspace.intake.who_drove import (
 )
 
 TRIED = 5  # instants at which the commands fit best
-BESIDE = 4  # steps from the best of them, within which the commands may be the policy's exactly
+BESIDE = 4  # steps before the best of them, within which the commands may be the policy's exactly
 HELD = 3.5  # steps: what changes no sooner may begin a run
 FINEST = 8  # parts of a step, between which the start is sought
 QUIET_S = 1.0  # without a change of commands, before a run that the log does not have whole
@@ -163,15 +163,15 @@ class Recording:
         return likeliest if alike else None
 
     def _exactly(self, policy: Policy, found: Start) -> Start:
-        """A start moved by some steps to where the commands are the policy's exactly, if they are.
+        """A start some steps sooner, where the commands are the policy's exactly, if they are.
 
         Where lively gains throw noise from limit to limit, a mean may be less some rows off.
         """
         here = acted_on(self, policy, found.seconds) if found.opens_alike else None
         if policy.gain is None or here is None or here.exact:
             return found
-        for steps in sorted(range(-BESIDE, BESIDE + 1), key=abs)[1:]:
-            at = found.seconds + steps * self.dt
+        for steps in range(1, BESIDE + 1):  # later they are, too, in a log that has them late
+            at = found.seconds - steps * self.dt
             fit = acted_on(self, policy, at)
             if fit is not None and fit.throughout:
                 apart = self.apart_at(policy, at)
