@@ -77,7 +77,8 @@ class Ahead:
         self.at = at[:: -(-len(at) // starts)] if len(at) else at
         self.first, self.last = logged[self.at], logged[self.at + self.steps]
         self.left_out = _basis(self.first[:, self.shown] if linear else self.first[:, :0])
-        self.least = LITTLE * np.nanstd(logged[:, self.shown], axis=0) + TINY
+        moves = np.nanstd(logged[:, self.shown], axis=0) if good.any() else np.zeros(len(shown))
+        self.least = LITTLE * moves + TINY
         params = list(model.params.values())
         self.moving = [k for k, param in enumerate(params) if param.uncertain]
         self.spread = np.array([params[k].spread for k in self.moving])

@@ -17,7 +17,7 @@ from grounded.instruments.mistaken import (
     mended_by,
     mistaken,
 )
-from grounded.instruments.short_runs import Fit
+from grounded.instruments.short_runs import Ahead, Fit
 from grounded.trial import Trial
 
 
@@ -317,6 +317,14 @@ def test_gaps_hidden_states_and_short_logs_are_no_obstacle():
     assert mistaken(vessel(), [trial.until(12)], every(vessel())) is None
     assert mistaken(vessel(), [trial.until(0)], every(vessel())) is None
     assert mistaken(vessel(), [], every(vessel())) is None
+
+
+def test_a_channel_that_a_change_leaves_empty_tells_nothing():
+    """Two warnings of numpy's stood above a diagnosis' verdict."""
+    trial = driven(vessel())
+    states = np.array(trial.states)
+    states[:, 1] = np.nan
+    assert not Ahead(vessel(), replace(trial, states=states), range(5), 100).enough
 
 
 def test_a_diagnosis_stops_at_exchanged_commands():
