@@ -256,7 +256,7 @@ def _effects(found: Diagnosis) -> None:
         _note(
             "credit: what predictions lose without it, of what they gain in all; evidence: of "
             "what is claimed or tied, what is lost without it beside the other causes; of the "
-            "rest, what it gains alone"
+            "rest, what it gains alone; +-: one standard deviation, if the equations are right"
         )
     for group in found.indistinguishable:
         if group in found.equivalent:

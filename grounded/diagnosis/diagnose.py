@@ -47,6 +47,7 @@ from grounded.effects import Effect, Library
 from grounded.effects.actuator import delay_again
 from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError
+from grounded.instruments.lag import whole_steps
 from grounded.instruments.sound_trials import sound_trials
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
@@ -134,7 +135,9 @@ def diagnose(
     trials = looked.trials
     data = prepare(model, trials, latency, past, options.hidden)
     filters = {model.state_names.index(name): tau for name, tau in looked.filters.items()}
-    data = replace(data, filters=filters)
+    moved = [f for f in looked.findings if f.corrected and f.kind == "delay"]
+    between = {f.signal for f in moved if not whole_steps(f.delay_s / data.dt)}
+    data = replace(data, filters=filters, between=frozenset(between))
     known = limits(data, looked.left_out)
     known = replace(known, sentences=(*known.sentences, *copies))
     tick("candidates")

@@ -258,7 +258,6 @@ def judge_speed(model: Model, relation: Turned, lag: Lag | None, dt: float) -> I
     if d > max(SURE * lag.std, 0.5 * dt):
         text = f"{d:.3g} s {'later' if lag.delay > 0 else 'earlier'} than {where} move"
         yield Finding(name, text, "delay", float(lag.delay), lag.std)
-    if lag.low > 1 + OFF or lag.high < 1 - OFF:
-        size = float(np.sqrt(lag.low * lag.high))
-        text = f"shows {100 * size:.3g} % of the speed of {where}: a sensor, or slip"
-        yield Finding(name, text, "scale", scale=size)
+    if lag.off(OFF):
+        text = f"shows {100 * lag.scale:.3g} % of the speed of {where}: a sensor, or slip"
+        yield Finding(name, text, "scale", scale=lag.scale)

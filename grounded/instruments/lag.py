@@ -52,6 +52,7 @@ class Lag:
         coherence: 0 to 1, how much of both is the same.
         scale_std: standard deviation of the scale.
         mean: b is the mean of a over so long [s], its middle `delay` ago; 0 where none is sure.
+        slow: the scale of slow motions, by the widest window that sees enough of them.
     """
 
     delay: float
@@ -63,6 +64,20 @@ class Lag:
     coherence: float
     scale_std: float = np.inf
     mean: float = 0.0
+    slow: float = np.nan
+
+    @property
+    def scale(self) -> float:
+        """Of b, without its sign."""
+        return float(np.sqrt(self.low * self.high))
+
+    def off(self, by: float) -> bool:
+        """Whether the scale is off by more, of slow motions as well.
+
+        What swings a few samples a period is bent between them: its mean over a step is no scale.
+        """
+        slow = self.slow if np.isfinite(self.slow) else self.scale
+        return min(self.low, slow) > 1 + by or max(self.high, slow) < 1 - by
 
     @property
     def one_size(self) -> bool:
@@ -92,7 +107,9 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
     apart = float(np.median([abs(one.delay - best.delay) for _, one in clear]))
     told = [one for p, one in clear if p.windows >= BLOCKS // 2]  # wider ones sway by chance
     sure = bool(told) and min(told, key=lambda lag: lag.std).mean > 0
-    return replace(best, std=float(np.hypot(best.std, apart)), mean=best.mean * sure)
+    slow = told[-1].scale if told else np.nan
+    std = float(np.hypot(best.std, apart))
+    return replace(best, std=std, mean=best.mean * sure, slow=slow)
 
 
 def reach_of(steps: int, dt: float) -> int:
@@ -253,10 +270,15 @@ def at_samples(x: Array, at: Any) -> Array:
     return np.where((at < -1e-9) | (at > T - 1 + 1e-9), np.nan, value)
 
 
+def whole_steps(steps: float) -> bool:
+    """Whether a signal is moved from sample to sample: between them its noise is smoothed."""
+    return abs(steps - round(steps)) < 0.05
+
+
 def earlier(x: Array, steps: float) -> Array:
     """X as it was so many steps later; missing at the end."""
     at = np.arange(len(x)) + steps
     whole = round(steps)
-    if abs(steps - whole) < 0.05:
+    if whole_steps(steps):
         return np.concatenate([x[whole:], np.full(min(whole, len(x)), np.nan)])
     return at_samples(x, at)

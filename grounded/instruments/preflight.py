@@ -285,13 +285,12 @@ class _Bench:
             yield self.turned_round(relation.i, text)
         elif lag.sign < 0:
             yield self.turned_round(relation.j, f"has the opposite sign of the rate of {q}")
-        size = float(np.sqrt(lag.low * lag.high))
-        for i, factor in ((relation.j, size), (relation.i, 1 / size)):
+        for i, factor in ((relation.j, lag.scale), (relation.i, 1 / lag.scale)):
             if abs(factor / DEGREES - 1) < UNIT:
                 yield self.from_degrees(i)
                 return
-        if lag.low > 1 + OFF or lag.high < 1 - OFF:
-            yield scaled(w, q, size, self.model.states[w])
+        if lag.off(OFF):
+            yield scaled(w, q, lag.scale, self.model.states[w])
         elif relation.exact and lag.one_size:
             self.refuted |= {f"sensor_scale:{w}", f"sensor_scale:{q}", f"rate_gain:{q}"}
 

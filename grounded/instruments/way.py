@@ -215,8 +215,7 @@ def rate_agrees(model: Model, heading: int, trials: Sequence[Trial]) -> int:
         if relation.i == heading and relation.exact:
             lag = lag_of(model, relation, trials)
             if lag is not None and lag.coherence > TOLD:
-                size = float(np.sqrt(lag.low * lag.high))
-                return lag.sign * (1 / SAME_SIZE < size < SAME_SIZE)
+                return lag.sign * (1 / SAME_SIZE < lag.scale < SAME_SIZE)
     return 0
 
 

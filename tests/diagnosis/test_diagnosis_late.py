@@ -322,3 +322,25 @@ def test_a_late_sensor_is_found_where_the_state_is_disturbed(sensor, shown, star
     error = held_out_errors(search.predictor, fit, fit.track, where)
     of_late = float(np.sqrt((error[:, 1] ** 2 / where.spread[:, 1] ** 2).mean()))
     assert 0.85 < of_late < 1.15 and 0.85 < normalised(error, where) < 1.15
+
+
+@pytest.mark.slow
+def test_a_sensor_moved_between_its_samples_leaves_no_doubt():
+    """Noise between two samples is their mean: it is no sign of a cause that is missing."""
+    model, dt, parts, rng = pendulum, 0.02, 5, np.random.default_rng(4)
+    trials = []
+    for k in range(4):
+        u = 0.5 * np.sin((1.0 + k) * dt * np.arange(200))[:, None]
+        x, fine = np.zeros((1, 2)), [np.zeros(2)]
+        for push in np.repeat(u, parts, axis=0):
+            x = model.system.step(x, push[None], model.values, dt / parts)
+            x = x + rng.standard_normal(2) * [0.0, 0.004]
+            fine.append(x[0])
+        path = np.concatenate([np.zeros((12, 2)), fine])
+        logged = np.stack([path[12::parts, 0], path[: len(fine) : parts, 1]], axis=1)
+        logged = logged + rng.standard_normal(logged.shape) * [0.002, 0.02]
+        trials.append(Trial(logged, u, dt, model.state_names, model.input_names, id=f"t{k:04}"))
+    found = gr.diagnose(model, trials)
+    late = [one.delay_s for one in found.preflight if one.signal == model.state_names[1]]
+    assert late == [pytest.approx(2.4 * dt, rel=0.02)]
+    assert found.verdict.kind == "none"

@@ -419,8 +419,19 @@ def test_what_a_filter_takes_from_fast_swings_is_no_scale(filtered):
     lag = lag_between([(a, b)], DT)
     assert lag.filtered == filtered
     assert lag.delay == pytest.approx(tau if filtered else 0.01, rel=0.08)
-    size = np.sqrt(lag.low * lag.high)
-    assert size == pytest.approx(1.0 if filtered else 0.96, abs=0.012)
+    assert lag.scale == pytest.approx(1.0 if filtered else 0.96, abs=0.012)
+
+
+@pytest.mark.parametrize("of_slow", [1.0, 0.94])
+def test_a_size_that_only_chatter_has_is_no_scale(of_slow):
+    """A balancer's torque changed sign every 25 ms: its gyro showed 94.5 % of its pitch's rate."""
+    rng, t = np.random.default_rng(3), 0.01 * np.arange(1000)
+    slow, chatter = 0.3 * np.sin(2.1 * t), np.sin(2 * np.pi * 19.94 * t)
+    a, b = slow + chatter, of_slow * slow + 0.94 * chatter
+    lag = lag_between([tuple(x + 0.01 * rng.standard_normal(1000) for x in (a, b))], 0.01)
+    assert lag.scale < 0.96
+    assert lag.slow == pytest.approx(of_slow, abs=0.01)
+    assert lag.off(0.03) == (of_slow < 1)
 
 
 @pytest.mark.slow

@@ -51,6 +51,7 @@ class Data:
     ids: tuple[str, ...]
     hidden: tuple[int, ...] = ()  # states that no sensor has: only their start is known
     filters: Mapping[int, float] = field(default_factory=dict)  # sensors' time constants [s]
+    between: frozenset[str] = frozenset()  # sensors that were moved in time, between samples
 
     @property
     def count(self) -> int:

@@ -54,8 +54,8 @@ class Measured:
         self.left = leftovers(self.predictor, self.best)
         self.flexible = self.corrections()
         self.whiteness = self.white()
-        least = min(self.whiteness.values(), default=0.0)
-        self.is_white = not self.left and least * len(self.whiteness) > WHITE
+        told = [p for n, p in self.whiteness.items() if n not in self.data.between]
+        self.is_white = not self.left and min(told, default=0.0) * len(told) > WHITE
         self.floor, self.source = self.noise_floor()  # and `unsure`: of its logarithm, (K, 1)
         self.at_most = self.source == "short horizon" and not self.is_white
 
