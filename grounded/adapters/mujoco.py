@@ -29,7 +29,9 @@ from typing import Any
 
 import numpy as np
 
+from grounded.adapters.beside import located, remember
 from grounded.adapters.mujoco_body import MujocoBody
+from grounded.adapters.mujoco_files import files_of
 from grounded.adapters.mujoco_names import (
     BALL,
     FREE,
@@ -49,6 +51,8 @@ from grounded.model import Model, Param
 
 SHIFT = 1e-6  # relative step of the forward differences, as mjd_transitionFD uses it
 CHUNK = 4096  # samples stepped in one call
+EXACT = 1e-6  # of a control step: it is a whole multiple of the simulation's step
+NEAR = 1e-3  # of a control step: a simulation step so much longer or shorter is as exact, as stable
 HUGE = 1e9  # MuJoCo calls 1e10 unstable, warns and stops there
 
 
@@ -65,7 +69,8 @@ def model(
     """The Model of an MJCF or URDF file.
 
     Args:
-        xml: path of the file, or MJCF text.
+        xml: path of the file, or MJCF text. In a model file, a relative path leads to what lies
+            beside that file, or else in the current folder.
         params: what may be set, fitted or diagnosed, "element.field": `mass` of a body (its inertia
             scales with it); `damping`, `frictionloss`, `armature`, `stiffness` of a joint; `gear`,
             `kp`, `kv`, `gain`, `tau` of an actuator; `friction` of a geom. A
@@ -74,7 +79,8 @@ def model(
             values are else the file's.
         inputs: "actuators", "torques" (generalised forces on all hinges and slides), the names of
             the joints that get a torque, or "auto": actuators where there are any.
-        timestep: of the simulation [s], instead of the file's; dt must be a whole multiple.
+        timestep: of the simulation [s], instead of the file's; dt must be a whole multiple, to
+            0.1 %: what is left is shared among its steps.
         reference: qpos (nq,), or the name of a keyframe, that rotation vectors are about.
         threads: threads that step a batch; the result does not depend on them.
         name: the model's name; the file's without one.
@@ -158,16 +164,20 @@ def load(xml: str | Path) -> Any:
         GroundedError: if the file is missing or MuJoCo refuses it, with MuJoCo's reason.
     """
     mj = library("mujoco")
-    text = str(xml).lstrip()
-    if not text.startswith("<") and not Path(xml).is_file():
+    if str(xml).lstrip().startswith("<"):
+        shown, path = "the MJCF text", None
+    elif not (path := located(xml)).is_file():
         raise GroundedError(f"there is no MJCF or URDF file {xml}")
+    else:
+        shown = str(path)
     try:
-        if text.startswith("<"):
-            return mj.MjModel.from_xml_string(text)
-        return mj.MjModel.from_xml_path(str(xml))
+        if path is None:
+            return mj.MjModel.from_xml_string(str(xml).lstrip())
+        compiled = mj.MjModel.from_xml_path(shown)
     except ValueError as error:
-        shown = "the MJCF text" if text.startswith("<") else xml
         raise GroundedError(f"MuJoCo can't load {shown}: {error}") from error
+    remember(xml, files_of)
+    return compiled
 
 
 class MujocoStepper(Stepper):
@@ -187,6 +197,7 @@ class MujocoStepper(Stepper):
         self.coordinates, self.controls, self.settings = coordinates, controls, tuple(settings)
         self.threads = threads
         self._model = copy.deepcopy(compiled)  # private: parameters are written into it
+        self._own = float(compiled.opt.timestep)
         self._model.opt.disableflags |= mj.mjtDisableBit.mjDSBL_AUTORESET.value
         self._made = np.array([s.nominal for s in settings])  # the parameters that it has now
         self._prepare()
@@ -215,7 +226,7 @@ class MujocoStepper(Stepper):
     @property
     def timestep(self) -> float:
         """The simulation's own step [s]; a control step is a whole multiple of it."""
-        return float(self._model.opt.timestep)
+        return self._own
 
     @property
     def body(self) -> MujocoBody:
@@ -226,13 +237,17 @@ class MujocoStepper(Stepper):
 
     def advance(self, x: Array, u: Array, p: Array, dt: float) -> Array:
         """The next states (N, n); NaN where a sample is unstable."""
-        steps = self._substeps(dt)
+        steps, h = self._substeps(dt)
         with self._lock:
             self._set(p)
-            parts = [
-                self._step(x[at : at + CHUNK], u[at : at + CHUNK], steps)
-                for at in range(0, len(x), CHUNK)
-            ]
+            self._model.opt.timestep = h
+            try:
+                parts = [
+                    self._step(x[at : at + CHUNK], u[at : at + CHUNK], steps)
+                    for at in range(0, len(x), CHUNK)
+                ]
+            finally:
+                self._model.opt.timestep = self._own
         return np.concatenate(parts) if parts else np.zeros((0, len(self.states)))
 
     def derivatives(self, x: Array, u: Array, p: Array, dt: float) -> tuple[Array, Array]:
@@ -247,16 +262,21 @@ class MujocoStepper(Stepper):
         J = ((y[1:] - y[0]) / width[:, :, None]).transpose(1, 2, 0)
         return np.ascontiguousarray(J[:, :, :n]), np.ascontiguousarray(J[:, :, n:])
 
-    def _substeps(self, dt: float) -> int:
+    def _substeps(self, dt: float) -> tuple[int, float]:
+        """How many simulation steps make a control step, and how long each is [s].
+
+        An interval that was taken from a log's stamps is off by their jitter: it is made exactly.
+        """
         h = self.timestep
         steps = round(dt / h)
-        if steps < 1 or abs(steps * h - dt) > 1e-6 * dt:
+        off = abs(steps * h - dt)
+        if steps < 1 or off > NEAR * dt:
             raise GroundedError(
                 f"the control step of {dt:g} s is not a whole multiple of the simulation's "
-                f"timestep of {h:g} s: give timestep={dt / max(1, steps):g}, or another dt "
-                "(a simulated real system takes `substeps = 1` in real.py)"
+                f"timestep of {h:g} s: give timestep={dt / max(1, steps):.12g}, "
+                "or another dt (a simulated real system takes `substeps = 1` in real.py)"
             )
-        return steps
+        return steps, h if off <= EXACT * dt else dt / steps
 
     def _set(self, p: Array) -> None:
         """Writes parameters into the private model, and what MuJoCo derives from them."""

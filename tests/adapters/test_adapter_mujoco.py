@@ -14,6 +14,7 @@ from facts import holding
 mj: Any = pytest.importorskip("mujoco", reason="the adapter's extra, .[mujoco]")
 
 from grounded.adapters import mujoco as adapter  # noqa: E402
+from grounded.adapters.beside import beside, recorded  # noqa: E402
 from grounded.adapters.stepper import Stepper  # noqa: E402
 from grounded.adapters.tangent import Coordinates  # noqa: E402
 from grounded.diagnosis.diagnose import diagnose  # noqa: E402
@@ -333,3 +334,40 @@ def test_a_diagnosis_of_an_adapted_model_finds_the_parameter_that_is_off() -> No
     found = diagnose(task, trials)
     assert found.parameters["hinge_damping"].value == pytest.approx(0.3, abs=0.03)
     assert all("hinge" in name for name in found.verdict.effects)
+
+
+def test_a_control_step_with_the_jitter_of_a_log_is_made_exactly() -> None:
+    model, x, u = adapter.model(PENDULUM), [0.3, -0.2], [0.1]
+    exact = step(model, x, u, dt=0.05)
+    late = step(model, x, u, dt=0.0500045)
+    assert np.array_equal(step(model, x, u, dt=0.05), exact), "the timestep is put back"
+    own = step(adapter.model(PENDULUM, timestep=0.00500045), x, u, dt=0.0500045)
+    np.testing.assert_allclose(late, own, rtol=1e-14)
+    assert late[0, 0] != exact[0, 0]
+    assert getattr(model.step, "timestep", 0.0) == 0.005
+    for dt in (0.0503, 0.0525):
+        with pytest.raises(GroundedError, match="not a whole multiple") as refused:
+            step(model, x, u, dt=dt)
+        advised = float(str(refused.value).split("timestep=")[1].split(",")[0])
+        assert np.isfinite(step(adapter.model(PENDULUM, timestep=advised), x, u, dt=dt)).all()
+
+
+def test_a_model_file_names_its_files_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot, elsewhere = tmp_path / "robot", tmp_path / "elsewhere"
+    (robot / "parts").mkdir(parents=True)
+    elsewhere.mkdir()
+    drives = '<mujoco><actuator><motor name="m" joint="hinge"/></actuator></mujoco>'
+    (robot / "parts" / "drives.xml").write_text(drives)
+    whole = PENDULUM.replace("</mujoco>", '<include file="parts/drives.xml"/></mujoco>')
+    (robot / "a.xml").write_text(whole)
+    monkeypatch.chdir(elsewhere)
+    with pytest.raises(GroundedError, match=r"no MJCF or URDF file a\.xml"):
+        adapter.model("a.xml")
+    with recorded() as read, beside(robot):
+        assert adapter.model("a.xml").input_names == ("motor", "m")
+        assert "motor" in adapter.limits("a.xml")
+    assert {path for _, path in read} == {robot / "a.xml", robot / "parts" / "drives.xml"}
+    (elsewhere / "a.xml").write_text(PENDULUM)
+    assert adapter.model("a.xml").input_names == ("motor",), "else in the current folder"

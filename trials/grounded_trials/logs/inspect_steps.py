@@ -16,6 +16,7 @@ from itertools import islice
 
 import numpy as np
 
+from grounded.effects.places import probe
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded_trials.formats.messages import Floats
@@ -110,7 +111,7 @@ def _left(model: Model, step: float, values: Floats) -> Array:
     """Logarithm of the squares that inputs leave, and that are there without, (P, n, 2)."""
     k, n = max(1, round(WINDOW / step)), model.n
     x, sums = values[:, :n], np.cumsum(np.vstack([np.zeros(model.m), values[:, n:]]), axis=0)
-    u, dt = ((sums[k:] - sums[:-k]) / k)[: len(x) - k], k * step
+    u, dt = ((sums[k:] - sums[:-k]) / k)[: len(x) - k], probe(model, k * step)
     with np.errstate(all="ignore"):
         none = model.system.step(x[:-k], 0 * u, model.values, dt)
         moved = model.difference(x[k:], none)

@@ -1,0 +1,28 @@
+"""Which files an MJCF or URDF file is made of: itself, what it includes, meshes, textures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from grounded.adapters.stepper import library
+
+
+def files_of(path: Path) -> list[Path]:
+    """The file and all that it names, as far as MuJoCo tells.
+
+    Args:
+        path: of an MJCF or URDF file that MuJoCo can load. Of a URDF MuJoCo lists no meshes: they
+            are sought where it seeks them. Versions before 3.3 list none of an MJCF either.
+    """
+    mj = library("mujoco")
+    listed = getattr(mj, "mju_getXMLDependencies", lambda name: [name])(str(path))
+    files = {path: None} | dict.fromkeys(map(Path, listed))
+    return [*files, *(mesh for mesh in _meshes(mj, path) if mesh not in files)]
+
+
+def _meshes(mj: Any, path: Path) -> list[Path]:
+    spec = mj.MjSpec.from_file(str(path))
+    folder = path.parent / getattr(spec, "meshdir", "")
+    named = [mesh.file for mesh in spec.meshes if mesh.file]
+    return [file for name in named if (file := folder / name).is_file()]
