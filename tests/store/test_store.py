@@ -135,3 +135,17 @@ def test_a_system_without_file_locks_is_told_so(monkeypatch: pytest.MonkeyPatch)
     assert spec is not None and spec.loader is not None
     with pytest.raises(GroundedError, match="fcntl"):
         spec.loader.exec_module(module_from_spec(spec))
+
+
+def test_what_fails_afterwards_is_taken_back(tmp_path: Path) -> None:
+    store = Store(tmp_path / "trials")
+    with store.adding(b"one") as first:
+        pass
+    for content in (b"one", b"two"):  # one that is known stays
+        with pytest.raises(KeyError), store.adding(content):
+            raise KeyError
+    assert [s.path for s in store.list()] == [first.path]
+    with pytest.raises(KeyError), store.adding(b"two"):
+        store.add(b"three")  # by another process: numbers have no gaps
+        raise KeyError
+    assert [s.id for s in store.list()] == ["t0001", "t0002", "t0003"]

@@ -373,3 +373,25 @@ def test_samples_of_a_slow_sensor_that_a_table_holds_are_told(w, tmp_path):
     for good in (x, np.round(x, 2)):  # a coarse sensor is no slow one
         told, _ = taken(f"{len(w.trials())}.csv", [f"{one:.6f}" for one in good])
         assert not any("held" in one for one in told)
+
+
+@pytest.mark.parametrize("judge", ["warnings_about", "standing_in"])
+def test_what_can_t_be_judged_is_not_stored(w, tmp_path, monkeypatch, judge):
+    """A model that failed on a log left it stored, and every later command failed with it."""
+    first, second = run(w), tmp_path / "second.mcap"
+    trial = read_trial(first)[0]
+    write_trial(second, replace(trial, states=trial.states + 1e-9), meta={})  # it carries no policy
+    ingest_log(w, first)
+    before = sorted((w.folder / "trials").iterdir())
+
+    def fails(*_, **__):
+        raise GroundedError("the control step is not a multiple")
+
+    for path in (first, second):  # what was there stays
+        with monkeypatch.context() as patched:
+            patched.setattr(f"grounded_trials.workspace.intake.ingest.{judge}", fails)
+            with pytest.raises(GroundedError, match="not a multiple"):
+                ingest_log(w, path)
+        assert sorted((w.folder / "trials").iterdir()) == before
+    w.forget()
+    assert [one.stored.id for one in w.trials()] == ["t0001"]

@@ -18,6 +18,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -136,6 +137,13 @@ class Notes:
         """
         text = json.dumps(dict(note), sort_keys=True)
         self.store.add(text.encode(), ".json", again=again)
+
+    @contextmanager
+    def adding(self, note: Mapping[str, str]) -> Iterator[None]:
+        """Adds a note unless one says the same; it is taken back if what is done then fails."""
+        text = json.dumps(dict(note), sort_keys=True)
+        with self.store.adding(text.encode(), ".json"):
+            yield
 
     def read(
         self, lost: list[Damaged] | None = None, known: Known | None = None

@@ -175,6 +175,30 @@ class Store:
             finally:
                 _remove(temporary)
 
+    @contextmanager
+    def adding(
+        self, source: str | Path | bytes, suffix: str = ".mcap", *, again: bool = False
+    ) -> Iterator[Added]:
+        """`add`, but what it added is taken back if what is done with it fails.
+
+        Args:
+            source: see `add`. What came meanwhile keeps it there: numbers have no gaps.
+            suffix: see `add`.
+            again: see `add`.
+
+        Raises:
+            GroundedError: see `add`.
+        """
+        added = self.add(source, suffix, again=again)
+        try:
+            yield added
+        except BaseException:
+            with self.locked(), suppress(OSError, GroundedError):
+                if not added.known and self.list()[-1:] == (self.find(added.path.name),):
+                    added.path.unlink()
+                    sync_folder(self.folder)
+            raise
+
     def verify(self) -> tuple[Damaged, ...]:
         """Reads every file; returns those that changed, and names that do not belong here.
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -24,7 +25,7 @@ from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
-from grounded_trials.store.store import DIGITS
+from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.intake.acted_on import rival_in, sender_of
@@ -39,8 +40,10 @@ from grounded_trials.workspace.intake.read_otherwise import misled, pace_of, uni
 from grounded_trials.workspace.intake.reading import (
     NoneWaits,
     Read,
+    copied,
     cut_log,
     cut_short,
+    is_stored,
     misread,
     read_log_file,
     read_own_trial,
@@ -55,9 +58,7 @@ from grounded_trials.workspace.intake.run_start import (
 from grounded_trials.workspace.intake.stored_before import (
     as_stored,
     estimated_otherwise,
-    refuse_as_another,
     repeated,
-    same_recording,
     what_repeats,
 )
 from grounded_trials.workspace.intake.trial_check import (
@@ -102,18 +103,25 @@ def ingest_log(
             read = read_log_file(workspace, path, candidate, data)
         except NoneWaits as error:
             raise _by_its_commands(workspace, path, error) from None
-    read = _copied(workspace, path, read, "" if data else candidate)
+    read = copied(workspace, path, read, "" if data else candidate)
     read = _recognised(workspace, path, read, candidate)
     if read.log and (other := estimated_otherwise(workspace, read.log)):
         read = replace(read, notes=(*read.notes, *other))
     if read.log and read.log.stored:
         read = replace(read, data=as_stored(workspace, read.log, read.trial, read.data))
     before = "" if read.copy else repeated(workspace, path, read.trial, read.data)
-    added = workspace.store.add(read.data, again=before != "")
-    if read.bare:  # what it ran is kept beside it
-        ran = sha256(workspace.candidate_bytes(read.trial.candidate))
-        trial_hash = added.sha256[:DIGITS]
-        workspace.notes.add({"note": "run", "trial": trial_hash, "sha256": ran}, again=False)
+    with ExitStack() as new:  # what can't be judged is not stored: the log stays where it is
+        added = new.enter_context(workspace.store.adding(read.data, again=before != ""))
+        if read.bare:  # what it ran is kept beside it
+            ran = sha256(workspace.candidate_bytes(read.trial.candidate))
+            note = {"note": "run", "trial": added.sha256[:DIGITS], "sha256": ran}
+            new.enter_context(workspace.notes.adding(note))
+        workspace.forget_trials()
+        return _judged(workspace, read, added, before, ahead=ahead)
+
+
+def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: bool) -> Ingested:
+    """What is to be said of a trial that has just been stored."""
     workspace.forget_trials()
     trial = replace(read.trial, id=added.id)
     warnings = (*read.warnings, *warnings_about(workspace, trial, read.last_s))
@@ -169,24 +177,13 @@ def _whole(read: Read, task: Task) -> Trial | None:
     return more.trial_from(1e-9 * (read.cut.start_ns - log.whole.origin_ns))
 
 
-def _copied(workspace: Folder, path: Path, read: Read, wanted: str | None) -> Read:
-    """The stored trial in place of a file that is a copy of it, or a part."""
-    if _stored(workspace, read.data) or (read.log and read.log.stored):
-        return read
-    if (one := same_recording(workspace, path, read.data, read.log)) is None:
-        return read
-    refuse_as_another(path, (one,), wanted)
-    note = f"its rows are those of {one.stored.id}: it is the same recording, or a part of it"
-    return Read(one.trial, workspace.store.read(one.stored), notes=(note,), copy=True)
-
-
 def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None) -> Read:
     """Refuses a log whose commands are not its candidate's; with a warning if one was named.
 
     A foreign log without a [log.span] may begin before the run: it is taken from where that fits.
     """
     ran = read.trial.candidate
-    if not ran or (_stored(workspace, read.data) and not (read.log and not read.log.stored)):
+    if not ran or (is_stored(workspace, read.data) and not (read.log and not read.log.stored)):
         return read  # but for a log that is set aside: where its run begins is sought anew
     (own, _), candidates = workspace.candidate(ran), _may_have_run(workspace)
     logs = [read.log]
@@ -276,11 +273,6 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
 
 def _undo(identity: str) -> str:
     return f"`restore {identity}` takes that back"
-
-
-def _stored(workspace: Folder, data: bytes) -> bool:
-    """Whether a file is in the store, be it set aside."""
-    return sha256(data)[:DIGITS] in workspace.store.digests()
 
 
 def _is(names: Sequence[str]) -> str:

@@ -21,13 +21,18 @@ from grounded_trials.logs.samples import SignalReport
 from grounded_trials.logs.stated_units import same_unit
 from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import FILE_LIMIT
+from grounded_trials.store.store import DIGITS
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, ROWS
+from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, ROWS, sha256
 from grounded_trials.workspace.intake.crossed import crossed
 from grounded_trials.workspace.intake.foreign import ForeignLog, begun, mapping_of, read_foreign
 from grounded_trials.workspace.intake.no_angle import no_angles
-from grounded_trials.workspace.intake.stored_before import refuse_as_another, set_aside_of
+from grounded_trials.workspace.intake.stored_before import (
+    refuse_as_another,
+    same_recording,
+    set_aside_of,
+)
 from grounded_trials.workspace.proposing import standing_in
 
 HOLE = 10.0  # usual intervals without a sample
@@ -247,3 +252,19 @@ def _encode(workspace: Folder, trial: Trial, about: dict[str, str], start_ns: in
         input_units=dict(workspace.base_model.inputs),
         start_ns=start_ns,
     )
+
+
+def copied(workspace: Folder, path: Path, read: Read, wanted: str | None) -> Read:
+    """The stored trial in place of a file that is a copy of it, or a part."""
+    if is_stored(workspace, read.data) or (read.log and read.log.stored):
+        return read
+    if (one := same_recording(workspace, path, read.data, read.log)) is None:
+        return read
+    refuse_as_another(path, (one,), wanted)
+    note = f"its rows are those of {one.stored.id}: it is the same recording, or a part of it"
+    return Read(one.trial, workspace.store.read(one.stored), notes=(note,), copy=True)
+
+
+def is_stored(workspace: Folder, data: bytes) -> bool:
+    """Whether a file is in the store, be it set aside."""
+    return sha256(data)[:DIGITS] in workspace.store.digests()
