@@ -181,15 +181,16 @@ def coasts_out(task: Task, plan: Task, run: Trial, held: Array) -> str:
         return ""
     t = int(np.argmax((excess > 0).any(axis=1)))
     i = int(np.argmax(excess[t]))
-    far = states[int(np.argmax(excess[:, i])), i]
+    most = int(np.argmax(excess[:, i]))
     (name, unit), inputs = list(task.model.states.items())[i], task.model.inputs.items()
     sent = ", ".join(
         f"{one} = {value:.3g} {of}".removesuffix(" 1")
         for (one, of), value in zip(inputs, held, strict=True)
     )
     return (
-        f"its runner holds {sent}, and by the model the robot goes on to {name} = {far:.3g} "
-        f"{unit}, outside [safety] {name} = [{task.safety_low[i]:g}, {task.safety_high[i]:g}] "
-        f"{t * task.dt:.2g} s later: be ready to stop it, go over to a controller that holds it "
-        "once the runner is done, or let the target come to rest inside"
+        f"its runner holds {sent}, and by the model the robot leaves [safety] {name} = "
+        f"[{task.safety_low[i]:g}, {task.safety_high[i]:g}] {t * task.dt:.2g} s later and goes on "
+        f"to {states[most, i]:.3g} {unit}, {most * task.dt:.2g} s later: be ready to stop it, go "
+        "over to a controller that holds it once the runner is done, or let the target come to "
+        "rest inside"
     )

@@ -123,6 +123,7 @@ def test_who_coasts_out_of_safety_after_a_run_is_told_when_and_how_far(made):
     tight = cart_task(safety_low=-np.full(2, np.inf), safety_high=bound)
     clause = coasts_out(tight, task, run, np.zeros(1))
     assert holds(clause, "x", "[safety]", f"{11 * task.dt:.2g} s later", f"{moved[-1, 0]:.3g}")
+    assert holds(clause, f"{(len(moved) - 1) * task.dt:.2g} s later")  # and when it is so far
     wide = cart_task(safety_low=-np.full(2, np.inf), safety_high=np.array([99.0, np.inf]))
     assert coasts_out(wide, task, run, np.zeros(1)) == ""
     assert coasts_out(cart_task(), task, run, np.zeros(1)) == ""
