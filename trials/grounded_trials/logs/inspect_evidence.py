@@ -37,7 +37,13 @@ from grounded_trials.logs.inspect_pairs import (
     velocities,
 )
 from grounded_trials.logs.inspect_steps import by_steps
-from grounded_trials.logs.joint_names import in_order, joint_names, joint_units, of_joint
+from grounded_trials.logs.joint_names import (
+    by_efforts,
+    in_order,
+    joint_names,
+    joint_units,
+    of_joint,
+)
 from grounded_trials.logs.stated_units import Stated, factor_between, unit_of
 
 
@@ -82,7 +88,10 @@ def weigh(
         guesses |= agreed(guesses, pair, signals, units, log, measured)
     bare = [pair for pair in pairs if unnamed.issuperset(pair)]
     guesses |= by_groups(model, guesses, bare, signals, measured)
+    told = by_efforts(guesses, model.input_names, joints, signals, log)
+    guesses |= {name: guess for name, guess in told.items() if guess.sure}
     guesses |= by_steps(model, guesses, signals)
+    guesses |= by_efforts(guesses, model.input_names, joints, signals, log)
     guesses |= _taken_by_inputs(guesses, model)
     guesses = {name: _as_logged(guess, log) for name, guess in guesses.items()}
     guesses = {name: as_stated(stated, units[name], guess) for name, guess in guesses.items()}

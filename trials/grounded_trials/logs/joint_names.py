@@ -10,12 +10,19 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from grounded_trials.formats.mcap_records import Channel, Messages
 from grounded_trials.logs.inspect_guess import Guess
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.log_files import log_records
 from grounded_trials.logs.stated_units import SLIDING, TURNING
+
+if TYPE_CHECKING:
+    from grounded_trials.logs.inspect_pairs import Signals
 
 LIMB = ("base", "waist", "torso", "shoulder", "upper", "elbow", "fore", "wrist", "hand", "finger")
 LEG = ("hip", "thigh", "knee", "shin", "ankle", "foot", "toe")
@@ -32,6 +39,8 @@ TURNS = {  # words of one that turns all the same: a shoulder's lift, a pole on 
     *("yaw", "pan", "pitch", "flex", "roll", "tilt", "wheel", "hinge", "revolute", "rotation"),
     *("pole", "pendulum", "swing", "sway", "angle", "theta"),
 } - {"base", "torso"}
+ALIKE, CLEARLY = 0.9, 0.1  # a command's correlation with an effort; how much less all others have
+LATEST = 0.1  # [s] that an effort may come after its command
 FULL_TURNS, DEGREES = 4 * math.pi, 720.0  # of a joint: what spans more; its most, in degrees
 
 
@@ -144,11 +153,12 @@ def of_joint(
             kind = next((k for k, u in measured.items() if u == unit), None)
             kind = kind or ("position" if unit in ("m", "1") else None)
             path = f"{topic}.{kind}[{i}]"
-            commanded = _commands(log, len(names)) if sent and kind == "effort" else []
-            if commanded:
+            plain = unit == "1"  # an actuator takes torques, or places, or speeds
+            torque = sent and kind == "effort"
+            if commanded := _commands(log, len(names), plain) if torque or (sent and plain) else []:
                 at = from_base(names).index(joint)
                 paths = [f"{command}[{at}]" for command in commanded]
-                paths += [path] if path in there else []
+                paths += [path] if torque and path in there else []
                 rest = [f"{c}[{k}]" for c in commanded for k in range(len(names)) if k != at]
                 why = f"commands name no joint; in their order from the base, {at} is '{joint}'"
                 others = (*paths[1:], *rest)
@@ -238,15 +248,83 @@ def _there(log: LogReport) -> set[str]:
     }
 
 
-def _commands(log: LogReport, count: int) -> list[str]:
-    """Topics of arrays with a command for each of `count` joints."""
+def by_efforts(
+    guesses: Mapping[str, Guess],
+    inputs: Sequence[str],
+    joints: Mapping[str, tuple[str, ...]],
+    signals: Signals,
+    log: LogReport,
+) -> dict[str, Guess]:
+    """Commands of an array, told by the joints' measured efforts: what is sent comes out there.
+
+    Where each command goes with one joint's effort, and clearly less with the others', that joint's
+    input is there; where not, it is said what decides.
+
+    Args:
+        guesses: of all states and inputs.
+        inputs: names of inputs.
+        joints: see `joint_names`.
+        signals: reads their samples.
+        log: that was looked through.
+    """
+    found: dict[str, Guess] = {}
+    there = _there(log)
+    for (topic, names), name in product(joints.items(), inputs):
+        guess = guesses[name]
+        own = [joint for joint in names if _holds(name, joint)]
+        arrays = [c for c in _commands(log, len(names), True) if guess.path.startswith(f"{c}[")]
+        if guess.sure or len(own) != 1 or not arrays or name in found:
+            continue
+        sent, measured = (
+            [f"{array}[{k}]" for k in range(len(names))] for array in (*arrays, f"{topic}.effort")
+        )
+        joint, torques = names.index(own[0]), arrays[0] in _commands(log, len(names))
+        known = torques and there.issuperset(measured)
+        at = _goes_with(sent, measured, signals)[joint] if known else None
+        if at is None:
+            why = "to decide, see the order of `joints` in the parameters of its controller"
+            found[name] = replace(guess, reasons=(*guess.reasons, why))
+        else:
+            why = f"goes with {measured[joint]}, the effort of '{own[0]}', clearly more than with "
+            why += "any other joint's"
+            found[name] = replace(guess, path=sent[at], sure=True, others=(), reasons=(why,))
+    return found
+
+
+def _goes_with(sent: Sequence[str], measured: Sequence[str], signals: Signals) -> list[int | None]:
+    """Which command goes with each of some efforts; all None where that is not clear of each."""
+    signals.read([*sent, *measured])
+    gridded = signals.grid((*sent, *measured))
+    none: list[int | None] = [None] * len(measured)
+    if gridded is None:
+        return none
+    step, columns = gridded
+    like = np.full((len(sent), len(measured)), -1.0)
+    for late in range(1 + min(round(LATEST / step), len(columns[0]) // 2)):
+        u = np.array(columns[: len(sent)])[:, : len(columns[0]) - late]
+        y = np.array(columns[len(sent) :])[:, late:]
+        if not (np.ptp(u, axis=1).all() and np.ptp(y, axis=1).all()):
+            return none
+        like = np.maximum(like, np.corrcoef(u, y)[: len(sent), len(sent) :])
+    best = like.argmax(axis=0)
+    others = like.copy()
+    others[best, np.arange(len(measured))] = -1.0
+    own = like[best, np.arange(len(measured))]
+    rest = np.maximum(others.max(axis=0), others[best].max(axis=1))
+    if len(set(best.tolist())) < len(best) or (own < ALIKE).any() or (own - rest < CLEARLY).any():
+        return none
+    return [int(k) for k in best]
+
+
+def _commands(log: LogReport, count: int, plain: bool = False) -> list[str]:
+    """Topics of arrays with a command for each of `count` joints: torques; `plain`: or any."""
     words = ("cmd", "command", "effort", "torque", "desired", "ref")
     return [
         f"{topic.topic}.data"
         for topic in log.topics
         if "MultiArray" in topic.type
         and any(word in topic.topic.lower() for word in words)
-        and not any(word in topic.topic.lower() for word in ("position", "velocity"))
+        and (plain or not any(word in topic.topic.lower() for word in ("position", "velocity")))
         and sum(".data[" in field.path for field in topic.fields) == count
     ]
 
