@@ -118,8 +118,24 @@ def test_what_held_a_robot_as_its_log_began_is_written(tmp_path):
     high = start(5 + rising, v, thrust)
     assert high == {"h": 5.0, "thrust": 0.4905, "turn": 0.0}
     assert start(rising, v + 0.4, thrust) == {}  # it flies on
-    assert start(rising, v, thrust + 0.01 * np.sin(t)) == {}
+    assert start(rising, v, thrust + 0.2 * np.sin(t)) == {}
     assert start(rising, v, thrust - 0.4905) == {}  # nothing has to hold it
+    assert start(rising, v, thrust - 0.4905 + noise) == {}
+
+
+def test_what_holds_a_robot_is_what_its_controller_ended_at(tmp_path):
+    """An arm held by a PD controller sagged at first: its start was { }."""
+    (tmp_path / "link.py").write_text(LINK)
+    t = np.arange(0, 10, 0.01)
+    moves = np.where(t < 1, 0, np.sin(t - 1))
+    sag = 0.02 * (1 - np.exp(-np.minimum(t, 1) / 0.06))
+    q, w = 0.4 + sag + moves, np.gradient(sag + moves, 0.01)
+    tau = 4.0 + 40 * sag + 6 * moves + 0.02 * np.random.default_rng(1).standard_normal(len(t))
+    rows = np.column_stack([t, q, w, tau])
+    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header="t,q,w,tau", comments="")
+    begin(tmp_path / "w", tmp_path / "log.csv", model=tmp_path / "link.py")
+    start = tomllib.loads((tmp_path / "w/grounded.toml").read_text())["task"]["start"]
+    assert start == {"q": pytest.approx(0.42, abs=1e-3), "tau": pytest.approx(4.8, abs=0.02)}
 
 
 LINK = """

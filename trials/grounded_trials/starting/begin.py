@@ -33,13 +33,13 @@ from grounded_trials.starting.examples import fresh_folder
 from grounded_trials.starting.first_toml import held_first, write_first
 from grounded_trials.starting.interval import interval_of
 from grounded_trials.starting.kinds import KINDS, Joints, called_input, kind_in, moving, skeleton
+from grounded_trials.starting.own_model import OwnModel, own_model
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.model_file import load_module, model_in
 
 NONE: Mapping[str, Array] = {}  # no input was read
-WRITTEN = (FILE, "model.py", "target.csv")
 SLOWEST = 0.5  # [Hz] rows of a robot's log: slower ones have times in another unit
 HORIZON = 200  # steps of a target that is a recorded run, at most
 Ask = Callable[[Guess], str]
@@ -122,7 +122,8 @@ def begin(
     Args:
         folder: where it is made.
         log: of any format.
-        model: the user's model.py, which is copied; None: a skeleton is written.
+        model: the user's model.py, or an MJCF or URDF file, which is copied with what it reads
+            beside it; None: a skeleton is written.
         kind: of the skeleton, see `KINDS`; None: as the log looks.
         dt: control interval [s]; None: that in which the commands of the log change, see
             `interval_of`.
@@ -133,17 +134,20 @@ def begin(
         GroundedError: if the log can't be read or is ours, the folder holds a workspace, or a
             name is unknown.
     """
-    _check(model, kind)
-    if inputs and (model or kind not in (None, "generic")):
+    if kind is not None and kind not in KINDS:
+        raise GroundedError(f"there is no kind '{kind}': {nearest(kind, KINDS)}")
+    if inputs and (model is not None or kind not in (None, "generic")):
         raise GroundedError("--inputs is for a skeleton of kind generic: others have their own")
-    with fresh_folder(folder, WRITTEN):
-        return _begin(folder, log, model, "generic" if inputs else kind, dt, inputs, ask)
+    own = own_model(model) if model is not None else None
+    files = (FILE, "target.csv", *(own.missing(folder) if own else ("model.py",)))
+    with fresh_folder(folder, files):
+        return _begin(folder, log, own, "generic" if inputs else kind, dt, inputs, ask)
 
 
 def _begin(
     folder: Path,
     log: str | Path,
-    model: str | Path | None,
+    own: OwnModel | None,
     kind: str | None,
     dt: float | None,
     named: Sequence[str],
@@ -158,19 +162,19 @@ def _begin(
     report, notes = _one_run(report)
     joints = joint_names(report)
     chosen, why = (kind, "as you said") if kind else kind_in(report, joints)
-    if model:
-        why, text = "your model", Path(model).read_text("utf-8")
+    if own:
+        why, found = "your model", own.bring(folder)
     else:
         text = skeleton(chosen, report, joints, named, column_units(files[0])).source()
-    found = _model_in(folder, text)
-    states, inputs = _matched(report, found, joints, unnamed=not model)
-    if not (kind or model or any(g.path for g in states)):
+        found = _model_in(folder, text)
+    states, inputs = _matched(report, found, joints, unnamed=not own)
+    if not (kind or own or any(g.path for g in states)):
         why = f"no number of the log fits a state of kind {chosen}: the names are the log's"
         chosen = "generic"
         text = skeleton(chosen, report, joints, named, column_units(files[0])).source()
         found = _model_in(folder, text)
         states, inputs = _matched(report, found, joints)
-    if chosen == "generic" and not model:
+    if chosen == "generic" and not own:
         states, inputs = (
             tuple(_only_named(g, of) for g in s) for s, of in ((states, "state"), (inputs, "input"))
         )
@@ -202,7 +206,7 @@ def _begin(
     return Begun(
         workspace=str(folder),
         log=str(log),
-        kind="" if model else chosen,
+        kind="" if own else chosen,
         why=why,
         dt=step,
         horizon=horizon,
@@ -252,13 +256,6 @@ def _one_run(report: LogReport) -> tuple[LogReport, tuple[str, ...]]:
         return report, ()
     note = f"{same[0].topic} of {len(same)} runs is taken; [log] may name another"
     return replace(report, topics=(same[0],)), (note,)
-
-
-def _check(model: str | Path | None, kind: str | None) -> None:
-    if kind is not None and kind not in KINDS:
-        raise GroundedError(f"there is no kind '{kind}': {nearest(kind, KINDS)}")
-    if model is not None and not Path(model).is_file():
-        raise GroundedError(f"{model} does not exist: --model names a Python file with `model`")
 
 
 def _model_in(folder: Path, text: str) -> Model:

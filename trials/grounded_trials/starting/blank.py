@@ -20,10 +20,10 @@ from grounded.model import Model
 from grounded.task import Task
 from grounded.utility import Reward
 from grounded_trials.starting.examples import fresh_folder, toml_of
+from grounded_trials.starting.own_model import own_model
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.first_plan import resting
-from grounded_trials.workspace.model_file import load_module, model_in
 from grounded_trials.workspace.task_file import change_weight, write_target
 
 DT, HORIZON = 0.05, 100  # [s], steps
@@ -84,47 +84,24 @@ def write_blank(folder: Path, file: str | Path, dt: float | None = None) -> None
 
     Args:
         folder: where it is made.
-        file: holds `model`; it is copied to model.py, files that it reads or imports are not.
+        file: holds `model`, or is an MJCF or URDF file; see `own_model`.
         dt: control interval [s]; None: 0.05.
 
     Raises:
         GroundedError: if the file holds no model, or needs its neighbours, or the folder a
             workspace already.
     """
-    file = Path(file)
-    model = model_in(load_module(file.resolve().parent, file.name, key="--blank"))
-    try:
-        source = file.read_bytes()
-    except OSError as error:
-        raise GroundedError(f"{file} can't be read: {error.strerror}") from None
-    own = file.resolve() == (folder / "model.py").resolve()
-    written = (FILE, "target.csv", "drive.py") if own else FILES
-    with fresh_folder(folder, written):
-        if not own:
-            write_atomically(folder / "model.py", source)
-            _loads_alone(folder, file)
+    own = own_model(file)
+    with fresh_folder(folder, (FILE, "target.csv", "drive.py", *own.missing(folder))):
+        model = own.bring(folder)
         task = _task(model, dt or DT)
         columns = {name: task.target[:, i] for i, name in enumerate(model.state_names)}
         write_target(folder / "target.csv", task.dt, columns)
         drive = DRIVE.format(states=dict(model.states), inputs=dict(model.inputs))
         write_atomically(folder / "drive.py", drive.encode())
-        name = f"{model.name or file.stem}: target, weights and limits are yours"
+        name = f"{model.name or own.file.stem}: target, weights and limits are yours"
         text = toml_of(task, name, COMMAND).replace("\ninput_change", f"\n{CHANGES}\ninput_change")
         write_atomically(folder / FILE, text.encode())
-
-
-def _loads_alone(folder: Path, file: Path) -> None:
-    try:
-        load_module(folder, "model.py")
-    except GroundedError as error:
-        raise GroundedError(
-            f"{file} loads where it lies, but not as a copy in {folder}: {error}. Make {folder} "
-            f"yourself, put {file.name} there as model.py and beside it the files that it reads, "
-            f"then give --model {folder / 'model.py'}"
-        ) from None
-
-
-FILES = (FILE, "model.py", "target.csv", "drive.py")
 
 
 def _task(model: Model, dt: float) -> Task:

@@ -221,7 +221,8 @@ def toml_of(task: Task, name: str, system: str = SIMULATED) -> str:
         f"# {name}: {EXAMPLES[name].text}" if name in EXAMPLES else f"# {name}",
         "",
         "[model]",
-        'file = "model.py"             # the crude model, plain NumPy',
+        'file = "model.py"             # the crude model'
+        + ", plain NumPy" * (task.model.step is None),
         f"smoothing = {_number(task.smoothing)}              # width over which planning blends "
         "np.where, abs ...",
         "",

@@ -59,7 +59,7 @@ def write_first(
         f"# made from a log by `grounded init --from` ({why})",
         "",
         "[model]",
-        'file = "model.py"             # the crude model, plain NumPy',
+        'file = "model.py"             # the crude model' + ", plain NumPy" * (model.step is None),
         "",
         "[task]",
         f"dt = {dt:g}                     # [s] control interval{whose}",
@@ -106,11 +106,13 @@ def held_first(
     dt: float,
     ranges: Mapping[str, tuple[float, float] | None],
 ) -> dict[str, float]:
-    """Where a robot stands as a log begins, and the constant inputs, other than 0, that hold it.
+    """Where a robot stands as a log begins, and the inputs, not all 0, that hold it there.
 
-    {} where it moves, where an input changes, or where nothing has to hold it: then the input
-    counts as 0 before a run, which is also what is sent after one. Without a speed among the
-    states nothing tells a robot that stands from one that goes on slowly.
+    A controller that holds it sags at first and lets its commands tremble: what counts is that they
+    stay about where they are in the second half of the time. {} where the robot moves, where an
+    input changes, or where nothing has to hold it: then the input counts as 0 before a run, which
+    is also what is sent after one. Without a speed among the states nothing tells a robot that
+    stands from one that goes on slowly.
 
     Args:
         model: whose states and inputs they are.
@@ -127,19 +129,25 @@ def held_first(
     first = {name: values[:steps] for name, values in {**columns, **sent}.items()}
     if not all(len(v) == steps and np.isfinite(v).all() for v in first.values()):
         return {}
-    if any(np.ptp(first[name]) for name in sent) or not any(first[name][0] for name in sent):
-        return {}
-    found = {}
+    found, held = {}, {}
     for name in columns:
         low, high = ranges[name] or (0.0, 0.0)
         most = max(abs(low), abs(high)) if name in speeds else high - low
-        at = float(first[name].mean())
-        off = abs(at if name in speeds else first[name][-1] - first[name][0])
-        if off > STILL * most:
+        off = first[name].mean() if name in speeds else first[name][-1] - first[name][0]
+        if abs(off) > STILL * most:
             return {}
+        at = float(first[name][steps // 2 :].mean())
         if name not in speeds and abs(at) > STILL * most:
             found[name] = at
-    return found | {name: float(first[name][0]) for name in sent}
+    needed = False
+    for name in sent:
+        low, high = ranges[name] or (0.0, 0.0)
+        later = first[name][steps // 2 :]
+        if np.ptp(later) > STILL * (high - low):
+            return {}
+        held[name] = float(later.mean() if np.ptp(later) else later[0])
+        needed |= held[name] != 0 and (not np.ptp(later) or abs(held[name]) > STILL * (high - low))
+    return found | held if needed else {}
 
 
 def _inline(values: Mapping[str, float]) -> str:

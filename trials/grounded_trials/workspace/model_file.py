@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from grounded.adapters.beside import beside
 from grounded.errors import GroundedError, nearest
 from grounded.model import Model
 from grounded.trusted import check_own
@@ -51,7 +52,8 @@ def load_module(
     sys.path.insert(0, str(folder))
     sys.modules[spec.name] = found  # dataclasses look their module up there
     try:
-        with contextlib.redirect_stdout(sys.stderr):  # what a model prints is no data of ours
+        # what a model prints is no data of ours; what it reads lies beside it
+        with contextlib.redirect_stdout(sys.stderr), beside(path.parent):
             spec.loader.exec_module(found)
     except GroundedError as error:
         raise GroundedError(f"{path}: {error}") from None

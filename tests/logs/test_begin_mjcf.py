@@ -1,0 +1,62 @@
+"""A workspace from somebody else's log and the MuJoCo file of their robot."""
+
+import shutil
+
+import pytest
+
+from cli import grounded
+from grounded_trials import Workspace
+from grounded_trials.starting.begin import begin
+from ros_bags import commanded_arm_bag
+
+pytest.importorskip("mujoco", reason="the adapter's extra, .[mujoco]")
+MJCF = """
+<mujoco model="arm">
+  <option timestep="0.004" integrator="implicitfast"/>
+  <worldbody>
+    <body><joint name="shoulder_joint" axis="0 -1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.35" size="0.02" mass="2" contype="0"/>
+      <body pos="0 0 -0.35"><joint name="elbow_joint" axis="0 -1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="1.2" contype="0"/></body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="shoulder" joint="shoulder_joint"/><motor name="elbow" joint="elbow_joint"/>
+  </actuator>
+</mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    return commanded_arm_bag(tmp_path_factory.mktemp("log") / "bag", measured_torques=True)
+
+
+@pytest.mark.parametrize("xml", ["arm.xml", "model.py"])
+def test_an_mjcf_file_is_a_model_and_comes_along(tmp_path, monkeypatch, log, xml):
+    """It was read as Python, or left behind, or sought in whatever folder a command came from."""
+    robot, w = tmp_path / "robot", tmp_path / "w"
+    robot.mkdir()
+    (robot / "arm.xml").write_text(MJCF)
+    named = 'from grounded.adapters import mujoco\nmodel = mujoco.model("arm.xml")\n'
+    (robot / "model.py").write_text(named)
+    done = grounded("init", w, "--from", log, "--model", robot / xml, "--yes", "--json")
+    paths = {one["name"]: one["path"] for one in done.json["signals"]}
+    assert paths["shoulder"] == "/effort_controller/commands.data[0]"
+    assert paths["elbow_joint_vel"] == "/joint_states.velocity[0]"
+    assert (w / "arm.xml").read_bytes() == (robot / "arm.xml").read_bytes()
+    assert "NumPy" not in (w / "grounded.toml").read_text()
+    shutil.rmtree(robot)
+    moved = w.rename(tmp_path / "moved")
+    monkeypatch.chdir(tmp_path)
+    assert Workspace("moved").base_model.input_names == ("shoulder", "elbow")
+    refused = grounded("init", moved / "x", "--blank", "--model", "missing.xml")
+    assert refused.code == 1 and "missing.xml" in refused.err
+
+
+def test_an_mjcf_s_steps_are_as_long_as_its_own_allow(tmp_path):
+    """Steps of 0.05 s told inputs apart; of 4 ms there are twelve and a half in it."""
+    (tmp_path / "arm.xml").write_text(MJCF)
+    log = commanded_arm_bag(tmp_path / "bag")
+    found = begin(tmp_path / "w", log, model=tmp_path / "arm.xml")
+    paths = [guess.path for guess in found.inputs]
+    assert paths == [f"/effort_controller/commands.data[{i}]" for i in range(2)]
