@@ -32,7 +32,11 @@ FEW = 8  # numbers of a log that are named for one that is missing
 @click.command("init")
 @click.argument("folder", metavar="DIR", required=False)
 @click.option("--from", "log", metavar="LOG", help="A log of your robot, of any format.")
-@click.option("--model", metavar="FILE", help="Your model.py, beside --from or --blank.")
+@click.option(
+    "--model",
+    metavar="FILE",
+    help="Your model.py, or an MJCF or URDF file, beside --from or --blank.",
+)
 @click.option("--blank", is_flag=True, help="No log yet: a workspace of --model, to fill in.")
 @click.option(
     "--kind",

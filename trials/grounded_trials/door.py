@@ -74,8 +74,8 @@ class Workspace(Folder):
             folder: where it is made.
             example: car-turn, car-circle, car-figure8, flight-figure8 or pendulum.
             log: of your robot, any format; `starting.begin.begin` says what it found.
-            model: your model.py, beside `log`, where None writes a skeleton; or alone: target,
-                weights and drive.py are to be filled in then.
+            model: your model.py, or an MJCF or URDF file, beside `log`, where None writes a
+                skeleton; or alone: target, weights and drive.py are to be filled in then.
             dt: control interval [s]; None: the log's, 0.05 for a model alone.
 
         Raises:

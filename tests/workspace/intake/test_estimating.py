@@ -1,9 +1,13 @@
 """Speeds that no sensor gives, along a whole log: gaps, slow sensors, units, the noise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from facts import holds
+from grounded.errors import GroundedError
+from grounded.model import Model
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.workspace.adopted import planner_of
@@ -56,6 +60,23 @@ def test_a_speed_is_estimated_whatever_the_sensor_s_rate(task, every):
     logged, t, v = driven(every)
     error, at = off(with_estimates(logged, TABLE, task), t, v)
     assert np.sqrt(np.mean(error**2)) < 0.06 and np.abs(error[at < 0.8]).max() < 0.05
+
+
+def test_a_speed_is_estimated_in_steps_that_a_simulator_can_make(task):
+    """One of 25 ms was asked for steps of 10 ms, as the sensor had them."""
+
+    class Simulator:
+        timestep = 0.025
+
+        def __call__(self, s, a, p, dt):
+            if abs(dt / self.timestep - round(dt / self.timestep)) > 1e-6:
+                raise GroundedError(f"{dt:g} s is no multiple")
+            return {"x": s.x + dt * s.v, "v": s.v + dt * (a.force - 0.4 * s.v) / 1.3}
+
+    model = Model(states=task.model.states, inputs=task.model.inputs, step=Simulator())
+    logged, t, v = driven(0.01)
+    error, _ = off(with_estimates(logged, TABLE, replace(task, model=model)), t, v)
+    assert np.sqrt(np.mean(error**2)) < 0.06
 
 
 def test_samples_that_were_lost_part_a_log(task):

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from grounded.effects.places import probe
 from grounded.errors import GroundedError
 from grounded.estimate.record import Record
 from grounded.frozen import Array
@@ -35,6 +36,7 @@ OVERLAP_S = 1.5  # by which they know of each other
 LEAST = 3  # rows that can be smoothed
 MARGIN_S = 0.5  # of motion after the last change of a command
 WIDE = 10.0  # times as large as a state gets in a log: what is known of its first value
+EXACT = 1e-3  # of a step of the smoother: it is a whole multiple of a simulator's own
 SIZED = 256  # moments at which that is asked
 
 
@@ -89,7 +91,7 @@ def with_estimates(
     samples = [tidy(n, series[n], unwrap=n in model.angles) for n in table.measured]
     sent = [tidy(name, series[name], unwrap=False) for name in model.input_names]
     check_overlap(samples, sent)
-    clock = _Clock.of(samples, min(int(s.t[0]) for s in (*samples, *sent)), task.dt)
+    clock = _Clock.of(samples, min(int(s.t[0]) for s in (*samples, *sent)), task)
     records = _records(samples, sent, clock, task.dt)
     if not records:
         return dict(series)
@@ -113,10 +115,12 @@ class _Clock:
     rows: int
 
     @classmethod
-    def of(cls, samples: Sequence[Samples], earliest: int, dt: float) -> _Clock:
+    def of(cls, samples: Sequence[Samples], earliest: int, task: Task) -> _Clock:
         """Of the measured samples, not before the earliest of all: a log's time begins there."""
-        every = min(s.interval for s in samples)
-        step = dt / int(np.clip(np.ceil(dt / every - 0.01), 1, FINEST))
+        dt, every = task.dt, min(s.interval for s in samples)
+        finest = int(np.clip(np.ceil(dt / every - 0.01), 1, FINEST))
+        parts = (k for k in range(finest, 0, -1) if _makes(task.model, dt / k))
+        step = dt / next(parts, 1)
         margin = round(dt * 1e9)  # half an interval beyond its samples a signal is still known
         first, last = max(s.t[0] for s in samples), min(s.t[-1] for s in samples)
         origin = max(int(first) - margin, earliest)
@@ -125,6 +129,11 @@ class _Clock:
 
     def stamps(self, times: Array) -> Ints:
         return self.origin + np.round(times * 1e9).astype(np.int64)
+
+
+def _makes(model: Model, step: float) -> bool:
+    """Whether the model's simulator, if it is one, can make a step so long [s]."""
+    return abs(probe(model, step) - step) < EXACT * step
 
 
 def _records(
