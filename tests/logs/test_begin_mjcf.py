@@ -1,7 +1,9 @@
 """A workspace from somebody else's log and the MuJoCo file of their robot."""
 
 import shutil
+import struct
 
+import numpy as np
 import pytest
 
 from cli import grounded
@@ -24,6 +26,18 @@ MJCF = """
     <motor name="shoulder" joint="shoulder_joint"/><motor name="elbow" joint="elbow_joint"/>
   </actuator>
 </mujoco>"""
+
+
+URDF = """
+<robot name="slider">
+  <mujoco><compiler meshdir="{folder}" strippath="true"/></mujoco>
+  <link name="base"/>
+  <link name="cart"><inertial><mass value="2"/>
+    <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><mesh filename="package://robot/a.stl"/></geometry></collision></link>
+  <joint name="rail" type="prismatic"><parent link="base"/><child link="cart"/>
+    <axis xyz="1 0 0"/><limit lower="-9" upper="9" effort="5" velocity="10"/></joint>
+</robot>"""
 
 
 @pytest.fixture(scope="module")
@@ -60,3 +74,22 @@ def test_an_mjcf_s_steps_are_as_long_as_its_own_allow(tmp_path):
     found = begin(tmp_path / "w", log, model=tmp_path / "arm.xml")
     paths = [guess.path for guess in found.inputs]
     assert paths == [f"/effort_controller/commands.data[{i}]" for i in range(2)]
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_meshes_of_a_urdf_come_along_from_its_own_folder(tmp_path, inside):
+    """MuJoCo names the files of an MJCF, and of a URDF none but itself."""
+    robot, w = tmp_path / "robot", tmp_path / "w"
+    meshes = robot / "meshes" if inside else tmp_path / "meshes"
+    meshes.mkdir(parents=True)
+    robot.mkdir(exist_ok=True)
+    faces = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
+    corners = np.vstack([np.zeros(3), 0.1 * np.eye(3)])
+    rows = [struct.pack("<12f2x", 0, 0, 0, *corners[list(face)].ravel()) for face in faces]
+    (meshes / "a.stl").write_bytes(bytes(80) + struct.pack("<I", len(faces)) + b"".join(rows))
+    folder = "meshes" if inside else "../meshes"
+    (robot / "a.urdf").write_text(URDF.format(folder=folder))
+    assert grounded("init", w, "--blank", "--model", robot / "a.urdf").code == 0
+    assert (w / "meshes" / "a.stl").is_file() is (w / "a.urdf").is_file() is inside
+    assert str(robot) in (w / "model.py").read_text() or inside
+    assert Workspace(w).base_model.input_names == ("rail_force",)
