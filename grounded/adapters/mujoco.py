@@ -22,8 +22,10 @@ A sample that MuJoCo finds unstable becomes NaN.
 from __future__ import annotations
 
 import copy
+import os
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +55,7 @@ SHIFT = 1e-6  # relative step of the forward differences, as mjd_transitionFD us
 CHUNK = 4096  # samples stepped in one call
 EXACT = 1e-6  # of a control step: it is a whole multiple of the simulation's step
 NEAR = 1e-3  # of a control step: a simulation step so much longer or shorter is as exact, as stable
+MOST_THREADS, SHARED = 8, 64  # so many threads at most, and samples from which they pay
 HUGE = 1e9  # MuJoCo calls 1e10 unstable, warns and stops there
 
 
@@ -63,7 +66,7 @@ def model(
     inputs: str | Sequence[str] = "auto",
     timestep: float | None = None,
     reference: str | Sequence[float] | None = None,
-    threads: int = 1,
+    threads: int | None = None,
     name: str = "",
 ) -> Model:
     """The Model of an MJCF or URDF file.
@@ -82,7 +85,8 @@ def model(
         timestep: of the simulation [s], instead of the file's; dt must be a whole multiple, to
             0.1 %: what is left is shared among its steps.
         reference: qpos (nq,), or the name of a keyframe, that rotation vectors are about.
-        threads: threads that step a batch; the result does not depend on them.
+        threads: threads that step a batch, all cores (8 at most) where None; the result does not
+            depend on them.
         name: the model's name; the file's without one.
 
     Raises:
@@ -99,7 +103,8 @@ def model(
     named = params if isinstance(params, Mapping) else dict.fromkeys(params, None)
     settings = [setting_of(mj, compiled, spec) for spec in named]
     values = {s.name: _param(s, given) for s, given in zip(settings, named.values(), strict=True)}
-    stepper = MujocoStepper(compiled, coordinates, list(states), controls, settings, threads)
+    several = threads or min(os.cpu_count() or 1, MOST_THREADS)
+    stepper = MujocoStepper(compiled, coordinates, list(states), controls, settings, several)
     angles = [
         joint_name(compiled, j)
         for j in range(compiled.njnt)
@@ -238,7 +243,7 @@ class MujocoStepper(Stepper):
     def advance(self, x: Array, u: Array, p: Array, dt: float) -> Array:
         """The next states (N, n); NaN where a sample is unstable."""
         steps, h = self._substeps(dt)
-        with self._lock:
+        with self._lock, _quiet():
             self._set(p)
             self._model.opt.timestep = h
             try:
@@ -301,14 +306,10 @@ class MujocoStepper(Stepper):
         kind = (
             mj.mjtState.mjSTATE_QFRC_APPLIED if self.controls.torques else mj.mjtState.mjSTATE_CTRL
         )
-        heard = mj.get_mju_user_warning()
-        mj.set_mju_user_warning(_silent)  # or MuJoCo writes MUJOCO_LOG.TXT where it stands
-        try:
-            rolled, _ = library("mujoco.rollout").rollout(
-                compiled, self._data, state, wide, control_spec=kind, nstep=steps
-            )
-        finally:
-            mj.set_mju_user_warning(heard)
+        several = self._data if len(x) >= SHARED else self._data[:1]
+        rolled, _ = library("mujoco.rollout").rollout(
+            compiled, several, state, wide, control_spec=kind, nstep=steps
+        )
         last = rolled[:, -1]
         moved = np.hstack(
             [self.coordinates.from_qpos(last[:, 1 : ends[1]], x[:, :nv]), last[:, ends[1] :]]
@@ -320,8 +321,16 @@ class MujocoStepper(Stepper):
         return np.where(wild, np.nan, moved)
 
 
-def _silent(_: str) -> None:
-    return None
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Drops MuJoCo's warnings of what a search tries; it writes MUJOCO_LOG.TXT where it stands."""
+    mj = library("mujoco")
+    heard = mj.get_mju_user_warning()
+    mj.set_mju_user_warning(lambda _: None)
+    try:
+        yield
+    finally:
+        mj.set_mju_user_warning(heard)
 
 
 def _reference(compiled: Any, given: str | Sequence[float] | None) -> Array:

@@ -76,17 +76,23 @@ def step_with(
 
 def loads(pairs: Pairs, s: Any, a: Named, step: Callable[[Named], Any]) -> Loads:
     """What the losses of a step are solved from; step(a) -> next state by name."""
-    drives = [coupled(effect.site) for effect, _ in pairs]
     free, found = step(a), dict[str, dict[str, Any]]()
-    for name in dict.fromkeys(tau for tau, _ in drives):
+    for name in dict.fromkeys(coupled(effect.site)[0] for effect, _ in pairs):
         more = [a[n] + NUDGE if n == name else a[n] for n in a]
         reached = step(Named("input", tuple(a), more))
         found[name] = {n: (reached[n] - free[n]) / NUDGE for n in free}
-    gain = [[found[tau][w] for tau, _ in drives] for _, w in drives]
+    return loads_from(pairs, s, a, free, found)
+
+
+def loads_from(
+    pairs: Pairs, s: Any, a: Mapping[str, Any], free: Any, answers: Mapping[str, Any]
+) -> Loads:
+    """The same, where a step without losses leads, and what a unit of each input adds to it."""
+    drives = [coupled(effect.site) for effect, _ in pairs]
+    gain = [[answers[tau][w] for tau, _ in drives] for _, w in drives]
     speeds, ends = ([x[w] for _, w in drives] for x in (s, free))
-    return Loads(
-        speeds, ends, gain, [a[tau] for tau, _ in drives], [found[tau] for tau, _ in drives]
-    )
+    taken, own = [a[tau] for tau, _ in drives], [answers[tau] for tau, _ in drives]
+    return Loads(speeds, ends, gain, taken, own)
 
 
 def solved(pairs: Pairs, at: Loads, dt: Any) -> list[Any]:

@@ -231,9 +231,10 @@ def test_rotation_vectors_near_zero_and_pi() -> None:
 def test_batches_are_single_samples_bit_for_bit(threads: int) -> None:
     model = adapter.model(ARM.format(**NOMINAL), threads=threads)
     rng = np.random.default_rng(3)
-    x, u = rng.normal(size=(30, 5)), rng.normal(size=(30, 2))
+    many = 2 * adapter.SHARED  # so many are shared among threads
+    x, u = rng.normal(size=(many, 5)), rng.normal(size=(many, 2))
     together = step(model, x, u)
-    for i in rng.permutation(30):
+    for i in rng.permutation(many):
         np.testing.assert_array_equal(step(model, x[i], u[i])[0], together[i])
     copied = pickle.loads(pickle.dumps(model.step))
     np.testing.assert_array_equal(copied.advance(x, u, model.values, 0.02), together)
@@ -266,6 +267,8 @@ def test_an_unstable_sample_is_not_a_number_and_spoils_no_other(
     moved = step(model, x, np.zeros((3, 2)))
     np.testing.assert_array_equal(np.isfinite(moved).all(axis=1), [True, False, False])
     np.testing.assert_array_equal(moved[0], step(model, x[0], [0.0, 0.0])[0])
+    heavy = adapter.model(PENDULUM, params=("pole.mass",))
+    heavy.system.step(np.zeros((1, 2)), np.zeros((1, 1)), np.array([-5.0]), 0.02)
     assert not list(tmp_path.iterdir())  # MuJoCo's own log
 
 

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from grounded.diagnosis.likelihood.carried import Carried, stepper
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import linearise
@@ -78,3 +79,50 @@ def test_columns_by_slopes_are_those_of_steps(monkeypatch):
     assert (exact_F == F).all() and (d[..., 0] == exact[..., 0]).all()
     size = np.abs(exact[..., 1:]).max(axis=(0, 1, 2))
     assert (size > 0).all() and (np.abs(d - exact)[..., 1:].max(axis=(0, 1, 2)) < 0.02 * size).all()
+
+
+def test_steps_with_losses_take_one_call_of_the_simulator(monkeypatch):
+    data = data_of()
+    effect = Library().effect("joint_friction:torque<-omega", MODEL, data.scales)
+    h = Hypothesis().plus(effect, {"c": 0.05, "b": 0.3})
+    predictor = Predictor(data)
+    x = np.array([[0.3, 1.0], [0.1, -0.2], [2.0, 0.0]])
+    u = 0.5 * np.sin(np.arange(100) / 15)[:, None, None] * np.ones((100, 3, 1))
+    asked, step = [], type(MODEL.system).step
+
+    def counted(self, x, *more):
+        asked.append(len(x))
+        return step(self, x, *more)
+
+    exact = [x]
+    for now in u:
+        exact.append(predictor.advance(h, exact[-1], now, np.zeros(3)))
+    monkeypatch.setattr(type(MODEL.system), "step", counted)
+    advance, carried = stepper(predictor, h), [x]
+    for now in u:
+        carried.append(advance(carried[-1], now, np.zeros(3)))
+    plain = predictor.moved(Hypothesis(), x, u[30])
+    assert np.abs(plain - predictor.moved(h, x, u[30])).max() > 1e-3  # the losses are felt
+    np.testing.assert_allclose(np.stack(carried), np.stack(exact), atol=1e-5)
+    assert sum(asked) < 1.5 * 300 < 3 * 300  # before, three of each row and step
+    stays = Carried(data)
+    assert (stays.moved(h, x, u[0], 1e-4) == predictor.moved(h, x, u[0], 1e-4)).all()
+
+
+def test_hypotheses_set_out_from_the_slopes_of_the_first():
+    asked = []
+
+    def take(x, u):
+        asked.append(len(x))
+        return np.ones((len(x), 2, 2)), np.ones((len(x), 2, 1))
+
+    first = Slopes((np.ones(2), np.ones(1), np.ones(1))).following()
+    x, u, p = np.zeros((5, 2)), np.ones((5, 1)), np.ones(1)
+    assert first.about(x) is None
+    first.at(take, x, u, p, False)
+    one, other = first.following(), first.following()
+    moved = x + np.array([[0.0], [0.0], [1.0], [0.0], [1.0]])
+    one.at(take, moved, u, p, False)
+    assert asked == [5, 2] and other.about(x) == first.about(x)
+    other.at(take, moved, u, p, False)  # the same rows were asked before
+    assert asked == [5, 2] and other.about(x[:2]) is None

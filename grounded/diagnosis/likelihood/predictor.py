@@ -42,7 +42,7 @@ from grounded.effects import (
     acting_order,
 )
 from grounded.effects.family import braked, coupled
-from grounded.effects.losses import Left, Loads, ahead, loads, solved
+from grounded.effects.losses import Left, Loads, ahead, loads, loads_from, solved
 from grounded.effects.medium import medium_of, through_it
 from grounded.effects.places import integrated
 from grounded.effects.plain_step import quantities_of
@@ -79,7 +79,7 @@ class Predictor(SentOnce):
         """One that keeps to the track of one hypothesis, where the model is a simulator."""
         if not simulated(self.data.model):
             return self
-        return replace(self, _taken=self.taken.following())
+        return replace(self, _taken=self.taken.following(), _loads={})
 
     def inputs(self, h: Hypothesis) -> Array:
         """What the actuators receive under a hypothesis, by run (L, B, m)."""
@@ -207,13 +207,6 @@ class Predictor(SentOnce):
             else logged(model, x, after, self.params(h), self.data.dt)
         )
 
-    def stepper(self, h: Hypothesis) -> Callable[[Array, Array, Array], Array]:
-        """`advance` of many steps one after the other: from x (M, n) with u (M, m) at t (M,)."""
-        step, p, dt = self.data.model.system.step, self.params(h), self.data.dt
-        if p.ndim > 1 or adds_to_steps(h):
-            return lambda x, u, t: self.advance(h, x, u, t)
-        return lambda x, u, t: step(x, u, p, dt)
-
     def marched(self, h: Hypothesis, x: Array, u: Array) -> Array | None:
         """States (T + 1, M, n) from x (M, n) through u (T, M, m), of the model's steps alone.
 
@@ -257,8 +250,14 @@ class Predictor(SentOnce):
         def step(a: Named) -> Named:
             return self.named(self.step(x, np.stack([a[n] for n in names], axis=-1), p, dt))
 
-        inputs = list(np.moveaxis(u, -1, 0))
-        found = loads(losses_of(h), self.named(x), Named("input", names, inputs), step)
+        a = Named("input", names, list(np.moveaxis(u, -1, 0)))
+        slopes = self.taken.about(self.flat(x, u)[0]) if dt is None and self._taken else None
+        if slopes is None:
+            found = loads(losses_of(h), self.named(x), a, step)
+        else:  # what inputs do is known well enough from there
+            by_u = slopes[1].reshape(*x.shape, len(names))
+            answers = {tau: self.named(by_u[..., names.index(tau)]) for tau, _ in drives}
+            found = loads_from(losses_of(h), self.named(x), a, step(a), answers)
         if len(self._loads) > LOADS_KEPT // x.size:
             self._loads.clear()
         self._loads[key] = found

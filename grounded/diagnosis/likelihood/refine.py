@@ -30,6 +30,7 @@ from grounded.diagnosis.likelihood.linearise import (
     filter_system,
     gains_of,
     linearise,
+    sensitivities_of,
     smoothed,
 )
 from grounded.diagnosis.likelihood.noise import (
@@ -41,6 +42,7 @@ from grounded.diagnosis.likelihood.noise import (
     working,
 )
 from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.likelihood.step import ProposedStep, inside, proposed
 from grounded.engine import each
 from grounded.filter import kalman
@@ -153,12 +155,21 @@ def _after(
     shapes = _of_one_shape(works, predictor.data)
     blocks = [a[at : at + size] for a in shapes for at in range(0, len(a), size)]
     many, some = len(blocks), [[works[i] for i in block] for block in blocks]
+    if many and simulated(predictor.data.model):
+        predictor = _begun(predictor, some[0][0])
     found = each(_climb, [predictor] * many, some, [how] * many, done=tick)
     after = list(works)
     for block, part in zip(blocks, found, strict=True):
         for i, work in zip(block, part, strict=True):
             after[i] = work
     return after
+
+
+def _begun(predictor: Predictor, work: Work) -> Predictor:
+    """One from whose slopes, at where a work stands, all others set out."""
+    begun = predictor.following()
+    sensitivities_of(begun, work.h, work.track[:-1], begun.inputs(work.h))
+    return begun
 
 
 def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool, bool]) -> list[Work]:

@@ -6,9 +6,10 @@ A diagnosis asks for thousands of steps along much the same tracks, so what was 
             are taken anew where it moved by more than NEAR of what the log spans. A filter is
             linearised about a track that is no nearer to the truth than that
 `tangent`   steps from samples close by, with a value nudged or an input changed, by these slopes
+`carried`   one step after the other, with what joints lose
 
-Each hypothesis that climbs follows its own track (`Slopes.following`), so that it does not matter
-what else is fitted, or where.
+Each hypothesis that climbs follows its own track (`Slopes.following`), from the slopes at the first
+of those that climb together (`refine`), so that it does not matter what else is fitted, or where.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from grounded.frozen import Array
 from grounded.model import Model
 
 NEAR = 0.01  # of the spread of a state, the peak of an input, the size of a parameter
-KEPT = 8  # sets of slopes
+KEPT = 24  # sets of slopes
 
 Take = Callable[[Array, Array], tuple[Array, ...]]  # x (N, n), u (N, m) -> slopes (N, ...)
 
@@ -53,8 +54,8 @@ class Slopes:
     near: dict[bool, _Taken] | None = None  # with those of the parameters, or without
 
     def following(self) -> Slopes:
-        """Those of one track, however it moves."""
-        return Slopes(self.unit, self.same, {})
+        """Those of one track, however it moves, from where these stand."""
+        return Slopes(self.unit, self.same, dict(self.near or {}))
 
     def at(self, take: Take, x: Array, u: Array, p: Array, full: bool) -> tuple[Array, ...]:
         """The slopes at x (N, n), u (N, m), parameters p (k,); `full` where they are among them."""
@@ -68,13 +69,19 @@ class Slopes:
             found = old.found if full else old.found[:2]
             if moved.any():
                 found = tuple(f.copy() for f in found)
-                for kept, fresh in zip(found, take(x[moved], u[moved]), strict=True):
+                again = self._same(take, x[moved], u[moved], p, full)
+                for kept, fresh in zip(found, again, strict=True):
                     kept[moved] = fresh
             x, u = (np.where(moved[:, None], a, b) for a, b in ((x, old.x), (u, old.u)))
             p = old.p
         if self.near is not None and len(found) == 2 + full:
             self.near[full] = _Taken(x, u, p, found)
         return found
+
+    def about(self, x: Array) -> tuple[Array, ...] | None:
+        """Those that stand for as many rows as x (N, n), wherever they were taken."""
+        old = (self.near or {}).get(True) or (self.near or {}).get(False)
+        return old.found if old is not None and old.x.shape == x.shape else None
 
     def _far(self, kind: int, one: Array, other: Array) -> Array:
         return np.asarray(np.abs(one - other) > NEAR * self.unit[kind])

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.likelihood.carried import stepper
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, by_row
 from grounded.diagnosis.likelihood.marching import marched
@@ -57,7 +58,7 @@ def missed(
     oldest = max(begin.values())
     path = [track[np.maximum(at - j, 0), run] for j in range(oldest, -1, -1)]
     together = by_row([h for h, _ in each], np.searchsorted(np.unique(which), which))
-    advance = predictor.stepper(together)
+    advance = stepper(predictor, together)
     if added is None and (marched := _marched(predictor, each, path[-1], sent)) is not None:
         path, sent = [*path, *marched[1:]], sent[:0]  # every step is made
     for j, (u, now) in enumerate(zip(sent, t[: len(sent)] * data.dt, strict=True)):

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.diagnosis.error_report import UtilityPrediction
+from grounded.diagnosis.likelihood.carried import stepper
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out, moved
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -135,7 +136,7 @@ def _again(predictor: Predictor, h: Hypothesis, trial: Trial, start: Array, i: i
     received = predictor.received(h)[i]
     states = predictor.marched(h, start[None], received[: trial.steps, None])
     if states is None or not (np.abs(states) < FAR).all():
-        advance, path = predictor.stepper(h), [start[None]]
+        advance, path = stepper(predictor, h), [start[None]]
         for t in range(trial.steps):
             x = advance(path[-1], received[t][None], np.array([t * data.dt]))
             path.append(np.minimum(np.maximum(x, -FAR), FAR))

@@ -18,6 +18,7 @@ import numpy as np
 
 from grounded.diagnosis.error_report import Region, TimeShare
 from grounded.diagnosis.hypotheses.leftover import filter_of
+from grounded.diagnosis.likelihood.carried import stepper
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
@@ -102,7 +103,7 @@ def errors(predictor: Predictor, h: Hypothesis, track: Array, where: Horizon) ->
     delays = delays_of(h, data)
     oldest = 0 if delays is None else delays.oldest  # what delayed sensors may still show
     path = [track[np.maximum(where.at - j, 0), where.run] for j in range(oldest, -1, -1)]
-    advance = predictor.stepper(h)
+    advance = stepper(predictor, h)
     for j in range(where.steps):
         index = (where.at + j, where.run)
         x = np.clip(advance(x, u[index], t[index]), -1e6, 1e6)

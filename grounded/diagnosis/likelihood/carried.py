@@ -1,0 +1,91 @@
+"""Steps of a simulator one after the other, with losses: one call of it a step.
+
+What a joint loses in a step is solved from the speed it would reach without a loss, and from what a
+unit of the input adds to all states (`effects.losses`). To ask a simulator for each takes k + 2
+calls a step for k inputs. From step to step a loss changes little, so here each step is made with
+what was lost in the step before, T-,
+
+    x' = f(x, u - T-) - B (T - T-),        w_free = w' + B T-
+
+and B, which changes as slowly as the robot's posture, is taken anew every FRESH steps. Where T is
+far from T- (a joint that turns round), the step is made again with T.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, adds_to_steps, losses_of
+from grounded.diagnosis.likelihood.moving import moving
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.likelihood.simulated import simulated
+from grounded.effects.family import coupled
+from grounded.effects.losses import NUDGE, ahead, loads_from, solved
+from grounded.frozen import Array
+
+FRESH = 5  # steps after which B is taken anew
+FAR = 0.1  # of an input's peak: a loss that changed by more
+
+
+def stepper(predictor: Predictor, h: Hypothesis) -> Callable[[Array, Array, Array], Array]:
+    """Its `advance` of many steps one after the other: from x (M, n) with u (M, m) at t (M,)."""
+    model, dt = predictor.data.model, predictor.data.dt
+    if losses_of(h) and simulated(model):
+        one = Carried(predictor.data, predictor._inputs)
+        return lambda x, u, t: one.advance(h, x, u, t)
+    p = predictor.params(h)
+    if p.ndim > 1 or adds_to_steps(h):
+        return lambda x, u, t: predictor.advance(h, x, u, t)
+    return lambda x, u, t: model.system.step(x, u, p, dt)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Carried(Predictor):
+    """A predictor that is asked for one step after the other, of rows (M, n) that stay the same."""
+
+    memory: dict[str, Any] = field(default_factory=dict)
+
+    def moved(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
+        """The model's step with what its motion takes off the inputs, without further rates."""
+        pairs = losses_of(h)
+        if dt is not None or not pairs or moving(h, self.seen):
+            return super().moved(h, x, u, dt)
+        inputs, seen, p = self.data.model.input_names, self.seen, self.params(h)
+        drives = [inputs.index(coupled(effect.site)[0]) for effect, _ in pairs]
+        lost = self.memory.get("lost", np.zeros((*x.shape[:-1], len(inputs))))
+        before = u - lost
+        after = self.step(x, before, p)
+        if self.memory.get("age", 0) % FRESH == 0:
+            self.memory["B"] = self._answers(x, before, p, after, set(drives))
+        B = self.memory["B"]
+        free = after + sum(B[tau] * lost[..., tau, None] for tau in B)
+        answers = {inputs[tau]: self.named(by) for tau, by in B.items()}
+        given = dict(zip(inputs, np.moveaxis(u, -1, 0), strict=True))
+        at = loads_from(pairs, self.named(x), given, self.named(free), answers)
+        losses, now = solved(pairs, at, self.data.dt), np.zeros_like(lost)
+        for tau, loss in zip(drives, losses, strict=True):
+            now[..., tau] += loss
+        found = after - sum(B[tau] * (now - lost)[..., tau, None] for tau in B)
+        peaks = np.array([self.data.scales.peak(name) for name in inputs])
+        again = (np.abs(now - lost) > FAR * peaks).any(axis=-1)
+        if again.any():
+            found[again] = self.step(x[again], (u - now)[again], p if p.ndim == 1 else p[again])
+        for q, by in ahead(pairs, at, losses, self.data.dt, self.positions).items():
+            found[..., seen.index(q)] += by
+        self.memory.update(lost=np.nan_to_num(now), age=self.memory.get("age", 0) + 1)
+        return np.asarray(found)
+
+    def _answers(
+        self, x: Array, u: Array, p: Array, after: Array, which: set[int]
+    ) -> dict[int, Array]:
+        """B: what a unit of each input, held over the step, adds to all states (..., n)."""
+        found = {}
+        for tau in sorted(which):
+            more = u.copy()
+            more[..., tau] += NUDGE
+            found[tau] = (self.step(x, more, p) - after) / NUDGE
+        return found
