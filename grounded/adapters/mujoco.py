@@ -31,9 +31,8 @@ from typing import Any
 
 import numpy as np
 
-from grounded.adapters.beside import located, remember
 from grounded.adapters.mujoco_body import MujocoBody
-from grounded.adapters.mujoco_files import files_of
+from grounded.adapters.mujoco_files import load
 from grounded.adapters.mujoco_names import (
     BALL,
     FREE,
@@ -56,6 +55,8 @@ CHUNK = 4096  # samples stepped in one call
 EXACT = 1e-6  # of a control step: it is a whole multiple of the simulation's step
 NEAR = 1e-3  # of a control step: a simulation step so much longer or shorter is as exact, as stable
 MOST_THREADS, SHARED = 8, 64  # so many threads at most, and samples from which they pay
+MOST_COPIES = 20  # of the model with other parameters, side by side
+PRIVATE = ("_lock", "_data", "_base", "_copies")  # to a process
 HUGE = 1e9  # MuJoCo calls 1e10 unstable, warns and stops there
 
 
@@ -162,29 +163,6 @@ def limits(xml: str | Path, inputs: str | Sequence[str] = "auto") -> dict[str, t
     return found
 
 
-def load(xml: str | Path) -> Any:
-    """The compiled file (an MjModel).
-
-    Raises:
-        GroundedError: if the file is missing or MuJoCo refuses it, with MuJoCo's reason.
-    """
-    mj = library("mujoco")
-    if str(xml).lstrip().startswith("<"):
-        shown, path = "the MJCF text", None
-    elif not (path := located(xml)).is_file():
-        raise GroundedError(f"there is no MJCF or URDF file {xml}")
-    else:
-        shown = str(path)
-    try:
-        if path is None:
-            return mj.MjModel.from_xml_string(str(xml).lstrip())
-        compiled = mj.MjModel.from_xml_path(shown)
-    except ValueError as error:
-        raise GroundedError(f"MuJoCo can't load {shown}: {error}") from error
-    remember(xml, files_of)
-    return compiled
-
-
 class MujocoStepper(Stepper):
     """Control steps of MuJoCo, many samples at a time."""
 
@@ -211,6 +189,7 @@ class MujocoStepper(Stepper):
         mj, compiled = library("mujoco"), self._model
         self._lock = threading.Lock()
         self._data = [mj.MjData(compiled) for _ in range(self.threads)]
+        self._copies: dict[bytes, Any] = {}
         whole = mj.mjtState.mjSTATE_FULLPHYSICS.value
         self._base = np.zeros(mj.mj_stateSize(compiled, whole))
         mj.mj_getState(compiled, self._data[0], self._base, whole)
@@ -222,7 +201,7 @@ class MujocoStepper(Stepper):
             )
 
     def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in self.__dict__.items() if k not in ("_lock", "_data", "_base")}
+        return {k: v for k, v in self.__dict__.items() if k not in PRIVATE}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -248,12 +227,38 @@ class MujocoStepper(Stepper):
             self._model.opt.timestep = h
             try:
                 parts = [
-                    self._step(x[at : at + CHUNK], u[at : at + CHUNK], steps)
+                    self._step(x[at : at + CHUNK], u[at : at + CHUNK], steps, self._model)
                     for at in range(0, len(x), CHUNK)
                 ]
             finally:
                 self._model.opt.timestep = self._own
         return np.concatenate(parts) if parts else np.zeros((0, len(self.states)))
+
+    def rows(self, x: Array, u: Array, p: Array, dt: float) -> Array:
+        """The same of samples with parameters of their own, (N, k): a copy of the model for each.
+
+        In one batch: the folds of a prediction differ in their numbers alone.
+        """
+        steps, h = self._substeps(dt)
+        each, which = np.unique(p, axis=0, return_inverse=True)
+        if len(each) > MOST_COPIES or len(x) > CHUNK:
+            return super().rows(x, u, p, dt)
+        with self._lock, _quiet():
+            copies = [self._copy(one) for one in each]
+            for model in copies:
+                model.opt.timestep = h
+            return self._step(x, u, steps, [copies[i] for i in which.reshape(-1)])
+
+    def _copy(self, p: Array) -> Any:
+        """The model with some parameters, (k,): the last that were asked for are kept."""
+        found = self._copies.pop(p.tobytes(), None)
+        if found is None:
+            found = copy.deepcopy(self._model)
+            self._write(found, p)
+        self._copies[p.tobytes()] = found
+        for old in list(self._copies)[: -2 * MOST_COPIES]:
+            del self._copies[old]
+        return found
 
     def derivatives(self, x: Array, u: Array, p: Array, dt: float) -> tuple[Array, Array]:
         """f_x and f_u by forward differences: n + m + 1 steps a sample, all in one batch."""
@@ -287,12 +292,16 @@ class MujocoStepper(Stepper):
         """Writes parameters into the private model, and what MuJoCo derives from them."""
         if np.array_equal(p, self._made):
             return
-        for setting, value in zip(self.settings, p, strict=True):
-            setting.write(self._model, float(value))
-        library("mujoco").mj_setConst(self._model, self._data[0])
+        self._write(self._model, p)
         self._made = np.array(p)
 
-    def _step(self, x: Array, u: Array, steps: int) -> Array:
+    def _write(self, model: Any, p: Array) -> None:
+        for setting, value in zip(self.settings, p, strict=True):
+            setting.write(model, float(value))
+        library("mujoco").mj_setConst(model, self._data[0])
+
+    def _step(self, x: Array, u: Array, steps: int, models: Any) -> Array:
+        """Samples through simulation steps; models: one of all, or a list of each one's."""
         mj, compiled, nv = library("mujoco"), self._model, self._model.nv
         given = np.hstack([x, u])
         wild = ~(np.abs(given) < HUGE).all(axis=1, keepdims=True)
@@ -308,15 +317,14 @@ class MujocoStepper(Stepper):
         )
         several = self._data if len(x) >= SHARED else self._data[:1]
         rolled, _ = library("mujoco.rollout").rollout(
-            compiled, several, state, wide, control_spec=kind, nstep=steps
+            models, several, state, wide, control_spec=kind, nstep=steps
         )
         last = rolled[:, -1]
         moved = np.hstack(
             [self.coordinates.from_qpos(last[:, 1 : ends[1]], x[:, :nv]), last[:, ends[1] :]]
         )
-        stopped = (
-            last[:, :1] < (steps - 0.5) * compiled.opt.timestep
-        )  # unstable: it went no further
+        h = (models[0] if isinstance(models, list) else models).opt.timestep
+        stopped = last[:, :1] < (steps - 0.5) * h  # unstable: it went no further
         wild = wild | stopped | ~(np.abs(moved) < HUGE).all(axis=1, keepdims=True)
         return np.where(wild, np.nan, moved)
 

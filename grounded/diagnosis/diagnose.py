@@ -164,9 +164,13 @@ def diagnose(
         search, best = attribute(data, candidates, max_effects=most, tick=tick, joints=joints)
     used = [trial for trial in trials if trial.known_steps >= 2]
     task = subject if isinstance(subject, Task) else None
-    here = interruptible(lambda: so_far(search, most))
+    written: Writer | None = None
+
+    def found_so_far() -> str:
+        return so_far(search, most, written.claims.names if written else None)
+
+    here = interruptible(found_so_far)
     with np.errstate(all="ignore"), here, running(engine):
-        written: Writer | None = None
         while True:
             tick("predict")
             ruler = Ruler(search.predictor, options.origin)

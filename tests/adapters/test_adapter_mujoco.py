@@ -15,6 +15,7 @@ mj: Any = pytest.importorskip("mujoco", reason="the adapter's extra, .[mujoco]")
 
 from grounded.adapters import mujoco as adapter  # noqa: E402
 from grounded.adapters.beside import beside, recorded  # noqa: E402
+from grounded.adapters.mujoco_files import load  # noqa: E402
 from grounded.adapters.stepper import Stepper  # noqa: E402
 from grounded.adapters.tangent import Coordinates  # noqa: E402
 from grounded.diagnosis.diagnose import diagnose  # noqa: E402
@@ -195,7 +196,7 @@ def test_urdf_without_actuators_gets_forces_and_effort_limits(tmp_path: Path) ->
 
 
 def test_rotations_are_the_tangent_of_mujoco() -> None:
-    model, compiled = adapter.model(FREE), adapter.load(FREE)
+    model, compiled = adapter.model(FREE), load(FREE)
     assert model.state_names[:6] == ("box_x", "box_y", "box_z", "box_rx", "box_ry", "box_rz")
     assert model.state_names[6:9] == ("socket_rx", "socket_ry", "socket_rz")
     assert model.state_names[9:12] == ("box_vx", "box_vy", "box_vz")
@@ -238,6 +239,29 @@ def test_batches_are_single_samples_bit_for_bit(threads: int) -> None:
         np.testing.assert_array_equal(step(model, x[i], u[i])[0], together[i])
     copied = pickle.loads(pickle.dumps(model.step))
     np.testing.assert_array_equal(copied.advance(x, u, model.values, 0.02), together)
+
+
+@pytest.mark.parametrize("most", [20, 2])
+def test_samples_with_parameters_of_their_own_step_together(
+    most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(adapter, "MOST_COPIES", most)  # more than that are stepped in turn
+    model = adapter.model(PENDULUM, params=("pole.mass", "hinge.damping"))
+    rng = np.random.default_rng(5)
+    x, u = rng.normal(size=(90, 2)), rng.normal(size=(90, 1))
+    each = model.values * np.array([[1.0, 1.0], [1.5, 1.2], [0.7, 3.0]])
+    p = each[rng.integers(3, size=90)]
+    assert isinstance(model.step, Stepper)
+    for dt in (0.02, 0.04):
+        found = model.step.rows(x, u, p, dt)
+        for one in each:
+            own = (p == one).all(axis=1)
+            alone = model.system.step(x[own], u[own], one, dt)
+            np.testing.assert_array_equal(found[own], alone)
+    assert np.abs(found - model.system.step(x, u, model.values, 0.04)).max() > 1e-3
+    x[4] = np.nan
+    found = model.step.rows(x, u, p, 0.02)
+    assert np.isnan(found[4]).all() and np.isfinite(np.delete(found, 4, axis=0)).all()
 
 
 def test_derivatives_are_those_of_central_differences() -> None:

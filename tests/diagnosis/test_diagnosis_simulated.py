@@ -10,6 +10,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import linearise
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import NEAR, Slopes, simulated
+from grounded.diagnosis.validation.limits import limits
 from grounded.effects import Library
 from grounded.model import Model, Param
 from grounded.trial import Trial
@@ -126,3 +127,17 @@ def test_hypotheses_set_out_from_the_slopes_of_the_first():
     assert asked == [5, 2] and other.about(x) == first.about(x)
     other.at(take, moved, u, p, False)  # the same rows were asked before
     assert asked == [5, 2] and other.about(x[:2]) is None
+
+
+def test_of_a_long_log_the_stretches_that_move_most_are_asked():
+    names, T = (MODEL.state_names, MODEL.input_names), 3000
+    x, u = np.zeros((T + 1, 2)), np.zeros((T, 1))
+    u[2000:2400, 0] = np.sin(np.arange(400) / 5)
+    x[2000:2401, 0] = np.cos(np.arange(401) / 50)
+    data = prepare(MODEL, [Trial(x, u, 0.02, *names)])
+    assert data.steps <= 1000 < T and data.skipped == 15 and len(data.valid) == 5
+    begin = data.step_at[:, 0]
+    assert begin[0] == 0 and ((begin >= 1800) & (begin < 2400)).any()  # where the trial begins, too
+    assert "5 of 20 stretches" in " ".join(limits(data).sentences)
+    short = prepare(MODEL, [Trial(x[:201], u[:200], 0.02, *names) for _ in range(2)])
+    assert short.skipped == 0 and short.steps == 400

@@ -65,8 +65,11 @@ def attribute(
         return search, grown(search, best, max_effects)
 
 
-def so_far(search: HypothesisSearch, most: int) -> str:
-    """The best hypothesis that was fitted, and what it predicts, for someone who can't wait."""
+def so_far(search: HypothesisSearch, most: int, decided: Sequence[str] | None = None) -> str:
+    """The best hypothesis that was fitted, and what it predicts, for someone who can't wait.
+
+    decided: what was, where one effect more was looked for then.
+    """
     if not search.of_size(0):
         return "no hypothesis was fitted yet"
     with np.errstate(all="ignore"):
@@ -80,10 +83,12 @@ def so_far(search: HypothesisSearch, most: int) -> str:
         for i, name in zip(ruler.shown, ruler.names, strict=True)
     )
     causes = [*best.hypothesis.names, *["calibrated parameters"] * (best.hypothesis.spread > 0)]
-    return (
-        f"so far, of {len(search.fits)} hypotheses: {listed(causes) or 'no cause'}; "
-        f"{seconds:.2g} s ahead predictions miss {rows}"
-    )
+    told = f"of {len(search.fits)} hypotheses the likeliest has {listed(causes) or 'no cause'}"
+    rest = "which nothing has confirmed; no diagnosis is stored"
+    if decided is not None:
+        rest = f"decided was {listed(decided) or 'none'}, and one more was looked for"
+        rest += "; no diagnosis is stored"
+    return f"so far, {told}, {rest}. {seconds:.2g} s ahead predictions miss {rows}"
 
 
 def _searched(search: HypothesisSearch) -> tuple[HypothesisSearch, Fitted]:

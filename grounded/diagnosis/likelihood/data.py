@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.effects import Scales, scales_of
 from grounded.effects.memory import true_values
 from grounded.errors import GroundedError, NextCommand
@@ -25,9 +26,10 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.trial import Trial
 
-LONGEST_RUN = 200  # steps
+LONGEST_RUN, SHORTER_RUN = 200, 150  # steps; the shorter of a simulator
 PIECES, SHORTEST_PIECE = 5, 50  # one log alone is held out by pieces; steps of a piece at least
 MOST_NUMBERS = 1.2e6  # of one (L, B, N, N) array: above it, the most informative runs are used
+SIMULATED = 800  # steps of a simulator, each of which is asked thousands of times
 BEGINNINGS = 8  # runs among them at most that are kept because a trial begins with them
 
 
@@ -175,9 +177,13 @@ def prepare(
     behind = true_values(model.state_names, hidden)
     states[:, list(behind)] = states[:, list(behind.values())]
     steps = np.concatenate([trial.inputs[:T] for trial, T in used])
-    state_at, step_at, valid, trial_of = _cut(lengths)
+    longest = SHORTER_RUN if simulated(model) else LONGEST_RUN
+    state_at, step_at, valid, trial_of = _cut(lengths, longest)
     most = max(1, int(MOST_NUMBERS / (step_at.shape[1] * model.n**2 * 4)))
     begins = np.flatnonzero(np.diff(trial_of, prepend=-1))
+    if simulated(model):
+        some = max(PIECES, min(len(begins), BEGINNINGS), SIMULATED // step_at.shape[1])
+        most = min(most, some)
     keep = _informative([_filled(states)[state_at], steps[step_at]], begins, most)
     return Data(
         model=model,
@@ -218,12 +224,12 @@ def _check(model: Model, trials: Sequence[Trial]) -> None:
             )
 
 
-def _cut(lengths: Any) -> tuple[Any, Any, Array, Any]:
-    """Index arrays of runs: each trial in equal parts of at most LONGEST_RUN steps."""
+def _cut(lengths: Any, longest: int) -> tuple[Any, Any, Array, Any]:
+    """Index arrays of runs: each trial in equal parts of so many steps at most."""
     pieces = []
     step0 = state0 = 0
     for i, T in enumerate(lengths):
-        parts = int(np.ceil(T / LONGEST_RUN))
+        parts = int(np.ceil(T / longest))
         if len(lengths) == 1 and T >= PIECES * SHORTEST_PIECE:
             parts = max(parts, PIECES)
         edges = np.linspace(0, T, parts + 1).astype(int)

@@ -135,6 +135,9 @@ class Predictor(SentOnce):
     def step(self, x: Array, u: Array, p: Array, dt: float | None = None) -> Array:
         """The model's own step at any leading shape; of rows where each has its parameters."""
         if p.ndim > 1:
+            together = getattr(self.data.model.step, "rows", None)  # a simulator's
+            if together is not None and x.ndim == 2:
+                return np.asarray(together(x, u, p, dt or self.data.dt))
             after = np.empty_like(x)
             for one, own in _alike(p):
                 after[own] = self.step(x[own], u[own], one, dt)

@@ -16,6 +16,7 @@ from grounded.diagnosis.likelihood.data import PIECES, Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.linearise import base_columns
 from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.report import Estimate, Identifiable
 from grounded.effects import (
     Effect,
@@ -76,7 +77,11 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
     for name in unmoved:
         found.append(f"state {name} never moved, so nothing can be said of what acts on it")
     if data.skipped:
-        found.append(f"{data.skipped} stretches of the trials were left out, to bound memory")
+        all_of, why = data.skipped + len(data.valid), "to bound memory"
+        if simulated(data.model):
+            why = "each step of a simulator takes its time"
+        used = f"{len(data.valid)} of {all_of} stretches of the trials were used, those that move"
+        found.append(f"{used} most: {why}")
     empty = [n for n, told in zip(data.model.state_names, data.told, strict=True) if not told]
     for name in (name for name in empty if name not in left_out):
         found.append(f"state {name} was never measured")

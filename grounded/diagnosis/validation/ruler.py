@@ -35,7 +35,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 SECONDS = (0.1, 0.5, 1.0)
-MOST_STARTS, FEWER_STARTS = 400, 150  # the fewer of a simulator, whose steps are slow
+MOST_STARTS, FEWER_STARTS = 400, 75  # the fewer of a simulator, whose steps are slow
 MOST_WHOLE = 8  # trials that are predicted from beginning to end
 WHOLE_STEPS = 4000  # of them together, where that leaves LEAST_WHOLE
 LEAST_WHOLE = 3

@@ -102,9 +102,9 @@ def own_model(file: str | Path) -> OwnModel:
 
 def _loads(file: Path, name: str) -> str:
     """The text of a model.py that loads an MJCF or URDF file by a name."""
-    from grounded.adapters import mujoco
+    from grounded.adapters.mujoco_files import load
 
-    compiled, quoted = mujoco.load(file), json.dumps(name, ensure_ascii=False)
+    compiled, quoted = load(file), json.dumps(name, ensure_ascii=False)
     masses = {compiled.body(i).name: float(compiled.body_mass[i]) for i in range(compiled.nbody)}
     text = LOADS.format(name=quoted, remark="" if name == file.name else STAYS)
     for body, mass in masses.items():
