@@ -85,7 +85,11 @@ class DifferencedSystem(Interpreted):
     def jacobian(
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
     ) -> Array:
-        """See `Interpreted.jacobian`; by central differences."""
+        """See `Interpreted.jacobian`; by central differences.
+
+        Where derivatives come with the model, those by a parameter are taken to one side: half the
+        steps, and none with a friction below zero.
+        """
         shifted = self.n + self.m
         both = np.concatenate([x, u], axis=1)
         relative = self._relative_step(x, u, p, dt)
@@ -95,12 +99,15 @@ class DifferencedSystem(Interpreted):
             J[:, :, :shifted], size = self._given(x, u, p, dt), 0
         for at in range(0, len(x), size) if size else ():
             J[at : at + size, :, :shifted] = self._by_state_and_input(both[at : at + size], p, dt)
+        given = self.signature.jacobian is not None
+        base = self.step(x, u, p, dt) if given and width > shifted else None
         for i in range(width - shifted):
             up, down = np.array(p, float), np.array(p, float)
             up[i] += relative * max(1.0, abs(p[i]))
-            down[i] -= relative * max(1.0, abs(p[i]))
-            change = self.step(x, u, up, dt) - self.step(x, u, down, dt)
-            J[:, :, shifted + i] = change / (up[i] - down[i])
+            if base is None:
+                down[i] -= relative * max(1.0, abs(p[i]))
+            after = self.step(x, u, down, dt) if base is None else base
+            J[:, :, shifted + i] = (self.step(x, u, up, dt) - after) / (up[i] - down[i])
         return J
 
     def _relative_step(self, x: Array, u: Array, p: Array, dt: float) -> float:
