@@ -22,7 +22,6 @@ from grounded.frozen import Array
 from grounded.instruments.finding import DEGREES, Finding
 from grounded.instruments.inputs import OVER
 from grounded.instruments.kinematics import integrals
-from grounded.instruments.odd_trial import AHEAD
 from grounded.instruments.other_units import unusable
 from grounded.instruments.short_runs import Ahead, Fit
 from grounded.model import Model
@@ -35,7 +34,7 @@ PART = 0.7  # the same, of a turned sensor: a wrong sign is off by twice what th
 HINT = 0.5  # [nats], of the model as it is: less is not looked into
 LIKE = 4.0  # times what the model says, or a part of it: what gain an exchanged input may have
 SEEN = 0.5  # [nats] by which commands in their own unit must do better than none
-ODD_SPANS = 20  # times 0.25 s, from which two inputs may be exchanged and one turned, too
+ODD_FROM = 5.0  # [s] of log, from which two inputs may be exchanged and one turned, too
 STARTS, FEWER = 120, 40  # samples of a trial, and where many changes are asked about
 TRIALS = 4  # that are asked
 MANY = 8  # changes
@@ -125,8 +124,7 @@ def mistaken(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Tol
                     told = replace(change, signs=_signs(change, fits[1]))
                     found.setdefault(told, {})[k] = fits
     whole = {c: fits for c, fits in found.items() if not sound.get(replace(c, signs=()))}
-    spans = [trials[k].steps * trials[k].dt / AHEAD for k in some]
-    if sum(spans) < ODD_SPANS:
+    if sum(trials[k].steps * trials[k].dt for k in some) < ODD_FROM:
         whole = {c: fits for c, fits in whole.items() if not any(sign < 0 for sign in c.signs)}
     return _best(whole) if whole else None
 

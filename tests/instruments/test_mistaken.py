@@ -10,6 +10,7 @@ from facts import holding, holds
 from grounded import Model, Param
 from grounded.errors import GroundedError
 from grounded.instruments.mistaken import (
+    ODD_FROM,
     Mistake,
     _best,
     described,
@@ -137,6 +138,18 @@ def test_an_exchange_with_a_sign_says_whose():
     told = mistaken(vessel(), [odd], every(vessel()))
     assert told is not None and told.mistake.inputs == (0, 1) and told.mistake.signs == (-1, 1)
     assert holds(described(vessel(), told), "sign of port")
+
+
+def test_an_exchange_with_a_sign_takes_five_seconds_of_log():
+    """2.5 s of an arm whose joints stick more than the model knows were refused as one."""
+    for gains, signs in (((-1.0, 1.0), (-1, 1)), ((1.0, 1.0), (1, 1))):
+        whole = SWAPPED.mended(driven(vessel(), gains=np.array(gains)))
+        short = whole.until(round(4.8 / whole.dt))
+        assert short.steps * short.dt < ODD_FROM < whole.steps * whole.dt
+        told = mistaken(vessel(), [short], every(vessel()))
+        assert (told is None) if min(signs) < 0 else (told is not None)
+        told = mistaken(vessel(), [short, short], every(vessel()))  # of all trials together
+        assert told is not None and told.mistake.signs == signs
 
 
 @pytest.mark.parametrize("gains", [(-1.0, 1.0), (-1.0, -1.0), (0.0, 1.0), (0.3, 2.5)])

@@ -102,11 +102,11 @@ class DifferencedSystem(Interpreted):
         given = self.signature.jacobian is not None
         base = self.step(x, u, p, dt) if given and width > shifted else None
         for i in range(width - shifted):
-            up, down = np.array(p, float), np.array(p, float)
+            up, down, after = np.array(p, float), np.array(p, float), base
             up[i] += relative * max(1.0, abs(p[i]))
-            if base is None:
+            if after is None:
                 down[i] -= relative * max(1.0, abs(p[i]))
-            after = self.step(x, u, down, dt) if base is None else base
+                after = self.step(x, u, down, dt)
             J[:, :, shifted + i] = (self.step(x, u, up, dt) - after) / (up[i] - down[i])
         return J
 

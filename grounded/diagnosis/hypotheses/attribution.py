@@ -68,7 +68,7 @@ def attribute(
 def so_far(search: HypothesisSearch, most: int, decided: Sequence[str] | None = None) -> str:
     """The best hypothesis that was fitted, and what it predicts, for someone who can't wait.
 
-    decided: what was, where one effect more was looked for then.
+    decided: the effects that stood when one more was looked for; None before that.
     """
     if not search.of_size(0):
         return "no hypothesis was fitted yet"
@@ -84,11 +84,13 @@ def so_far(search: HypothesisSearch, most: int, decided: Sequence[str] | None = 
     )
     causes = [*best.hypothesis.names, *["calibrated parameters"] * (best.hypothesis.spread > 0)]
     told = f"of {len(search.fits)} hypotheses the likeliest has {listed(causes) or 'no cause'}"
-    rest = "which nothing has confirmed; no diagnosis is stored"
+    more = "nothing has confirmed it"
     if decided is not None:
-        rest = f"decided was {listed(decided) or 'none'}, and one more was looked for"
-        rest += "; no diagnosis is stored"
-    return f"so far, {told}, {rest}. {seconds:.2g} s ahead predictions miss {rows}"
+        more = f"{listed(decided) or 'no cause'} stood when one more was looked for"
+    return (
+        f"so far, {told}; {more}; no diagnosis is stored. {seconds:.2g} s ahead predictions miss "
+        f"{rows}"
+    )
 
 
 def _searched(search: HypothesisSearch) -> tuple[HypothesisSearch, Fitted]:

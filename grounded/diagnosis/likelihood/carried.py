@@ -70,7 +70,7 @@ class Carried(Predictor):
         for tau, loss in zip(drives, losses, strict=True):
             now[..., tau] += loss
         found = after - sum(B[tau] * (now - lost)[..., tau, None] for tau in B)
-        peaks = np.array([self.data.scales.peak(name) for name in inputs])
+        _, peaks, _ = self.taken.unit
         again = (np.abs(now - lost) > FAR * peaks).any(axis=-1)
         if again.any():
             found[again] = self.step(x[again], (u - now)[again], p if p.ndim == 1 else p[again])

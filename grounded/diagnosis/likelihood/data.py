@@ -177,11 +177,11 @@ def prepare(
     behind = true_values(model.state_names, hidden)
     states[:, list(behind)] = states[:, list(behind.values())]
     steps = np.concatenate([trial.inputs[:T] for trial, T in used])
-    longest = SHORTER_RUN if simulated(model) else LONGEST_RUN
-    state_at, step_at, valid, trial_of = _cut(lengths, longest)
+    slow = simulated(model)
+    state_at, step_at, valid, trial_of = _cut(lengths, SHORTER_RUN if slow else LONGEST_RUN)
     most = max(1, int(MOST_NUMBERS / (step_at.shape[1] * model.n**2 * 4)))
     begins = np.flatnonzero(np.diff(trial_of, prepend=-1))
-    if simulated(model):
+    if slow:
         some = max(PIECES, min(len(begins), BEGINNINGS), SIMULATED // step_at.shape[1])
         most = min(most, some)
     keep = _informative([_filled(states)[state_at], steps[step_at]], begins, most)

@@ -77,11 +77,10 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
     for name in unmoved:
         found.append(f"state {name} never moved, so nothing can be said of what acts on it")
     if data.skipped:
-        all_of, why = data.skipped + len(data.valid), "to bound memory"
-        if simulated(data.model):
-            why = "each step of a simulator takes its time"
-        used = f"{len(data.valid)} of {all_of} stretches of the trials were used, those that move"
-        found.append(f"{used} most: {why}")
+        slow = simulated(data.model)
+        why = "each step of a simulator takes its time" if slow else "to bound memory"
+        used = f"{len(data.valid)} of {len(data.valid) + data.skipped} stretches of the trials"
+        found.append(f"{used} were used, those that move most: {why}")
     empty = [n for n, told in zip(data.model.state_names, data.told, strict=True) if not told]
     for name in (name for name in empty if name not in left_out):
         found.append(f"state {name} was never measured")
