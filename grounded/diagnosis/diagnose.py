@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.hypotheses.attribution import attribute, grown, so_far
+from grounded.diagnosis.hypotheses.attribution import USUAL_EFFECTS, attribute, grown, so_far
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data, prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -159,9 +159,11 @@ def diagnose(
     candidates = knowable(data, [e for e in offered if e.name not in settled])
     joints = options.library.joints(data.model, data.scales)
     joints = knowable(data, [e for e in joints if e.name not in settled])
-    most = options.max_effects or USUAL_EFFECTS
     with running(engine):
-        search, best = attribute(data, candidates, max_effects=most, tick=tick, joints=joints)
+        search, best = attribute(
+            data, candidates, max_effects=options.max_effects, tick=tick, joints=joints
+        )
+    most = options.max_effects or max(USUAL_EFFECTS, len(best.hypothesis.effects))
     used = [trial for trial in trials if trial.known_steps >= 2]
     task = subject if isinstance(subject, Task) else None
     written: Writer | None = None
@@ -215,7 +217,6 @@ def _again(effect: Effect, known: float, data: Data) -> Effect:
     return delay_again(effect, known, float(late.min()))
 
 
-USUAL_EFFECTS = 3  # that are looked for at first
 MOST_NAMES = 50  # of 36 and 12 come 1,649 effects, of 20 and 100 as many; each is filtered
 USUAL = 160  # stages of a diagnosis, and hypotheses that are refined together
 FIRST_LOOK = 6  # iterations of the fit by whose noise the parameters are found identifiable

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import CLAIM
+from grounded.diagnosis.hypotheses.joint_model import joint_model
 from grounded.diagnosis.hypotheses.search import (
     LARGE,
     LARGE_GAIN,
@@ -31,6 +32,8 @@ from grounded.effects import Effect
 from grounded.progress import interruptible
 from grounded.result import listed
 
+USUAL_EFFECTS = 3  # that are looked for at first
+WHITE = 0.9  # of a nat is believed where what is left is white noise
 HOPEFUL = 4  # larger sets that are fitted to the end
 TUNED = 2  # sets whose constants are set by the data
 FORETOLD = (2.0, 0.05)  # scatters, and least gain, from which what predicts better is grown too
@@ -43,7 +46,7 @@ def attribute(
     data: Data,
     candidates: Sequence[Effect],
     *,
-    max_effects: int = 3,
+    max_effects: int | None = None,
     tick: Callable[[str], None] | None = None,
     joints: Sequence[Effect] = (),
 ) -> tuple[HypothesisSearch, Fitted]:
@@ -52,17 +55,22 @@ def attribute(
     Args:
         data: from `prepare`.
         candidates: the effects that may be blamed.
-        max_effects: at most so many at once.
+        max_effects: at most so many at once; None: `USUAL_EFFECTS`, more where joints share an
+            inertia and each of them is off.
         tick: called with what is being done, for a progress display.
         joints: plain frictions that stand beside richer ones, whether they are candidates or not.
     """
-    search = HypothesisSearch(data, candidates, tick, joints)
+    search, most = HypothesisSearch(data, candidates, tick, joints), max_effects or USUAL_EFFECTS
     with (
         np.errstate(all="ignore"),  # a hypothesis that diverges scores minus infinity
-        interruptible(lambda: so_far(search, max_effects)),
+        interruptible(lambda: so_far(search, most)),
     ):
         search, best = _searched(search)
-        return search, grown(search, best, max_effects)
+        if search.tempering.factor < WHITE:  # else one effect, or none, leaves nothing to explain
+            whole = joint_model(search, max_effects)
+            if whole is not None and search.score(whole) > search.score(best) + LARGE_GAIN:
+                best = whole
+        return search, grown(search, best, max(most, len(best.hypothesis.effects)))
 
 
 def so_far(search: HypothesisSearch, most: int, decided: Sequence[str] | None = None) -> str:

@@ -55,7 +55,7 @@ def plain_forms(search: HypothesisSearch, h: Hypothesis) -> Iterator[Hypothesis]
         stiction = by_family.get(("stiction", motion))
         if family == "coulomb_friction" and stiction is not None and joint is not None:
             rest = h.minus(effect.name).minus(stiction[0].name)
-            yield rest.plus(joint, {"c": values["c"] / _push(joint), "b": 0.0})
+            yield rest.plus(joint, {"c": values["c"] / push(joint), "b": 0.0})
         if family == joint_friction.name and values["b"] == 0 and "b" not in effect.fixed:
             some = (replace(q, fixed=q.fixed or q.name == "b") for q in effect.quantities)
             dry = replace(effect, quantities=tuple(some))
@@ -71,7 +71,7 @@ def _of_joint(joint: Effect, values: Mapping[str, float]) -> dict[str, float]:
     return {q.name: float(values[q.name]) for q in joint.quantities}
 
 
-def _push(joint: Effect) -> float:
+def push(joint: Effect) -> float:
     """The acceleration that a unit of the input makes, in the middle of what it does."""
     model, (tau, w) = joint.site.model, coupled(joint.site)
     dt, (x, u) = places.probe(model, 1e-5), places.samples(model, 8)

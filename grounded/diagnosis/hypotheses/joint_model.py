@@ -1,0 +1,130 @@
+"""All joints of an arm at once: dry and viscous friction and inertia of each, then what is needed.
+
+Of an arm whose every joint differs from its model none moves as the model says by the friction of
+one. Alone each true effect gains little, and a weak input of all joints goes before it, so a search
+that adds one effect at a time never gets there. Here the search starts from the other end, from
+what an identification of robots fits: every joint with friction and a rotor's inertia. What the
+evidence does not need is taken out again, one by one; what it still needs is added.
+
+Source: Swevers, Verdonck & De Schutter, Dynamic Model Identification for Industrial Robots (2007);
+the order of the removals is Wald's test (values against their covariance), each is fitted again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+
+from grounded.diagnosis.hypotheses.explored import CLAIM
+from grounded.diagnosis.hypotheses.plainest import push
+from grounded.diagnosis.hypotheses.search import CRUDE, TO_THE_TOP, HypothesisSearch, Start
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.effects import Effect
+from grounded.effects.family import coupled
+from grounded.effects.joint import added_inertia
+from grounded.frozen import Array
+
+STICKING = (0.03, 0.2)  # of an input's peak: dry frictions from which all joints start
+AGAIN = 8  # iterations after an effect was taken out or added
+BEYOND = 2  # effects of each joint that may be added
+OWN = 0.3  # of a joint's own inertia: what is added at the start
+
+
+def joint_model(search: HypothesisSearch, most: int | None = None) -> Fitted | None:
+    """The likeliest hypothesis with all that joints may have, less what it can spare.
+
+    Args:
+        search: to which all that is fitted is added.
+        most: at most so many effects; None: as many as the evidence asks for.
+
+    Returns None where fewer than two joints share an inertia, or `most` are too few for that.
+    """
+    joints = _joints(search)
+    if len(joints) < 2:
+        return None
+    found = search.refined(_starts(search, joints), TO_THE_TOP, rivals=True)
+    if not found:
+        return None
+    best = max(found, key=search.score)
+    search.structures(best)
+    best = _completed(search, _spared(search, best), (2 + BEYOND) * len(joints))
+    while most is not None and len(best.hypothesis.effects) > most:
+        best = _less(search, best, _losses(search, best).argmin())
+    return best
+
+
+def _joints(search: HypothesisSearch) -> list[tuple[Effect, Effect]]:
+    """Friction and inertia of each joint whose inertia is coupled with others'."""
+    candidates = {e.name: e for e in search.candidates}
+    inertias = [e for e in search.candidates if e.family.name == added_inertia.name]
+    found = []
+    for inertia in inertias:
+        if (friction := search.joints.get(coupled(inertia.site)[1])) is not None:
+            found.append((candidates.get(friction.name, friction), inertia))
+    return found
+
+
+def _starts(search: HypothesisSearch, joints: Sequence[tuple[Effect, Effect]]) -> list[Start]:
+    """All joints with little and with much friction, with the parameters as they are and free."""
+    data = search.data
+    bare, spreads = Hypothesis(), [0.0]
+    if param_scale(data.model).any():
+        spreads.append(CRUDE)
+    starts = []
+    for part, spread in product(STICKING, spreads):
+        h = Hypothesis(shift=np.zeros(data.model.system.k), spread=spread) if spread else bare
+        for friction, inertia in joints:
+            dry = part * data.scales.peak(coupled(friction.site)[0])
+            h = h.plus(friction, {q.name: dry * (q.name == "c") for q in friction.free})
+            h = h.plus(inertia, {"J": OWN * _own(inertia)})
+        starts.append(search.fresh(h))
+    return starts
+
+
+def _own(inertia: Effect) -> float:
+    """What a joint's motor moves by the model: effort over acceleration."""
+    return 1 / max(push(inertia), 1e-12)
+
+
+def _spared(search: HypothesisSearch, fit: Fitted) -> Fitted:
+    """Without the effects that evidence does not ask for, the least needed first."""
+    while fit.hypothesis.effects:
+        less = _less(search, fit, int(_losses(search, fit).argmin()))
+        if less is fit or search.score(less) < search.score(fit) - CLAIM:
+            return fit
+        fit = less
+    return fit
+
+
+def _losses(search: HypothesisSearch, fit: Fitted) -> Array:
+    """About what evidence would lose without each effect, by Wald's test [nats], (effects,)."""
+    h, covariance, at = fit.hypothesis, fit.covariance, 0
+    found = []
+    for effect, values in h.pairs:
+        own = slice(at, at + len(effect.free))
+        theta, at = h.theta[own], own.stop
+        nats = 0.5 * float(theta @ np.linalg.pinv(covariance[own, own]) @ theta)
+        found.append(search.tempering.factor * nats - search.price(effect, values))
+    return np.array(found)
+
+
+def _less(search: HypothesisSearch, fit: Fitted, index: int) -> Fitted:
+    """The fit without one of its effects, all the rest fitted again; the fit where none can be."""
+    start = fit.hypothesis.minus(fit.hypothesis.names[index])
+    found = search.refined([(start, fit.noise, fit.track)], AGAIN)
+    return found[0] if found else fit
+
+
+def _completed(search: HypothesisSearch, fit: Fitted, most: int) -> Fitted:
+    """With what the joints alone don't do: a lag of all motors, one that is weaker."""
+    while len(fit.hypothesis.effects) < most:
+        further = search.extended(fit, iterations=AGAIN)
+        best = max(further, key=search.score, default=fit)
+        best = max(search.refined([best], TO_THE_TOP), key=search.score, default=best)
+        if search.score(best) < search.score(fit) + CLAIM:
+            return fit
+        fit = _spared(search, best)
+    return fit
