@@ -17,7 +17,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, nearest
 
-FREE, BALL, SLIDE = 0, 1, 2  # mjtJoint; a hinge is 3
+FREE, BALL, SLIDE, HINGE = 0, 1, 2, 3  # mjtJoint
 
 
 class Controls:
@@ -65,6 +65,7 @@ def controls_of(compiled: Any, inputs: str | Sequence[str], states: Mapping[str,
         if not compiled.nu:
             raise GroundedError('the MuJoCo model has no actuator: give inputs="torques"')
         names: list[str] = []
+        units: list[str] = []
         columns: list[int] = []
         for i in range(_actuators(compiled)):
             name = _actuator_name(compiled, i)
@@ -72,8 +73,9 @@ def controls_of(compiled: Any, inputs: str | Sequence[str], states: Mapping[str,
             many = int(getattr(compiled, "actuator_ctrlnum", [1] * compiled.nu)[i])
             name = f"{name}_ctrl" if name in states else name
             names += [f"{name}{k or ''}" for k in range(many)]
+            units += [_effort(compiled, i)] * many
             columns += range(first, first + many)
-        return Controls(names, ["1"] * len(names), columns, torques=False)
+        return Controls(names, units, columns, torques=False)
     chosen = list(by_name) if inputs == "torques" else inputs
     if inputs == "torques" and not chosen:
         raise GroundedError("the MuJoCo model has no hinge, slide or actuator: add an actuator")
@@ -107,6 +109,21 @@ def joint_name(compiled: Any, j: int) -> str:
 
 def _actuator_name(compiled: Any, i: int) -> str:
     return identifier(compiled.actuator(i).name or f"actuator{i}")
+
+
+def _effort(compiled: Any, i: int) -> str:
+    """The unit of an actuator's control: N m or N where it is the force on one hinge or slide."""
+    import mujoco  # type: ignore[import-untyped]
+
+    single = compiled.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
+    straight = (
+        compiled.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_NONE
+        and compiled.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
+        and compiled.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
+        and compiled.actuator_gainprm[i, 0] == compiled.actuator_gear[i, 0] == 1
+    )
+    kind = compiled.jnt_type[compiled.actuator_trnid[i, 0]] if single else FREE
+    return {SLIDE: "N", HINGE: "N m"}.get(int(kind), "1") if straight else "1"
 
 
 def _actuators(compiled: Any) -> int:

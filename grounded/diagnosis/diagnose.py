@@ -163,7 +163,8 @@ def diagnose(
         search, best = attribute(
             data, candidates, max_effects=options.max_effects, tick=tick, joints=joints
         )
-    most = options.max_effects or max(USUAL_EFFECTS, len(best.hypothesis.effects))
+    many = len(best.hypothesis.effects)  # of all joints, beside which one more was looked for
+    most = options.max_effects or (many + 1 if many > USUAL_EFFECTS else USUAL_EFFECTS)
     used = [trial for trial in trials if trial.known_steps >= 2]
     task = subject if isinstance(subject, Task) else None
     written: Writer | None = None

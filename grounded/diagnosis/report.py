@@ -38,8 +38,9 @@ Kind = Literal["effect", "several", "none", "unknown"]
 class Verdict(Document):
     """The answer: its kind, the effects that it claims, and why.
 
-    `sentences` is a line each and `sentence` their join; the first tells `causes`, a clause each
-    in the order of `Diagnosis.credit`. `parameters` are the model's own that it calls off, beside
+    `sentences` is a line each and `sentence` their join; the first is made of `clauses`. `causes`
+    is a clause each in the order of `Diagnosis.credit`; where they are many, `clauses` tells those
+    of one kind together. `parameters` are the model's own that it calls off, beside
     effects or alone. `look_for` is how many effects to look for before any is adopted, where as
     many as were looked for leave more than noise; 0 where none need be.
     """
@@ -49,6 +50,7 @@ class Verdict(Document):
     sentence: str = ""
     causes: tuple[str, ...] = ()
     sentences: tuple[str, ...] = ()
+    clauses: tuple[str, ...] = ()
     parameters: tuple[str, ...] = ()
     look_for: int = 0
 

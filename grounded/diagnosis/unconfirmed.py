@@ -16,12 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.cause_words import meaning
 from grounded.diagnosis.report import Ranked, Unconfirmed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Doubtful
 from grounded.diagnosis.validation.prediction_error import by_region
 from grounded.diagnosis.validation.visits import acting, few_trials
-from grounded.diagnosis.verdict import LOG, LOST, meaning
+from grounded.diagnosis.verdict import LOG, LOST
 from grounded.frozen import Array
 from grounded.task import Task
 from grounded.trial import Trial

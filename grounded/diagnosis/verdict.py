@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from grounded.diagnosis.cause_words import clauses, give_or_take, meaning
 from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, furthest, runaway
-from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
+from grounded.diagnosis.report import Kind, Ranked, Unconfirmed, Verdict
 from grounded.diagnosis.ruler_words import explained, floor, improvement, rest, worsened
 from grounded.diagnosis.stopped import AT_BOUNDS, ENDED, wider
-from grounded.model import Model, all_at_bounds
-from grounded.result import listed, number, percent
+from grounded.model import all_at_bounds
+from grounded.result import listed
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.validation.claims import Claims
-    from grounded.effects import Effect
 
 LOG, LOST = "is a log that no candidate made", "was lost"  # why a trial can't be run again
 MOST_EFFECTS, FURTHER = 6, 2  # that may be blamed at once; so many more are looked for next
-AS_STRONG = 0.2  # of what is modelled: a turned input that is so near to it has the wrong sign
-TURNED = ": turn its sign in model.py, or if only the log counts so, with {log} scale = -1"
-MOST_DIGITS = 6  # of a value, however sure it is
 NAMED = 3  # parameters, channels and leftovers that a sentence names at most
 
 
@@ -57,8 +52,8 @@ def verdict(
     """
     from grounded.effects import like_a_load
 
-    told = [one for one in seen if not one.repeats] + [one for one in seen if one.repeats][:1]
-    once = [sentence([one.sentence()]) for one in told]
+    rare = [one for one in seen if not one.repeats] + [one for one in seen if one.repeats][:1]
+    once = [sentence([one.sentence()]) for one in rare]
     left = remainder[0].sentence() if remainder else ""
     left += f"; {len(remainder) - 1} more" if len(remainder) > 1 else ""
     claimed = [row for row in ranking if row.claimed]
@@ -77,11 +72,16 @@ def verdict(
             text = explained(rows)
         return _said("none", text, *once)
     causes = _causes(claims, ranking, credit, given or {})
-    several = len(causes) > 1
-    shares = [f" ({percent(one.share)} of the improvement)" * several for one in credit]
-    words = [sentence(map(str.__add__, causes, shares)), improvement(rows), worsened(rows)]
+    told = clauses(
+        [one.of for one in credit],
+        causes,
+        [one.share for one in credit],
+        {e.name: e for e in claims.best.hypothesis.effects},
+        {row.effect: row.params for row in ranking},
+    )
+    words = [sentence(told), improvement(rows), worsened(rows)]
     words += [runaway(rows), wider(claims.parameters())]
-    words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed])
+    words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed], _off(claims))
     words += [f"{told_apart(group, same)}." for group in groups[:1]]
     words += [one.sentence() for one in claims.one_clock[:1]]
     more = 0
@@ -97,7 +97,9 @@ def verdict(
     words += once
     kind: Kind = "effect" if len(claimed) == 1 else "several"
     effects, off = tuple(r.effect for r in claimed), tuple(_off(claims))
-    said = replace(_said(kind, *words), effects=effects, causes=causes, parameters=off)
+    said = replace(
+        _said(kind, *words), effects=effects, causes=causes, clauses=told, parameters=off
+    )
     return replace(said, look_for=more if more > most else 0)
 
 
@@ -160,16 +162,6 @@ def _moved(claims: Claims) -> str:
     return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
 
 
-def give_or_take(estimate: Estimate) -> str:
-    """A value with its +-, as precise as that is: `1.5763 +- 0.0012 N/V`."""
-    value, std = estimate.value, estimate.std
-    if not (0 < std < math.inf and math.isfinite(value)):
-        return quantity(estimate)
-    places = math.floor(math.log10(max(abs(value), std))) - math.floor(math.log10(std)) + 2
-    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
-    return f"{value:.{min(max(places, 3), MOST_DIGITS)}g} +- {std:.2g}{unit}"
-
-
 def next_trial(
     claims: Claims,
     look: str,
@@ -224,7 +216,7 @@ def next_trial(
         return f"Nothing is tied, but predictions get worse with {_it(claims)}: {REPEAT}."
     if further:
         return "None is needed yet: nothing is tied, and more effects have to be looked for first."
-    if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names):
+    if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names, _off(claims)):
         return "Nothing is tied: give the model a parameter for a load, then diagnose again."
     if ended:
         return AT_BOUNDS
@@ -275,96 +267,6 @@ STRAIGHT = {  # where nothing has a heading or drives a curve
     "sensor_bias": "hold still before and after the run, and move both ways",
     "rate_gain": "make the same motion slowly and fast",
 }
-
-GREEK = (
-    "alpha|beta|gamma|delta|epsilon|zeta|eta|theta|iota|kappa|lambda|mu|nu|xi|omicron|pi|rho|sigma"
-    "|tau|upsilon|phi|chi|psi|omega"
-)
-
-
-def called(model: Model, name: str) -> str:
-    """A state or an input in a sentence: `the speed v`, `the state delta`, `the throttle`.
-
-    Symbols get a word before them: what is short, Greek, or not letters alone.
-    """
-    from grounded.effects import places
-
-    roles = {
-        "speed": (places.speed(model),),
-        "heading": places.role(model, "heading"),
-        "heading rate": places.role(model, "heading_rate"),
-        "position": places.position(model),
-        "angle": model.angles,
-    }
-    word = next((role for role, played in roles.items() if name in played), "")
-    if not word and (len(name) <= 3 or re.fullmatch(GREEK, name) or not name.isalpha()):
-        word = "input" if name in model.input_names else "state"
-    return f"the {name}" if not word or name == word else f"the {word} {name}"
-
-
-def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
-    """The family's sentence with names and numbers filled in; starts with a small letter."""
-    from grounded.effects import ParamFamily
-
-    model, targets = effect.site.model, effect.site.targets
-    constants = {q.name: Estimate(q.start, 0.0, None, q.unit) for q in effect.quantities if q.fixed}
-    words = {name: quantity(e) for name, e in {**constants, **params}.items()}
-    words.setdefault("s", "s" if len(targets) == 1 else "")
-    driven, _, source = effect.site.target.partition("<-")
-    words["target"] = listed(called(model, n) for n in targets)
-    if isinstance(effect.family, ParamFamily):
-        words["target"] = effect.site.target
-    words |= {"log": "[log]", "driven": called(model, driven), "source": called(model, source)}
-
-    def filled(found: re.Match[str]) -> str:
-        name, percent, more, less = found.groups()
-        if percent is None or name not in params:
-            return words.get(name, found.group(0))
-        value = 100 * effect.family.ratio(name, params[name].value)
-        if more is None:
-            return f"{number(value)} %"
-        return f"{number(abs(value))} % {more if value >= 0 else less}"
-
-    told = {n for n, e in params.items() if e.value != 0 and not abs(e.value) <= e.std}
-
-    def kept(found: re.Match[str]) -> str:  # of quantities that are estimated and not about zero
-        parts = found[1].split(" & ")
-        known = [p for p in parts if {*re.findall(r"\{(\w)[%}]", p)} <= told]
-        return listed(known or (parts[1:] and parts[:1]))
-
-    own = isinstance(effect.family, ParamFamily) and effect.site.target in model.params
-    if own and "d" in params:
-        old = model.params[effect.site.target].value
-        new = give_or_take(params["d"].moved(old))
-        return f"the parameter {effect.site.target} should be {new} instead of {number(old)}"
-
-    if effect.known and "d" in params:
-        by, now = params["d"], params["d"].moved(effect.quantities[0].known)
-        more = f"{number(abs(by.value))} s {'less' if by.value < 0 else 'more'} than adopted"
-        return f"the delay of {words['target']} should be {give_or_take(now)}, {more}"
-
-    def signed(found: re.Match[str]) -> str:
-        name, positive, negative = found.groups()
-        less = name in params and params[name].value < 0
-        if less:
-            words[name] = words[name].removeprefix("-")
-        return negative if less else positive
-
-    text = re.sub(r"\[([^]]*)\]", kept, _turned(effect, params) or effect.family.sentence)
-    text = re.sub(r"\{(\w+)>([^{}|]+)\|([^{}|]+)\}", signed, text)
-    return re.sub(r"\{(\w+)(%)?(?:([^{}|]+)\|([^{}|]+))?\}", filled, text)
-
-
-def _turned(effect: Effect, params: Mapping[str, Estimate]) -> str:
-    """The sentence of a gain whose sign is the other one; "" where it isn't."""
-    from grounded.effects import InputFamily
-
-    text, size = effect.family.turned, -1 - params["g"].value if "g" in params else 0.0
-    if not text or size <= 0:
-        return ""
-    if abs(size - 1) < AS_STRONG:
-        return text + TURNED * isinstance(effect.family, InputFamily)
-    return f"{text} (by {number(100 * size)} % of what is modelled)"
 
 
 def sentence(clauses: Iterable[str]) -> str:

@@ -30,6 +30,7 @@ from grounded.model import Model
 ALIKE = 0.999  # cosine from which two slopes are one
 ONLY = 2e-3  # of a speed's answer: what an input may do besides
 TURNS = 4  # times as many samples where axes stand anywhere
+SOME = 0.1  # of a parameter, to see what it does
 FORCES = ("N", "V", "A")  # what a unit of an effort begins with: N m, V ...
 
 
@@ -82,10 +83,11 @@ def _strongest(site: Site) -> float:
 def pairs_of(model: Model) -> list[str]:
     """`tau<-w` for every effort and the velocity that it always pushes the same way.
 
-    Efforts are inputs in N, N m, V or A, and whatever moves several velocities through an inertia.
+    Efforts are inputs in N, N m, V or A, of a simulator also those without a unit, and whatever
+    moves several velocities through an inertia.
     """
     own, units = getattr(model.step, "timestep", 0.0), model.inputs.items()
-    efforts = [n for n, unit in units if unit.startswith(FORCES)]
+    efforts = [n for n, unit in units if unit.startswith(FORCES) or (own and unit == "1")]
     if own and not efforts:
         efforts = list(model.input_names)
     velocities = places.velocities(model)
@@ -169,20 +171,32 @@ def alone(model: Model, tau: str, w: str) -> bool:
 GAINS = ("input_gain", "rate_gain", "added_inertia")
 
 
-def like_a_load(model: Model, names: Collection[str]) -> bool:
+def like_a_load(model: Model, names: Collection[str], moved: Collection[str] = ()) -> bool:
     """Whether two at least of these effects change the inertia of joints that share one.
 
     Each alone is a gear, a motor. What an arm carries, or a link's mass that is off, is in all of
-    the inertia matrix and in gravity: without a parameter for it, gains stand in its place.
+    the inertia matrix and in gravity: without a parameter for it, gains stand in its place. With
+    one among those that `moved` they are what they say.
     """
     gains = {name for name in names if name.partition(":")[0] in GAINS}
-    if len(gains) < 2:
+    if len(gains) < 2 or any(_of_inertia(model, name) for name in moved):
         return False
     coupled = [pair.split("<-") for pair in pairs_of(model)]
     coupled = [pair for pair in coupled if not alone(model, *pair)]
     said = {f"input_gain:{tau}" for tau, _ in coupled} | {f"rate_gain:{w}" for _, w in coupled}
     said |= {f"added_inertia:{tau}<-{w}" for tau, w in coupled}
     return len(said & gains) > 1
+
+
+def _of_inertia(model: Model, name: str) -> bool:
+    """Whether a parameter changes what inputs accelerate."""
+    if name not in model.param_names:
+        return False
+    dt, (x, u) = places.probe(model, 1e-2), places.samples(model, 8)
+    other = model.values.copy()
+    other[model.param_names.index(name)] *= 1 + SOME
+    before, after = (model.system.linearise(x, u, p, dt)[1] for p in (model.values, other))
+    return bool(np.abs(after - before).max() > ONLY * SOME * np.abs(before).max())
 
 
 def renamed(model: Model) -> dict[str, str]:

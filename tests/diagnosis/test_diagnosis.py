@@ -9,6 +9,7 @@ import pytest
 
 from grounded import GroundedError, Model, Param, Trial
 from grounded.challenge import judge, make, oracle, sealed, summary
+from grounded.diagnosis.cause_words import meaning
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import Credit, Remainder, RulerRow
 from grounded.diagnosis.excitation import probe
@@ -18,7 +19,7 @@ from grounded.diagnosis.report import Estimate, Ranked
 from grounded.diagnosis.ruler_words import rest
 from grounded.diagnosis.validation.claims import Blame, has_size, loss
 from grounded.diagnosis.validation.prediction_error import _stump
-from grounded.diagnosis.verdict import meaning, sentence, verdict
+from grounded.diagnosis.verdict import sentence, verdict
 from grounded.effects import Library
 from grounded.effects.memory import shifted
 from grounded.filter import kalman

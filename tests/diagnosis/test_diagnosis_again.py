@@ -7,6 +7,7 @@ import pytest
 from test_diagnosis import cart
 
 from grounded import Model, Param, Reward, Task, Trial
+from grounded.diagnosis.cause_words import meaning
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses.lookalike import one_thing
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
@@ -19,7 +20,6 @@ from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked, Verdict
 from grounded.diagnosis.validation.decide import SURE
 from grounded.diagnosis.validation.ruler import Ruler, folds
-from grounded.diagnosis.verdict import meaning
 from grounded.effects import Library
 from grounded.effects.actuator import delay_again
 from grounded_trials.workspace.adopting import joined

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
+from grounded.diagnosis.cause_words import meaning
 from grounded.diagnosis.hypotheses.counterpart import counterparts
 from grounded.diagnosis.hypotheses.explored import FittedHypotheses
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.report import Estimate
-from grounded.diagnosis.verdict import meaning
 from grounded.effects import Library
 from grounded.models.car import model as car
 

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from grounded.diagnosis.cause_words import give_or_take
 from grounded.diagnosis.hypotheses.leftover import Leftover
 from grounded.diagnosis.report import Estimate
 from grounded.diagnosis.validation.measured import Measured
-from grounded.diagnosis.verdict import give_or_take
 
 
 @pytest.mark.parametrize(

@@ -98,6 +98,9 @@ def test_gains_of_several_joints_of_an_arm_are_like_a_load():
     assert like_a_load(arm, [f"input_gain:{other}", f"rate_gain:{w}", f"delay:{tau}"])
     assert like_a_load(arm, [f"input_gain:{tau}", f"added_inertia:{PAIRS[1]}"])
     assert not like_a_load(arm, [f"input_gain:{tau}", f"joint_friction:{PAIRS[1]}"])
+    gains = [f"input_gain:{tau}", f"added_inertia:{PAIRS[1]}"]
+    assert not like_a_load(arm, gains, ["m2"])  # the load has a parameter, which moved
+    assert like_a_load(arm, gains, ["t1.lag"])
     assert not like_a_load(pendulum, ["input_gain:torque", "rate_gain:omega"])
 
 

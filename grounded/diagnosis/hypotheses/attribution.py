@@ -33,7 +33,7 @@ from grounded.progress import interruptible
 from grounded.result import listed
 
 USUAL_EFFECTS = 3  # that are looked for at first
-WHITE = 0.9  # of a nat is believed where what is left is white noise
+MOST_OF_JOINTS = 30  # the same, of joints that share an inertia: friction and inertia of each
 HOPEFUL = 4  # larger sets that are fitted to the end
 TUNED = 2  # sets whose constants are set by the data
 FORETOLD = (2.0, 0.05)  # scatters, and least gain, from which what predicts better is grown too
@@ -65,11 +65,7 @@ def attribute(
         np.errstate(all="ignore"),  # a hypothesis that diverges scores minus infinity
         interruptible(lambda: so_far(search, most)),
     ):
-        search, best = _searched(search)
-        if search.tempering.factor < WHITE:  # else one effect, or none, leaves nothing to explain
-            whole = joint_model(search, max_effects)
-            if whole is not None and search.score(whole) > search.score(best) + LARGE_GAIN:
-                best = whole
+        search, best = _searched(search, max_effects or MOST_OF_JOINTS)
         return search, grown(search, best, max(most, len(best.hypothesis.effects)))
 
 
@@ -101,18 +97,21 @@ def so_far(search: HypothesisSearch, most: int, decided: Sequence[str] | None = 
     )
 
 
-def _searched(search: HypothesisSearch) -> tuple[HypothesisSearch, Fitted]:
-    """The best single hypothesis; with outliers in the data, the best with their weights."""
+def _searched(search: HypothesisSearch, most: int) -> tuple[HypothesisSearch, Fitted]:
+    """Where to grow from, the likeliest; with outliers in the data, the best with their weights."""
     search.nulls()
-    best = _explore(search)
+    best = _explore(search, most)
     if outliers(best):
         search = search.with_weights(clean(search.predictor, best))
-        best = _explore(search)
+        best = _explore(search, most)
     return search, best
 
 
-def _explore(search: HypothesisSearch) -> Fitted:
-    """The best hypothesis of one effect, or without when there is none to try."""
+def _explore(search: HypothesisSearch, most: int) -> Fitted:
+    """The best hypothesis of one effect, or without when there is none to try.
+
+    Where no one effect is nearly as likely as what all joints do together (at most `most`), that.
+    """
     null = search.best_null()
     plain = search.fits.get((Structure(), 0.0, ()), null)
     for context in [null] if plain is null else [null, plain]:
@@ -122,6 +121,10 @@ def _explore(search: HypothesisSearch) -> Fitted:
         return null
     # a large effect has a long way from its first look
     search.finished(singles[:SHORTLIST], 8, rivals=True)
+    if most > USUAL_EFFECTS and (whole := joint_model(search, most)) is not None:
+        more = search.score(whole) - search.score(search.of_size(1)[0])
+        if more > LARGE_GAIN and len(whole.hypothesis.effects) > 2:
+            return whole
     search.again(search.of_size(1)[: RESTARTED if search.data.model.n <= LARGE else 2])
     sweep(search)
     search.beside_parameters()

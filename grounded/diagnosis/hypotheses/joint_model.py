@@ -19,9 +19,16 @@ import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import CLAIM
 from grounded.diagnosis.hypotheses.plainest import push
-from grounded.diagnosis.hypotheses.search import CRUDE, TO_THE_TOP, HypothesisSearch, Start
+from grounded.diagnosis.hypotheses.search import (
+    CRUDE,
+    TO_THE_TOP,
+    HypothesisSearch,
+    Start,
+    tune,
+)
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.effects import Effect
 from grounded.effects.family import coupled
 from grounded.effects.joint import added_inertia
@@ -30,30 +37,34 @@ from grounded.frozen import Array
 STICKING = (0.03, 0.2)  # of an input's peak: dry frictions from which all joints start
 AGAIN = 8  # iterations after an effect was taken out or added
 BEYOND = 2  # effects of each joint that may be added
+LATE = ("delay", "first_order_lag")  # what motors on one bus, of one kind, have in common
 OWN = 0.3  # of a joint's own inertia: what is added at the start
 
 
-def joint_model(search: HypothesisSearch, most: int | None = None) -> Fitted | None:
+def joint_model(search: HypothesisSearch, most: int) -> Fitted | None:
     """The likeliest hypothesis with all that joints may have, less what it can spare.
 
     Args:
         search: to which all that is fitted is added.
-        most: at most so many effects; None: as many as the evidence asks for.
+        most: at most so many effects.
 
-    Returns None where fewer than two joints share an inertia, or `most` are too few for that.
+    Returns None where fewer than two joints share an inertia, or one effect is likelier.
     """
     joints = _joints(search)
     if len(joints) < 2:
         return None
     found = search.refined(_starts(search, joints), TO_THE_TOP, rivals=True)
-    if not found:
+    best = max(found, key=search.score, default=None)
+    if best is None or any(search.score(best) < search.score(f) for f in search.of_size(1)[:1]):
         return None
-    best = max(found, key=search.score)
+    best = _spared(search, best)
+    if len(best.hypothesis.effects) < 2 * len(joints) - 1:
+        return best  # one after the other, they would have been found too
+    if not simulated(search.data.model):
+        tune(search, [best])
+        best = max(search.of_size(len(best.hypothesis.effects)), key=search.score)
     search.structures(best)
-    best = _completed(search, _spared(search, best), (2 + BEYOND) * len(joints))
-    while most is not None and len(best.hypothesis.effects) > most:
-        best = _less(search, best, _losses(search, best).argmin())
-    return best
+    return shared(search, _completed(search, best, min(most, (2 + BEYOND) * len(joints))))
 
 
 def _joints(search: HypothesisSearch) -> list[tuple[Effect, Effect]]:
@@ -116,6 +127,21 @@ def _less(search: HypothesisSearch, fit: Fitted, index: int) -> Fitted:
     start = fit.hypothesis.minus(fit.hypothesis.names[index])
     found = search.refined([(start, fit.noise, fit.track)], AGAIN)
     return found[0] if found else fit
+
+
+def shared(search: HypothesisSearch, fit: Fitted) -> Fitted:
+    """With one delay, or one lag, of all inputs in the place of those of some, where that pays."""
+    h = fit.hypothesis
+    late = [(e, v) for e, v in h.pairs if e.family.name in LATE]
+    starts = []
+    for effect in search.candidates:
+        if late and effect.family.name in LATE and len(effect.site.targets) == search.data.model.m:
+            other, size = h, max(max(v.values()) for _, v in late)
+            for one, _ in late:
+                other = other.minus(one.name)
+            start = other.plus(effect, {effect.free[0].name: size})
+            starts.append((start, fit.noise, fit.track))
+    return max([fit, *search.refined(starts, TO_THE_TOP)], key=search.score)
 
 
 def _completed(search: HypothesisSearch, fit: Fitted, most: int) -> Fitted:

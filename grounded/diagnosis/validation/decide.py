@@ -25,7 +25,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from grounded.diagnosis.hypotheses.attribution import WHITE
 from grounded.diagnosis.hypotheses.counterpart import counterparts
 from grounded.diagnosis.hypotheses.explored import CLAIM, TIE, parametric
 from grounded.diagnosis.hypotheses.plainest import plainer
@@ -44,6 +43,7 @@ LEAST = 0.01  # gain that a cause must have in one channel
 PAYS = (2.0, LEAST)  # scatters that it must gain, and that
 ALONE = (1.0, LEAST)  # the same of the only effect, or of calibration, that is beyond doubt
 SURE = 8.0  # nats, odds of 3,000 to 1, from which an effect is likely beyond doubt
+WHITE = 0.9  # of a nat is believed where what is left is white noise
 BETTER = (2.0, 0.05)  # the same for a rival to take the place of a likelier hypothesis
 OVERRULES = (3.0, 0.1)  # and for a claim that is likely under another noise only
 SLIGHT = 0.02  # of what all causes gain, adopted ones too: less in each channel is not named

@@ -239,6 +239,8 @@ def verdict_lines(diagnosis: Diagnosis) -> tuple[list[str], list[str]]:
     causes, told = diagnosis.verdict.causes, list(diagnosis.verdict.lines)
     if len(causes) < 2:
         return [], told
+    if clauses := diagnosis.verdict.clauses:
+        return [f"{clause[:1].upper()}{clause[1:]}" for clause in clauses], told[1:]
     shares = (percent(one.share) for one in diagnosis.credit)
     return [
         f"{cause[:1].upper()}{cause[1:]} ({share} of the improvement)"

@@ -137,7 +137,7 @@ def _as_claimed(diagnosis: Diagnosis, table: ModelTable) -> bool:
 
 def _clause(entry: Mapping[str, Any], model: Model) -> str:
     """An adopted effect in words, with its values."""
-    from grounded.diagnosis.verdict import meaning
+    from grounded.diagnosis.cause_words import meaning
     from grounded_trials.workspace.adopted import installed_effects
 
     name, given = str(entry["name"]), {k: v for k, v in entry.items() if k != "name"}

@@ -1,0 +1,175 @@
+"""What each cause is in words: an effect with its numbers, and effects of one kind together."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from grounded.diagnosis.report import Estimate, quantity
+from grounded.model import Model
+from grounded.result import listed, number, percent
+
+if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
+    from grounded.effects import Effect
+
+AS_STRONG = 0.2  # of what is modelled: a turned input that is so near to it has the wrong sign
+TURNED = ": turn its sign in model.py, or if only the log counts so, with {log} scale = -1"
+MOST_DIGITS = 6  # of a value, however sure it is
+FEW = 3  # causes that are told one by one
+TOLD = 4  # clauses of more: of one kind together, the smallest are counted
+
+
+def give_or_take(estimate: Estimate) -> str:
+    """A value with its +-, as precise as that is: `1.5763 +- 0.0012 N/V`."""
+    value, std = estimate.value, estimate.std
+    if not (0 < std < math.inf and math.isfinite(value)):
+        return quantity(estimate)
+    places = math.floor(math.log10(max(abs(value), std))) - math.floor(math.log10(std)) + 2
+    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    return f"{value:.{min(max(places, 3), MOST_DIGITS)}g} +- {std:.2g}{unit}"
+
+
+GREEK = (
+    "alpha|beta|gamma|delta|epsilon|zeta|eta|theta|iota|kappa|lambda|mu|nu|xi|omicron|pi|rho|sigma"
+    "|tau|upsilon|phi|chi|psi|omega"
+)
+
+
+def called(model: Model, name: str) -> str:
+    """A state or an input in a sentence: `the speed v`, `the state delta`, `the throttle`.
+
+    Symbols get a word before them: what is short, Greek, or not letters alone.
+    """
+    from grounded.effects import places
+
+    roles = {
+        "speed": (places.speed(model),),
+        "heading": places.role(model, "heading"),
+        "heading rate": places.role(model, "heading_rate"),
+        "position": places.position(model),
+        "angle": model.angles,
+    }
+    word = next((role for role, played in roles.items() if name in played), "")
+    if not word and (len(name) <= 3 or re.fullmatch(GREEK, name) or not name.isalpha()):
+        word = "input" if name in model.input_names else "state"
+    return f"the {name}" if not word or name == word else f"the {word} {name}"
+
+
+def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
+    """The family's sentence with names and numbers filled in; starts with a small letter."""
+    from grounded.effects import ParamFamily
+
+    model, targets = effect.site.model, effect.site.targets
+    constants = {q.name: Estimate(q.start, 0.0, None, q.unit) for q in effect.quantities if q.fixed}
+    words = {name: quantity(e) for name, e in {**constants, **params}.items()}
+    words.setdefault("s", "s" if len(targets) == 1 else "")
+    driven, _, source = effect.site.target.partition("<-")
+    words["target"] = listed(called(model, n) for n in targets)
+    if isinstance(effect.family, ParamFamily):
+        words["target"] = effect.site.target
+    words |= {"log": "[log]", "driven": called(model, driven), "source": called(model, source)}
+
+    def filled(found: re.Match[str]) -> str:
+        name, percent, more, less = found.groups()
+        if percent is None or name not in params:
+            return words.get(name, found.group(0))
+        value = 100 * effect.family.ratio(name, params[name].value)
+        if more is None:
+            return f"{number(value)} %"
+        return f"{number(abs(value))} % {more if value >= 0 else less}"
+
+    told = {n for n, e in params.items() if e.value != 0 and not abs(e.value) <= e.std}
+
+    def kept(found: re.Match[str]) -> str:  # of quantities that are estimated and not about zero
+        parts = found[1].split(" & ")
+        known = [p for p in parts if {*re.findall(r"\{(\w)[%}]", p)} <= told]
+        return listed(known or (parts[1:] and parts[:1]))
+
+    own = isinstance(effect.family, ParamFamily) and effect.site.target in model.params
+    if own and "d" in params:
+        old = model.params[effect.site.target].value
+        new = give_or_take(params["d"].moved(old))
+        return f"the parameter {effect.site.target} should be {new} instead of {number(old)}"
+
+    if effect.known and "d" in params:
+        by, now = params["d"], params["d"].moved(effect.quantities[0].known)
+        more = f"{number(abs(by.value))} s {'less' if by.value < 0 else 'more'} than adopted"
+        return f"the delay of {words['target']} should be {give_or_take(now)}, {more}"
+
+    def signed(found: re.Match[str]) -> str:
+        name, positive, negative = found.groups()
+        less = name in params and params[name].value < 0
+        if less:
+            words[name] = words[name].removeprefix("-")
+        return negative if less else positive
+
+    text = re.sub(r"\[([^]]*)\]", kept, _turned(effect, params) or effect.family.sentence)
+    text = re.sub(r"\{(\w+)>([^{}|]+)\|([^{}|]+)\}", signed, text)
+    return re.sub(r"\{(\w+)(%)?(?:([^{}|]+)\|([^{}|]+))?\}", filled, text)
+
+
+def _turned(effect: Effect, params: Mapping[str, Estimate]) -> str:
+    """The sentence of a gain whose sign is the other one; "" where it isn't."""
+    from grounded.effects import InputFamily
+
+    text, size = effect.family.turned, -1 - params["g"].value if "g" in params else 0.0
+    if not text or size <= 0:
+        return ""
+    if abs(size - 1) < AS_STRONG:
+        return text + TURNED * isinstance(effect.family, InputFamily)
+    return f"{text} (by {number(100 * size)} % of what is modelled)"
+
+
+def clauses(
+    names: Sequence[str],
+    causes: Sequence[str],
+    shares: Sequence[float],
+    effects: Mapping[str, Effect],
+    values: Mapping[str, Mapping[str, Estimate]],
+) -> tuple[str, ...]:
+    """What the first sentence of a verdict tells, largest first, each with its share.
+
+    More than a FEW causes are told by kind: the friction of every joint in one clause.
+
+    Args:
+        names: of the causes, largest first.
+        causes: a clause each (`meaning`, what parameters moved).
+        shares: of what predictions gain.
+        effects: by name, those of the causes that are effects.
+        values: the estimates of each effect, by its name.
+    """
+    if len(names) < 2:
+        return tuple(causes)
+    if len(names) <= FEW:
+        return tuple(f"{c}{_share(share)}" for c, share in zip(causes, shares, strict=True))
+    kinds: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        own = effects.get(name)
+        alike = own is not None and not re.search(r"[%|>]", own.family.sentence)
+        kinds.setdefault(own.family.name if own is not None and alike else name, []).append(i)
+    groups = sorted(kinds.values(), key=lambda group: -sum(shares[i] for i in group))
+    told = groups if len(groups) <= TOLD + 1 else groups[:TOLD]
+    found = []
+    for first, *others in told:
+        same = [f", {_beside(effects[names[i]], values[names[i]])}" for i in others]
+        together = sum(shares[i] for i in (first, *others))
+        found.append(f"{causes[first]}{''.join(same)}{_share(together)}")
+    if rest := [i for group in groups[len(told) :] for i in group]:
+        left = _share(sum(shares[i] for i in rest))
+        found.append(f"{len(rest)} smaller causes{left}")
+    return tuple(found)
+
+
+def _share(share: float) -> str:
+    return f" ({percent(share)} of the improvement)"
+
+
+def _beside(effect: Effect, params: Mapping[str, Estimate]) -> str:
+    """What an effect adds to the sentence of another one of its family: `the base 0.45 N m`."""
+    driven, _, source = effect.site.target.partition("<-")
+    targets = [driven] if source else effect.site.targets
+    who = listed(called(effect.site.model, n) for n in targets)
+    told = {n: e for n, e in params.items() if e.value != 0 and not abs(e.value) <= e.std}
+    return f"{who} {listed(quantity(e) for e in (told or params).values())}"

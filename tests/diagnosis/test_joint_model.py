@@ -1,0 +1,108 @@
+"""All joints of an arm at once: what one effect after the other never finds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded.diagnosis.hypotheses import attribution
+from grounded.diagnosis.hypotheses.joint_model import joint_model, shared
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.effects import Library
+from grounded.models.pendulum import model as pendulum
+from grounded.trial import Trial
+from tests.effects.test_effects_joint import DT, PAIRS, arm, real_trials
+
+C, J = (0.25, 0.1), (0.3, 0.03)  # [N m], [kg m^2]
+
+
+def searched(model, trials):
+    data = prepare(model, trials)
+    candidates = Library().candidates(model, data.scales)
+    return HypothesisSearch(data, candidates, joints=Library().joints(model, data.scales))
+
+
+def of_all_joints(model, trials, alone=False):
+    """By effect, its values in the likeliest model of all joints; None without one."""
+    search = searched(model, trials)
+    with np.errstate(all="ignore"):
+        search.nulls()
+        if alone:
+            search.extended(search.best_null())
+        found = joint_model(search, 30)
+    return None if found is None else {e.name: values for e, values in found.hypothesis.pairs}
+
+
+def test_friction_and_inertia_of_every_joint_are_found_at_once():
+    values = of_all_joints(arm, real_trials(c=C, J=J))
+    for pair, dry, more in zip(PAIRS, C, J, strict=True):
+        assert values[f"joint_friction:{pair}"]["c"] == pytest.approx(dry, rel=0.1)
+        assert values[f"added_inertia:{pair}"]["J"] == pytest.approx(more, rel=0.1)
+    assert len(values) == 4
+
+
+def test_joints_that_are_as_modelled_are_left_out():
+    trials = real_trials(c=(0.0, 0.1))
+    assert set(of_all_joints(arm, trials)) == {f"joint_friction:{PAIRS[1]}"}
+    assert of_all_joints(arm, trials, alone=True) is None
+
+
+def test_one_delay_of_all_motors_takes_the_place_of_one_each():
+    late = late_by_a_step()
+    search = searched(arm, late)
+    with np.errstate(all="ignore"):
+        each = search.fresh(Hypothesis())
+        for name, size in (("delay:t1", 0.01), ("first_order_lag:t2", 0.01)):
+            effect = Library().effect(name, arm, search.data.scales)
+            each = search.fresh(each[0].plus(effect, {effect.free[0].name: size}))
+        (fit,) = search.refined([each], 12)
+        found = shared(search, fit)
+    assert found.hypothesis.names in (("delay:t1+t2",), ("first_order_lag:t1+t2",))
+
+
+def late_by_a_step():
+    return [
+        replace(trial, inputs=np.vstack([trial.inputs[1:], trial.inputs[-1:]])).until(
+            trial.known_steps - 1
+        )
+        for trial in real_trials(c=C, J=J)
+    ]
+
+
+def test_what_all_motors_share_is_found_beside_the_joints():
+    values = of_all_joints(arm, late_by_a_step())
+    late = {"delay:t1+t2", "first_order_lag:t1+t2"} & set(values)  # smooth commands can't tell
+    assert len(late) == 1 and len(values) == 5
+    assert list(values[late.pop()].values()) == pytest.approx([DT], rel=0.1)
+
+
+def test_a_single_joint_has_no_such_start():
+    trial = Trial(
+        np.zeros((41, 2)),
+        np.random.default_rng(0).standard_normal((40, 1)),
+        0.05,
+        pendulum.state_names,
+        pendulum.input_names,
+    )
+    assert of_all_joints(pendulum, [trial]) is None
+
+
+def test_a_search_grows_from_all_joints_where_no_effect_alone_is_nearly_as_likely(monkeypatch):
+    trials = real_trials(c=C, J=J)
+    data = prepare(arm, trials)
+    candidates = Library().candidates(arm, data.scales)
+    joints = Library().joints(arm, data.scales)
+    asked = []
+
+    def spied(search, most):
+        asked.append(most)
+        return joint_model(search, most)
+
+    monkeypatch.setattr(attribution, "joint_model", spied)
+    _, best = attribution.attribute(data, candidates, joints=joints)
+    assert asked and len(best.hypothesis.effects) == 4
+    asked.clear()
+    _, best = attribution.attribute(data, candidates, joints=joints, max_effects=2)
+    assert not asked and len(best.hypothesis.effects) == 2
