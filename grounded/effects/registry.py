@@ -38,17 +38,12 @@ from grounded.effects.family import (
 from grounded.effects.sensed import moved_model
 from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
-from grounded.model import Model, Param
-
-
-def _bounds(param: Param) -> tuple[float, float]:
-    low = -np.inf if param.low is None else param.low
-    return low, np.inf if param.high is None else param.high
+from grounded.model import Model
 
 
 def _shift(site: Site) -> tuple[Quantity, ...]:
     param = site.model.params[site.target]
-    low, high = _bounds(param)
+    low, high = param.reach
     return (Quantity("d", param.unit, low=low - param.value, high=high - param.value),)
 
 
@@ -261,6 +256,6 @@ def _free(model: Model, name: str) -> bool:
     param = model.params[target]
     if not param.uncertain:
         return False
-    low, high = _bounds(param)
+    low, high = param.reach
     ends = (0.5 * param.value, 2 * param.value) if param.value else (-0.05, 0.05)
     return bool(low <= min(ends) and high >= max(ends))

@@ -123,7 +123,7 @@ def _explore(search: HypothesisSearch, most: int) -> Fitted:
     search.finished(singles[:SHORTLIST], 8, rivals=True)
     if most > USUAL_EFFECTS and (whole := joint_model(search, most)) is not None:
         more = search.score(whole) - search.score(search.of_size(1)[0])
-        if more > LARGE_GAIN and len(whole.hypothesis.effects) > 2:
+        if more > LARGE_GAIN:
             return whole
     search.again(search.of_size(1)[: RESTARTED if search.data.model.n <= LARGE else 2])
     sweep(search)

@@ -28,6 +28,7 @@ from grounded.diagnosis.hypotheses.search import (
 )
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.effects import Effect
 from grounded.effects.family import coupled
@@ -35,6 +36,7 @@ from grounded.effects.joint import added_inertia
 from grounded.frozen import Array
 
 STICKING = (0.03, 0.2)  # of an input's peak: dry frictions from which all joints start
+MANY = 3  # joints, and effects, from which a search that adds one at a time may not get there
 AGAIN = 8  # iterations after an effect was taken out or added
 BEYOND = 2  # effects of each joint that may be added
 LATE = ("delay", "first_order_lag")  # what motors on one bus, of one kind, have in common
@@ -48,23 +50,27 @@ def joint_model(search: HypothesisSearch, most: int) -> Fitted | None:
         search: to which all that is fitted is added.
         most: at most so many effects.
 
-    Returns None where fewer than two joints share an inertia, or one effect is likelier.
+    Returns None where fewer than MANY joints share an inertia (of a simulator, which is slow, two),
+    one effect is likelier, or less than MANY effects are needed.
     """
     joints = _joints(search)
-    if len(joints) < 2:
+    if len(joints) < (2 if simulated(search.data.model) else MANY):
         return None
     found = search.refined(_starts(search, joints), TO_THE_TOP, rivals=True)
     best = max(found, key=search.score, default=None)
-    if best is None or any(search.score(best) < search.score(f) for f in search.of_size(1)[:1]):
+    if best is None:
+        return None
+    best = _coloured(search, best)
+    if any(search.score(best) < search.score(single) for single in search.of_size(1)[:1]):
         return None
     best = _spared(search, best)
-    if len(best.hypothesis.effects) < 2 * len(joints) - 1:
-        return best  # one after the other, they would have been found too
+    if len(best.hypothesis.effects) < MANY:
+        return None  # one after the other, they are found too
     if not simulated(search.data.model):
         tune(search, [best])
         best = max(search.of_size(len(best.hypothesis.effects)), key=search.score)
-    search.structures(best)
-    return shared(search, _completed(search, best, min(most, (2 + BEYOND) * len(joints))))
+    best = _completed(search, best, min(most, (2 + BEYOND) * len(joints)))
+    return _coloured(search, shared(search, best))
 
 
 def _joints(search: HypothesisSearch) -> list[tuple[Effect, Effect]]:
@@ -79,20 +85,34 @@ def _joints(search: HypothesisSearch) -> list[tuple[Effect, Effect]]:
 
 
 def _starts(search: HypothesisSearch, joints: Sequence[tuple[Effect, Effect]]) -> list[Start]:
-    """All joints with little and with much friction, with the parameters as they are and free."""
+    """All joints with little and with much friction, parameters free or not, with a lag or none."""
     data = search.data
     bare, spreads = Hypothesis(), [0.0]
     if param_scale(data.model).any():
         spreads.append(CRUDE)
     starts = []
-    for part, spread in product(STICKING, spreads):
+    together = [e for e in search.candidates if e.family.name == LATE[1]]
+    together = [e for e in together if len(e.site.targets) == data.model.m]
+    for part, spread, late in product(STICKING, spreads, [None, *together]):
         h = Hypothesis(shift=np.zeros(data.model.system.k), spread=spread) if spread else bare
+        h = h if late is None else h.plus(late, {late.free[0].name: 2 * data.dt})
         for friction, inertia in joints:
             dry = part * data.scales.peak(coupled(friction.site)[0])
             h = h.plus(friction, {q.name: dry * (q.name == "c") for q in friction.free})
             h = h.plus(inertia, {"J": OWN * _own(inertia)})
         starts.append(search.fresh(h))
     return starts
+
+
+def _coloured(search: HypothesisSearch, fit: Fitted) -> Fitted:
+    """Under the noise, white or of another correlation time, under which it is likeliest."""
+    own, dt = fit.noise.structure, search.data.dt
+    found = [fit]
+    for tau in search.taus:
+        if tau != own.tau:
+            noise = fit.noise.allowing(Structure(tau), dt)
+            found += search.refined([(fit.hypothesis, noise, fit.track)], AGAIN)
+    return max(found, key=search.score)
 
 
 def _own(inertia: Effect) -> float:
@@ -147,7 +167,7 @@ def shared(search: HypothesisSearch, fit: Fitted) -> Fitted:
 def _completed(search: HypothesisSearch, fit: Fitted, most: int) -> Fitted:
     """With what the joints alone don't do: a lag of all motors, one that is weaker."""
     while len(fit.hypothesis.effects) < most:
-        further = search.extended(fit, iterations=AGAIN)
+        further = search.extended(fit, iterations=AGAIN, late=False)
         best = max(further, key=search.score, default=fit)
         best = max(search.refined([best], TO_THE_TOP), key=search.score, default=best)
         if search.score(best) < search.score(fit) + CLAIM:

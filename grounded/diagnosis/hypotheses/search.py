@@ -257,12 +257,14 @@ class HypothesisSearch(FittedHypotheses):
         others = [look for _, look in worth if not isinstance(look.effect.family, ParamFamily)]
         return others[:count] + params[: count // 2]
 
-    def extended(self, fit: Fitted, count: int = 0, iterations: int = 7) -> list[Fitted]:
-        """The fit with each shortlisted effect added, refined."""
-        starts = self.one_more(fit, count or self.most)
+    def extended(
+        self, fit: Fitted, count: int = 0, iterations: int = 7, *, late: bool = True
+    ) -> list[Fitted]:
+        """The fit with each shortlisted effect added, refined; late: states late together, too."""
+        starts = self.one_more(fit, count or self.most, late=late)
         return self.refined([fit, *starts], iterations, rivals=True)[1:]
 
-    def one_more(self, fit: Fitted, count: int) -> list[Start]:
+    def one_more(self, fit: Fitted, count: int, *, late: bool = True) -> list[Start]:
         """Where a fit with each shortlisted effect added starts."""
         starts: list[Start] = []
         for look in self.shortlist(fit, count):
@@ -274,7 +276,7 @@ class HypothesisSearch(FittedHypotheses):
             if isinstance(look.effect.family, SensorLagFamily):
                 # what passes a filter is far quicker than what it shows: so is its noise
                 starts.append(self.anew(fit, look.effect, look.values))
-        for effect in self.together:
+        for effect in self.together if late else ():
             if not delayed([effect]) & delayed(fit.hypothesis.effects):
                 starts += [self.anew(fit, effect, {"d": d}) for d in effect.free[0].grid[LATE]]
         return starts
