@@ -10,7 +10,8 @@
 |                        | frame of that pose; `wrist_wx _wy _wz`: angular velocity, body frame   |
 | free joint `torso`     | `torso_x _y _z`, `torso_rx ...`, `torso_vx ...`, `torso_wx ...`        |
 | actuator activation    | `motor_act`                                                            |
-| actuator `motor`       | input `motor` (`motor_ctrl` where a state has that name)               |
+| actuator `motor`       | input `motor` (`motor_ctrl` where a state has that name); in N m or N  |
+|                        | where it is the force itself: gear and gain 1                          |
 | joint torque           | input `elbow_torque`, `slider_force`                                   |
 | parameter "pole.mass"  | `pole_mass`                                                            |
 

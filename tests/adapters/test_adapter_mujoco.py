@@ -116,6 +116,13 @@ def test_pendulum_has_the_names_units_angles_and_limits_of_the_file() -> None:
     assert adapter.model(PENDULUM, params={"pole.mass": (0.5, 2)}).params["pole_mass"].high == 2
 
 
+def test_a_motor_whose_control_is_its_force_has_the_unit_of_one() -> None:
+    assert dict(adapter.model(PENDULUM.replace(' gear="3"', "")).inputs) == {"motor": "N m"}
+    assert dict(adapter.model(CART_POLE).inputs) == {"force": "N"}
+    servo = PENDULUM.replace('<motor name="motor"', '<position name="motor" kp="5"')
+    assert dict(adapter.model(servo.replace(' gear="3"', "")).inputs) == {"motor": "1"}
+
+
 def test_pendulum_swings_as_the_equation_says() -> None:
     model = adapter.model(PENDULUM, timestep=1e-4)
     x = np.array([0.3, -0.2])

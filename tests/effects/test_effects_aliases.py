@@ -60,3 +60,16 @@ def test_a_gain_that_only_resembles_a_parameter_is_kept():
     """The speed rises with tau_v but brakes with a4: no one parameter scales both."""
     assert "rate_gain:v" not in aliases(car, ["psi_rate"])
     assert "rate_gain:v" in names(car)
+
+
+def test_a_parameter_that_is_blamed_goes_no_further_than_its_std_lets_it():
+    """A measured length of 0.2 m was told as 0.042 m, by thousands of nats of a wrong model."""
+    known = Model(
+        states={"v": "m/s"},
+        inputs={"u": "N"},
+        params={"m": Param(2.0, "kg", std=0.1), "k": Param(1.0, "1", 0.2, 3.0)},
+        derivative=lambda s, a, p: {"v": (p.k * a.u - s.v) / p.m},
+    )
+    m, k = (Library().effect(f"parameter:{name}", known).quantities[0] for name in "mk")
+    assert (m.low, m.high) == pytest.approx((-0.3, 0.3))
+    assert (k.low, k.high) == pytest.approx((-0.8, 2.0))

@@ -38,7 +38,7 @@ from grounded.frozen import Array
 STICKING = (0.03, 0.2)  # of an input's peak: dry frictions from which all joints start
 MANY = 3  # joints, and effects, from which a search that adds one at a time may not get there
 AGAIN = 8  # iterations after an effect was taken out or added
-BEYOND = 2  # effects of each joint that may be added
+BEYOND = 4  # effects that are added at most to those of the joints
 LATE = ("delay", "first_order_lag")  # what motors on one bus, of one kind, have in common
 OWN = 0.3  # of a joint's own inertia: what is added at the start
 
@@ -69,7 +69,7 @@ def joint_model(search: HypothesisSearch, most: int) -> Fitted | None:
     if not simulated(search.data.model):
         tune(search, [best])
         best = max(search.of_size(len(best.hypothesis.effects)), key=search.score)
-    best = _completed(search, best, min(most, (2 + BEYOND) * len(joints)))
+    best = _completed(search, best, min(most, len(best.hypothesis.effects) + BEYOND))
     return _coloured(search, shared(search, best))
 
 
