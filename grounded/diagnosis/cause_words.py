@@ -80,7 +80,7 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
             return f"{number(value)} %"
         return f"{number(abs(value))} % {more if value >= 0 else less}"
 
-    told = {n for n, e in params.items() if e.value != 0 and not abs(e.value) <= e.std}
+    told = set(_told(params))
 
     def kept(found: re.Match[str]) -> str:  # of quantities that are estimated and not about zero
         parts = found[1].split(" & ")
@@ -144,11 +144,12 @@ def clauses(
         return tuple(causes)
     if len(names) <= FEW:
         return tuple(f"{c}{_share(share)}" for c, share in zip(causes, shares, strict=True))
-    kinds: dict[str, list[int]] = {}
+    kinds: dict[tuple[str, ...], list[int]] = {}
     for i, name in enumerate(names):
         own = effects.get(name)
         alike = own is not None and not re.search(r"[%|>]", own.family.sentence)
-        kinds.setdefault(own.family.name if own is not None and alike else name, []).append(i)
+        key = (own.family.name, *_told(values[name])) if own is not None and alike else (name,)
+        kinds.setdefault(key, []).append(i)
     groups = sorted(kinds.values(), key=lambda group: -sum(shares[i] for i in group))
     told = groups if len(groups) <= TOLD + 1 else groups[:TOLD]
     found = []
@@ -171,5 +172,10 @@ def _beside(effect: Effect, params: Mapping[str, Estimate]) -> str:
     driven, _, source = effect.site.target.partition("<-")
     targets = [driven] if source else effect.site.targets
     who = listed(called(effect.site.model, n) for n in targets)
-    told = {n: e for n, e in params.items() if e.value != 0 and not abs(e.value) <= e.std}
-    return f"{who} {listed(quantity(e) for e in (told or params).values())}"
+    told = [params[name] for name in _told(params)] or list(params.values())
+    return f"{who} {listed(map(quantity, told))}"
+
+
+def _told(params: Mapping[str, Estimate]) -> list[str]:
+    """The quantities that are not about zero."""
+    return [n for n, e in params.items() if e.value != 0 and not abs(e.value) <= e.std]

@@ -81,7 +81,7 @@ def verdict(
     )
     words = [sentence(told), improvement(rows), worsened(rows)]
     words += [runaway(rows), wider(claims.parameters())]
-    words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed], _off(claims))
+    words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed])
     words += [f"{told_apart(group, same)}." for group in groups[:1]]
     words += [one.sentence() for one in claims.one_clock[:1]]
     more = 0
@@ -216,7 +216,7 @@ def next_trial(
         return f"Nothing is tied, but predictions get worse with {_it(claims)}: {REPEAT}."
     if further:
         return "None is needed yet: nothing is tied, and more effects have to be looked for first."
-    if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names, _off(claims)):
+    if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names):
         return "Nothing is tied: give the model a parameter for a load, then diagnose again."
     if ended:
         return AT_BOUNDS

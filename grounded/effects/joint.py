@@ -171,15 +171,15 @@ def alone(model: Model, tau: str, w: str) -> bool:
 GAINS = ("input_gain", "rate_gain", "added_inertia")
 
 
-def like_a_load(model: Model, names: Collection[str], moved: Collection[str] = ()) -> bool:
+def like_a_load(model: Model, names: Collection[str]) -> bool:
     """Whether two at least of these effects change the inertia of joints that share one.
 
     Each alone is a gear, a motor. What an arm carries, or a link's mass that is off, is in all of
-    the inertia matrix and in gravity: without a parameter for it, gains stand in its place. With
-    one among those that `moved` they are what they say.
+    the inertia matrix and in gravity: without a parameter for it, gains stand in its place. Where
+    an uncertain parameter changes the inertia, that was free beside them: they are what they say.
     """
     gains = {name for name in names if name.partition(":")[0] in GAINS}
-    if len(gains) < 2 or any(_of_inertia(model, name) for name in moved):
+    if len(gains) < 2 or any(_of_inertia(model, name) for name in model.uncertain):
         return False
     coupled = [pair.split("<-") for pair in pairs_of(model)]
     coupled = [pair for pair in coupled if not alone(model, *pair)]
@@ -190,8 +190,6 @@ def like_a_load(model: Model, names: Collection[str], moved: Collection[str] = (
 
 def _of_inertia(model: Model, name: str) -> bool:
     """Whether a parameter changes what inputs accelerate."""
-    if name not in model.param_names:
-        return False
     dt, (x, u) = places.probe(model, 1e-2), places.samples(model, 8)
     other = model.values.copy()
     other[model.param_names.index(name)] *= 1 + SOME
@@ -211,10 +209,12 @@ def renamed(model: Model) -> dict[str, str]:
 
 
 def one_friction(one: Effect, other: Effect) -> bool:
-    """Whether both describe the dry friction of one motion, which no model has twice."""
-    dry = {"coulomb_friction", joint_friction.name, load_friction.name}
+    """Whether both describe the friction, dry or viscous, of one motion: no model has it twice."""
     (a, of), (b, at) = ((e.family.name, e.site.target.rpartition("<-")[2]) for e in (one, other))
-    return {a, b} <= dry and of == at
+    joints = {joint_friction.name, load_friction.name}
+    if of == at and "viscous_friction" in (a, b) and joints & {a, b}:
+        return any(q.name == "b" for e in (one, other) for q in e.free)
+    return {a, b} <= joints | {"coulomb_friction"} and of == at
 
 
 joint_friction = LossFamily(

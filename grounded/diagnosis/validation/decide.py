@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 from grounded.diagnosis.hypotheses.counterpart import counterparts
 from grounded.diagnosis.hypotheses.explored import CLAIM, TIE, parametric
 from grounded.diagnosis.hypotheses.plainest import plainer
-from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
+from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.validation.motions import of_no_size, repeats
@@ -196,8 +196,9 @@ def _pays(
 
     A second ahead noise that has added up hides what single steps show. So where nothing but white
     noise is left, a further effect that is likely beyond doubt, and not for one trial alone, need
-    only gain anything; so need any effect that single steps of several trials bear out. Where more
-    is left, thousands of nats are no certainty.
+    only gain anything; so need any effect that single steps of several trials bear out, and one
+    that they bear out by far need only not lose. Where more is left, thousands of nats are no
+    certainty.
     """
     gain, effects = ruler.gain(before, after), len(after.hypothesis.effects)
     sure = search.score(after) - search.score(before) > SURE
@@ -215,8 +216,10 @@ def _pays(
         return False
     if further and gain.mean > 0 and _in_several(search, after, new):
         return True
-    near = gain.mean > 0 and gain.pieces.sum() > 0
-    return bool(near) and borne_out(search, before, after)
+    if gain.mean > 0 and gain.pieces.sum() > 0:
+        return borne_out(search, before, after)
+    # of few pieces the values without one of them may predict an arm's fall no better
+    return gain.mean > -gain.scatter and borne_out(search, before, after, LARGE_GAIN)
 
 
 def _as_given(fit: Fitted, names: set[str]) -> bool:

@@ -26,11 +26,16 @@ from grounded.frozen import Array
 SAME_SAMPLES = 1e-6  # of a likelihood: what a delayed sensor's first samples add is more
 
 
-def borne_out(search: FittedHypotheses, before: Fitted, after: Fitted) -> bool:
-    """Whether the trials would claim `after` rather than `before` without any one of them."""
+def borne_out(
+    search: FittedHypotheses, before: Fitted, after: Fitted, least: float = CLAIM
+) -> bool:
+    """Whether trials would claim `after` rather than `before` without any one of them.
+
+    least: by more than so many nats.
+    """
     paid = search.paid(after.hypothesis) - search.paid(before.hypothesis)
     nats = search.tempering.factor * left_out(search.predictor, before, after)
-    return len(nats) > 1 and float(nats.min(initial=np.inf)) - paid > CLAIM
+    return len(nats) > 1 and float(nats.min(initial=np.inf)) - paid > least
 
 
 def left_out(predictor: Predictor, before: Fitted, after: Fitted) -> Array:

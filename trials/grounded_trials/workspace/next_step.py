@@ -230,7 +230,7 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     undone = {*declined(workspace)}  # whoever did that is not asked to do it again
     late = tuple(name for name in late_open(workspace, diagnosis) if name not in undone)
     claimed = diagnosis.kind in ("effect", "several") and not diagnosis.contested
-    if not claimed or {*new} <= undone or _like_a_load(workspace, diagnosis, new):
+    if not claimed or {*new} <= undone or _like_a_load(workspace, new):
         return NextCommand("adopt", late) if late else None
     if most := diagnosis.verdict.look_for:
         return _with_more(most, diagnosis.made or Made())
@@ -247,13 +247,13 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     return NextCommand("adopt", (*new, *late))
 
 
-def _like_a_load(workspace: Folder, diagnosis: Diagnosis, effects: Sequence[str]) -> bool:
+def _like_a_load(workspace: Folder, effects: Sequence[str]) -> bool:
     """Whether they stand in the place of a load, for which the model wants a parameter."""
     if len(effects) < 2:  # and nothing is imported
         return False
     from grounded.effects.joint import like_a_load
 
-    return like_a_load(workspace.planner.plan.model, effects, diagnosis.verdict.parameters)
+    return like_a_load(workspace.planner.plan.model, effects)
 
 
 def late_open(workspace: Folder, diagnosis: Diagnosis) -> tuple[str, ...]:
