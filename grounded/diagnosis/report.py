@@ -38,11 +38,10 @@ Kind = Literal["effect", "several", "none", "unknown"]
 class Verdict(Document):
     """The answer: its kind, the effects that it claims, and why.
 
-    `sentences` is a line each and `sentence` their join; the first is made of `clauses`. `causes`
-    is a clause each in the order of `Diagnosis.credit`; where they are many, `clauses` tells those
-    of one kind together. `parameters` are the model's own that it calls off, beside
-    effects or alone. `look_for` is how many effects to look for before any is adopted, where as
-    many as were looked for leave more than noise; 0 where none need be.
+    `sentences` is a line each, `sentence` their join; the first is made of `clauses`, which tell
+    many `causes` (a clause each, in the order of `Diagnosis.credit`) by kind. `parameters` are the
+    model's own that it calls off, beside effects or alone. `look_for` is how many effects to look
+    for before any is adopted, where as many as were looked for leave more than noise; else 0.
     """
 
     kind: str  # one of `Kind`
