@@ -173,9 +173,11 @@ def test_an_interrupt_at_any_moment_leaves_no_traceback(folder: Path) -> None:
             stderr=subprocess.PIPE,
             text=True,
         )
-        time.sleep(0.05 + 0.05 * k)  # Python's own start is out of our hands
+        time.sleep(0.05 + 0.05 * k)
         child.send_signal(signal.SIGINT)
         _, err = child.communicate()
+        if "init_import_site" in err:  # Python's own start is out of our hands
+            continue
         assert "Traceback" not in err or "<string>" not in err, err
         assert child.returncode in (0, 130, -signal.SIGINT), (child.returncode, err)
 
