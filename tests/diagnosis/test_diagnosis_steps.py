@@ -124,6 +124,10 @@ def test_what_steps_of_several_trials_bear_out_need_not_stand_out_a_second_ahead
     assert not pays(bare, rubs, Coarse(0.01), white=False)
     assert not pays(bare, rubs, Coarse(-0.01))  # worse
     assert not pays(bare, rubs, Coarse(0.01, largest=0.001))  # nothing that matters
+    with monkeypatch.context() as one_log:
+        one_log.setattr(type(search.data), "count", property(lambda data: 1))
+        assert pays(bare, rubs, Coarse(-0.01))  # of its pieces: no worse than by chance
+        assert not pays(bare, rubs, Coarse(-2.0))
     monkeypatch.setattr(search, "tempering", Tempering(1e-6))
     assert not pays(bare, rubs, Coarse(0.01))
 

@@ -196,9 +196,9 @@ def _pays(
 
     A second ahead noise that has added up hides what single steps show. So where nothing but white
     noise is left, a further effect that is likely beyond doubt, and not for one trial alone, need
-    only gain anything; so need any effect that single steps of several trials bear out, and one
-    that they bear out by far need only not lose. Where more is left, thousands of nats are no
-    certainty.
+    only gain anything; so need any effect that single steps of several trials bear out, and of one
+    long log one that those of its pieces bear out by far need only not lose. Where more is left,
+    thousands of nats are no certainty.
     """
     gain, effects = ruler.gain(before, after), len(after.hypothesis.effects)
     sure = search.score(after) - search.score(before) > SURE
@@ -218,8 +218,9 @@ def _pays(
         return True
     if gain.mean > 0 and gain.pieces.sum() > 0:
         return borne_out(search, before, after)
-    # of few pieces the values without one of them may predict an arm's fall no better
-    return gain.mean > -gain.scatter and borne_out(search, before, after, LARGE_GAIN)
+    # of one log the values without one of its pieces may predict an arm's fall no better
+    alone = search.data.count == 1 and gain.mean > -gain.scatter
+    return alone and borne_out(search, before, after, LARGE_GAIN)
 
 
 def _as_given(fit: Fitted, names: set[str]) -> bool:
