@@ -143,7 +143,7 @@ def clauses(
     if len(names) < 2:
         return tuple(causes)
     if len(names) <= FEW:
-        return tuple(f"{c}{_share(share)}" for c, share in zip(causes, shares, strict=True))
+        return tuple(map(with_share, causes, shares))
     kinds: dict[tuple[str, ...], list[int]] = {}
     for i, name in enumerate(names):
         own = effects.get(name)
@@ -156,15 +156,15 @@ def clauses(
     for first, *others in told:
         same = [f", {_beside(effects[names[i]], values[names[i]])}" for i in others]
         together = sum(shares[i] for i in (first, *others))
-        found.append(f"{causes[first]}{''.join(same)}{_share(together)}")
+        found.append(with_share(f"{causes[first]}{''.join(same)}", together))
     if rest := [i for group in groups[len(told) :] for i in group]:
-        left = _share(sum(shares[i] for i in rest))
-        found.append(f"{len(rest)} smaller causes{left}")
+        found.append(with_share(f"{len(rest)} smaller causes", sum(shares[i] for i in rest)))
     return tuple(found)
 
 
-def _share(share: float) -> str:
-    return f" ({percent(share)} of the improvement)"
+def with_share(clause: str, share: float) -> str:
+    """A clause and what it is worth of all that predictions gain."""
+    return f"{clause} ({percent(share)} of the improvement)"
 
 
 def _beside(effect: Effect, params: Mapping[str, Estimate]) -> str:

@@ -30,7 +30,7 @@ from grounded.model import Model
 ALIKE = 0.999  # cosine from which two slopes are one
 ONLY = 2e-3  # of a speed's answer: what an input may do besides
 TURNS = 4  # times as many samples where axes stand anywhere
-SOME = 0.1  # of a parameter, to see what it does
+SOME = 0.1  # of a parameter's uncertainty, to see what it does
 FORCES = ("N", "V", "A")  # what a unit of an effort begins with: N m, V ...
 
 
@@ -179,7 +179,7 @@ def like_a_load(model: Model, names: Collection[str]) -> bool:
     an uncertain parameter changes the inertia, that was free beside them: they are what they say.
     """
     gains = {name for name in names if name.partition(":")[0] in GAINS}
-    if len(gains) < 2 or any(_of_inertia(model, name) for name in model.uncertain):
+    if len(gains) < 2 or _uncertain_inertia(model):
         return False
     coupled = [pair.split("<-") for pair in pairs_of(model)]
     coupled = [pair for pair in coupled if not alone(model, *pair)]
@@ -188,13 +188,17 @@ def like_a_load(model: Model, names: Collection[str]) -> bool:
     return len(said & gains) > 1
 
 
-def _of_inertia(model: Model, name: str) -> bool:
-    """Whether a parameter changes what inputs accelerate."""
+def _uncertain_inertia(model: Model) -> bool:
+    """Whether an uncertain parameter, be it zero, changes what inputs accelerate."""
     dt, (x, u) = places.probe(model, 1e-2), places.samples(model, 8)
-    other = model.values.copy()
-    other[model.param_names.index(name)] *= 1 + SOME
-    before, after = (model.system.linearise(x, u, p, dt)[1] for p in (model.values, other))
-    return bool(np.abs(after - before).max() > ONLY * SOME * np.abs(before).max())
+
+    def pushes(values: Array) -> Array:
+        return np.asarray(model.system.linearise(x, u, values, dt)[1])
+
+    before, spreads = pushes(model.values), [p.spread for p in model.params.values()]
+    moved = [step for step in np.diag(SOME * np.array(spreads)) if step.any()]
+    most = ONLY * SOME * np.abs(before).max()
+    return any(np.abs(pushes(model.values + step) - before).max() > most for step in moved)
 
 
 def renamed(model: Model) -> dict[str, str]:

@@ -41,7 +41,7 @@ def of_all_joints(model, trials, alone=False):
         search.nulls()
         if alone:
             search.extended(search.best_null())
-        found = joint_model(search, 30)
+        found = joint_model(search)
     return None if found is None else {e.name: values for e, values in found.hypothesis.pairs}
 
 
@@ -117,9 +117,9 @@ def test_a_search_grows_from_all_joints_where_no_effect_alone_is_nearly_as_likel
     joints = Library().joints(arm, data.scales)
     asked = []
 
-    def spied(search, most):
-        asked.append(most)
-        return joint_model(search, most)
+    def spied(search):
+        asked.append(search)
+        return joint_model(search)
 
     monkeypatch.setattr(attribution, "joint_model", spied)
     _, best = attribution.attribute(data, candidates, joints=joints)

@@ -1,6 +1,7 @@
 """What a motion takes off the input that drives it: in small steps, wrapped, and in MuJoCo."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -101,6 +102,12 @@ def test_gains_of_several_joints_of_an_arm_are_like_a_load():
     assert like_a_load(known, gains)
     assert not like_a_load(known, [f"input_gain:{tau}", f"joint_friction:{PAIRS[1]}"])
     assert not like_a_load(arm, gains)  # its mass was free beside them
+    load = replace(
+        arm,
+        params={"m2": Param(1.0, "kg"), "load": Param(0.0, "kg", std=0.3)},
+        derivative=lambda s, a, p: dynamics(s, a, SimpleNamespace(m2=p.m2 + p.load)),
+    )
+    assert not like_a_load(load, gains)  # nor one that is zero in the model
     assert not like_a_load(pendulum, ["input_gain:torque", "rate_gain:omega"])
 
 

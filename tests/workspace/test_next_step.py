@@ -165,8 +165,7 @@ def test_gains_in_the_place_of_a_load_are_not_offered(cart, tmp_path, monkeypatc
     names = two_claimed(folder)
     asked = []
     monkeypatch.setattr(
-        "grounded.effects.joint.like_a_load",
-        lambda model, given: asked.append(given) or True,
+        "grounded.effects.joint.like_a_load", lambda model, given: asked.append(given) or True
     )
     assert last(grounded("-C", folder, "status")) == "grounded export best --runner"
     assert asked and set(asked[0]) == set(names)

@@ -33,7 +33,6 @@ from grounded.progress import interruptible
 from grounded.result import listed
 
 USUAL_EFFECTS = 3  # that are looked for at first
-MOST_OF_JOINTS = 30  # the same, of joints that share an inertia: friction and inertia of each
 HOPEFUL = 4  # larger sets that are fitted to the end
 TUNED = 2  # sets whose constants are set by the data
 FORETOLD = (2.0, 0.05)  # scatters, and least gain, from which what predicts better is grown too
@@ -65,7 +64,7 @@ def attribute(
         np.errstate(all="ignore"),  # a hypothesis that diverges scores minus infinity
         interruptible(lambda: so_far(search, most)),
     ):
-        search, best = _searched(search, max_effects or MOST_OF_JOINTS)
+        search, best = _searched(search, any_number=max_effects is None)
         return search, grown(search, best, max(most, len(best.hypothesis.effects)))
 
 
@@ -97,20 +96,21 @@ def so_far(search: HypothesisSearch, most: int, decided: Sequence[str] | None = 
     )
 
 
-def _searched(search: HypothesisSearch, most: int) -> tuple[HypothesisSearch, Fitted]:
+def _searched(search: HypothesisSearch, *, any_number: bool) -> tuple[HypothesisSearch, Fitted]:
     """Where to grow from, the likeliest; with outliers in the data, the best with their weights."""
     search.nulls()
-    best = _explore(search, most)
+    best = _explore(search, any_number=any_number)
     if outliers(best):
         search = search.with_weights(clean(search.predictor, best))
-        best = _explore(search, most)
+        best = _explore(search, any_number=any_number)
     return search, best
 
 
-def _explore(search: HypothesisSearch, most: int) -> Fitted:
+def _explore(search: HypothesisSearch, *, any_number: bool) -> Fitted:
     """The best hypothesis of one effect, or without when there is none to try.
 
-    Where no one effect is nearly as likely as what all joints do together (at most `most`), that.
+    Where any number may be blamed, and none alone is nearly as likely as what all joints do
+    together, that.
     """
     null = search.best_null()
     plain = search.fits.get((Structure(), 0.0, ()), null)
@@ -121,7 +121,7 @@ def _explore(search: HypothesisSearch, most: int) -> Fitted:
         return null
     # a large effect has a long way from its first look
     search.finished(singles[:SHORTLIST], 8, rivals=True)
-    if most > USUAL_EFFECTS and (whole := joint_model(search, most)) is not None:
+    if any_number and (whole := joint_model(search)) is not None:
         more = search.score(whole) - search.score(search.of_size(1)[0])
         if more > LARGE_GAIN:
             return whole

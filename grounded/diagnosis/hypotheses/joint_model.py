@@ -43,15 +43,12 @@ LATE = ("delay", "first_order_lag")  # what motors on one bus, of one kind, have
 OWN = 0.3  # of a joint's own inertia: what is added at the start
 
 
-def joint_model(search: HypothesisSearch, most: int) -> Fitted | None:
+def joint_model(search: HypothesisSearch) -> Fitted | None:
     """The likeliest hypothesis with all that joints may have, less what it can spare.
 
-    Args:
-        search: to which all that is fitted is added.
-        most: at most so many effects.
-
-    Returns None where fewer than MANY joints share an inertia (of a simulator, which is slow, two),
-    one effect is likelier, or less than MANY effects are needed.
+    All that is fitted is added to the search. Returns None where fewer than MANY joints
+    share an inertia (of a simulator, which is slow, two), one effect is likelier, or fewer than
+    MANY effects are needed.
     """
     joints = _joints(search)
     if len(joints) < (2 if simulated(search.data.model) else MANY):
@@ -69,7 +66,7 @@ def joint_model(search: HypothesisSearch, most: int) -> Fitted | None:
     if not simulated(search.data.model):
         tune(search, [best])
         best = max(search.of_size(len(best.hypothesis.effects)), key=search.score)
-    best = _completed(search, best, min(most, len(best.hypothesis.effects) + BEYOND))
+    best = _completed(search, best, len(best.hypothesis.effects) + BEYOND)
     return _coloured(search, shared(search, best))
 
 
@@ -90,34 +87,29 @@ def _starts(search: HypothesisSearch, joints: Sequence[tuple[Effect, Effect]]) -
     bare, spreads = Hypothesis(), [0.0]
     if param_scale(data.model).any():
         spreads.append(CRUDE)
+    own = [1 / max(push(inertia), 1e-12) for _, inertia in joints]  # effort over acceleration
     starts = []
     together = [e for e in search.candidates if e.family.name == LATE[1]]
     together = [e for e in together if len(e.site.targets) == data.model.m]
     for part, spread, late in product(STICKING, spreads, [None, *together]):
         h = Hypothesis(shift=np.zeros(data.model.system.k), spread=spread) if spread else bare
         h = h if late is None else h.plus(late, {late.free[0].name: 2 * data.dt})
-        for friction, inertia in joints:
+        for (friction, inertia), size in zip(joints, own, strict=True):
             dry = part * data.scales.peak(coupled(friction.site)[0])
             h = h.plus(friction, {q.name: dry * (q.name == "c") for q in friction.free})
-            h = h.plus(inertia, {"J": OWN * _own(inertia)})
+            h = h.plus(inertia, {"J": OWN * size})
         starts.append(search.fresh(h))
     return starts
 
 
 def _coloured(search: HypothesisSearch, fit: Fitted) -> Fitted:
-    """Under the noise, white or of another correlation time, under which it is likeliest."""
-    own, dt = fit.noise.structure, search.data.dt
-    found = [fit]
-    for tau in search.taus:
-        if tau != own.tau:
-            noise = fit.noise.allowing(Structure(tau), dt)
-            found += search.refined([(fit.hypothesis, noise, fit.track)], AGAIN)
-    return max(found, key=search.score)
-
-
-def _own(inertia: Effect) -> float:
-    """What a joint's motor moves by the model: effort over acceleration."""
-    return 1 / max(push(inertia), 1e-12)
+    """The fit, or the same under noise of another correlation time, where that is likelier."""
+    starts = [
+        (fit.hypothesis, fit.noise.allowing(Structure(tau), search.data.dt), fit.track)
+        for tau in search.taus
+        if tau != fit.noise.structure.tau
+    ]
+    return max([fit, *search.refined(starts, AGAIN)], key=search.score)
 
 
 def _spared(search: HypothesisSearch, fit: Fitted) -> Fitted:
@@ -151,16 +143,18 @@ def _less(search: HypothesisSearch, fit: Fitted, index: int) -> Fitted:
 
 def shared(search: HypothesisSearch, fit: Fitted) -> Fitted:
     """With one delay, or one lag, of all inputs in the place of those of some, where that pays."""
-    h = fit.hypothesis
-    late = [(e, v) for e, v in h.pairs if e.family.name in LATE]
-    starts = []
-    for effect in search.candidates:
-        if late and effect.family.name in LATE and len(effect.site.targets) == search.data.model.m:
-            other, size = h, max(max(v.values()) for _, v in late)
-            for one, _ in late:
-                other = other.minus(one.name)
-            start = other.plus(effect, {effect.free[0].name: size})
-            starts.append((start, fit.noise, fit.track))
+    rest = fit.hypothesis
+    late = [(e, v) for e, v in rest.pairs if e.family.name in LATE]
+    if not late:
+        return fit
+    for one, _ in late:
+        rest = rest.minus(one.name)
+    size = max(max(v.values()) for _, v in late)
+    starts = [
+        (rest.plus(effect, {effect.free[0].name: size}), fit.noise, fit.track)
+        for effect in search.candidates
+        if effect.family.name in LATE and len(effect.site.targets) == search.data.model.m
+    ]
     return max([fit, *search.refined(starts, TO_THE_TOP)], key=search.score)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 
+from grounded.diagnosis.cause_words import with_share
 from grounded.diagnosis.error_report import Gap, RulerRow, furthest
 from grounded.diagnosis.report import Correction, Diagnosis, Estimate
 from grounded.diagnosis.stopped import ENDED
@@ -239,10 +240,6 @@ def verdict_lines(diagnosis: Diagnosis) -> tuple[list[str], list[str]]:
     causes, told = diagnosis.verdict.causes, list(diagnosis.verdict.lines)
     if len(causes) < 2:
         return [], told
-    if clauses := diagnosis.verdict.clauses:
-        return [f"{clause[:1].upper()}{clause[1:]}" for clause in clauses], told[1:]
-    shares = (percent(one.share) for one in diagnosis.credit)
-    return [
-        f"{cause[:1].upper()}{cause[1:]} ({share} of the improvement)"
-        for cause, share in zip(causes, shares, strict=True)
-    ], told[1:]
+    each = zip(causes, diagnosis.credit, strict=True)
+    clauses = diagnosis.verdict.clauses or tuple(with_share(c, one.share) for c, one in each)
+    return [f"{clause[:1].upper()}{clause[1:]}" for clause in clauses], told[1:]
