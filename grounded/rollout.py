@@ -8,6 +8,7 @@ import numpy as np
 
 from grounded.compile import Problem
 from grounded.frozen import Array, readonly, wrapped
+from grounded.model import Model
 from grounded.policy import Policy
 
 Run = tuple[Array, Array]  # states (H + 1, n) and inputs (H, m)
@@ -41,6 +42,31 @@ def simulate(problem: Problem, policy: Policy) -> Rollout:
     cost = float(swarm.cost[0])
     utility = -cost if np.isfinite(cost) else -np.inf
     return Rollout(swarm.z[0], swarm.u[0], utility, problem.system.n)
+
+
+def each_stepped(model: Model, x: Array, u: Array, p: Array, dt: float) -> Array:
+    """The model's step of rows that each have their own parameters.
+
+    Args:
+        model: of n states, m inputs and k parameters.
+        x: states (N, n).
+        u: inputs (N, m).
+        p: parameters (N, k).
+        dt: the control interval [s].
+
+    Returns:
+        The next states (N, n).
+    """
+    together = getattr(model.step, "rows", None)  # a simulator's
+    if together is not None:
+        return np.asarray(together(x, u, p, dt))
+    alike: dict[bytes, list[int]] = {}
+    for i, one in enumerate(p):
+        alike.setdefault(one.tobytes(), []).append(i)
+    after = np.empty_like(x)
+    for own in alike.values():
+        after[own] = model.system.step(x[own], u[own], p[own[0]], dt)
+    return after
 
 
 def augmented(problem: Problem, states: Array, inputs: Array, past: Array) -> Array:

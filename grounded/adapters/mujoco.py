@@ -57,7 +57,7 @@ EXACT = 1e-6  # of a control step: it is a whole multiple of the simulation's st
 NEAR = 1e-3  # of a control step: a simulation step so much longer or shorter is as exact, as stable
 MOST_THREADS, SHARED = 8, 64  # so many threads at most, and samples from which they pay
 MOST_COPIES = 20  # of the model with other parameters, side by side
-PRIVATE = ("_lock", "_data", "_base", "_copies")  # to a process
+PRIVATE = ("_lock", "_data", "_base", "_copies", "_pools")  # to a process
 HUGE = 1e9  # MuJoCo calls 1e10 unstable, warns and stops there
 
 
@@ -191,6 +191,7 @@ class MujocoStepper(Stepper):
         self._lock = threading.Lock()
         self._data = [mj.MjData(compiled) for _ in range(self.threads)]
         self._copies: dict[bytes, Any] = {}
+        self._pools: dict[tuple[int, int], Any] = {}
         whole = mj.mjtState.mjSTATE_FULLPHYSICS.value
         self._base = np.zeros(mj.mj_stateSize(compiled, whole))
         mj.mj_getState(compiled, self._data[0], self._base, whole)
@@ -238,17 +239,23 @@ class MujocoStepper(Stepper):
     def rows(self, x: Array, u: Array, p: Array, dt: float) -> Array:
         """The same of samples with parameters of their own, (N, k): a copy of the model for each.
 
-        In one batch: the folds of a prediction differ in their numbers alone.
+        In few batches: the folds of a prediction differ in their numbers alone.
         """
         steps, h = self._substeps(dt)
         each, which = np.unique(p, axis=0, return_inverse=True)
-        if len(each) > MOST_COPIES or len(x) > CHUNK:
-            return super().rows(x, u, p, dt)
+        which, after = which.reshape(-1), np.empty_like(x)
         with self._lock, _quiet():
-            copies = [self._copy(one) for one in each]
-            for model in copies:
-                model.opt.timestep = h
-            return self._step(x, u, steps, [copies[i] for i in which.reshape(-1)])
+            for first in range(0, len(each), MOST_COPIES):
+                copies = [self._copy(one) for one in each[first : first + MOST_COPIES]]
+                for model in copies:
+                    model.opt.timestep = h
+                own = np.flatnonzero((which >= first) & (which < first + MOST_COPIES))
+                for at in range(0, len(own), CHUNK):
+                    some = own[at : at + CHUNK]
+                    models = [copies[which[i] - first] for i in some]
+                    one = len(copies) == 1
+                    after[some] = self._step(x[some], u[some], steps, models[0] if one else models)
+        return after
 
     def _copy(self, p: Array) -> Any:
         """The model with some parameters, (k,): the last that were asked for are kept."""
@@ -301,6 +308,14 @@ class MujocoStepper(Stepper):
             setting.write(model, float(value))
         library("mujoco").mj_setConst(model, self._data[0])
 
+    def _pool(self, threads: int) -> Any:
+        """MuJoCo's pool of threads, kept: a new one for each batch takes as long as the batch."""
+        key = (os.getpid(), threads)  # a forked process has none of its parent's threads
+        if key not in self._pools:
+            pool = library("mujoco.rollout").Rollout
+            self._pools[key] = pool(nthread=threads if threads > 1 else 0)
+        return self._pools[key]
+
     def _step(self, x: Array, u: Array, steps: int, models: Any) -> Array:
         """Samples through simulation steps; models: one of all, or a list of each one's."""
         mj, compiled, nv = library("mujoco"), self._model, self._model.nv
@@ -316,9 +331,9 @@ class MujocoStepper(Stepper):
         kind = (
             mj.mjtState.mjSTATE_QFRC_APPLIED if self.controls.torques else mj.mjtState.mjSTATE_CTRL
         )
-        several = self._data if len(x) >= SHARED else self._data[:1]
-        rolled, _ = library("mujoco.rollout").rollout(
-            models, several, state, wide, control_spec=kind, nstep=steps
+        threads = self.threads if len(x) >= SHARED else 1
+        rolled, _ = self._pool(threads).rollout(
+            models, self._data[:threads], state, wide, control_spec=kind, nstep=steps
         )
         last = rolled[:, -1]
         moved = np.hstack(

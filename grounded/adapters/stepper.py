@@ -50,14 +50,6 @@ class Stepper:
         """The next states (N, n) of states x (N, n), inputs u (N, m), parameters p (k,)."""
         raise NotImplementedError
 
-    def rows(self, x: Array, u: Array, p: Array, dt: float) -> Array:
-        """The same, where each sample has its own parameters p (N, k)."""
-        after = np.empty_like(x)
-        for one in np.unique(p, axis=0):
-            own = (p == one).all(axis=1)
-            after[own] = self.advance(x[own], u[own], one, dt)
-        return after
-
     def derivatives(self, x: Array, u: Array, p: Array, dt: float) -> tuple[Array, Array]:
         """f_x (N, n, n) and f_u (N, n, m) at N samples."""
         raise NotImplementedError

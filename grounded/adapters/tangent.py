@@ -36,29 +36,27 @@ class Coordinates:
 
     def to_qpos(self, r: Array) -> Array:
         """Coordinates (N, nv) -> positions (N, nq)."""
-        from scipy.spatial.transform import Rotation
-
         qpos = np.tile(self.reference, (len(r), 1))
         qpos[:, self.plain] = r[:, self.plain_columns]
         for place, column in zip(self.quaternions, self.rotations, strict=True):
-            turned = self._about(place) * Rotation.from_rotvec(r[:, column : column + 3])
+            about = self._about(place)
+            turned = about * type(about).from_rotvec(r[:, column : column + 3])
             qpos[:, place : place + 4] = np.roll(turned.as_quat(), 1, axis=1)  # MuJoCo: w first
         return qpos
 
     def from_qpos(self, qpos: Array, near: Array) -> Array:
         """Positions (N, nq) -> coordinates (N, nv), rotation vectors nearest to `near` (N, nv)."""
-        from scipy.spatial.transform import Rotation
-
         r = np.zeros((len(qpos), len(self.plain) + 3 * len(self.rotations)))
         r[:, self.plain_columns] = qpos[:, self.plain]
         for place, column in zip(self.quaternions, self.rotations, strict=True):
-            turned = Rotation.from_quat(np.roll(qpos[:, place : place + 4], -1, axis=1))
-            found = (self._about(place).inv() * turned).as_rotvec()
+            about = self._about(place)
+            turned = type(about).from_quat(np.roll(qpos[:, place : place + 4], -1, axis=1))
+            found = (about.inv() * turned).as_rotvec()
             r[:, column : column + 3] = nearest_turn(found, near[:, column : column + 3])
         return r
 
     def _about(self, place: int) -> Any:
-        """The reference orientation of the quaternion at a place in qpos."""
+        """The reference orientation of the quaternion at a place in qpos, a scipy Rotation."""
         from scipy.spatial.transform import Rotation
 
         return Rotation.from_quat(np.roll(self.reference[place : place + 4], -1))

@@ -12,10 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from grounded.frozen import Array
 from grounded.instruments.odd_trial import AHEAD, FAR
 from grounded.model import Model
+from grounded.rollout import each_stepped
 from grounded.trial import Trial
 
 DELAYS = (0.0, 0.05, 0.1, 0.2)  # [s], of all commands
@@ -24,6 +26,8 @@ LITTLE, TINY = 1e-3, 1e-12  # of a state's spread, and in its unit: no smaller e
 ROUNDS, DAMPING, SLOPE = 5, (1.0, 0.3, 0.1), 0.02
 SAME = 1e-6  # of the largest: columns that say the same
 ENOUGH = 0.01  # [nats]: a round that gains less is the last
+
+Steps = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,7 @@ class Ahead:
 
     def plain(self, gains: Array) -> Fit:
         """As the model is, with some gains (m,) of its inputs."""
-        return self._fit(self._size(self._off(gains, self.model.values, 0)), gains)
+        return self._fit(self._size(self._off(gains, self.model.values, 0)[0]), gains)
 
     def still(self) -> Fit:
         """Calibrated, with every command at its mean throughout: what commands do is missing."""
@@ -122,11 +126,9 @@ class Ahead:
 
     def _late(self, gains: Array) -> int:
         """Steps by which the commands, of these gains, seem to be late."""
-
-        def left(late: int) -> float:
-            return float(np.log(self._size(self._off(gains, self.model.values, late))).sum())
-
-        return min(self.delays, key=left)
+        off = self._off(gains, self.model.values, np.array(self.delays))
+        left = [float(np.log(self._size(one)).sum()) for one in off]
+        return self.delays[int(np.argmin(left))]
 
     def _with(self, sent: Array) -> Ahead:
         other = object.__new__(Ahead)
@@ -140,24 +142,24 @@ class Ahead:
         theta = np.zeros(len(prior))
 
         def off(theta: Array) -> Array:
-            moved = gains.copy()
-            moved[:m] += theta[:m]
-            values = np.array(self.model.values, float)
-            shifted = values[self.moving] + theta[m:] * self.spread
-            values[self.moving] = np.clip(shifted, self.low, self.high)
+            """Errors (K, N, shown) of several, (K, q)."""
+            moved, values = (np.tile(one, (len(theta), 1)) for one in (gains, self.model.values))
+            moved[:, :m] += theta[:, :m]
+            shifted = values[:, self.moving] + theta[:, m:] * self.spread
+            values[:, self.moving] = np.clip(shifted, self.low, self.high)
             return self._off(moved, values, late)
 
-        r = off(theta)
+        (r,) = off(theta[None])
         size = self._size(r)
         for _ in range(ROUNDS if len(theta) else 0):
-            each = [(off(theta + SLOPE * e) - r) / size / SLOPE for e in np.eye(len(theta))]
-            J, white = np.array([one.ravel() for one in each]).T, (r / size).ravel()
+            each = (off(theta + SLOPE * np.eye(len(theta))) - r) / size / SLOPE
+            J, white = each.reshape(len(theta), -1).T, (r / size).ravel()
             if not (np.isfinite(J).all() and np.isfinite(white).all()):
                 break  # it runs away
             H = J.T @ J + np.diag(prior + 1e-9 * len(white))
             step = -np.linalg.lstsq(H, J.T @ white + prior * theta, rcond=None)[0]
             for part in DAMPING:
-                new = off(theta + part * step)
+                (new,) = off((theta + part * step)[None])
                 if np.log(self._size(new) / size).sum() < -ENOUGH:
                     break
             else:
@@ -167,13 +169,21 @@ class Ahead:
         found[:m] += theta[:m]
         return self._fit(size, found)
 
-    def _off(self, gains: Array, values: Array, late: int) -> Array:
-        """Errors (N, shown) without what is left out: their means at least."""
-        x, sent = self.first, self.sent * gains
+    def _off(self, gains: Array, values: Array, late: int | Steps) -> Array:
+        """Errors (K, N, shown) without what is left out: their means at least.
+
+        Of K gains (K, m), parameters (K, k), delays (K,): one of any goes with all of the others.
+        """
+        gains, values, late = np.atleast_2d(gains), np.atleast_2d(values), np.atleast_1d(late)
+        K, N = max(len(gains), len(values), len(late)), len(self.at)
+        at = self.at - late[:, None]
+        x, last = np.tile(self.first, (K, 1)), np.tile(self.last, (K, 1))
+        own = np.repeat(np.broadcast_to(values, (K, values.shape[1])), N, axis=0)
         for j in range(self.steps):
-            x = self.model.system.step(x, sent[self.at + j - late], values, self.dt)
+            u = np.broadcast_to(self.sent[at + j] * gains[:, None], (K, N, self.model.m))
+            x = each_stepped(self.model, x, u.reshape(K * N, -1), own, self.dt)
             x = np.fmax(np.fmin(x, FAR), -FAR)
-        off = self.model.difference(x, self.last)[:, self.shown]
+        off = self.model.difference(x, last)[:, self.shown].reshape(K, N, -1)
         return np.asarray(off - self.left_out @ (self.left_out.T @ off))
 
     def _size(self, off: Array) -> Array:

@@ -18,7 +18,8 @@ never comes back. So the target itself is made a nominal run, in three moves:
 The trim is Levenberg-Marquardt on many steps at once, inputs inside their limits. It starts from
 several inputs, because a stalled motor has no slope to follow; then every step tries again with one
 input set back (of few: what one of many could do, the others do), and tries the solutions of its
-neighbours, because a manoeuvre is continuous and a bad local minimum seldom is.
+neighbours, because a manoeuvre is continuous and a bad local minimum seldom is. Where all starts
+end alike no input is set back.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ ROUNDS = 3
 FEW = 8  # inputs that are set back one by one
 FREE_WEIGHT = 0.3  # what is prescribed goes first where both can't be had
 KNOTS = 250  # steps that are solved from scratch; those between start from their neighbours
+ALIKE = 1e-3  # of an error: ends that differ by less are one minimum
 EXACT = 1e-12  # of the mean squared rate: a trim this good is not tried again
 
 
@@ -177,22 +179,34 @@ def _from_scratch(task: Task, batch: LeastSquares, states: Array, knots: Rows) -
     starts = [_toward_limit(task, held, part) for part in STARTS]
     best = solve(batch, np.hstack([states, starts[0]]), knots, ITERATIONS)
 
-    def again(w: Array, iterations: int) -> Minimum:
-        open_ = np.flatnonzero(best.error > batch.solved)
+    def again(w: Array, iterations: int, wanted: NDArray[np.bool_]) -> tuple[Minimum, Array]:
+        """The better of both, and what was reached from w: infinite where it was not tried."""
+        reached = np.full(len(knots), np.inf)
+        open_ = np.flatnonzero((best.error > batch.solved) & wanted)
         if not len(open_):
-            return best
-        return best.better_of(solve(batch, w[open_], knots[open_], iterations), open_)
+            return best, reached
+        other = solve(batch, w[open_], knots[open_], iterations)
+        reached[open_] = other.error
+        return best.better_of(other, open_), reached
 
+    everywhere = np.ones(len(knots), dtype=bool)
+    ends = [best.error]
     for start in starts[1:]:
-        best = again(np.hstack([states, start]), ITERATIONS)
+        best, reached = again(np.hstack([states, start]), ITERATIONS, everywhere)
+        ends.append(reached)
+    differ = ~(np.max(ends, axis=0) <= (1 + ALIKE) * best.error)
     for j in range(task.model.m if task.model.m <= FEW else 0):
         for start in starts:
             w = best.w.copy()
             w[:, states.shape[1] + j] = start[:, j]
-            best = again(w, MORE)
+            best, _ = again(w, MORE, differ)
+    tried: dict[int, Array] = {}
     for _ in range(ROUNDS):
         for shift in (1, -1):
-            best = again(np.roll(best.w, shift, axis=0), MORE)
+            w = np.roll(best.w, shift, axis=0)
+            new = (w != tried[shift]).any(axis=1) if shift in tried else everywhere
+            tried[shift] = w
+            best, _ = again(w, MORE, new)
     return best
 
 

@@ -50,6 +50,7 @@ from grounded.effects.registry import partner
 from grounded.effects.sensed import behind_logs, logged, moved_model, seen_names
 from grounded.engine import SentOnce
 from grounded.frozen import Array
+from grounded.rollout import each_stepped
 
 MOST_KEPT = 8_000_000  # numbers of inputs that a predictor keeps
 STEPS_KEPT = 16  # of a simulator
@@ -134,15 +135,11 @@ class Predictor(SentOnce):
 
     def step(self, x: Array, u: Array, p: Array, dt: float | None = None) -> Array:
         """The model's own step at any leading shape; of rows where each has its parameters."""
-        if p.ndim > 1:
-            together = getattr(self.data.model.step, "rows", None)  # a simulator's
-            if together is not None and x.ndim == 2:
-                return np.asarray(together(x, u, p, dt or self.data.dt))
-            after = np.empty_like(x)
-            for one, own in _alike(p):
-                after[own] = self.step(x[own], u[own], one, dt)
-            return after
         rows, system = self.flat(x, u), self.data.model.system
+        if p.ndim > 1:
+            own = np.repeat(p, len(rows[0]) // max(1, len(p)), axis=0)
+            moved = each_stepped(self.data.model, *rows, own, dt or self.data.dt)
+            return moved.reshape(x.shape)
         if not simulated(self.data.model):
             return system.step(*rows, p, dt or self.data.dt).reshape(x.shape)
         parts = (*rows, p, np.array(dt or self.data.dt))  # a simulator is slow: losses ask again
@@ -385,11 +382,3 @@ class Predictor(SentOnce):
             i = names.index(effect.site.target)
             total[..., i] += sensor_offset(effect, values, shown[..., i], self.data.dt)
         return total
-
-
-def _alike(p: Array) -> list[tuple[Array, Any]]:
-    """Parameters (M, k) that are not the same, each (k,) with the indices of its rows."""
-    rows: dict[bytes, list[int]] = {}
-    for i, one in enumerate(p):
-        rows.setdefault(one.tobytes(), []).append(i)
-    return [(p[own[0]], np.array(own)) for own in rows.values()]
