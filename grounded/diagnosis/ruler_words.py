@@ -70,9 +70,13 @@ def worsened(rows: Sequence[RulerRow]) -> str:
     ratio, row, name = _lost_most(rows)
     if row is None or not (ratio > 1 + SHOWS or outweighed(rows)):
         return ""
-    values = [row.with_effects[name], row.crude[name]]
-    now, then = measured_alike(values, row.unit_by_channel[name])
+    unit = row.unit_by_channel[name]
+    now, then = measured_alike([row.with_effects[name], row.crude[name]], unit)
     text = f"{_ahead(row)} miss {name} by {now} instead of {then}: that is worse"
+    if not row.tells(name, "with_effects"):  # how far says nothing
+        (then,) = measured_alike([row.crude[name]], unit)
+        ahead = "Predictions of whole trials" if row.whole_trial else _ahead(row)
+        text = f"{ahead} run away in {name}, which the crude model misses by {then}"
     return f"{text}." if outweighed(rows) else f"{text}, though over all states they gain."
 
 

@@ -2,6 +2,7 @@
 
 from copy import copy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -108,6 +109,9 @@ class Coarse:
         part = np.full(TRIALS, 0.01 * self.mean if self.mean else 0.01)
         channel = np.array([0.02 * self.mean]), np.array([0.02])
         return Gain(0.02 * self.mean, 0.02, self.largest, *channel, part, np.arange(TRIALS))
+
+
+CLEAR = Gain(0.2, 0.01, 0.3, np.array([0.2]), np.array([0.01]), np.full(TRIALS, 0.2))
 
 
 def test_what_steps_of_several_trials_bear_out_need_not_stand_out_a_second_ahead(
@@ -231,3 +235,15 @@ def test_intervals_are_those_of_all_likely_fits_of_the_same_effects(search, cali
     assert found(30.0, Coarse(0.0))[0] == pytest.approx(np.hypot(0.02, apart), rel=1e-6)
     assert found(-20.0, Coarse(0.0)) == [0.01, 0.03]
     assert found(30.0, Coarse(3.0, 0.1)) == [0.01, 0.03]  # refuted by predictions
+
+
+def test_what_a_rival_has_to_gain_grows_with_what_is_gained_to_a_quarter_of_the_error(search):
+    crude, found, rival = (fit_of(search, *n) for n in ((), (LIMIT,), (FRICTION,)))
+
+    def overrules(more, whole):
+        means = {crude: whole, found: more}  # by what is compared with
+        one = SimpleNamespace(gain=lambda before, _: replace(CLEAR, mean=means[before]))
+        return decide._overrules(one, crude, found, rival, decide.OVERRULES)
+
+    assert overrules(0.13, 1.2) and not overrules(0.11, 1.2)
+    assert overrules(0.16, 1.5) and overrules(0.16, 4.0) and not overrules(0.14, 4.0)

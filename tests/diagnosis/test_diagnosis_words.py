@@ -50,6 +50,9 @@ def test_what_got_worse_is_said_of_the_channel_that_lost_most():
     assert "0.60 m/s" in worsened((short,))
     assert outweighed((short, whole)) and not outweighed((short,))
     assert said.endswith("that is worse.") and not worsened((short,)).endswith("that is worse.")
+    wild = replace(whole, with_effects={"x": 6e5, "v": 0.3}, runs_away={"with_effects": ("x",)})
+    said = worsened((short, wild))
+    assert "run away in x" in said and "2.1 m" in said and "0,000" not in said  # no distance
 
 
 def test_where_noise_alone_leaves_all_that_was_measured_nothing_is_told_of_a_horizon():

@@ -48,6 +48,7 @@ BETTER = (2.0, 0.05)  # the same for a rival to take the place of a likelier hyp
 OVERRULES = (3.0, 0.1)  # and for a claim that is likely under another noise only
 SLIGHT = 0.02  # of what all causes gain, adopted ones too: less in each channel is not named
 AMOUNTS = 0.1  # of what the likeliest gains: what a rival has to gain beyond it
+FAR = 1.5  # of that, in logs of errors (to a quarter): more asks no more of a rival
 LIKELY = 10.0  # nats from which a dropped effect is mentioned
 HARDLY = 0.1  # of its own prior: a parameter that is off by less is as it was given
 REFIT = 12  # iterations after a cause was taken out
@@ -255,7 +256,7 @@ def _overrules(
 ) -> bool:
     """Whether predictions bear out a less likely hypothesis, by an amount that matters."""
     more, whole = ruler.gain(found, rival), ruler.gain(crude, found).mean
-    return more.beyond(*bar) and more.mean > AMOUNTS * whole
+    return more.beyond(*bar) and more.mean > AMOUNTS * min(whole, FAR)
 
 
 def _proposed(
