@@ -237,13 +237,14 @@ def test_intervals_are_those_of_all_likely_fits_of_the_same_effects(search, cali
     assert found(30.0, Coarse(3.0, 0.1)) == [0.01, 0.03]  # refuted by predictions
 
 
-def test_what_a_rival_has_to_gain_grows_with_what_is_gained_to_a_quarter_of_the_error(search):
+def test_what_another_noise_s_claim_has_to_gain_grows_until_a_quarter_of_the_error_is_left(search):
     crude, found, rival = (fit_of(search, *n) for n in ((), (LIMIT,), (FRICTION,)))
 
-    def overrules(more, whole):
+    def overrules(more, whole, far=np.inf):
         means = {crude: whole, found: more}  # by what is compared with
         one = SimpleNamespace(gain=lambda before, _: replace(CLEAR, mean=means[before]))
-        return decide._overrules(one, crude, found, rival, decide.OVERRULES)
+        return decide._overrules(one, crude, found, rival, *decide.OVERRULES, far=far)
 
-    assert overrules(0.13, 1.2) and not overrules(0.11, 1.2)
-    assert overrules(0.16, 1.5) and overrules(0.16, 4.0) and not overrules(0.14, 4.0)
+    assert overrules(0.13, 1.2, 1.5) and not overrules(0.11, 1.2, 1.5)
+    assert overrules(0.16, 1.5, 1.5) and overrules(0.16, 4.0, 1.5) and not overrules(0.14, 4.0, 1.5)
+    assert overrules(0.41, 4.0) and not overrules(0.39, 4.0)  # under the same noise

@@ -25,6 +25,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from grounded.diagnosis.hypotheses.counterpart import counterparts
 from grounded.diagnosis.hypotheses.explored import CLAIM, TIE, parametric
 from grounded.diagnosis.hypotheses.plainest import plainer
@@ -48,7 +50,7 @@ BETTER = (2.0, 0.05)  # the same for a rival to take the place of a likelier hyp
 OVERRULES = (3.0, 0.1)  # and for a claim that is likely under another noise only
 SLIGHT = 0.02  # of what all causes gain, adopted ones too: less in each channel is not named
 AMOUNTS = 0.1  # of what the likeliest gains: what a rival has to gain beyond it
-FAR = 1.5  # of that, in logs of errors (to a quarter): more asks no more of a rival
+FAR = 1.5  # of that, in logs of errors (to a quarter): more asks no more of another noise's claim
 LIKELY = 10.0  # nats from which a dropped effect is mentioned
 HARDLY = 0.1  # of its own prior: a parameter that is off by less is as it was given
 REFIT = 12  # iterations after a cause was taken out
@@ -252,11 +254,11 @@ def _beyond_doubt(search: HypothesisSearch, found: Fitted, rival: Fitted) -> boo
 
 
 def _overrules(
-    ruler: Ruler, crude: Fitted, found: Fitted, rival: Fitted, bar: tuple[float, float]
+    ruler: Ruler, crude: Fitted, found: Fitted, rival: Fitted, *bar: float, far: float = np.inf
 ) -> bool:
     """Whether predictions bear out a less likely hypothesis, by an amount that matters."""
     more, whole = ruler.gain(found, rival), ruler.gain(crude, found).mean
-    return more.beyond(*bar) and more.mean > AMOUNTS * min(whole, FAR)
+    return more.beyond(*bar) and more.mean > AMOUNTS * min(whole, far)
 
 
 def _proposed(
@@ -274,14 +276,14 @@ def _proposed(
         rivals.append(null)
     found, at = best, search
     for rival in rivals:
-        if _overrules(ruler, crude, found, rival, BETTER):
+        if _overrules(ruler, crude, found, rival, *BETTER):
             found = found if white and _beyond_doubt(search, found, rival) else rival
     for structure, spread in dict.fromkeys((s, w) for s, w, _ in search.fits):
         other = search.under(structure, spread)
         if other is None or (structure, spread) == (best.noise.structure, best.hypothesis.spread):
             continue
         rival = other.chosen(most)
-        if causes(rival) and _overrules(ruler, crude, found, rival, OVERRULES):
+        if causes(rival) and _overrules(ruler, crude, found, rival, *OVERRULES, far=FAR):
             if rival.hypothesis.effects:
                 other.finished(other.of_size(len(rival.hypothesis.effects))[:2], TO_THE_TOP)
                 rival = other.chosen(most)
