@@ -148,20 +148,20 @@ def limits(xml: str | Path, inputs: str | Sequence[str] = "auto") -> dict[str, t
         (low, high) of every input that has a limit.
     """
     compiled = load(xml)
-    controls = controls_of(compiled, inputs, states_of(compiled))
-    found = {}
-    for name, column in zip(controls.names, controls.columns, strict=True):
-        if controls.torques:
-            joint = int(compiled.dof_jntid[column])
-            limited, span = compiled.jnt_actfrclimited[joint], compiled.jnt_actfrcrange[joint]
-        else:
-            limited, span = (
-                compiled.actuator_ctrllimited[column],
-                compiled.actuator_ctrlrange[column],
-            )
-        if limited:
-            found[name] = (float(span[0]), float(span[1]))
-    return found
+    return _limits(compiled, controls_of(compiled, inputs, states_of(compiled)))
+
+
+def _limits(compiled: Any, controls: Controls) -> dict[str, tuple[float, float]]:
+    limited, spans, at = (
+        compiled.actuator_ctrllimited,
+        compiled.actuator_ctrlrange,
+        controls.columns,
+    )
+    if controls.torques:
+        limited, spans = compiled.jnt_actfrclimited, compiled.jnt_actfrcrange
+        at = tuple(int(compiled.dof_jntid[column]) for column in at)
+    own = {name: spans[i] for name, i in zip(controls.names, at, strict=True) if limited[i]}
+    return {name: (float(low), float(high)) for name, (low, high) in own.items()}
 
 
 class MujocoStepper(Stepper):
@@ -213,6 +213,11 @@ class MujocoStepper(Stepper):
     def timestep(self) -> float:
         """The simulation's own step [s]; a control step is a whole multiple of it."""
         return self._own
+
+    @property
+    def limits(self) -> dict[str, tuple[float, float]]:
+        """See `limits`."""
+        return _limits(self._model, self.controls)
 
     @property
     def body(self) -> MujocoBody:

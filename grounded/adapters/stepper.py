@@ -29,6 +29,11 @@ class Stepper:
         """What it looks like, for pictures; None where it doesn't know."""
         return None
 
+    @property
+    def limits(self) -> Mapping[str, tuple[float, float]]:
+        """What its file says that inputs may get, (low, high) by name; of those that it limits."""
+        return {}
+
     def __call__(
         self, s: Mapping[str, Any], a: Mapping[str, Any], p: Mapping[str, Any], dt: float
     ) -> dict[str, Any]:

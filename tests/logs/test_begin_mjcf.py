@@ -67,6 +67,23 @@ def test_an_mjcf_file_is_a_model_and_comes_along(tmp_path, monkeypatch, log, xml
     assert refused.code == 1 and "missing.xml" in refused.err
 
 
+def test_limits_of_a_model_file_are_taken_without_a_log_and_told_beside_those_of_one(tmp_path, log):
+    limited = MJCF.replace('joint="shoulder_joint"/>', 'joint="shoulder_joint" ctrlrange="-9 8"/>')
+    (tmp_path / "arm.xml").write_text(limited)
+    grounded("init", tmp_path / "blank", "--blank", "--model", tmp_path / "arm.xml")
+    task = Workspace(tmp_path / "blank").task
+    assert (task.low[0], task.high[0]) == (-9.0, 8.0) and np.isinf(task.high[1])
+    begin(tmp_path / "w", log, model=tmp_path / "arm.xml")
+    task = Workspace(tmp_path / "w").task
+    assert np.isfinite(task.high).all() and task.high[0] != 8.0  # what the log shows is less
+    told = [
+        line
+        for line in (tmp_path / "w" / "grounded.toml").read_text().split("\n")
+        if "file says" in line
+    ]
+    assert len(told) == 1 and told[0].startswith("shoulder =") and "[-9, 8]" in told[0]
+
+
 def test_an_mjcf_s_steps_are_as_long_as_its_own_allow(tmp_path):
     """Steps of 0.05 s told inputs apart; of 4 ms there are twelve and a half in it."""
     (tmp_path / "arm.xml").write_text(MJCF)

@@ -1,10 +1,10 @@
 """A workspace from a model file alone: what a robot that no example is like begins with.
 
 Everything that has to be said about the task is there with a value that runs, to be replaced: the
-target holds every state at zero, each weighs 1, no input has a limit. Where the model stands there
-under some input (a quadrotor's hover), that is what counts as held before the start. `drive.py` is
-the robot's program: it reads the candidate and writes the trial, and lacks two functions, `measure`
-and `send`.
+target holds every state at zero, each weighs 1, an input has the limits that an MJCF or URDF file
+states, or none. Where the model stands there under some input (a quadrotor's hover), that is what
+counts as held before the start. `drive.py` is the robot's program: it reads the candidate and
+writes the trial, and lacks two functions, `measure` and `send`.
 """
 
 from __future__ import annotations
@@ -107,7 +107,8 @@ def write_blank(folder: Path, file: str | Path, dt: float | None = None) -> None
 def _task(model: Model, dt: float) -> Task:
     """Hold every state at zero for a hundred steps, from the inputs that hold it there."""
     n, m = model.n, model.m
-    free = np.full(m, np.inf)
+    stated = getattr(model.step, "limits", {})  # in a simulator's file
+    ends = [stated.get(name, (-np.inf, np.inf)) for name in model.input_names]
     changes = np.array([change_weight(None, unit) for unit in model.inputs.values()])
     task = Task(
         model=model,
@@ -116,8 +117,8 @@ def _task(model: Model, dt: float) -> Task:
         reward=Reward(np.ones(n), np.zeros(n), np.zeros(m), changes),
         start=np.zeros(n),
         past=np.zeros(m),
-        low=-free,
-        high=free,
+        low=np.array([low for low, _ in ends]),
+        high=np.array([high for _, high in ends]),
     )
     with suppress(GroundedError):  # a model that does not work says so when it is planned with
         if (still := resting(task, np.zeros(n, np.bool_))) is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -50,8 +50,10 @@ def write_first(
     write_target(folder / "target.csv", dt, dict(columns))
     weights = equal_weights(columns, model.states, position_names(model))
     changes = {name: change_weight(ranges[name], model.inputs[name]) for name in model.input_names}
+    stated = getattr(model.step, "limits", {})  # in a simulator's file
     limits = [
-        f"{key(name)} = [{found[0]:.6g}, {found[1]:.6g}]"
+        f"{key(name)} = {_span(found)}"
+        + f"  # the model's file says {_span(stated.get(name, ()))}" * (name in stated)
         for name in model.input_names
         if (found := ranges[name]) is not None and found[0] < found[1]
     ]
@@ -148,6 +150,10 @@ def held_first(
         held[name] = float(later.mean() if np.ptp(later) else later[0])
         needed |= held[name] != 0 and (not np.ptp(later) or abs(held[name]) > STILL * (high - low))
     return found | held if needed else {}
+
+
+def _span(ends: Sequence[float]) -> str:
+    return f"[{', '.join(f'{end:.6g}' for end in ends)}]"
 
 
 def _inline(values: Mapping[str, float]) -> str:
