@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from cli import grounded
+from grounded.diagnosis.diagnose import diagnose
 from grounded_trials.store.trial_file import write_trial
-from real_systems import DART_STEERING, DART_THROTTLE, EMPS, SERVO
+from real_systems import BAM_Q, DART_STEERING, DART_THROTTLE, EMPS, SERVO
 from shared_data import needs_data
 
 CONFIG = """[model]
@@ -96,6 +97,19 @@ def test_the_dart_throttle_has_a_dead_zone(tmp_path):
         if one["effect"] == "dead_zone:throttle"
     }
     assert 0.75 < alike["coulomb_friction:v"] < 1
+
+
+@pytest.mark.slow
+@needs_data
+def test_the_friction_of_a_geared_servo_grows_with_its_load():
+    """Only its angle is logged; under coloured noise a plain friction is likelier, and worse."""
+    found = diagnose(BAM_Q.model, BAM_Q.read())
+    assert found.credit[0].of == "load_friction:volts<-w"
+    load = next(row.params for row in found.ranking if row.effect == "load_friction:volts<-w")
+    assert 0.25 < load["c"].value < 0.45 and 0.15 < load["k"].value < 0.3  # [V], of what it carries
+    half, whole = found.prediction_error[1], found.prediction_error[-1]
+    assert half.horizon_s == 0.5 and half.with_effects["q"] < 0.095  # the best made by hand
+    assert whole.whole_trial and whole.with_effects["q"] < 0.098
 
 
 def lagged(tau, way):
