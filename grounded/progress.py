@@ -32,9 +32,11 @@ def interruptible(so_far: Callable[[], str]) -> Iterator[None]:
 class Stages:
     """Adds to each stage's name the share done and the time left, from how many are usual.
 
+    Where nearly as many are done and it goes on, nobody knows when it ends: the time taken so far.
+
     Args:
         tell: shows a line; None: nobody listens.
-        usual: calls until the end; where there are more, the end recedes.
+        usual: calls until the end.
     """
 
     tell: Callable[[str], None] | None
@@ -49,8 +51,18 @@ class Stages:
         self.count += 1
         if self.tell is None:
             return
-        share = self.count / max(self.usual, 1.1 * self.count)
-        left = (time.monotonic() - self.began) * (1 - share) / share
+        share, taken = self.count / self.usual, time.monotonic() - self.began
+        if share > NEARLY:
+            return self.tell(f"{stage}, longer than usual, {_told(taken)} so far")
+        left = taken * (1 - share) / share
         shrinks, self.left = left < self.left, left  # where the end recedes, nobody knows when
-        about = f", about {left:.0f} s left" if self.count > 10 and shrinks else ""
+        about = f", about {_told(left)} left" if self.count > 10 and shrinks else ""
         self.tell(f"{stage}, {100 * share:.0f} % done{about}")
+
+
+NEARLY = 0.9  # of what is usual: what is left then may be as long again
+
+
+def _told(seconds: float) -> str:
+    """A time as a person says it: 40 s, 7 min."""
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"

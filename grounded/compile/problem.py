@@ -234,6 +234,7 @@ class System(ABC):
     note: str  # why it is not compiled, naming the line; empty when it is
     source: str  # file:line of the user's function
     states: tuple[str, ...]  # names, for messages
+    inputs: tuple[str, ...]
 
     @abstractmethod
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
@@ -246,6 +247,10 @@ class System(ABC):
         Raises:
             GroundedError: where they differ, with both values.
         """
+
+    def fault(self, x: Array, u: Array, p: Array, dt: float) -> str:
+        """Where the user's function makes a number that is not finite, x (n,), u (m,); or ""."""
+        return ""
 
     @abstractmethod
     def linearise(

@@ -41,6 +41,7 @@ class Corrected(System):
         self.base, self.law, self.x, self.u, self.before = base, law, x, u, before
         n, m = base.n, base.m
         self.n, self.m, self.k, self.source = 2 * n + m, m, base.k, base.source
+        self.inputs = base.inputs
         missed = (f"{name} mispredicted" for name in base.states)
         self.states = (*base.states, *missed, *(f"input {i} before" for i in range(m)))
 

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.errors import NextCommand
+from grounded.errors import GroundedError, NextCommand
 from grounded.model import Model
 from grounded.result import figure
 from grounded.search.candidate import Candidate, Tried
@@ -73,6 +73,9 @@ def propose(
         refit: with options.refit, gives the model with parameters fitted to all trials; None: by
             `grounded.fit`.
         tick: told what is going on while planning takes its time.
+
+    Raises:
+        GroundedError: where the model's own plan can't be made, with the place in the model.
     """
     planner = planner or Planner(task, task)
     fingerprint = planner.fingerprint
@@ -86,6 +89,11 @@ def propose(
     make = Maker(planner, now, identity or f"c{len(candidates) + 1:04d}", fingerprint)
     if now.incumbent is None:
         policy, plan = planner.first_policy(now.caution, tick)
+        if not plan.ok:
+            raise GroundedError(
+                f"there is no plan to run: {plan.sentence}; mend the model there, or take a start "
+                "and a target at which it holds"
+            )
         model = planner.plan.problem(exact=True)
         made = make.checked(make.with_margin(make.candidate(policy, model, Step()), model))
         if plan.status == "converged":

@@ -155,11 +155,8 @@ def _solution(problem: Problem, found: Descent) -> Solution:
     k, K = found.k, found.K
     if found.status == "not finite":
         k, K = np.zeros(found.u.shape), np.zeros((*found.u.shape, problem.nz))
-        sentence = (
-            _first_bad(problem, found.z)
-            if found.failed_at < 0
-            else f"the sweep failed at step {found.failed_at}"
-        )
+        first = _first_bad if found.failed_at < 0 else _first_slope
+        sentence = first(problem, found)
     return Solution(found.status, sentence, found.z, found.u, k, K, found.cost, trace)
 
 
@@ -172,16 +169,33 @@ def ending(status: Status, iterations: int) -> str:
     }.get(status, "")
 
 
-def _first_bad(problem: Problem, z: Array) -> str:
-    system, bad = problem.system, ~np.isfinite(z[:, : problem.system.n])
+def _first_bad(problem: Problem, found: Descent) -> str:
+    """Where the first rollout leaves the finite numbers, as a sentence."""
+    system, z = problem.system, found.z
+    bad = ~np.isfinite(z[:, : system.n])
     if not bad.any():
         return "the cost of the first rollout is not finite"
     when = int(np.argmax(bad.any(axis=1)))
-    name = system.states[int(np.argmax(bad[when]))]
-    return (
-        f"the first rollout leaves the finite numbers at step {when}, state '{name}' "
-        f"(the model is at {system.source})"
-    )
+    name, time = system.states[int(np.argmax(bad[when]))], when * problem.dt
+    text = f"the model leaves the finite numbers at {time:g} s, in state '{name}'"
+    before = max(when - 1, 0)
+    given = problem.received(z[before], found.u[min(before, len(found.u) - 1)], before)
+    fault = system.fault(z[before, : system.n], given, problem.p, problem.dt)
+    return f"{text} ({fault or system.source})"
+
+
+def _first_slope(problem: Problem, found: Descent) -> str:
+    """Which derivative the first sweep failed on, as a sentence."""
+    system, x = problem.system, found.z[:-1, : problem.system.n]
+    given = problem.received(found.z[:-1], found.u)
+    slopes = system.linearise(x, given, problem.p, problem.dt, problem.smoothing)
+    for what, J in zip((system.states, system.inputs), slopes, strict=True):
+        for t, i, j in np.argwhere(~np.isfinite(J))[:1]:
+            return (
+                f"the derivative of state '{system.states[i]}' by '{what[j]}' is not finite at "
+                f"{t * problem.dt:g} s ({system.source})"
+            )
+    return f"no step is known at {found.failed_at * problem.dt:g} s"
 
 
 def _check(problem: Problem, u: Array, K: Array | None, z: Array | None) -> None:

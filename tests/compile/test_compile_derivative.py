@@ -175,6 +175,29 @@ def test_a_branch_not_taken_never_leaks_nan():
             assert np.isfinite(f_x[:, 0]).all() and np.isfinite(f_u[:, 0]).all()
 
 
+@pytest.mark.parametrize("eps", [0.0, 0.05])
+def test_what_is_infinitely_steep_at_rest_has_a_slope_there(eps):
+    """A drag by np.hypot(vx, vy) from rest: its slope was 0/0, and the plan a free fall."""
+
+    def drag(s, a, p):
+        speed = np.hypot(s.x, s.v)
+        return {
+            "x": a.u - p.c * s.x * speed - np.sqrt(s.x**2 + s.v**2),
+            "v": np.arctan2(s.v, s.x) + np.cbrt(s.v) + np.abs(s.x) ** 0.7 + np.arcsin(1 - s.x**2),
+        }
+
+    signature = Signature(drag, "derivative", **NAMES)
+    twin = TracedSystem(signature, trace(signature, None, 0.1), "euler", "")
+    x, u, p = np.zeros((1, 2)), np.ones((1, 1)), np.ones(2)
+    for some in (system_of(drag, kind="derivative", integrator="euler", **NAMES), twin):
+        f_x, f_u, f_p = some.sensitivities(x, u, p, 0.1, eps)
+        np.testing.assert_array_equal(f_x[0], np.eye(2))
+        np.testing.assert_allclose(f_u[0], [[0.1], [0.0]])
+        np.testing.assert_array_equal(f_p[0], 0.0)
+        away = some.linearise(np.array([[3.0, 4.0]]), u, p, 0.1, eps)[0][0]
+        assert away[0, 1] == pytest.approx(-0.1 * (3 * 0.8 + 0.8))
+
+
 def test_smoothing_narrows_to_the_exact_branch():
     made, p = system("car")
     x = np.array([[0.1, 0.5, 0.0, 0.0, 0.2]])
@@ -195,12 +218,6 @@ def test_what_depends_on_parameters_alone_is_never_smoothed():
         return {"y": s.y + sign * np.abs(p.tau) / tau * (1 - np.exp(-dt / tau)) * (a.u - s.y)}
 
     model = Model(states={"y": "1"}, inputs={"u": "1"}, params={"tau": Param(0.04)}, step=lag)
-    twin = (
-        TracedSystem(model.signature, trace(model.signature, None, 0.02), "rk4", "")
-        if False
-        else None
-    )
-    assert twin is None
     x, u, p = np.array([[0.2]]), np.array([[1.0]]), np.array([0.04])
     exact = model.system.step(x, u, p, 0.02, 0.0)
     np.testing.assert_array_equal(model.system.step(x, u, p, 0.02, 0.05), exact)

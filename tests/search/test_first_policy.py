@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import grounded as gr
 from grounded.experiments.car_tasks import NAMES, car_task, target
 from grounded.experiments.figure8 import flight_task
 from grounded.experiments.pendulum import pendulum_task
@@ -87,3 +88,51 @@ def test_caution_does_not_hang_on_the_unit_of_an_input():
     free = cautious(replace(task, low=np.full(2, -np.inf), high=np.full(2, np.inf)), 1)
     np.testing.assert_allclose(wide.reward.input_change, fine / 1e4)
     np.testing.assert_allclose(free.reward.input_change, fine)
+
+
+def no_plan(**function):
+    """What is raised where a model has no number at the start, in place of a plan."""
+    nothing = {"states": {"x": "m", "v": "m/s"}, "inputs": {"a": "m/s^2"}}
+    task = gr.Task(
+        model=gr.Model(**nothing, **function),
+        dt=0.1,
+        target=np.array([[0.0, np.nan]] + 10 * [[1.0, np.nan]]),
+        reward=gr.Reward(
+            state=[1.0, 0.0], terminal=[1.0, 0.0], input=[0.1], input_change=[0.0]
+        ),
+        start=np.zeros(2),
+        past=np.zeros(1),
+        low=-np.ones(1),
+        high=np.ones(1),
+    )
+    with pytest.raises(gr.GroundedError, match="there is no plan to run") as raised:
+        gr.Search(task).ask()
+    return str(raised.value)
+
+
+def test_a_model_without_a_number_is_told_with_its_line():
+    def dynamics(s, a, p):
+        root = np.sqrt(s.v - 0.5)
+        return {"x": s.v, "v": a.a - root}
+
+    line = dynamics.__code__.co_firstlineno + 1
+    told = no_plan(derivative=dynamics)
+    assert f"test_first_policy.py:{line}: invalid value encountered in sqrt" in told
+
+    def nothing(s, a, p):
+        return {"x": s.v, "v": a.a + np.where(s.x < 0.01, np.nan, 0.0)}
+
+    told = no_plan(derivative=nothing)
+    assert f"test_first_policy.py:{nothing.__code__.co_firstlineno}: nan for 'v'" in told
+
+
+def test_a_derivative_without_a_number_is_told_by_its_names():
+    def step(s, a, p, dt):
+        return {"x": s.x + dt * s.v, "v": s.v + dt * a.a}
+
+    def slopes(s, a, p, dt):
+        return np.array([[1, dt], [0, 1]]), np.array([[0], [np.nan]])
+
+    told = no_plan(step=step, jacobian=slopes)
+    assert "derivative of state 'v' by 'a' is not finite at 0 s" in told
+    assert "test_first_policy.py" in told

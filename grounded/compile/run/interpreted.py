@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.compile.names import where
+from grounded.compile.names import raised_at, where
 from grounded.compile.problem import (
     ARMIJO,
     MAX_ITERATIONS,
@@ -65,7 +65,7 @@ class Interpreted(System):
         self, signature: Signature, integrator: Integrator = "rk4", note: str = ""
     ) -> None:
         self.signature, self.integrator, self.note = signature, integrator, note
-        self.kind, self.states = signature.kind, signature.states
+        self.kind, self.states, self.inputs = signature.kind, signature.states, signature.inputs
         self.source = where(signature.function)
         self.n, self.m, self.k = self.sizes = signature.sizes
 
@@ -84,6 +84,25 @@ class Interpreted(System):
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
     ) -> Array:
         """Derivatives of `step` by the first `width` of x, u and p, (N, n, width)."""
+
+    def fault(self, x: Array, u: Array, p: Array, dt: float) -> str:
+        """See `System.fault`; at the state itself, and where a first stage of the step goes."""
+        signature = self.signature
+        given = [[np.float64(v) for v in values] for values in (u, p)]
+        for _ in range(2):
+            try:
+                with np.errstate(all="raise", under="ignore"):
+                    values = signature.call([np.float64(v) for v in x], *given, np.float64(dt))
+            except (ArithmeticError, ValueError) as error:
+                return f"{raised_at(error, signature.function)}: {error}"
+            found = np.array([float(values[name]) for name in signature.outputs])
+            if not np.isfinite(found).all():
+                name = signature.outputs[int(np.argmin(np.isfinite(found)))]
+                return f"{self.source}: {values[name]:g} for '{name}'"
+            if self.kind == "step":
+                break
+            x = x + 0.5 * dt * found
+        return ""
 
     def linearise(
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0

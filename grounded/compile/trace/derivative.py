@@ -7,7 +7,9 @@ and with each other. By the chain rule
     d op(a, b) = (d op / d a) d a + (d op / d b) d b
 
 where each partial is built once a node. Indicator terms have the derivatives of their smoothed
-forms, which at eps = 0 are those of the branch that is taken.
+forms, which at eps = 0 are those of the branch that is taken. Where an operation is infinitely
+steep, as the speed sqrt(vx^2 + vy^2) is at rest, its slope counts as zero, which is one of its
+slopes there.
 """
 
 from __future__ import annotations
@@ -82,25 +84,31 @@ def _div(g: Graph, i: int, args: tuple[int, ...]) -> tuple[int, ...]:
     return inverse, g.node("neg", g.node("mul", i, inverse))
 
 
+def _finite(g: Graph, i: int) -> int:
+    """A slope, 0 where it is not finite."""
+    return g.node("gate", g.const(1.0), i)
+
+
 def _pow(g: Graph, i: int, args: tuple[int, ...]) -> tuple[int, ...]:
     x, e = args
     lower = g.node("pow", x, g.node("sub", e, g.const(1.0)))
-    by_base = g.node("mul", e, lower)
+    by_base = _finite(g, g.node("mul", e, lower))
     if g.constant(e) is not None:
         return by_base, g.const(0.0)
-    return by_base, g.node("mul", i, g.node("log", x))
+    return by_base, _finite(g, g.node("mul", i, g.node("log", x)))
 
 
 def _atan2(g: Graph, i: int, args: tuple[int, ...]) -> tuple[int, ...]:
     y, x = args
     square = g.node("add", g.node("mul", x, x), g.node("mul", y, y))
     inverse = _reciprocal(g, square)
-    return g.node("mul", x, inverse), g.node("neg", g.node("mul", y, inverse))
+    by_y, by_x = g.node("mul", x, inverse), g.node("neg", g.node("mul", y, inverse))
+    return _finite(g, by_y), _finite(g, by_x)
 
 
 def _asin(g: Graph, i: int, args: tuple[int, ...]) -> tuple[int, ...]:
     rest = g.node("sub", g.const(1.0), g.node("mul", args[0], args[0]))
-    return (_reciprocal(g, g.node("sqrt", rest)),)
+    return (_finite(g, _reciprocal(g, g.node("sqrt", rest))),)
 
 
 def _atan(g: Graph, i: int, args: tuple[int, ...]) -> tuple[int, ...]:
@@ -118,7 +126,7 @@ def _max(g: Graph, i: int, args: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _cbrt(g: Graph, i: int, args: tuple[int, ...]) -> tuple[int, ...]:
-    return (_reciprocal(g, g.node("mul", g.const(3.0), g.node("mul", i, i))),)
+    return (_finite(g, _reciprocal(g, g.node("mul", g.const(3.0), g.node("mul", i, i)))),)
 
 
 RULES: dict[str, Rule] = {
@@ -128,7 +136,7 @@ RULES: dict[str, Rule] = {
     "div": _div,
     "neg": lambda g, i, a: (g.const(-1.0),),
     "pow": _pow,
-    "sqrt": lambda g, i, a: (g.node("div", g.const(0.5), i),),
+    "sqrt": lambda g, i, a: (_finite(g, g.node("div", g.const(0.5), i)),),
     "cbrt": _cbrt,
     "exp": lambda g, i, a: (i,),
     "expm1": lambda g, i, a: (g.node("add", i, g.const(1.0)),),
