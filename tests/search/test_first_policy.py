@@ -97,9 +97,7 @@ def no_plan(**function):
         model=gr.Model(**nothing, **function),
         dt=0.1,
         target=np.array([[0.0, np.nan]] + 10 * [[1.0, np.nan]]),
-        reward=gr.Reward(
-            state=[1.0, 0.0], terminal=[1.0, 0.0], input=[0.1], input_change=[0.0]
-        ),
+        reward=gr.Reward(state=[1.0, 0.0], terminal=[1.0, 0.0], input=[0.1], input_change=[0.0]),
         start=np.zeros(2),
         past=np.zeros(1),
         low=-np.ones(1),

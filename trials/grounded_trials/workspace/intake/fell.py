@@ -2,7 +2,8 @@
 
 Once a robot is down its program sends something else than the policy, zeros mostly, and the log has
 that, too. Where the run had left [safety] by then it is the candidate's, and failed there, as if
-the log had ended with it.
+the log had ended with it: also where so little of the run was left that its commands are like the
+candidate's on the whole, as one input is held to the end that the policy would have moved.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ class Fall:
     told: str
 
 
-def fall_in(task: Task, name: str, trial: Trial, ran: Following | None) -> Fall | None:
+def fall_in(task: Task, own: Candidate, trial: Trial, ran: Following | None) -> Fall | None:
     """Where a run had left [safety] when its commands ceased to be its candidate's.
 
     Args:
         task: whose [safety] and horizon hold.
-        name: of the candidate.
+        own: the candidate.
         trial: the run and what follows it, of the task's states and inputs.
         ran: how its commands compare with the candidate's.
 
@@ -42,13 +43,14 @@ def fall_in(task: Task, name: str, trial: Trial, ran: Following | None) -> Fall 
         None where they are the candidate's to the end, or never were, where the run was in [safety]
         for `LEAST` steps before and after they ceased to be, or was all but over.
     """
-    if ran is None or ran.alike or ran.until_s < LEAST * task.dt:
+    ceased = None if ran is None else _ceased(task, trial, ran)
+    if ceased is None or ceased < LEAST:
         return None
     assert task.safety_low is not None and task.safety_high is not None
     whole = interpolate_gaps(trial).trial
     states = whole.states[: whole.finite_steps + 1]
     beyond = np.maximum(task.safety_low - states, states - task.safety_high)
-    out, ceased = beyond.max(axis=1) > 0, round(ran.until_s / task.dt)
+    out = beyond.max(axis=1) > 0
     begin = max(0, ceased - LEAST)
     about = out[begin : ceased + LEAST + 1]
     if not about.any():
@@ -59,17 +61,37 @@ def fall_in(task: Task, name: str, trial: Trial, ran: Following | None) -> Fall 
     steps = min(first, ceased)
     if steps < LEAST or steps + LAST >= task.horizon:
         return None
-    i = int(np.argmax(beyond[first]))
+    i, name = int(np.argmax(beyond[first])), own.id
     state, unit = list(task.model.states.items())[i]
-    was = with_unit(f"{states[first, i]:.3g}", unit)
+    was, predicted = (with_unit(f"{x[first, i]:.3g}", unit) for x in (states, own.predicted_states))
     low, high = task.safety_low[i], task.safety_high[i]
     return Fall(
         steps,
-        f"{state} left [safety] = [{low:g}, {high:g}] at {first * task.dt:.2f} s (it was {was}), "
-        f"and the commands are those of {name} up to {ran.until_s:.2f} s only: this counts as a "
-        f"failed run of {name}, cut at {steps * task.dt:.2f} s, and what follows is not judged. If "
-        "something disturbed it, `discard` it",
+        f"{state} left [safety] = [{low:g}, {high:g}] at {first * task.dt:.2f} s (it was {was}, "
+        f"where {predicted} was predicted), and the commands are those of {name} up to "
+        f"{ceased * task.dt:.2f} s only: this counts as a failed run of {name}, cut at "
+        f"{steps * task.dt:.2f} s; what came before is kept for fit and diagnose, what follows is "
+        "not judged. If something disturbed it, `discard` it",
     )
+
+
+def _ceased(task: Task, trial: Trial, ran: Following) -> int | None:
+    """The step at which the commands of a run cease to be its candidate's; None: they don't.
+
+    Held from there to the end, where the policy would have moved them; or unlike the policy's.
+    """
+    T = len(ran.off)
+    sent, off = trial.inputs[:T], np.nan_to_num(ran.off) / (ran.fine / FINE)
+    moves = np.flatnonzero((np.abs(np.diff(sent, axis=0)) > ran.fine).any(axis=1))
+    held = int(moves[-1]) + 1 if len(moves) else 0
+    before, after = (float((part**2).mean()) for part in (off[: max(held, 1)], off[held:]))
+    if T - held >= FEW and after > max(STOPPED**2, 4 * before):
+        return held
+    return None if ran.alike else round(ran.until_s / task.dt)
+
+
+FEW = 5  # steps for which inputs are held at least when the motors are cut,
+STOPPED = 0.1  # of an input: by so much the policy would have moved it, rms
 
 
 def who_fell(

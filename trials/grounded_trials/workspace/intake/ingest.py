@@ -124,7 +124,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     """What is to be said of a trial that has just been stored."""
     workspace.forget_trials()
     trial = replace(read.trial, id=added.id)
-    warnings = (*read.warnings, *warnings_about(workspace, trial, read.last_s))
+    warnings = (*read.warnings, *warnings_about(workspace, trial, read.last_s, read.fell))
     if whole := _whole(read, workspace.task):
         warnings = (*warnings, *afterwards(workspace.task, whole))
     if before:
@@ -200,18 +200,21 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     fell, stored = look.fell, read.log.stored if read.log else ()
     if before := [one.trial.steps for one in stored if one.trial.candidate == ran]:
         # it was believed when it came; what was made of it since is like it
-        return cut_short(read, fell.steps) if fell and fell.steps in before else read
+        return cut_short(read, fell.steps, "") if fell and fell.steps in before else read
     units, by = other_units(workspace.task, whole, own, seen.ran)
     units = () if other else units
     if not why and not units:
-        return replace(read, warnings=(*read.warnings, *_like(read, ran, seen.ran)))
+        told = _like(read, ran, seen.ran)
+        if fell:
+            read = cut_short(read, fell.steps, fell.told)
+        return replace(read, warnings=(*read.warnings, *told))
     slow = pace_of(log, workspace.task, own.policy) if log else None
     if slow:  # drawn out, it may pass for one in another unit
         units = ()
     elif log and not units and not other:
         units, by = unit_of(log, workspace.task, own.policy)
     if fell and not (units or slow or misled(log, workspace.task, own.policy)):
-        return replace(cut_short(read, fell.steps), warnings=(*read.warnings, fell.told))
+        return cut_short(read, fell.steps, fell.told)
     pace = slow and (
         f"a second of its stamps is {slow:g} s of the run (a recording played at another rate?): "
         f"correct the stamps, times {slow:g}, and ingest it again"
@@ -357,8 +360,8 @@ class _Look:
             given = Start(begins, 0.0, alike=True, opens_alike=True)
             if sender_of(log.anywhere, own, [], lambda _: given).sure:
                 seen = replace(seen, why="", other="")
-        doubted = read.log and seen.why and not seen.other
-        self.fell = fall_in(task, ran, self.read.trial, seen.ran) if doubted else None
+        asked = read.log and not seen.other
+        self.fell = fall_in(task, own, self.read.trial, seen.ran) if asked else None
         if self.fell and self.log:
             first, steps = self.found.seconds if self.found else self.log.first, self.fell.steps
             if name := who_fell(self.log, own, candidates, start_of, first + steps * task.dt):

@@ -52,6 +52,7 @@ class Read:
     doubted: bool = False  # taken in as a candidate's run, though its commands say otherwise
     log: ForeignLog | None = None
     cut: Gridded | None = None  # of a foreign log: how it was sampled
+    fell: bool = False  # it failed before the log ends, which its warnings say
     last_s: float = math.nan  # its last sample of every state, since the start; of a foreign log
 
     @property
@@ -198,13 +199,15 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
     )
 
 
-def cut_short(read: Read, steps: int) -> Read:
-    """A run in a foreign log up to so many steps, as it is where the log is no longer."""
+def cut_short(read: Read, steps: int, told: str) -> Read:
+    """A run in a foreign log up to so many steps, as it is where the log is no longer; and why."""
     if read.log is None or read.cut is None or read.trial.steps <= steps:
         return read
     trial, workspace = read.trial.until(steps), read.log.workspace
     about = _about(workspace, trial.candidate) | read.log.source
-    return replace(read, trial=trial, data=_encode(workspace, trial, about, read.cut.start_ns))
+    data = _encode(workspace, trial, about, read.cut.start_ns)
+    warnings = (*read.warnings, told) if told else read.warnings
+    return replace(read, trial=trial, data=data, warnings=warnings, fell=bool(told))
 
 
 def misread(log: ForeignLog) -> tuple[str, ...]:

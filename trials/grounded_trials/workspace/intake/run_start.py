@@ -14,9 +14,8 @@ sent answers to where the robot was then.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -24,11 +23,12 @@ from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.task import Task
-from grounded.trial import LAST, Trial, interpolate_gaps
+from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.command_steps import changes_of, phase_of
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
 from grounded_trials.workspace.intake.acted_on import acted_on
+from grounded_trials.workspace.intake.instants import instants_apart, least_of
 from grounded_trials.workspace.intake.missed_steps import missed_steps
 from grounded_trials.workspace.intake.who_drove import (
     FINE,
@@ -42,15 +42,14 @@ TRIED = 5  # instants at which the commands fit best
 BESIDE = 4  # steps before the best of them, within which the commands may be the policy's exactly
 HELD = 3.5  # steps: what changes no sooner may begin a run
 FINEST = 8  # parts of a step, between which the start is sought
-QUIET_S = 1.0  # without a change of commands, before a run that the log does not have whole
-SHORT = 4  # at least 1 / SHORT of a run tells that it was one
 ALIGNED = 0.75  # of the time between samples: a start nearer than that is as good
 CLEARLY = 0.7  # of the commands' difference at the first command: the start is elsewhere
 KNOWN = 0.25  # of a row: the standard deviation from which feedback tells when in it a run began
 EXACT = 0.1  # of what a row's lateness does to commands: with less, the states were the policy's
 LOOSE = 0.1  # of a step: a start that is known no better is told
-EXACTLY = 0.02  # of an input's size: the mean difference of a run that is sought by how it begins
-BATCH = 256  # instants compared at once
+SOUGHT = 24  # instants at which the samples that the program acted on are sought
+MOVES = 0.05  # of an input's size: commands that move by less fit whatever was held before
+EXACT_TO = 1e-3  # of an input's size: half of the first commands are so near to the policy's there
 
 # the samples of a log, with those of the states that nothing measures: estimated from the others
 Complete = Callable[[Mapping[str, Series]], Mapping[str, Series]]
@@ -125,11 +124,13 @@ class Recording:
         """
         if (policy.state_names, policy.input_names) != self.names or policy.dt != self.dt:
             return None
-        apart, until = self._apart(policy)
+        apart, until, strays = instants_apart(self.whole, self.parts, policy)
         whole = self._starts(policy, apart)
         if (found := self._surest(policy, whole)) is None:
             begun = [one for one in self._starts(policy, until) if one.opens_alike]
             found = min(begun or whole, key=lambda one: (not one.alike, one.apart), default=None)
+        if found is None or not found.alike:
+            found = self._by_its_samples(policy, strays) or found
         found = found and self._exactly(policy, found)
         first, _ = self._on_step(policy, self.first)
         missed = missed_steps(self, policy, first, found.seconds if found else first)
@@ -161,6 +162,34 @@ class Recording:
         if fit is not None and alike and fit.left < SAME * usual:
             return replace(best, opens_alike=True)
         return likeliest if alike else None
+
+    def _by_its_samples(self, policy: Policy, strays: Array) -> Start | None:
+        """Where the first commands are the policy's to the last digits, on samples of some age.
+
+        Gains that throw an input from limit to limit make another command of a state that is a
+        millisecond younger, and a run that fell is not whole.
+        """
+        first = least_of(policy.horizon)
+
+        def off(at: float) -> float:
+            """Of half of the first commands, which must tell something; infinite if they don't."""
+            fit = acted_on(self, policy, at)
+            told = np.zeros(0, int) if fit is None else np.flatnonzero(fit.told[:first])
+            if fit is None or len(told) < LEAST:
+                return np.inf
+            moves = bool((np.ptp(fit.asked[told], axis=0) > MOVES * fit.size).any())
+            return float(np.median(fit.off[told])) if moves else np.inf
+
+        tried, left = dict[float, float](), strays.copy()
+        while len(tried) < SOUGHT and np.isfinite(left).any() and policy.gain is not None:
+            k = int(np.argmin(left))
+            left[max(0, k - self.parts + 1) : k + self.parts] = np.inf
+            at, _ = self._on_step(policy, self.first + k * self.dt / self.parts)
+            tried[at] = off(at)
+        best = min(tried, key=tried.__getitem__, default=0.0)
+        if not tried or tried[best] > EXACT_TO:
+            return None
+        return Start(best, self.apart_at(policy, best), alike=False, opens_alike=True)
 
     def _exactly(self, policy: Policy, found: Start) -> Start:
         """A start some steps sooner, where the commands are the policy's exactly, if they are.
@@ -199,7 +228,9 @@ class Recording:
         """The mean difference of the commands from an instant on, as `Start.apart`."""
         k = round((start - self.first) * self.parts / self.dt)
         inside = 0 <= k < len(self.whole.inputs)
-        return float(self._apart(policy, range(k, k + 1))[0][k]) if inside else np.inf
+        if not inside:
+            return np.inf
+        return float(instants_apart(self.whole, self.parts, policy, range(k, k + 1))[0][k])
 
     def _on_step(self, policy: Policy, start: float) -> tuple[float, float]:
         """A start moved to where commands change, by less than a step, and the room before it."""
@@ -253,55 +284,6 @@ class Recording:
         if left > KNOWN**2 * power or not -KNOWN < share < 1 + KNOWN:
             return start, loose
         return start - float(np.clip(share, 0.0, 1.0)) * row, loose
-
-    def _apart(self, policy: Policy, instants: range | None = None) -> tuple[Array, Array]:
-        """Two measures of every instant, infinite where it can't begin a run.
-
-        Returns:
-            The mean difference of the commands, where the log has the run whole, or begins it after
-            a rest. And the part of the run after which commands are the policy's no more: of one
-            that was cut, or stopped, in a log in which something moved before it.
-        """
-        sent, parts, H = self.whole.inputs, self.parts, policy.horizon
-        sent = np.clip(sent, policy.low, policy.high)
-        changed = np.any(np.diff(sent, axis=0, prepend=sent[:1]) != 0, axis=1)
-        count, quiet = np.cumsum(changed), round(QUIET_S / self.dt * parts)
-        apart, until = np.full((2, len(sent)), np.inf)
-        least, steps = max(LEAST, H // SHORT), np.arange(1, H + 1)
-        asked = range(len(sent)) if instants is None else instants
-        wanted = [k for k in asked if self._left(k) >= min(least, H - LAST)]
-        for ks, off, known in self._off(policy, wanted):
-            left = known.sum(axis=1)
-            before = np.maximum(ks - 1, 0)
-            begun = count[before] == count[np.maximum(ks - 1 - quiet, 0)]
-            whole = (left >= H - LAST) | (begun & (left >= least))
-            apart[ks[whole]] = ((off * known).sum(axis=1) / left)[whole]
-            mean = np.where(known, np.cumsum(off, axis=1) / steps, np.inf)
-            alike = np.where(mean < EXACTLY, steps, 0).max(axis=1)
-            at = mean[np.arange(len(ks)), np.maximum(alike - 1, 0)]
-            lost = 1 - alike / H + 0.1 * at / EXACTLY  # a step more is no better, for more apart
-            until[ks] = np.where(alike >= least, lost, np.inf)
-        return apart, until
-
-    def _left(self, k: int) -> int:
-        """Steps that the log has from an instant on."""
-        return (len(self.whole.inputs) - k - self.parts // 2 - 1) // self.parts + 1
-
-    def _off(self, policy: Policy, wanted: Sequence[int]) -> Iterator[tuple[Any, Any, Any]]:
-        """Differences of the commands (K, H), of instants (K,), and whether they are known."""
-        states, sent, parts, H = self.whole.states, self.whole.inputs, self.parts, policy.horizon
-        sent = np.clip(sent, policy.low, policy.high)
-        width = policy.high - policy.low
-        size = np.maximum(np.abs(sent).max(axis=0), np.abs(policy.feedforward).max(axis=0))
-        size = size + np.where(np.isfinite(width), 0.1 * width, 1e-12)
-        steps = parts * np.arange(H)
-        for at in range(0, len(wanted), BATCH):
-            ks = np.array(wanted[at : at + BATCH])
-            x = states[np.minimum(ks[:, None] + steps, len(states) - 1)]
-            here = ks[:, None] + steps + parts // 2
-            u = sent[np.minimum(here, len(sent) - 1)]
-            off = (np.abs(policy.commands(x, policy.past) - u) / size).mean(axis=2)
-            yield ks, off, here < len(sent)
 
 
 def _close(policy: Policy, trial: Trial) -> bool:

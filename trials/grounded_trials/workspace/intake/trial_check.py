@@ -36,7 +36,7 @@ WIDEN = "no plan will ask for that; widen them if the robot may get it"
 
 
 def warnings_about(
-    workspace: Folder, trial: Trial, last_s: float = float("nan")
+    workspace: Folder, trial: Trial, last_s: float = float("nan"), fell: bool = False
 ) -> tuple[str, ...]:
     """Gaps, odd columns, an early end, a start far from s_0, what left [limits] or [safety].
 
@@ -45,6 +45,7 @@ def warnings_about(
         trial: as it is stored.
         last_s: when the last of its states was logged, seconds of the run; NaN where all are on
             the control grid.
+        fell: whether it is known, and told, that the run failed where the trial ends.
     """
     from grounded.instruments.kinematics import integrals
     from grounded.instruments.swapped import exchanged, swapped_columns
@@ -77,7 +78,7 @@ def warnings_about(
     found += sent
     if not trial.candidate:
         return (*found, *_beyond(task, whole, scaled))
-    if whole.steps < task.horizon:
+    if whole.steps < task.horizon and not fell:
         ends = f"after {whole.steps} of {task.horizon} steps ({whole.steps * trial.dt:.2f} s)"
         found.append(
             f"the run ended {ends}: a failed candidate; its data stay usable for fit and diagnose"
@@ -95,7 +96,7 @@ def warnings_about(
     found += _start(task, whole, _starts_before(workspace, trial.id))
     found += _inputs(task, whole)
     candidate, _ = workspace.candidate(trial.candidate)
-    found += _unsafe(task, whole, candidate)
+    found += [] if fell else _unsafe(task, whole, candidate)
     ran = follows(candidate.policy, whole, max(LATEST, latest(task)))
     if ran is not None and ran.alike and ran.late and ran.moved < UNLIKE:
         by = count(abs(ran.late), "step")
