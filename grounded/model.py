@@ -26,6 +26,10 @@ from grounded.frozen import Array, readonly, wrapped
 
 Function = Callable[..., Mapping[str, Any]]
 MAX_SUBSTEPS = 1000
+ROLES = (
+    *("position", "altitude", "heading", "attitude", "heading_rate", "rates", "speed"),
+    *("steering_angle", "hanging", "upright", "level", "rail"),
+)
 BELIEVED = 3.0  # standard deviations, as the user gave them, that a parameter may be off
 LEAST = 0.2  # of a parameter without a bound on the side of zero: its sign is known
 MAX_SIZE = 200  # states and inputs: a step costs their cube, and minutes from here on
@@ -226,6 +230,9 @@ class Model:
                 "along an axis, two in a plane (horizontal first), or three"
             )
         for role, targets in self.roles.items():
+            meant = nearest(role, ROLES)
+            if role not in ROLES and meant.startswith("did you"):  # others may serve own effects
+                raise GroundedError(f"role '{role}' is none that is known: {meant}")
             for name in (targets,) if isinstance(targets, str) else targets:
                 if name not in self.states and name not in self.inputs:
                     raise GroundedError(

@@ -92,6 +92,8 @@ def summary(status: Status) -> str:
 
 def _gained(standing: Standing) -> str:
     """By how much the best candidate beats the model's own policy, as the end of a sentence."""
+    from grounded.search.certainty import owed_to_start
+
     best, own = standing.incumbent, standing.history[0]
     if best is None or best.candidate is own.candidate or own.candidate.base or not own.utilities:
         return ""
@@ -99,8 +101,11 @@ def _gained(standing: Standing) -> str:
         return "; the model's own policy failed"
     if best.candidate.base == "" or not own.utility:
         return ""
-    gain = 100 * (best.utility - own.utility) / abs(own.utility)
-    return f", {gain:.1f} % better than the model's own policy"
+    percent = 100 / abs(own.utility)
+    gain = f", {percent * (best.utility - own.utility):.1f} % better than the model's own policy"
+    if start := owed_to_start(own, best, standing.history):
+        return f"{gain}; {percent * start:.1f} % by where the runs began, as the model sees it"
+    return gain
 
 
 def _row(tried: Tried, verdict: str) -> tuple[str, ...]:

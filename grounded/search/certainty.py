@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.scatter import Repeats, by_pieces, noise_cost, white_noise, with_errors
+from grounded.search.scatter import (
+    Repeats,
+    beyond_noise,
+    by_pieces,
+    noise_cost,
+    white_noise,
+    with_errors,
+)
 from grounded.task import Task
 from grounded.trial import Trial, scattered
 
@@ -19,6 +26,7 @@ if TYPE_CHECKING:
     from grounded.search.standing import SearchOptions
 
 FAR = 1e100  # in its unit: "noise" of a run that flew off
+PART = 0.3  # of a gain: less than that by where runs began is not told
 FEW = 4.0  # degrees of freedom, with which two standard errors are no certainty
 
 
@@ -118,7 +126,14 @@ def last_improvement(history: Sequence[Tried], again: str = "run the best one ag
     if len(accepted) < 2:
         return ""
     before, after = accepted[-2], accepted[-1]
-    gain = after.utility - before.utility
+    gain, start = after.utility - before.utility, owed_to_start(before, after, history)
+    if start:
+        return (
+            f"the last gain is {gain:.3g}: where the runs of {before.candidate.id} and "
+            f"{after.candidate.id} began makes {start:.3g} of the difference, as the model sees "
+            f"it, and the policy {gain - start:.3g}; run {before.candidate.id} again from "
+            "[task] start to be sure"
+        )
     error, freedom = error_between(before, after, history)
     if not freedom:
         return (
@@ -132,6 +147,28 @@ def last_improvement(history: Sequence[Tried], again: str = "run the best one ag
         f"the last gain is {gain:.3g} +- {error:.2g}: an improvement with probability "
         f"{probability:.2f}" + ", for so few repeats" * (freedom < FEW)
     )
+
+
+def owed_to_start(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
+    """How much of a gain comes of where the runs of the two began; 0 where it is a small part.
+
+    A run from elsewhere than s_0 costs more or less, whatever the policy. What that is worth, the
+    models say that were grounded on these trials: U^ of the run from s_0 less that of the run from
+    where the trials began.
+    """
+
+    def worth(one: Tried) -> float:
+        found = [c for t in history if (c := t.candidate).base == one.candidate.id]
+        starts = [c.expected_of_base - c.base_as_run for c in found]
+        known = [start for start in starts if math.isfinite(start)]
+        if not known or not one.trials:
+            return 0.0
+        s_0 = one.candidate.predicted_states[0]
+        off = np.array([trial.states[0] - s_0 for trial in one.trials])
+        return known[-1] if beyond_noise(one.trials, off, s_0).any() else 0.0
+
+    gain, start = after.utility - before.utility, worth(before) - worth(after)
+    return start if abs(start) > PART * abs(gain) and math.isfinite(start) else 0.0
 
 
 def student(x: float, freedom: float) -> float:

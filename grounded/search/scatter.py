@@ -62,6 +62,23 @@ def by_pieces(task: Task, trials: Sequence[Trial]) -> Array:
     return np.array([[part.sum() for part in np.array_split(r, PIECES)] for r in worth])
 
 
+CHANCE = 3.0  # standard deviations of a sensor's noise that one row may be off by
+NOTHING = 1e-9  # in a state's unit, or of its value: no difference at all
+
+
+def beyond_noise(trials: Sequence[Trial], off: Array, start: Array) -> Array:
+    """Whether the first rows of trials are off s_0 by more than their sensors' noise, (n,) bool.
+
+    Args:
+        trials: of one candidate.
+        off: s_0 of each trial less that of the task, (N, n).
+        start: s_0 of the task (n,).
+    """
+    noise = np.sqrt(np.mean([white_noise(t.states) ** 2 for t in trials], axis=0) / len(trials))
+    least = np.maximum(CHANCE * noise, NOTHING * np.maximum(1.0, np.abs(start)))
+    return np.asarray(np.abs(np.mean(off, axis=0)) > least)
+
+
 def white_noise(states: Array) -> Array:
     """The white noise of each sensor (n,) by differences of states (H + 1, n); 0 of none.
 

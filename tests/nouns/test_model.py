@@ -53,6 +53,7 @@ def test_differences_of_angles_wrap_and_the_arguments_stay():
         ({"angles": ("vv",)}, holding("angle", "'vv'", "'v'")),
         ({"roles": {"position": ("x", "y")}}, holding("position", "'y'")),
         ({"roles": {"position": ("x", "x", "x", "x")}}, holding("position", "4")),
+        ({"roles": {"positon": "x"}}, holding("positon", "did you mean", "position")),
     ],
     ids=lambda v: " ".join(v) if isinstance(v, dict) else str(v)[:40],
 )

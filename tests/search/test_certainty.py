@@ -8,12 +8,13 @@ from scipy.stats import t, ttest_ind
 
 from facts import holds
 from grounded.search.candidate import Tried
-from grounded.search.certainty import error_between, last_improvement, student
+from grounded.search.certainty import error_between, last_improvement, owed_to_start, student
 from grounded.search.standing import _hardly
 
 
 def tried(*utilities, accepted=True, base="c0001"):
-    candidate = SimpleNamespace(base=base, model="m")
+    nothing = {"expected_of_base": np.nan, "base_as_run": np.nan}
+    candidate = SimpleNamespace(id="c", base=base, model="m", **nothing)
     return Tried(candidate=candidate, trials=(), utilities=utilities, accepted=accepted)
 
 
@@ -104,6 +105,32 @@ def test_a_crash_is_called_a_crash():
     ],
 )
 def test_a_verdict_is_one_of_a_few_words(accepted, base, doubt, trials, last, word):
-    candidate = SimpleNamespace(base=base, model="m")
+    nothing = {"expected_of_base": np.nan, "base_as_run": np.nan}
+    candidate = SimpleNamespace(id="c", base=base, model="m", **nothing)
     tried = Tried(candidate, (None,) * trials, (), accepted, in_doubt=doubt)
     assert tried.verdict(last) == word
+
+
+def test_what_a_start_is_worth_is_no_improvement():
+    """Seen: "an improvement with probability 1.00" of a robot that was set down 7 cm nearer."""
+
+    def ran(name, base, utility, off, as_run=np.nan):
+        """A run from `off` beside s_0; the model gives its base -4 from s_0."""
+        states = np.linspace(off, 0.0, 30)[:, None]
+        candidate = SimpleNamespace(
+            id=name, base=base, expected_of_base=-4.0, base_as_run=as_run, model="m"
+        )
+        candidate.predicted_states = np.zeros((30, 1))
+        trials = tuple(SimpleNamespace(states=states) for _ in range(2))
+        return Tried(candidate, trials, (utility, utility + 0.01), True)
+
+    first = ran("c0001", "", -6.0, off=0.07)
+    second = ran("c0002", "c0001", -3.9, off=0.0, as_run=-5.9)
+    assert owed_to_start(first, second, [first, second]) == pytest.approx(1.9)
+    found = last_improvement([first, second])
+    assert holds(found, "2.1", "1.9", "0.2", "c0001") and "probability" not in found
+    here = ran("c0001", "", -6.0, off=0.0)
+    assert owed_to_start(here, second, [here, second]) == 0.0
+    assert "probability" in last_improvement([here, second])
+    little = ran("c0002", "c0001", -3.9, off=0.0, as_run=-4.1)
+    assert owed_to_start(first, little, [first, little]) == 0.0

@@ -14,7 +14,7 @@ from grounded_trials import Workspace
 from grounded_trials.report.findings import improvements_in
 from grounded_trials.report.gathering import gather
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.off_target import off_target_of, reaches
+from grounded_trials.workspace.off_target import off_target_of, position_axes, reaches
 from reported import cart, copied
 
 __all__ = ["cart"]
@@ -55,6 +55,13 @@ def task(**weights):
 def run(states):
     names = (ROVER.state_names, ROVER.input_names)
     return Trial(states, np.zeros((len(states) - 1, 2)), DT, *names)
+
+
+def test_a_height_that_is_part_of_the_position_counts_once():
+    """A quadrotor in a plane: (x, z) and the altitude z were sqrt(x^2 + 2 z^2)."""
+    plane = replace(ROVER, roles={"position": ("x", "y"), "altitude": "y"})
+    assert position_axes(plane) == position_axes(ROVER) == [0, 1]
+    assert position_axes(replace(ROVER, roles={**ROVER.roles, "altitude": "v"})) == [0, 1, 3]
 
 
 def off(x=0.0, y=0.0, psi=0.0, steps=H):

@@ -14,14 +14,12 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Document, measured_alike
-from grounded.search.scatter import white_noise
+from grounded.search.scatter import beyond_noise
 from grounded.task import Task
 from grounded.trial import Trial
 
 FEW = 2  # groups of states that are told: positions and angles before their rates, then by cost
 MOST = 0.5  # of the cost of being off: what makes more of it is told, too
-NOTHING = 1e-9  # in a state's unit, or of its value: no difference at all
-CHANCE = 3.0  # standard deviations of a sensor's noise that one row may be off by
 REST = 0.1  # of the mean step of a target: one that moves less in the last step is at rest
 
 
@@ -125,7 +123,8 @@ def position_axes(model: Model) -> list[int]:
     axes = roles.get("position", [])[:3]
     if len(axes) < 2:
         return []
-    return axes + roles.get("altitude", [])[: 3 - len(axes)]
+    up = [i for i in roles.get("altitude", []) if i not in axes]  # (x, z) may have it already
+    return axes + up[: 3 - len(axes)]
 
 
 def position_names(model: Model) -> list[str]:
@@ -157,7 +156,6 @@ def began_elsewhere(task: Task, trials: Sequence[Trial]) -> tuple[str, ...]:
 
     A first row that is off by no more than its sensor's noise shows nothing of where a run began.
     """
-    off = np.mean([task.model.difference(t.states[0], task.start) for t in trials], axis=0)
-    noise = np.sqrt(np.mean([white_noise(t.states) ** 2 for t in trials], axis=0) / len(trials))
-    least = np.maximum(CHANCE * noise, NOTHING * np.maximum(1.0, np.abs(task.start)))
-    return tuple(np.array(task.model.state_names)[np.abs(off) > least].tolist())
+    off = np.array([task.model.difference(t.states[0], task.start) for t in trials])
+    names = np.array(task.model.state_names)
+    return tuple(names[beyond_noise(trials, off, task.start)].tolist())

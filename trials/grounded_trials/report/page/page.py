@@ -208,13 +208,19 @@ def _heading(findings: Findings) -> str:
 
 def _improved(findings: Findings) -> list[tuple[str, str]]:
     """What the first trial missed by, and the best one does: in the units of the states."""
+    from grounded.search.certainty import owed_to_start
+
     rows = [(one.text, one.what) for one in improvements_in(findings)]
     first, best = findings.first, findings.best
     same = first is None or best is None or figure(first.utility) == figure(best.utility)
     if first is not None and best is not None and not same:
         gain = ""
         if -math.inf < first.utility < 0 and best.utility <= 0:
-            gain = f": {100 * (1 - best.utility / first.utility):.1f} % of the first cost is gone"
+            share = 1 - best.utility / first.utility
+            gain = f": {100 * share:.1f} % of the first cost is gone"
+            if start := owed_to_start(first, best, findings.history):
+                part = -100 * start / first.utility
+                gain += f", {part:.1f} % by where the runs began, as the model sees it"
         moved = f"{figure(first.utility)} → {figure(best.utility)}"
         rows.append((moved, f"utility, the model’s own policy to {best.candidate.id}{gain}"))
     elif best is not None:
