@@ -55,15 +55,19 @@ def integrals(model: Model) -> list[Integral]:
     return found + [Integral(i, names.index(k), 1.0, exact=False) for i, k in carried]
 
 
-def logged_behind(model: Model, shown: Sequence[int]) -> list[Integral]:
-    """The same between the late logs of states whose true values adopted effects keep as memory."""
+def logged_behind(model: Model, shown: Sequence[int]) -> list[tuple[Integral, bool]]:
+    """The same between logs, where adopted effects keep the true values of late ones as memory.
+
+    Each with whether both are late.
+    """
     names = model.state_names
     memory = [name for i, name in enumerate(names) if i not in shown]
     log = true_values(names, memory)
     return [
-        replace(one, i=log[one.i], j=log[one.j])
+        (replace(one, i=log.get(one.i, one.i), j=log.get(one.j, one.j)), {one.i, one.j} <= {*log})
         for one in integrals(model)
-        if one.exact and {one.i, one.j} <= log.keys()
+        if one.exact and not {one.i, one.j}.isdisjoint(log)
+        if {log.get(k, k) for k in (one.i, one.j)} <= {*shown}
     ]
 
 

@@ -271,11 +271,13 @@ class _Bench:
             if relation.exact and over > 0:
                 yield self.smoothed(relation, over)
 
-        for relation in logged_behind(self.model, self.shown):  # how late both are is adopted
-            lag = lag_of(self.model, relation, self.trials)
-            if lag is not None and lag.coherence > ALIKE and lag.filtered and lag.delay > 0:
-                q = self.model.state_names[relation.i]
-                yield self.in_time(relation.j, lag, f"the derivative of {q}")
+        for relation, both in logged_behind(self.model, self.shown):  # how late is adopted
+            lag, q = lag_of(self.model, relation, self.trials), self.model.state_names[relation.i]
+            clear = lag if lag is not None and lag.coherence > ALIKE else None
+            if clear and both and clear.filtered and clear.delay > 0:
+                yield self.in_time(relation.j, clear, f"the derivative of {q}")
+            elif clear and not clear.filtered and clear.mean >= SMOOTH * self.dt:
+                yield self.smoothed(relation, clear.mean)
 
     def unit(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """Sign and unit, which are put right; a scale, which may be either sensor's."""

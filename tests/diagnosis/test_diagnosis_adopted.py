@@ -25,6 +25,7 @@ from grounded.diagnosis.validation.limits import knowable, limits
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library, LossFamily, RateFamily, memory_of, memory_start, wrap
 from grounded.errors import NextCommand
+from grounded.instruments.preflight import preflight
 from grounded.policy import Policy
 from grounded.task import Task
 from grounded.utility import Reward
@@ -388,3 +389,22 @@ def test_an_adopted_delay_predicts_as_diagnosed_and_the_filter_behind_it_is_stil
             assert now.crude[name] < one.crude[name], (one, name)
             if one.horizon_s > LATE:  # what comes after the logs that a moved one reads ahead
                 assert now.crude[name] < 1.5 * one.with_effects[name], (one, name)
+
+
+def test_a_mean_that_was_left_out_is_left_out_once_its_delay_is_adopted():
+    """Seen: a lag of 2,308 nats, two couplings and "unknown", of a speed that is a difference."""
+    model, runs = seen_late(trials=2)
+    back, differences = 3, []
+    for run in runs:
+        x = run.states[:, 0]
+        v = (x - np.r_[np.full(back, x[0]), x[:-back]]) / (back * DT)
+        differences.append(replace(run, states=np.column_stack([x, v, run.states[:, 2]])))
+    looked = preflight(model, differences)
+    assert {f.kind for f in looked.findings if f.signal == "v"} >= {"delay", "smoothed"}
+    (late,) = (f.delay_s for f in looked.findings if f.signal == "v" and f.kind == "delay")
+    better, lifted, hidden = adopted(model, differences, "sensor_delay:v", d=late)
+    again = preflight(better, lifted, hidden)
+    assert [(f.signal, f.kind) for f in again.findings] == [("v", "smoothed")]
+    data = prepare(better, list(again.trials), None, None, hidden)
+    assert not limits(data, again.left_out).sentences
+    assert not limits(data, again.left_out).no_cause

@@ -81,10 +81,12 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
         why = "each step of a simulator takes its time" if slow else "to bound memory"
         used = f"{len(data.valid)} of {len(data.valid) + data.skipped} stretches of the trials"
         found.append(f"{used} were used, those that move most: {why}")
-    empty = [n for n, told in zip(data.model.state_names, data.told, strict=True) if not told]
-    for name in (name for name in empty if name not in left_out):
+    names = data.model.state_names
+    empty = [name for name, told in zip(names, data.told, strict=True) if not told]
+    spared = {*left_out, *(names[i] for i, log in data.behind.items() if names[log] in left_out)}
+    for name in (name for name in empty if name not in spared):
         found.append(f"state {name} was never measured")
-    if len(unmoved) + len(empty) + len(data.hidden) == data.model.n:
+    if {*unmoved, *empty, *(names[i] for i in data.hidden)} == {*names}:
         no_cause = True
     return Limits(tuple(found), no_cause)
 
