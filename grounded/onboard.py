@@ -16,7 +16,8 @@ is raised; what can't be used is left out, and `runner.blind` counts it:
   - a time that runs backwards is taken as the latest one; one that is not a number sends the last
     input again;
   - after the last step the input that was held before the start is sent, inside the limits;
-    `done` is true then. Keep recording for a second more: the last state is part of the run.
+    `done` is true then. Keep recording for a second more: the last state is part of the run;
+  - a run that is over stays over, also where the time begins anew: a second run needs a new runner.
 """
 
 from __future__ import annotations
@@ -92,9 +93,9 @@ class Runner:
         return u
 
     def _step(self, t: float) -> int:
-        """The control step nearest to t; -1 where t is not a number, H where it is past the end.
+        """The control step nearest to t; -1 where t is not a number, H where the run is over.
 
-        The last one lasts to the end of the horizon.
+        The last one lasts to the end of the horizon; once it was sent, no time far back counts.
         """
         try:
             where = float(t) / self.policy.dt + 0.5
@@ -103,7 +104,8 @@ class Runner:
         if where != where:
             return -1
         last = self._H if where - 0.5 >= self._H - EARLY else self._H - 1
-        return int(min(max(where, 0.0), float(last)))
+        step = int(min(max(where, 0.0), float(last)))
+        return self._H if self._latest == self._H - 1 and step < self._H // 2 else step
 
     def _correction(self, step: int, base: int, s: Any) -> Any:
         """K_t (z - zbar), (m,); None where the state can't be used."""

@@ -101,6 +101,18 @@ def test_time_runs_forward_or_stays():
     assert not runner.done(np.nan) and not runner.done(0.44)
 
 
+def test_a_run_that_is_over_stays_over_where_the_time_begins_anew():
+    """Seen: a quadrotor's second flight by the same runner, on the last step's command to the end."""
+    runner, state = Runner(policy()), [0.0, 0.0]
+    dt = policy().dt
+    for k in range(H):
+        assert not runner.done(k * dt)
+        runner.action(k * dt, state)
+    assert runner.action((H - 1.4) * dt, state) != pytest.approx([0.45])  # a little early
+    assert runner.done(0.0) and runner.action(0.0, state) == pytest.approx([0.45])
+    assert not Runner(policy()).done(0.0)
+
+
 def test_what_is_held_after_the_end_is_inside_the_limits():
     runner = Runner(policy())
     for t in (0.5, 1e300, np.inf):
