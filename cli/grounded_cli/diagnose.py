@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -24,7 +23,7 @@ from grounded_cli.terminal import (
 from grounded_trials.wording import percent, with_unit
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.report import Diagnosis, Ranked
+    from grounded.diagnosis.report import Diagnosis
     from grounded.engine import Engine
     from grounded.instruments.finding import Finding
 
@@ -120,11 +119,11 @@ def command(
 
 
 def _tell(found: Diagnosis, before: dict[str, float]) -> None:
+    from grounded.diagnosis.tables import error_table
     from grounded_trials.report.diagnosis_words import (
         agreement_lines,
         correction_line,
         error_lines,
-        error_table,
         in_vain,
     )
 
@@ -179,7 +178,7 @@ def _held_out(found: Diagnosis) -> str:
 
 
 def _instruments(findings: Sequence[Finding]) -> None:
-    from grounded_trials.report.diagnosis_words import instrument_lines
+    from grounded.diagnosis.tables import instrument_lines
 
     for k, line in enumerate(instrument_lines(findings)):
         show(field("sensors" if k == 0 else "", line))
@@ -234,8 +233,8 @@ def _places(found: Diagnosis) -> None:
 
 
 def _effects(found: Diagnosis) -> None:
+    from grounded.diagnosis.tables import credit_of, values_of
     from grounded.diagnosis.verdict import told_apart
-    from grounded_trials.report.diagnosis_words import credit_of
 
     ranking = found.ranking[:8]
     if ranking:
@@ -246,7 +245,7 @@ def _effects(found: Diagnosis) -> None:
                 f"{r.evidence:,.{int(abs(r.evidence) < 1000)}f}"
                 if r.evidence == r.evidence
                 else "-",
-                _values(r),
+                values_of(r),
             )
             for r in ranking
         ]
@@ -263,16 +262,3 @@ def _effects(found: Diagnosis) -> None:
             show(field("same", told_apart(group, found.equivalent)))
         else:
             show(field("tied", f"the data can't tell apart: {', '.join(group)}"))
-
-
-def _values(row: Ranked) -> str:
-    return ", ".join(
-        with_unit(f"{name} = {number(e.value, 3)}{_spread(e.std)}", e.unit)
-        for name, e in row.params.items()
-    )
-
-
-def _spread(std: float) -> str:
-    if not math.isfinite(std):
-        return " (any value fits)"
-    return f" +- {number(std, 2)}" if std else ""

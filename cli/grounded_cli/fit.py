@@ -36,8 +36,8 @@ def command(params: str | None, latency: bool, apply_: bool, engine: Engine, jso
     that predict it worse are never written.
     """
     workspace = open_workspace()
+    from grounded.diagnosis.tables import instrument_lines
     from grounded.errors import GroundedError
-    from grounded_trials.report.diagnosis_words import instrument_lines
 
     names = names_in(params) or None
     if params is not None and names is None:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.report import Estimate, quantity
+from grounded.diagnosis.report import Estimate
 from grounded.model import Model
 from grounded.result import listed, number, percent
 
@@ -179,3 +179,9 @@ def _beside(effect: Effect, params: Mapping[str, Estimate]) -> str:
 def _told(params: Mapping[str, Estimate]) -> list[str]:
     """The quantities that are not about zero."""
     return [n for n, e in params.items() if e.value != 0 and not abs(e.value) <= e.std]
+
+
+def quantity(estimate: Estimate) -> str:
+    """A value with its unit; pure numbers as they are."""
+    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    return f"{number(estimate.value)}{unit}"

@@ -347,6 +347,11 @@ class Diagnosis(Document):
         row = self.ranked(effect)
         return self.late_sensors.get(effect, {}) if row is None else row.values
 
+    def _repr_html_(self) -> str:
+        from grounded.diagnosis.tables import as_html
+
+        return as_html(self, super()._repr_html_())
+
     @property
     def late_sensors(self) -> dict[str, dict[str, float]]:
         """The filters and delays of sensors that were found and corrected, as effects by name.
@@ -391,9 +396,3 @@ def _numbers(
         found[name] = effect
         found |= {f"parameter:{param_name(name, key)}": value for key, value in effect.items()}
     return found
-
-
-def quantity(estimate: Estimate) -> str:
-    """A value with its unit; pure numbers as they are."""
-    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
-    return f"{number(estimate.value)}{unit}"

@@ -195,7 +195,7 @@ def next_trial(
     if groups and groups[0] in same:
         return f"{told_apart(groups[0], same)}: no trial tells them apart, either will do."
     if groups:
-        made = f"A trial made for it would tell {tied(groups[0])}."
+        made = f"A trial made for it may tell {tied(groups[0])}."
         turns = bool(places.plane(claims.data.model))
         return " ".join([made, *distinguishing(groups[0], turns=turns)])
     if seen:

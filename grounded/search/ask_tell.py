@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, nearest
 from grounded.policy import Policy
@@ -60,6 +60,14 @@ class Search:
 
     def __repr__(self) -> str:
         return f"<Search: candidates {len(self._candidates)}, trials {len(self._trials)}>"
+
+    def _repr_html_(self) -> str:
+        """Where it stands, for Jupyter."""
+        return self.standing._repr_html_()
+
+    def plot(self) -> Any:
+        """Utilities of the candidates as a Plotly figure; see `Result.plot`."""
+        return self.standing.plot()
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:

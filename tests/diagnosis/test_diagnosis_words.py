@@ -21,11 +21,11 @@ from grounded.diagnosis.ruler_words import (
     telling,
     worsened,
 )
+from grounded.diagnosis.tables import error_table
 from grounded.diagnosis.unconfirmed import another_look, unrepeatable
 from grounded.diagnosis.verdict import LOG, LOST, next_trial, verdict
 from grounded.effects import Library
 from grounded.models import car, pendulum
-from grounded_trials.report.diagnosis_words import error_table
 from small_tasks import cart_task
 
 UNITS = {"x": "m", "v": "m/s"}

@@ -88,11 +88,12 @@ class Interpreted(System):
     def fault(self, x: Array, u: Array, p: Array, dt: float) -> str:
         """See `System.fault`; at the state itself, and where a first stage of the step goes."""
         signature = self.signature
-        given = [[np.float64(v) for v in values] for values in (u, p)]
+        sent, known = ([np.float64(v) for v in values] for values in (u, p))
         for _ in range(2):
             try:
                 with np.errstate(all="raise", under="ignore"):
-                    values = signature.call([np.float64(v) for v in x], *given, np.float64(dt))
+                    at = [np.float64(v) for v in x]
+                    values = signature.call(at, sent, known, np.float64(dt))
             except (ArithmeticError, ValueError) as error:
                 return f"{raised_at(error, signature.function)}: {error}"
             found = np.array([float(values[name]) for name in signature.outputs])

@@ -7,10 +7,10 @@ import pytest
 
 from cli import grounded
 from facts import holding, holds
+from grounded.diagnosis.tables import instrument_lines
 from grounded.errors import GroundedError
 from grounded.instruments.finding import Finding
 from grounded.trial import Trial
-from grounded_trials.report.diagnosis_words import instrument_lines
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.config import read_config
 from grounded_trials.workspace.diagnosing import instruments_in

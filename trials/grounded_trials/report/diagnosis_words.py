@@ -8,15 +8,14 @@ noise          what no model predicts
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 from grounded.diagnosis.cause_words import with_share
-from grounded.diagnosis.error_report import Gap, RulerRow, furthest
+from grounded.diagnosis.error_report import Gap
 from grounded.diagnosis.report import Correction, Diagnosis, Estimate
 from grounded.diagnosis.stopped import ENDED
-from grounded.instruments.finding import Finding
 from grounded.result import listed
-from grounded_trials.wording import changed, count, figure, percent, ranges, shown, with_unit
+from grounded_trials.wording import changed, count, figure, percent, ranges, with_unit
 
 MOST = 3  # parameters that are named
 
@@ -53,50 +52,6 @@ def made_from(diagnosis: Diagnosis) -> str:
     names = diagnosis.made.trials if diagnosis.made is not None else ()
     number = count(len(names) or diagnosis.trials, "trial")
     return f"made from {number}{f', {ranges(names)}' * bool(names)}"
-
-
-Cells = tuple[str, ...]
-
-
-def error_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
-    """(rows, header): held-out prediction errors a second ahead and over whole trials, in units."""
-    ahead = [row for row in [furthest(diagnosis.prediction_error)] if row]
-    whole = [row for row in diagnosis.prediction_error if row.whole_trial]
-    columns = {
-        "outset": "model.py",
-        "crude": "crude",
-        "calibrated": "calibrated",
-        "with_effects": "as diagnosed",
-        "noise_floor": "noise",
-    }
-    if any(row.outset for row in ahead):
-        columns["crude"] = "now"
-    if any(row.floor_at_most for row in ahead):
-        columns["noise_floor"] = "noise, at most"
-    for key in ("outset", "calibrated"):
-        if not any(getattr(row, key) for row in ahead):
-            del columns[key]
-    rows: list[Cells] = []
-    for row in (*ahead, *whole):
-        when = "whole trial" if row.whole_trial else f"{row.horizon_s:.3g} s ahead"
-        for name, unit in row.unit_by_channel.items():
-            if math.isnan(row.crude.get(name, math.nan)):
-                continue  # never measured
-            figures = (_cell(row, key, name) for key in columns)
-            rows.append((f"{name}, {when}", *figures, shown(unit)))
-    return rows, ("error (rms)", *columns.values(), "unit")
-
-
-def _cell(row: RulerRow, column: str, name: str) -> str:
-    value = getattr(row, column).get(name, math.nan)
-    if not row.tells(name, column):
-        return "runs away"
-    return figure(value, 3) if math.isfinite(value) else "-"
-
-
-def credit_of(diagnosis: Diagnosis, effect: str) -> str:
-    """What predictions lose without a cause, in percent of what they gain; "" if it has none."""
-    return next((percent(c.share) for c in diagnosis.credit if c.of == effect), "")
 
 
 def correction_line(correction: Correction) -> str:
@@ -153,17 +108,6 @@ def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 def _with_spread(estimate: Estimate) -> str:
     text = f"{figure(estimate.value, 3)} +- {figure(estimate.std, 2)}"
     return with_unit(text, estimate.unit)
-
-
-def instrument_lines(findings: Iterable[Finding]) -> list[str]:
-    """Each finding with its signal, whether it was corrected, and what does so in the logs, too."""
-    lines = []
-    for one in findings:
-        done = "; corrected here" * (one.corrected and one.kind != "smoothed")
-        more = f", for good by {one.log} in its table of [log]" * bool(one.log)
-        more += f"; {one.advice}" * bool(one.advice)
-        lines.append(f"{one.signal}: {one.finding}{done}{more}")
-    return lines
 
 
 def gap_sentence(gap: Gap) -> str:

@@ -6,15 +6,11 @@ import math
 from collections.abc import Callable, Sequence
 
 from grounded.diagnosis.report import Estimate
+from grounded.diagnosis.tables import credit_of, error_table
 from grounded.errors import NextCommand
 from grounded.search.candidate import Tried
 from grounded.search.pictures import few
-from grounded_trials.report.diagnosis_words import (
-    credit_of,
-    error_lines,
-    error_table,
-    verdict_lines,
-)
+from grounded_trials.report.diagnosis_words import error_lines, verdict_lines
 from grounded_trials.report.findings import (
     Findings,
     by_state,

@@ -19,12 +19,13 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.pictures import credit_figure, worth_figure
+from grounded.diagnosis.tables import instrument_lines
 from grounded.errors import needs
 from grounded.figures.body import Motion
 from grounded.figures.figure import Bars, Panel, typeset
 from grounded.figures.interactive import packed, palette, plotted
 from grounded.search.pictures import search_figure
-from grounded_trials.report.diagnosis_words import error_lines, instrument_lines
+from grounded_trials.report.diagnosis_words import error_lines
 from grounded_trials.report.figures.paths import crash, path_figure
 from grounded_trials.report.figures.runs import (
     bias_figure,
@@ -218,7 +219,9 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
         if -math.inf < first.utility < 0 and best.utility <= 0:
             share = 1 - best.utility / first.utility
             gain = f": {100 * share:.1f} % of the first cost is gone"
-            if start := owed_to_start(first, best, findings.history):
+            tried = {one.candidate.id: one for one in findings.history}
+            two = tried[first.candidate.id], tried[best.candidate.id]
+            if start := owed_to_start(*two, findings.history):
                 part = -100 * start / first.utility
                 gain += f", {part:.1f} % by where the runs began, as the model sees it"
         moved = f"{figure(first.utility)} → {figure(best.utility)}"
