@@ -268,9 +268,17 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
         said = number(last[-1].candidate.predicted_utility)
         noise = f" ({said} without its sensors' noise)" * (said != promised)
         text = f"the last prediction was {promised}{noise}, the real run gave {real}"
+        if not math.isfinite(last[-1].utility):
+            text = f"the last run failed, where {promised}{noise} was predicted"
     else:
-        told = [number(off) if math.isfinite(off) else "a crash" for off in missed]
-        text = f"the last {len(told)} predictions missed by {', '.join(told[:-1])} and {told[-1]}"
+        whole = [number(off) for off in missed if math.isfinite(off)]
+        failed = len(missed) - len(whole)
+        text = f"the last {len(whole)} predictions missed by {listed(whole)}"
+        if failed:
+            by = f"; where they did not, predictions missed by {listed(whole)}" * bool(whole)
+            text = f"of the last {len(missed)} runs {failed} failed{by}"
+        if failed == len(missed):
+            text = f"the last {failed} runs failed"
     best, tried = standing.incumbent, {one.candidate.id for one in standing.history}
     if best is None or candidate.id in tried or not math.isfinite(missed[-1]):
         return text

@@ -7,5 +7,6 @@ Read `diagnose` first; its docstring lists the stages. `report` is what comes ou
     validation/    what held-out predictions say of it, in units; what is claimed
     excitation     the trial that would tell what these data can't, one of `patterns`
     verdict        the result in words
+    tables         in rows, for terminal, page and notebook
     pictures       the result in figures
 """

@@ -572,6 +572,9 @@ def test_a_column_that_stays_has_the_range_of_its_unit():
     assert equal_weights(offset, units, ("x", "y")) == pytest.approx(by)
     assert without_range(offset, units) == ["psi"]
     assert without_range({"x": 5 + 0 * t, "v": 0 * t}, units) == ["v"]
+    nearly = {"psi": 0.02591 - 1e-5 * t, "v": 2e-5 * np.sin(3 * t)}  # to 0.0259: it was 100 each
+    assert equal_weights(nearly, units) == pytest.approx({"psi": 1.0, "v": 1.0})
+    assert without_range(nearly, units) == ["psi", "v"]
 
 
 def test_of_a_target_that_stays_at_a_sensors_offset_the_weight_is_to_be_chosen(tmp_path):

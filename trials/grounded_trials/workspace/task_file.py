@@ -117,6 +117,7 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
 
 ROW_LIMIT = 200_002
 LEAST = 0.1  # range of a column of the target that weights go by
+STILL, HARDLY = 0.01, 1e-4  # of its size, at most of LEAST, and in its unit: less is no way
 NARROW = 0.2  # of a position's largest range: the least that its smallest one counts for
 UNKNOWN = 1.0  # in its own unit: that of a column that is constant, as all of its unit
 FULL = {"%": (-100.0, 100.0)}  # what an input may be, by its unit, where nothing says it
@@ -284,7 +285,7 @@ def equal_weights(
         together: axes of one position: a metre costs the same along each, by the smallest range,
             but of one that is hardly any.
     """
-    ranges = {name: float(np.ptp(values)) for name, values in columns.items()}
+    ranges = {name: range_of(values) for name, values in columns.items()}
     if axes := [own for name, own in ranges.items() if name in together and own > 0]:
         narrow = max(min(axes), NARROW * max(axes))
         ranges |= {name: narrow for name in ranges if name in together}
@@ -300,6 +301,12 @@ def equal_weights(
     return {name: width**-2 for name, width in widths.items()}
 
 
+def range_of(values: Array) -> float:
+    """How far a column of a target goes: nothing from a start of 0.02591 rad to 0.0259."""
+    own = float(np.ptp(values))
+    return own if own > max(STILL * min(float(np.abs(values).max()), LEAST), HARDLY) else 0.0
+
+
 def without_range(columns: Mapping[str, Array], units: Mapping[str, str]) -> list[str]:
     """The states of whose unit no column moves, nor is as large as UNKNOWN: no error is small.
 
@@ -310,7 +317,7 @@ def without_range(columns: Mapping[str, Array], units: Mapping[str, str]) -> lis
     told = {
         units.get(name, "")
         for name, values in columns.items()
-        if np.ptp(values) > 0 or np.abs(values).max() > UNKNOWN
+        if range_of(values) > 0 or np.abs(values).max() > UNKNOWN
     }
     return [name for name in columns if units.get(name, "") not in told]
 
