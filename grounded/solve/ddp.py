@@ -176,8 +176,9 @@ def _first_bad(problem: Problem, found: Descent) -> str:
     if not bad.any():
         return "the cost of the first rollout is not finite"
     when = int(np.argmax(bad.any(axis=1)))
-    name, time = system.states[int(np.argmax(bad[when]))], when * problem.dt
-    text = f"the model leaves the finite numbers at {time:g} s, in state '{name}'"
+    name = system.states[int(np.argmax(bad[when]))]
+    time = f"{when * problem.dt:g} s (step {when})"
+    text = f"the model leaves the finite numbers at {time}, in state '{name}'"
     before = max(when - 1, 0)
     given = problem.received(z[before], found.u[min(before, len(found.u) - 1)], before)
     fault = system.fault(z[before, : system.n], given, problem.p, problem.dt)
@@ -195,7 +196,7 @@ def _first_slope(problem: Problem, found: Descent) -> str:
                 f"the derivative of state '{system.states[i]}' by '{what[j]}' is not finite at "
                 f"{t * problem.dt:g} s ({system.source})"
             )
-    return f"no step is known at {found.failed_at * problem.dt:g} s"
+    return f"the sweep failed at {found.failed_at * problem.dt:g} s (step {found.failed_at})"
 
 
 def _check(problem: Problem, u: Array, K: Array | None, z: Array | None) -> None:

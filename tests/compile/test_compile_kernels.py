@@ -221,11 +221,11 @@ def test_derivatives_too_long_to_be_written_out_are_exact_all_the_same(monkeypat
 
 
 def test_what_is_not_finite_reaches_no_other_derivative():
-    """At x = 0 the root of x has none; y's own, and that of a branch not taken, have theirs."""
+    """At x = 0 the log of x has none; y's own, and that of a branch not taken, have theirs."""
 
     def step(s, a, p, dt):
-        other = np.where(s.y > 0, s.y * s.y, np.sqrt(s.x))
-        return {"x": np.sqrt(s.x) + p.k * s.y, "y": np.maximum(a.u, s.y) + other}
+        other = np.where(s.y > 0, s.y * s.y, np.log(s.x))
+        return {"x": np.log(s.x) + p.k * s.y, "y": np.maximum(a.u, s.y) + other}
 
     names = {"states": ("x", "y"), "inputs": ("u",), "params": ("k",)}
     system = traced(step, kind="step", **names)
