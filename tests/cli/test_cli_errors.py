@@ -305,9 +305,8 @@ def test_a_model_without_numbers_proposes_nothing_and_says_why(tmp_path, rate, w
     folder = make(tmp_path / "w", model=MODEL.replace('"x": s.v', f'"x": {rate}')).folder
     done = grounded("-C", folder, "propose")
     said = " ".join((done.out + done.err).split())
-    assert "Traceback" not in said and why in said
+    assert done.code == 1 and "Traceback" not in said and why in said
     assert not list((folder / "candidates").iterdir())
-    assert grounded("-C", folder, "propose", "--json").json["phase"] == "stopped"
 
 
 def test_a_warning_of_the_model_is_no_failure(tmp_path):

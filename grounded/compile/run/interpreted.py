@@ -95,7 +95,8 @@ class Interpreted(System):
                     at = [np.float64(v) for v in x]
                     values = signature.call(at, sent, known, np.float64(dt))
             except (ArithmeticError, ValueError) as error:
-                return f"{raised_at(error, signature.function)}: {error}"
+                kind = "" if isinstance(error, FloatingPointError) else f"{type(error).__name__}: "
+                return f"{raised_at(error, signature.function)}: {kind}{error}"
             found = np.array([float(values[name]) for name in signature.outputs])
             if not np.isfinite(found).all():
                 name = signature.outputs[int(np.argmin(np.isfinite(found)))]
