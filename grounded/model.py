@@ -230,8 +230,8 @@ class Model:
                 "along an axis, two in a plane (horizontal first), or three"
             )
         for role, targets in self.roles.items():
-            meant = nearest(role, ROLES)
-            if role not in ROLES and meant.startswith("did you"):  # others may serve own effects
+            meant = "" if role in ROLES else nearest(role, ROLES)
+            if meant.startswith("did you"):  # others may serve own effects
                 raise GroundedError(f"role '{role}' is none that is known: {meant}")
             for name in (targets,) if isinstance(targets, str) else targets:
                 if name not in self.states and name not in self.inputs:

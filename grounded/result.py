@@ -61,6 +61,16 @@ def number(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.3g}"
 
 
+def shown(unit: str) -> str:
+    """A unit for a table: nothing where there is none, for a "1" beside a number is a digit."""
+    return "" if unit == "1" else unit
+
+
+def with_unit(text: str, unit: str) -> str:
+    """A number and its unit."""
+    return f"{text} {shown(unit)}".rstrip()
+
+
 def measured(value: float, unit: str) -> str:
     """An error in two digits: in cm, mm, mrad ... where it is small in its own unit."""
     return _told(value, *_scale(value, unit))
@@ -90,7 +100,7 @@ def _told(value: float, scale: float, unit: str, least: float = SMALL) -> str:
     value *= scale
     shape = ",.0f" if 9.95 <= value < 1e6 else "#.2g" if least <= value < 1e6 else ".1e"
     text = "-" if math.isnan(value) else f"{value:{shape}}" if value else "0"
-    return text if unit == "1" else f"{text} {unit}".rstrip()
+    return with_unit(text, unit)
 
 
 class Result:

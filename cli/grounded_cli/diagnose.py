@@ -233,25 +233,11 @@ def _places(found: Diagnosis) -> None:
 
 
 def _effects(found: Diagnosis) -> None:
-    from grounded.diagnosis.tables import credit_of, values_of
+    from grounded.diagnosis.tables import effect_table
     from grounded.diagnosis.verdict import told_apart
 
-    ranking = found.ranking[:8]
-    if ranking:
-        rows = [
-            (
-                ("* " if r.claimed else "  ") + r.effect,
-                credit_of(found, r.effect),
-                f"{r.evidence:,.{int(abs(r.evidence) < 1000)}f}"
-                if r.evidence == r.evidence
-                else "-",
-                values_of(r),
-            )
-            for r in ranking
-        ]
-        if share := credit_of(found, "calibration"):
-            rows.insert(0, ("  (calibration)", share, "", "the model's own parameters, below"))
-        show("\n" + table(rows, ("effect (*: claimed)", "credit", "evidence [nats]", "value")))
+    if found.ranking:
+        show("\n" + table(*effect_table(found)))
         _note(
             "credit: what predictions lose without it, of what they gain in all; evidence: of "
             "what is claimed or tied, what is lost without it beside the other causes; of the "

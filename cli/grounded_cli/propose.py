@@ -263,22 +263,22 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     last = sorted(same, key=lambda tried: max(trial.id for trial in tried.trials))[-LAST:]
     promises = [one.promised for one in last]
     missed = [abs(promise - one.utility) for promise, one in zip(promises, last, strict=True)]
+    whole = [number(off) for off in missed if math.isfinite(off)]
+    failed = len(missed) - len(whole)
     if len(missed) == 1:
         promised, real = number(promises[-1]), number(last[-1].utility)
         said = number(last[-1].candidate.predicted_utility)
         noise = f" ({said} without its sensors' noise)" * (said != promised)
         text = f"the last prediction was {promised}{noise}, the real run gave {real}"
-        if not math.isfinite(last[-1].utility):
-            text = f"the last run failed, where {promised}{noise} was predicted"
-    else:
-        whole = [number(off) for off in missed if math.isfinite(off)]
-        failed = len(missed) - len(whole)
-        text = f"the last {len(whole)} predictions missed by {listed(whole)}"
         if failed:
-            by = f"; where they did not, predictions missed by {listed(whole)}" * bool(whole)
-            text = f"of the last {len(missed)} runs {failed} failed{by}"
-        if failed == len(missed):
-            text = f"the last {failed} runs failed"
+            text = f"the last run failed, where {promised}{noise} was predicted"
+    elif not failed:
+        text = f"the last {len(whole)} predictions missed by {listed(whole)}"
+    elif not whole:
+        text = f"the last {failed} runs failed"
+    else:
+        text = f"of the last {len(missed)} runs {failed} failed; where they did not, predictions "
+        text += f"missed by {listed(whole)}"
     best, tried = standing.incumbent, {one.candidate.id for one in standing.history}
     if best is None or candidate.id in tried or not math.isfinite(missed[-1]):
         return text

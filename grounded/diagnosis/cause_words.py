@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from grounded.diagnosis.report import Estimate
 from grounded.model import Model
-from grounded.result import listed, number, percent
+from grounded.result import listed, number, percent, with_unit
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.effects import Effect
@@ -27,8 +27,8 @@ def give_or_take(estimate: Estimate) -> str:
     if not (0 < std < math.inf and math.isfinite(value)):
         return quantity(estimate)
     places = math.floor(math.log10(max(abs(value), std))) - math.floor(math.log10(std)) + 2
-    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
-    return f"{value:.{min(max(places, 3), MOST_DIGITS)}g} +- {std:.2g}{unit}"
+    digits = min(max(places, 3), MOST_DIGITS)
+    return with_unit(f"{value:.{digits}g} +- {std:.2g}", estimate.unit)
 
 
 GREEK = (
@@ -183,5 +183,4 @@ def _told(params: Mapping[str, Estimate]) -> list[str]:
 
 def quantity(estimate: Estimate) -> str:
     """A value with its unit; pure numbers as they are."""
-    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
-    return f"{number(estimate.value)}{unit}"
+    return with_unit(number(estimate.value), estimate.unit)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from grounded.result import Document, measured_alike, number
+from grounded.result import Document, measured_alike, number, with_unit
 
 ABOVE = 1.3  # times the noise floor: what is left is stated
 SURE = 3.0  # standard deviations of the floor: it is compared in each channel, at each horizon
@@ -46,7 +46,7 @@ class Region(Document):
     @property
     def told(self) -> str:
         """With its unit: `v > 0.5 m/s`."""
-        return self.when if self.unit == "1" else f"{self.when} {self.unit}".rstrip()
+        return with_unit(self.when, self.unit)
 
 
 @dataclass(frozen=True, eq=False)

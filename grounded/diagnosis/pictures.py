@@ -10,7 +10,7 @@ import numpy as np
 from grounded.diagnosis.error_report import Credit, RulerRow, furthest
 from grounded.diagnosis.report import Diagnosis
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
-from grounded.result import measured, measured_alike, number, percent
+from grounded.result import measured, measured_alike, number, percent, shown
 
 MOST = 12
 APART = 0.01  # of errors: curves that differ by less lie on each other
@@ -89,7 +89,7 @@ def _over_horizons(errors: Sequence[RulerRow]) -> list[Panel | Bars]:
                 curves.append(Curve(ahead, np.array(values, float), role, name, 2.0))
         if curves:
             curves.sort(key=lambda curve: curve.role != "other")  # noise lies behind
-            unit = "" if unit == "1" else unit
+            unit = shown(unit)
             label = f"{channel} [{unit}]" if unit else channel
             panels.append(Panel(label, "predicted ahead [s]", unit, tuple(curves), log=True))
     return panels

@@ -8,13 +8,14 @@ from html import escape
 from typing import TYPE_CHECKING
 
 from grounded.diagnosis.error_report import RulerRow, furthest
-from grounded.result import figure, percent
+from grounded.result import figure, percent, shown, with_unit
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis, Ranked
     from grounded.instruments.finding import Finding
 
 Cells = tuple[str, ...]
+EFFECTS = 8  # rows of them
 
 
 def error_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
@@ -42,7 +43,7 @@ def error_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
             if math.isnan(row.crude.get(name, math.nan)):
                 continue  # never measured
             figures = (_cell(row, key, name) for key in columns)
-            rows.append((f"{name}, {when}", *figures, _shown(unit)))
+            rows.append((f"{name}, {when}", *figures, shown(unit)))
     return rows, ("error (rms)", *columns.values(), "unit")
 
 
@@ -69,10 +70,26 @@ def instrument_lines(findings: Iterable[Finding]) -> list[str]:
     return lines
 
 
-def values_of(row: Ranked) -> str:
+def effect_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
+    """(rows, header): what is claimed, and what else was weighed, likeliest first."""
+    rows: list[Cells] = [
+        (
+            ("* " if r.claimed else "  ") + r.effect,
+            credit_of(diagnosis, r.effect),
+            "-" if math.isnan(r.evidence) else f"{r.evidence:,.{int(abs(r.evidence) < 1000)}f}",
+            _values(r),
+        )
+        for r in diagnosis.ranking[:EFFECTS]
+    ]
+    if rows and (share := credit_of(diagnosis, "calibration")):
+        rows.insert(0, ("  (calibration)", share, "", "the model's own parameters, below"))
+    return rows, ("effect (*: claimed)", "credit", "evidence [nats]", "value")
+
+
+def _values(row: Ranked) -> str:
     """The quantities of an effect, each with its standard deviation and unit."""
     return ", ".join(
-        f"{name} = {figure(e.value, 3)}{_spread(e.std)} {_shown(e.unit)}".rstrip()
+        with_unit(f"{name} = {figure(e.value, 3)}{_spread(e.std)}", e.unit)
         for name, e in row.params.items()
     )
 
@@ -81,10 +98,6 @@ def _spread(std: float) -> str:
     if not math.isfinite(std):
         return " (any value fits)"
     return f" +- {figure(std, 2)}" if std else ""
-
-
-def _shown(unit: str) -> str:
-    return "" if unit == "1" else unit
 
 
 def as_html(diagnosis: Diagnosis, everything: str) -> str:
@@ -100,12 +113,8 @@ def as_html(diagnosis: Diagnosis, everything: str) -> str:
         parts.append(f"<b>Sensors</b><ul>{''.join(f'<li>{escape(s)}</li>' for s in sensors)}</ul>")
     if diagnosis.prediction_error and not diagnosis.no_cause:
         parts.append(_html_table(*error_table(diagnosis)))
-    rows = [
-        ("* " * r.claimed + r.effect, credit_of(diagnosis, r.effect), values_of(r))
-        for r in diagnosis.ranking[:8]
-    ]
-    if rows and not diagnosis.no_cause:
-        parts.append(_html_table(rows, ("effect (*: claimed)", "credit", "value")))
+    if diagnosis.ranking and not diagnosis.no_cause:
+        parts.append(_html_table(*effect_table(diagnosis)))
     if diagnosis.next_trial:
         parts.append(f"<p><b>Next trial</b>: {escape(diagnosis.next_trial)}</p>")
     parts.append(f"<details><summary>The whole document</summary>{everything}</details>")

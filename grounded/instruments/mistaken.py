@@ -25,7 +25,7 @@ from grounded.instruments.kinematics import integrals
 from grounded.instruments.other_units import unusable
 from grounded.instruments.short_runs import Ahead, Fit
 from grounded.model import Model
-from grounded.result import listed
+from grounded.result import listed, with_unit
 from grounded.trial import Trial
 
 CLEAR = 1.0  # [nats] by which a change must lower the errors of a trial
@@ -184,8 +184,7 @@ def mended_by(model: Model, told: Told) -> str:
 def described(model: Model, told: Told) -> str:
     """What is wrong and how it is known, one clause."""
     unit = model.states[model.state_names[told.state]]
-    unit = "" if unit == "1" else f" {unit}"
-    error = f"{told.mended:.2g} rather than {told.logged:.2g}{unit}"
+    error = with_unit(f"{told.mended:.2g} rather than {told.logged:.2g}", unit)
     proof = f"misses {model.state_names[told.state]} by {error} 0.25 s ahead"
     if not told.mistake.swap:
         names = listed(model.input_names[j] for j in told.mistake.inputs)

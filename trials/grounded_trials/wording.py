@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 from grounded.result import figure as figure
 from grounded.result import percent as percent
+from grounded.result import shown as shown
+from grounded.result import with_unit as with_unit
 
 if TYPE_CHECKING:
     from grounded.errors import NextCommand
@@ -56,16 +58,6 @@ def ranges(names: Sequence[str]) -> str:
     if len(pieces) > PIECES:
         return f"{names[0]} to {names[-1]} without {numbers[-1] - numbers[0] + 1 - len(names)}"
     return ", ".join(" to ".join(dict.fromkeys([piece[0], piece[-1]])) for piece in pieces)
-
-
-def shown(unit: str) -> str:
-    """A unit for a table: nothing where there is none, for a "1" beside a number is a digit."""
-    return "" if unit == "1" else unit
-
-
-def with_unit(text: str, unit: str) -> str:
-    """A number and its unit."""
-    return f"{text} {shown(unit)}".rstrip()
 
 
 def changed(name: str, old: float, new: float, unit: str) -> str:

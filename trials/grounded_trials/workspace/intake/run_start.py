@@ -227,8 +227,7 @@ class Recording:
     def apart_at(self, policy: Policy, start: float) -> float:
         """The mean difference of the commands from an instant on, as `Start.apart`."""
         k = round((start - self.first) * self.parts / self.dt)
-        inside = 0 <= k < len(self.whole.inputs)
-        if not inside:
+        if not 0 <= k < len(self.whole.inputs):
             return np.inf
         return float(instants_apart(self.whole, self.parts, policy, range(k, k + 1))[0][k])
 
