@@ -18,10 +18,12 @@ from grounded.errors import GroundedError
 from grounded.frozen import Array, numbers, positive
 from grounded.model import Model
 from grounded.policy import Policy
+from grounded.result import with_unit
 from grounded.trial import Trial
 from grounded.utility import Reward, step_rewards
 
 MAX_HORIZON = 200_000  # a control step is a few kB of gains: a bound against nonsense
+HELD = 1e-6  # of an input's range: a value held before the start that was rounded is inside
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +47,8 @@ class Task:
         smoothing: width over which the PLANNING model blends indicator terms (`np.where`, `abs`).
 
     Raises:
-        GroundedError: for sizes that do not fit, limits the wrong way round, a target that is not
-            finite where it is weighted.
+        GroundedError: for sizes that do not fit, limits the wrong way round or that exclude what is
+            held before the start, a target that is not finite where it is weighted.
     """
 
     model: Model
@@ -151,6 +153,15 @@ class Task:
             raise GroundedError(
                 f"task: the input held before the start must be finite, got {self.past.tolist()}"
             )
+        for i, (name, unit) in enumerate(self.model.inputs.items()):
+            low, held, high = float(self.low[i]), float(self.past[i]), float(self.high[i])
+            room = HELD * (high - low if np.isfinite(high - low) else abs(held))
+            if not low - room <= held <= high + room:
+                raise GroundedError(
+                    f"{name} = {with_unit(f'{held:g}', unit)} is held before the start, beyond its "
+                    f"limits, {low:g} to {high:g}: hold a value inside ([task] start; in Python "
+                    "past), or widen the limits if the robot may get that"
+                )
 
     @property
     def horizon(self) -> int:

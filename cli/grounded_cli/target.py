@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from grounded_trials import Workspace
 
 SECONDS = 5.0  # of a step or a swing-up
+TURNS = 2.0  # of an angle: more is asked about, since it may be meant in degrees
 
 
 @click.command("target")
@@ -104,6 +105,13 @@ def command(
         found = {"target": str(path), "horizon": rows - 1, "columns": ranges, "free": free}
         show_json(found)
         return
+    for name, value in ends.items():
+        if model.states.get(name) == "rad" and abs(value) > TURNS * 2 * math.pi:
+            remark(
+                "warning",
+                f"{name} = {value:g} rad is {abs(value) / (2 * math.pi):.2g} turns: if degrees "
+                f"are meant, `--to {name}={math.radians(value):.4g}`",
+            )
     show(f"{path}: {shape}, {(rows - 1) * dt:g} s, {rows - 1} steps")
     for name, (low, high) in ranges.items():
         text = with_unit(f"{number(low)} to {number(high)}", model.states[name])
@@ -152,7 +160,10 @@ def _free(names: list[str], reward: dict[str, dict[str, float]], rest: str) -> s
     it = "them" if len(names) > 1 else "it"
     text = f"{listed(names)}: no column in the target, so nothing asks where a run takes {it}"
     if weighed:
-        text += f"; the weight of {listed(weighed)} in [reward] counts for nothing"
+        text += (
+            f". [reward] weighs {listed(weighed)}, and `propose` refuses a weight without a column: "
+            f"give it one (`--to {weighed[0]}=VALUE`), or take the weight out"
+        )
     if rest:
         text += f". `--to {rest}=0`, beside the others, asks for rest there"
     return text

@@ -41,7 +41,7 @@ from grounded.diagnosis.validation.limits import (
 )
 from grounded.diagnosis.validation.motions import without_others
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.diagnosis.verdict import MOST_EFFECTS
+from grounded.diagnosis.verdict import MOST_EFFECTS, with_faults
 from grounded.diagnosis.writer import Writer
 from grounded.effects import Effect, Library
 from grounded.effects.actuator import delay_again
@@ -206,6 +206,7 @@ def diagnose(
         apart = compared(search, decision.fit, groups) if compare else None
         return replace(
             found,
+            verdict=with_faults(found.verdict, looked.findings),
             preflight=looked.findings,
             changed=apart.changed if apart else None,
             unchanged=apart.unchanged if apart else (),

@@ -11,6 +11,7 @@ from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, furthes
 from grounded.diagnosis.report import Kind, Ranked, Unconfirmed, Verdict
 from grounded.diagnosis.ruler_words import explained, floor, improvement, rest, worsened
 from grounded.diagnosis.stopped import AT_BOUNDS, ENDED, wider
+from grounded.instruments.finding import Finding, in_the_log
 from grounded.model import all_at_bounds
 from grounded.result import listed
 
@@ -101,6 +102,16 @@ def verdict(
         _said(kind, *words), effects=effects, causes=causes, clauses=told, parameters=off
     )
     return replace(said, look_for=more if more > most else 0)
+
+
+def with_faults(said: Verdict, findings: Iterable[Finding]) -> Verdict:
+    """The verdict with what is wrong with the log itself, which is put right nowhere but here."""
+    odd = in_the_log(findings)
+    if not odd:
+        return said
+    told = "; ".join(f"{one.signal} {one.finding}" for one in odd)
+    sentences = (*said.lines, f"Put right here, but not in the trials: {told}.")
+    return replace(said, sentences=sentences, sentence=" ".join(sentences))
 
 
 LOAD = (

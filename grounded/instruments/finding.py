@@ -62,6 +62,11 @@ def filters_of(findings: Iterable[Finding]) -> dict[str, float]:
     return {f.signal: f.delay_s for f in findings if f.corrected and f.kind == "lag"}
 
 
+def in_the_log(findings: Iterable[Finding]) -> list[Finding]:
+    """Those of columns that are in degrees, or turned: put right here, and nowhere else."""
+    return [one for one in findings if one.corrected and one.kind in ("degrees", "sign")]
+
+
 def late_effects(findings: Iterable[Finding]) -> dict[str, dict[str, float]]:
     """The filters and delays of sensors that were found and corrected, as effects by name.
 

@@ -183,6 +183,7 @@ def learn(
     options: SearchOptions | None = None,
     *,
     max_iterations: int | None = None,
+    check: bool = True,
 ) -> Search:
     """Runs a search to its end on a real system that is a function call.
 
@@ -191,6 +192,11 @@ def learn(
         run: executes a candidate once and returns its trial; its `candidate` field is set here.
         options: the [search] table; None: its defaults.
         max_iterations: ends after so many accepted improvements.
+        check: look whether the columns of the first trial are what the model calls by their names.
+
+    Raises:
+        GroundedError: if they are in other units, turned or exchanged, as far as they tell: every
+            further plan would be made of such trials.
     """
     search = Search(task, options)
     while True:
@@ -202,3 +208,22 @@ def learn(
         assert candidate is not None
         trial = run(candidate)
         search.tell(replace(trial, candidate=candidate.id) if isinstance(trial, Trial) else trial)
+        if check and len(search.trials) == 1:
+            _check_columns(task, search.trials[0])
+
+
+def _check_columns(task: Task, trial: Trial) -> None:
+    """Raises for a trial that its own columns, or the model, say is in other units."""
+    from grounded.instruments.finding import in_the_log
+    from grounded.instruments.sound_trials import sound_trials
+
+    first = "the first trial can't be learned from"
+    mend = "Mend the function that runs the robot, or pass check=False where this is mistaken"
+    try:
+        looked = sound_trials(task.model, [replace(interpolate_gaps(trial).trial, id="")])
+    except GroundedError as error:
+        said = str(error).replace("in trial number 1 ", "")
+        raise GroundedError(f"{first}: {said}. {mend}") from None
+    if odd := in_the_log(looked.findings):
+        said = "; ".join(f"{one.signal} {one.finding}" for one in odd)
+        raise GroundedError(f"{first}: {said}. {mend}")

@@ -15,7 +15,7 @@ from grounded.instruments.preflight import preflight
 from grounded.instruments.rows import kinematic_rows, tied
 from grounded.instruments.way import plane_of, stop_at_axes
 from grounded.trial import Trial
-from grounded_trials.workspace.intake.trial_check import way_warnings
+from grounded_trials.workspace.intake.log_faults import way_faults
 
 DT = 0.1
 STATES = {"u": "m/s", "v": "m/s", "r": "rad/s", "x": "m", "y": "m", "psi": "rad"}
@@ -218,5 +218,5 @@ def test_a_gyro_that_is_no_difference_of_the_heading_stays():
 )
 def test_it_is_told_when_a_log_is_taken_in(fault, words):
     """Runs with a twist in the world's axes were taken in without a word, and planned from."""
-    told = way_warnings(BOAT, logged(fault)[0])
+    told = [one.told(logged(fault)[0], own=False) for one in way_faults(BOAT, logged(fault)[0])]
     assert len(told) == bool(words) and all(holds(one, *words) for one in told)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import grounded as gr
-from facts import holding
+from facts import holding, holds
 from grounded.plant import Plant
 from grounded.search.improve import propose
 from small_tasks import drive, other, rover_task
@@ -54,6 +54,22 @@ def test_ask_and_tell_give_the_candidates_of_propose_bit_for_bit(search):
 def test_a_search_goes_on_from_its_candidates_and_trials(search):
     half = gr.Search(TASK, OPTIONS, candidates=search.candidates[:2], trials=search.trials[:2])
     assert numbers([half.ask()]) == numbers([search.candidates[2]])
+
+
+def test_learning_stops_at_a_first_trial_whose_heading_is_in_degrees():
+    """It went on to its end, with plans made of headings 57 times too large."""
+    heading = TASK.model.state_names.index(str(TASK.model.roles["heading"]))
+
+    def in_degrees(candidate):
+        trial = run(candidate)
+        states = np.array(trial.states)
+        states[:, heading] = np.rad2deg(states[:, heading])
+        return replace(trial, states=states)
+
+    with pytest.raises(gr.GroundedError) as told:
+        gr.learn(TASK, in_degrees, OPTIONS)
+    assert holds(str(told.value), "in degrees", "check=False", "the first trial")
+    assert gr.learn(TASK, in_degrees, gr.SearchOptions(max_trials=2), check=False).trials
 
 
 @pytest.mark.slow

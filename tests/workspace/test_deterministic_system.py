@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from grounded.errors import NextCommand
 from grounded_trials import Workspace
 from workspaces import CONFIG, make
 
@@ -98,3 +99,19 @@ def test_the_same_bytes_beside_repeats_that_differ_are_called_a_copy(workspace):
     three = workspace.ingest(third)
     assert two.trial in three.warnings[-1] and "copy" in three.warnings[-1]
     assert workspace.status().standing.phase == "await-trial"
+
+
+def test_learn_stops_at_a_trial_in_other_units_and_goes_on_where_it_is_asked_again(workspace):
+    """It warned that the program writes millimetres, and ran three more plans made of them."""
+    drive = workspace.folder / "drive.py"
+    drive.write_text(
+        DRIVE.replace("candidate=meta", "states=ran.states * [1000, 1], candidate=meta")
+    )
+    told = []
+    status = workspace.learn(each=lambda _, found: told.append(found))
+    (first,) = told
+    assert first.faults and {*first.faults} <= {*first.warnings}
+    assert status.then == first.then == NextCommand("discard", (first.trial,))
+    assert any("learn stops here" in note for note in status.notes)
+    workspace.learn(2, each=lambda _, found: told.append(found))
+    assert len(told) == 3

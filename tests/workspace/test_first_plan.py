@@ -292,14 +292,36 @@ def test_a_target_says_what_it_leaves_free(tmp_path):
     """A cart-pole's line said nothing of the pole, which no column holds."""
     folder, file = planar(tmp_path)
     done = grounded("-C", folder, "target", "line", "--to", "x=2")
-    assert "free       z, th" in done.out and "[reward] counts for nothing" not in done.out
+    assert "free       z, th" in done.out and "refuses" not in done.out
     file.write_text(re.sub(r"(?m)^state = .*$", "state = { x = 2, z = 3 }", file.read_text()))
     done = grounded("-C", folder, "target", "line", "--to", "x=2")
-    assert "the weight of z in [reward] counts for nothing" in " ".join(done.out.split())
+    assert holds(" ".join(done.out.split()), "[reward] weighs z", "`propose` refuses", "--to z=")
+    refused = grounded("-C", folder, "propose")
+    assert refused.code == 1 and holds(refused.err, "weighs", "'z'")
     found = grounded("-C", folder, "target", "line", "--to", "x=2", "--json").json
     assert found["free"] == ["z", "th", "vz"] and {*found["columns"]} == {"x", "vx"}
     ends = [word for name in ("x", "z", "th") for word in ("--to", f"{name}=1")]
     assert "free" not in grounded("-C", folder, "target", "line", *ends).out
+
+
+def test_a_line_keeps_the_rest_of_a_position_where_it_starts(tmp_path):
+    """A line to x = 2 left the height free: the first plan of a quadrotor fell."""
+    folder, file = planar(tmp_path)
+    model = next(folder.glob("*.py"))
+    place = "derivative=rate, roles={'position': ('x', 'z')})"
+    model.write_text(model.read_text().replace("derivative=rate)", place))
+    file.write_text(re.sub(r"(?m)^start = .*$", "start = { z = 1.5 }", file.read_text()))
+    found = grounded("-C", folder, "target", "line", "--to", "x=2", "--json").json
+    assert found["columns"] == {"x": [0, 2], "z": [1.5, 1.5], "vx": [0, 1], "vz": [0, 0]}
+    weights = tomllib.loads(file.read_text())["reward"]["state"]
+    assert weights["z"] == weights["x"] and weights["vz"] == weights["vx"]
+
+
+def test_an_angle_of_many_turns_is_asked_about(tmp_path):
+    folder, _ = planar(tmp_path)
+    done = grounded("-C", folder, "target", "line", "--to", "th=45", "--to", "x=1")
+    assert holds(done.err, "th = 45 rad", "7.2 turns", "--to th=0.7854")
+    assert "turns" not in grounded("-C", folder, "target", "line", "--to", "th=3").err
 
 
 @pytest.mark.slow

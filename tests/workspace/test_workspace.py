@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
+from facts import holds
 from grounded.errors import GroundedError
 from grounded_trials.starting.examples import EXAMPLES, write_example
 from grounded_trials.workspace.config import read_config
@@ -47,7 +48,9 @@ def test_states_start_at_the_targets_first_row_else_at_0(tmp_path):
     assert w.task.start.tolist() == [0.1, 2.0] and w.task.past.tolist() == [1.5]
     held = named.replace("force = 1.5", "force = 50")
     w = make(tmp_path / "c", config=held, target="t,x\n0,0.5\n0.05,1\n0.1,1\n")
-    assert w.task.past.tolist() == [5.0]  # what is held is inside the limits
+    with pytest.raises(GroundedError) as told:  # it was planned from 5 N, and the robot held 50
+        _ = w.task
+    assert holds(str(told.value), "force = 50 N", "[task] start", "-5 to 5")
 
 
 def test_input_columns_of_the_target_are_what_inputs_are_compared_with(tmp_path):

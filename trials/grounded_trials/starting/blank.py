@@ -110,15 +110,16 @@ def _task(model: Model, dt: float) -> Task:
     stated = getattr(model.step, "limits", {})  # in a simulator's file
     ends = [stated.get(name, (-np.inf, np.inf)) for name in model.input_names]
     changes = np.array([change_weight(None, unit) for unit in model.inputs.values()])
+    low, high = np.array(ends).T
     task = Task(
         model=model,
         dt=dt,
         target=np.zeros((HORIZON + 1, n)),
         reward=Reward(np.ones(n), np.zeros(n), np.zeros(m), changes),
         start=np.zeros(n),
-        past=np.zeros(m),
-        low=np.array([low for low, _ in ends]),
-        high=np.array([high for _, high in ends]),
+        past=np.clip(np.zeros(m), low, high),
+        low=low,
+        high=high,
     )
     with suppress(GroundedError):  # a model that does not work says so when it is planned with
         if (still := resting(task, np.zeros(n, np.bool_))) is not None:

@@ -22,6 +22,7 @@ from grounded_trials.logs.inspect_pairs import velocities
 from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.off_target import position_names
 from grounded_trials.workspace.task_file import read_target
 
 PATHS = ("line", "circle", "figure-8")
@@ -99,6 +100,8 @@ def line_target(
 ) -> dict[str, Array]:
     """Columns of a straight line in the states, from rest to rest, with their rates.
 
+    Of a position whose one coordinate is named the others stay where they start.
+
     Args:
         to: where it ends, by state; none: `drive.size` further, on the model's one axis.
         start: where states start that do not start at 0.
@@ -132,7 +135,9 @@ def line_target(
     t = _grid(when[-1] + drive.hold, dt)
     share, rate = np.interp(t, when, along) / length, np.interp(t, when, speed) / length
     columns = {name: start.get(name, 0.0) + share * far for name, far in way.items()}
-    rates = velocities(model)
+    rates, place = velocities(model), position_names(model)
+    way |= dict.fromkeys([q for q in place if q not in way and not {*place}.isdisjoint(way)], 0.0)
+    columns |= {q: np.full(len(t), start.get(q, 0.0)) for q in way if q not in columns}
     return columns | {rates[q]: rate * far for q, far in way.items() if rates.get(q, q) not in way}
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.instruments.finding import in_the_log
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.identity import ROWS
@@ -95,7 +96,8 @@ def diagnose_in(
     found = diagnose(
         planner.plan, lifted, options, compare=second, engine=engine, progress=progress
     )
-    seen = where_to_mend(workspace, used + others, found.preflight)
+    measured = found.preflight
+    seen = where_to_mend(workspace, used + others, measured)
     known = _as_known(workspace, found.ranking, made)
     found = replace(found, made=made, preflight=seen, ranking=known)
     _keep(workspace, found)
@@ -114,8 +116,16 @@ def diagnose_in(
     undo = _in_vain(workspace, found)
     if undo:
         found = replace(found, next_trial=f"{undo} {found.next_trial}")
+    ran = tuple(trial.id for trial in used + others if trial.candidate)
+    wrong = ran if any(one.log for one in in_the_log(measured)) else ()  # in every trial
+    if wrong:
+        first = (
+            "Mend what writes the trials first, and take those out that the search learned from."
+        )
+        found = replace(found, next_trial=f"{first} {found.next_trial}")
     _keep(workspace, found)  # with what is said of the next trial
     then = REPORT if undo else after_diagnosis(workspace, found)
+    then = NextCommand("discard", wrong) if wrong else then
     if then == EXPORT and found.kind != "none":
         words = nothing_to_do(found, candidate_named(workspace, "best"))
         found = replace(found, next_trial=words)

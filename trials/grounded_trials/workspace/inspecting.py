@@ -86,7 +86,7 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     from grounded_trials.logs.joint_names import joint_names, joint_units, wide_joints
     from grounded_trials.logs.log_table import log_mapping
     from grounded_trials.logs.unnamed import from_the_rest
-    from grounded_trials.workspace.intake.no_angle import no_angles
+    from grounded_trials.workspace.intake.log_faults import no_angles
 
     report = inspect_log(log)
     if report.meta.get("format") or report.damage:

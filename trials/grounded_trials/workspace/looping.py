@@ -22,6 +22,11 @@ from grounded_trials.workspace.proposing import (
     status_of,
 )
 
+STOPS = (
+    "learn stops here, since the next plan would be made of such a log: mend it first, or run "
+    "`learn` again where the warning is mistaken"
+)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NextRun(Result):
@@ -56,7 +61,7 @@ def learn_in(
     """Proposes, runs and ingests until the search ends, see `Workspace.learn`."""
     from grounded_trials.workspace.running import run_candidate
 
-    tell, done = progress or (lambda stage: None), 0
+    tell, done, odd = progress or (lambda stage: None), 0, _odd_before(workspace)
     while trials is None or done < trials:
         tell("planning")
         proposed = propose_in(workspace)
@@ -70,9 +75,20 @@ def learn_in(
         done += 1
         if each is not None:
             each(made, found)
+        if found.faults and not odd:  # the next plan would be made of it: a person decides
+            status = status_of(workspace, standing_in(workspace), (STOPS,))
+            return replace(status, then=found.then)
     status = status_of(workspace, standing_in(workspace))
     goes_on = status.standing.phase == "propose"
     return replace(status, then=NextCommand("learn")) if goes_on else status
+
+
+def _odd_before(workspace: Folder) -> bool:
+    """Whether the last run's columns were odd, too, and somebody went on all the same."""
+    from grounded_trials.workspace.intake.log_faults import log_faults
+
+    runs = [trial for trial in workspace.task_trials() if trial.candidate]
+    return bool(runs) and bool(log_faults(workspace, runs[-1]))
 
 
 def next_in(workspace: Folder, log: Path, candidate: str | None, *, runner: bool) -> NextRun:

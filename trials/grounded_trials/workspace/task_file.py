@@ -62,7 +62,8 @@ def _build(config: Config, model: Model, folder: Path, read: Reader) -> Task:
     start = np.array([table.start.get(s, first[i]) for i, s in enumerate(states)])
     low, high = _limits(config, inputs)
     held = np.zeros(len(inputs)) if input_target is None else input_target[0]
-    past = np.array([table.start.get(name, held[i]) for i, name in enumerate(inputs)])
+    aimed = np.clip(held, low, high)  # what a run holds first, where nothing else is said
+    past = np.array([table.start.get(name, aimed[i]) for i, name in enumerate(inputs)])
     safety = config.safety.pairs(states)
     safe = np.array([safety.get(s, (-np.inf, np.inf)) for s in states])
     return Task(
@@ -71,7 +72,7 @@ def _build(config: Config, model: Model, folder: Path, read: Reader) -> Task:
         target=target,
         reward=_reward(config, states, inputs),
         start=start,
-        past=np.clip(past, low, high),
+        past=past,
         low=low,
         high=high,
         feedback=table.feedback,

@@ -33,6 +33,7 @@ from grounded_trials.workspace.intake.earlier_task import OfEarlierTask, of_earl
 from grounded_trials.workspace.intake.fell import fall_in, who_fell
 from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.intake.ingested import Ingested
+from grounded_trials.workspace.intake.log_faults import dead_sensors, log_faults, mistaken_in
 from grounded_trials.workspace.intake.missed_steps import not_sent
 from grounded_trials.workspace.intake.odd_run import odd_run
 from grounded_trials.workspace.intake.other_scale import other_units, units_told
@@ -61,12 +62,7 @@ from grounded_trials.workspace.intake.stored_before import (
     repeated,
     what_repeats,
 )
-from grounded_trials.workspace.intake.trial_check import (
-    afterwards,
-    dead_sensors,
-    mistaken_in,
-    warnings_about,
-)
+from grounded_trials.workspace.intake.trial_check import afterwards, warnings_about
 from grounded_trials.workspace.intake.who_drove import OTHERS, Following, suspicion
 from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of
@@ -124,7 +120,11 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     """What is to be said of a trial that has just been stored."""
     workspace.forget_trials()
     trial = replace(read.trial, id=added.id)
-    warnings = (*read.warnings, *warnings_about(workspace, trial, read.last_s, read.fell))
+    faults = log_faults(workspace, interpolate_gaps(trial).trial)
+    odd = tuple(one.told(trial, own=read.own) for one in faults)
+    scaled = [name for one in faults for name in one.inputs]
+    checked = warnings_about(workspace, trial, read.last_s, read.fell, scaled)
+    warnings = (*read.warnings, *odd, *checked)
     if whole := _whole(read, workspace.task):
         warnings = (*warnings, *afterwards(workspace.task, whole))
     if before:
@@ -146,12 +146,15 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         utility=workspace.task.utility(judged[0]) if judged else None,
         accepted=tried.accepted if tried else None,
         warnings=warnings,
+        faults=odd,
         signals=read.signals,
         verdict=verdict,
         crashed=tried.failed if tried and verdict == "crashed" else (),
         notes=(*read.notes, *(odd_run(workspace, now, added.id) if now and read.doubted else ())),
         off_target=off_target_of(workspace.task, judged),
-        then=after_log(workspace, verdict, now),
+        then=NextCommand("discard", (added.id,))
+        if odd and not aside
+        else after_log(workspace, verdict, now),
     )
 
 
@@ -246,9 +249,10 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             "and diagnosis, and run a candidate of this task",
             NextCommand("ingest", (str(path), "--data")),
         )
-    sent, _ = mistaken_in(workspace.base_model, replace(read.trial, id=""))
-    named = [*(misread(read.log) if read.log else ()), *sent]
-    named += dead_sensors(workspace.base_model, whole)
+    known = replace(read.trial, id="").until(read.trial.known_steps)
+    odd = [*mistaken_in(workspace.base_model, known), *dead_sensors(workspace.base_model, whole)]
+    named = [*(misread(read.log) if read.log else ())]
+    named += [one.told(known, own=read.own) for one in odd]
     if not named and not other:
         named += filter(None, [misled(log, workspace.task, own.policy)])
     if named:

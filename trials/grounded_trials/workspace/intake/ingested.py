@@ -28,6 +28,7 @@ class Ingested(Result):
     crashed: tuple[str, ...] = ()  # the candidate's trials that ended early, where it crashed
     notes: tuple[str, ...] = ()  # where in a longer log the run was found
     off_target: tuple[OffTarget, ...] = ()  # how far the run is off it, in units
+    faults: tuple[str, ...] = ()  # of the warnings those that say that its columns are wrong
     then: NextCommand = PROPOSE
 
     def summary(self) -> str:
@@ -48,6 +49,7 @@ class Ingested(Result):
             "crashed": list(self.crashed),
             "off_target": [one.to_json() for one in self.off_target],
             "warnings": list(self.warnings),
+            "faults": list(self.faults),
             "notes": list(self.notes),
             "signals": [vars(signal) for signal in self.signals],
         }

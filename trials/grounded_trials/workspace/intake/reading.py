@@ -27,7 +27,7 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, ROWS, sha256
 from grounded_trials.workspace.intake.crossed import crossed
 from grounded_trials.workspace.intake.foreign import ForeignLog, begun, mapping_of, read_foreign
-from grounded_trials.workspace.intake.no_angle import no_angles
+from grounded_trials.workspace.intake.log_faults import no_angles
 from grounded_trials.workspace.intake.stored_before import (
     refuse_as_another,
     same_recording,
@@ -54,6 +54,11 @@ class Read:
     cut: Gridded | None = None  # of a foreign log: how it was sampled
     fell: bool = False  # it failed before the log ends, which its warnings say
     last_s: float = math.nan  # its last sample of every state, since the start; of a foreign log
+
+    @property
+    def own(self) -> bool:
+        """Whether it was written in the model's units, with no [log] to read it by."""
+        return self.log is None and not self.copy
 
     @property
     def hole(self) -> str:

@@ -1,25 +1,22 @@
 """What a person should know about a trial before believing it, in sentences.
 
-Whether it ran its candidate at all is asked in `who_drove.py`.
+Whether it ran its candidate at all is asked in `who_drove.py`, whether its columns are what the
+model calls by their names in `log_faults.py`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from grounded.errors import GroundedError
 from grounded.frozen import Array
-from grounded.model import Model
 from grounded.result import measured_alike
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
 from grounded_trials.wording import count, in_digits_apart, with_unit
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.estimating import read_estimate
 from grounded_trials.workspace.intake.who_drove import UNLIKE, follows, latest, second_differences
 from grounded_trials.workspace.off_target import reaches, weighed_groups
 
@@ -31,14 +28,17 @@ FEWEST = 2  # earlier runs whose starts say how they scatter
 LATEST = 3  # steps by which inputs may be logged late, and are told so
 WHITE = 0.6745 * 6**0.5  # the median of its second differences, in its standard deviations
 AWAY = 0.02  # of its way: how much farther off after a run than at its end is told
-TURNS, WIDER = 5.0, 2.0  # of [safety]: beyond it in radians, about inside it in degrees
 WIDEN = "no plan will ask for that; widen them if the robot may get it"
 
 
 def warnings_about(
-    workspace: Folder, trial: Trial, last_s: float = float("nan"), fell: bool = False
+    workspace: Folder,
+    trial: Trial,
+    last_s: float = float("nan"),
+    fell: bool = False,
+    scaled: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """Gaps, odd columns, an early end, a start far from s_0, what left [limits] or [safety].
+    """Gaps, an early end, a start far from s_0, what left [limits] or [safety].
 
     Args:
         workspace: whose task and candidates hold.
@@ -46,10 +46,8 @@ def warnings_about(
         last_s: when the last of its states was logged, seconds of the run; NaN where all are on
             the control grid.
         fell: whether it is known, and told, that the run failed where the trial ends.
+        scaled: inputs that are known, and told, to be logged in another unit.
     """
-    from grounded.instruments.kinematics import integrals
-    from grounded.instruments.swapped import exchanged, swapped_columns
-
     task = workspace.task
     filled = interpolate_gaps(trial)
     found = []
@@ -65,17 +63,6 @@ def warnings_about(
             f"'{name}' is not a finite number at {step * trial.dt:.2f} s: the trial counts as "
             "ended there"
         )
-    model = workspace.base_model
-    relations = integrals(model)
-    if pair := swapped_columns(model, whole.until(whole.known_steps), relations=relations):
-        found.append(exchanged(pair))
-    found += dead_sensors(model, whole)
-    found += thousands(model, whole)
-    found += way_warnings(model, whole)
-    found += told_in_degrees(model, whole, found) or _in_degrees(task, whole)
-    found += clocks_apart(workspace, whole)
-    sent, scaled = mistaken_in(model, whole)
-    found += sent
     if not trial.candidate:
         return (*found, *_beyond(task, whole, scaled))
     if whole.steps < task.horizon and not fell:
@@ -274,115 +261,6 @@ def _inputs(task: Task, trial: Trial) -> list[str]:
         for i, name in enumerate(trial.input_names)
         if excess[i] > 1e-6
     ]
-
-
-def _in_degrees(task: Task, trial: Trial) -> list[str]:
-    """Angles far beyond [safety] that would be inside, were they degrees."""
-    assert task.safety_low is not None and task.safety_high is not None
-    found = []
-    for i, (name, unit) in enumerate(task.model.states.items()):
-        x, low, high = trial.states[:, i], task.safety_low[i], task.safety_high[i]
-        most = float(np.abs(x[np.isfinite(x)]).max(initial=0.0))
-        allowed = max(abs(low), abs(high))
-        inside = np.deg2rad(most) <= WIDER * allowed
-        if unit == "rad" and np.isfinite(allowed) and most > TURNS * allowed and inside:
-            found.append(
-                f"{name} goes to {most:.3g} rad, [safety] is [{low:g}, {high:g}]: in degrees? "
-                f"[log.state.{name}] scale = {np.pi / 180:.8g} would make it "
-                f"{np.deg2rad(most):.3g} rad"
-            )
-    return found
-
-
-def dead_sensors(model: Model, trial: Trial) -> list[str]:
-    """Velocities that show nothing of what their positions do."""
-    from grounded.instruments.dead import dead_rates
-
-    return [
-        f"{model.state_names[one.relation.j]} {one.told(model)}: is [log] its column, is its "
-        "sensor on?"
-        for one in dead_rates(model, trial)
-    ]
-
-
-def thousands(model: Model, trial: Trial) -> list[str]:
-    """That a position, or its velocity, is in mm, or a thousand times too large twice over."""
-    from grounded.instruments.other_units import MEND, units_apart
-
-    known = trial.until(trial.known_steps)
-    with np.errstate(all="ignore"):
-        apart = units_apart(model, known, range(model.n)) if known.steps > 1 else []
-    stored = f", without {trial.id}" if trial.id else ""
-    return [f"{one}. {MEND}, and ingest it again{stored}" for one in apart]
-
-
-def way_warnings(model: Model, trial: Trial) -> list[str]:
-    """What the way that was travelled says of heading and speeds: other axes, a compass, knots."""
-    from grounded.instruments.rows import kinematic_rows, tied
-    from grounded.instruments.way import judge_way
-
-    rows = tied(kinematic_rows(model, range(model.n)))
-    known = replace(trial.until(trial.known_steps), id="")
-    try:
-        with np.errstate(all="ignore"):
-            odd = list(judge_way(model, [known], rows))
-    except GroundedError as error:
-        return [str(error).replace("in trial number 1 ", "")]
-    return [f"{one.signal} {one.finding}: {one.log} in [log.state.{one.signal}]" for one in odd]
-
-
-def told_in_degrees(model: Model, trial: Trial, told: Sequence[str]) -> list[str]:
-    """Degrees that a diagnosis would put right, but for those that are told already."""
-    from grounded.instruments.preflight import preflight
-
-    try:
-        findings = preflight(model, [replace(trial.until(trial.known_steps), id="")]).findings
-    except GroundedError:  # it stops the diagnosis, which tells it
-        return []
-    return [
-        f"{said}: multiply the scale in [log.state.{one.signal}] by {one.log.split(' = ')[1]} (1 "
-        "where none is given)"
-        for one in findings
-        if one.kind == "degrees" and one.log
-        for said in [f"{one.signal} {one.finding}"]
-        if not any(other.startswith(said) for other in told)
-    ]
-
-
-def clocks_apart(workspace: Folder, trial: Trial) -> list[str]:
-    """That measured states answer commands before they are sent."""
-    from grounded.instruments.clocks import answers_early, one_clock, too_soon
-
-    model, table = workspace.base_model, workspace.config.estimate
-    measured = read_estimate(table, model).measured if table.names() else model.state_names
-    shown = [i for i, name in enumerate(model.state_names) if name in measured]
-    if (early := answers_early(model, trial, shown)) is None:
-        return []
-    said = f"{too_soon(model, early)}. {one_clock(model, shown, early)}, and ingest it again"
-    return [f"{said}, without {trial.id}"]
-
-
-def mistaken_in(model: Model, trial: Trial) -> tuple[list[str], tuple[str, ...]]:
-    """What the model says of exchanged commands or other units, and the inputs in other units."""
-    from grounded.instruments.mistaken import as_logged, described, mended_by, mistaken
-    from grounded.instruments.preflight import preflight
-
-    known = trial.until(trial.known_steps)
-    told = mistaken(model, [known], range(model.n))
-    if told is not None:
-        try:
-            looked = preflight(model, [known])
-        except GroundedError:  # of other instruments: the diagnosis tells what looks turned so
-            told = None if told.mistake.turned else told
-        else:
-            told = mistaken(model, looked.trials, range(model.n))
-            told = told and as_logged(model, told, looked.findings)
-    if told is None:
-        return [], ()
-    stored = f", without {trial.id}" if trial.id else ""
-    again = f"{mended_by(model, told)}, and ingest it again{stored}"
-    scaled = () if told.mistake.swap else told.mistake.inputs
-    return [f"{described(model, told)}. {again}"], tuple(model.input_names[j] for j in scaled)
 
 
 def _beyond(task: Task, trial: Trial, scaled: Sequence[str]) -> list[str]:

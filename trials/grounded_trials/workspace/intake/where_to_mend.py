@@ -17,7 +17,7 @@ import numpy as np
 from grounded.instruments.finding import Finding, late_effects
 from grounded_trials.logs.log_table import log_mapping
 from grounded_trials.workspace.identity import READ_BY
-from grounded_trials.workspace.intake.no_angle import no_angles
+from grounded_trials.workspace.intake.log_faults import no_angles
 from grounded_trials.workspace.task_file import seen_in
 
 if TYPE_CHECKING:

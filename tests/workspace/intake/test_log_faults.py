@@ -8,7 +8,7 @@ from grounded import Model
 from grounded_trials import Workspace
 from grounded_trials.logs.log_table import LogMapping
 from grounded_trials.logs.signals import SignalSpec
-from grounded_trials.workspace.intake.no_angle import no_angles
+from grounded_trials.workspace.intake.log_faults import no_angles
 from ros_bags import rover_bag
 
 CAR = Model(
