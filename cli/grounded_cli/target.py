@@ -161,7 +161,7 @@ def _free(names: list[str], reward: dict[str, dict[str, float]], rest: str) -> s
     text = f"{listed(names)}: no column in the target, so nothing asks where a run takes {it}"
     if weighed:
         text += (
-            f". [reward] weighs {listed(weighed)}, and `propose` refuses a weight without a column: "
+            f". [reward] weighs {listed(weighed)}, and `propose` refuses weights without a column: "
             f"give it one (`--to {weighed[0]}=VALUE`), or take the weight out"
         )
     if rest:

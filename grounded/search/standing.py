@@ -255,7 +255,11 @@ def standing(
                 ending="crashed",
                 then=NextCommand("diagnose"),
             )
-        return replace(now, step=options.first_step(), caution=failed)
+        now = replace(now, step=options.first_step(), caution=failed)
+        if failed < LOST or history[-1].candidate.model != model:
+            return now
+        why = f"{failed} policies crashed in a row: a diagnosis may say what the model lacks"
+        return replace(now, sentence=why, then=NextCommand("diagnose"), doubt=why)
     own = incumbent.candidate.id
     step, way = _next_step(history, incumbent, options, model)
     if step is None:

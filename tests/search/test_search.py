@@ -280,6 +280,8 @@ def test_a_crash_of_the_first_policy_makes_a_gentler_one(how):
         made = story.candidates[-1]
         assert made.caution == k and made.base == "" and made.iteration == 0
         efforts.append(float(np.abs(np.diff(made.predicted_inputs, axis=0)).sum()))
+        asked = story.now.then is not None and story.now.then.verb == "diagnose"
+        assert asked == (k > 0)  # nothing did before the search was at its end
     assert efforts == sorted(efforts, reverse=True) and efforts[1] < 0.7 * efforts[0]
     last = story.propose()
     assert last.candidate is None and last.standing.phase == "stopped"
@@ -543,8 +545,11 @@ ODD = {
     "latency as long as the manoeuvre": {"latency": np.array([2.5])},
     "open loop": {"feedback": False},
     "a far start": {"start": np.array([100.0, 50.0])},
-    "limits that leave no choice": {"low": np.array([0.999]), "high": np.array([1.0])},
-    "held beyond the limits": {"past": np.array([9.0])},
+    "limits that leave no choice": {
+        "low": np.array([0.999]),
+        "high": np.array([1.0]),
+        "past": np.array([1.0]),
+    },
     "exact planning": {"smoothing": 0.0},
     "nothing to do": {"target": np.column_stack([np.zeros(41), np.full(41, np.nan)])},
 }
