@@ -64,6 +64,10 @@ class Param:
             raise GroundedError(f"a parameter's value must be a finite number, got {self.value}")
         low = -np.inf if self.low is None else self.low
         high = np.inf if self.high is None else self.high
+        if low > high:
+            raise GroundedError(
+                f"a parameter's bounds are the wrong way round: low = {low:g}, high = {high:g}"
+            )
         if not low <= self.value <= high:
             raise GroundedError(f"a parameter's value {self.value} lies outside [{low}, {high}]")
         if self.std is not None and not (np.isfinite(self.std) and self.std > 0):

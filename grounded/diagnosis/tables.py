@@ -82,7 +82,7 @@ def effect_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
         for r in diagnosis.ranking[:EFFECTS]
     ]
     if rows and (share := credit_of(diagnosis, "calibration")):
-        rows.insert(0, ("  (calibration)", share, "", "the model's own parameters, below"))
+        rows.insert(0, ("  (calibration)", share, "", "the model's own parameters"))
     return rows, ("effect (*: claimed)", "credit", "evidence [nats]", "value")
 
 

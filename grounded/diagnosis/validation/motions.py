@@ -32,7 +32,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.effects import Library, param_name
+from grounded.effects import Library, ParamFamily, param_name
 from grounded.effects.places import dynamic
 from grounded.frozen import Array
 from grounded.model import Model, Param
@@ -72,11 +72,12 @@ def repeats(search: FittedHypotheses, fit: Fitted, less: Fitted, name: str) -> i
 
 
 def of_no_size(predictor: Predictor, fit: Fitted, trial_of: Array) -> list[str]:
-    """The loose effects of a fit that may as well be nothing, or lie where nobody was.
+    """The effects of a fit that may as well be nothing, or lie where nobody was.
 
-    Of a wave of half a period what it adds where something was measured is known, what it is is
-    not: no size is known to KNOWN deviations. The size of a patch of ground hangs on its place: it
-    counts where a trial came within a radius of that.
+    No size of it is known to KNOWN deviations. Of a wave of half a period what it adds where
+    something was measured is known, what it is is not; of two falls what grows with time is told by
+    how both ended. The size of a patch of ground hangs on its place: it counts where a trial came
+    within a radius of that. Parameters have priors of their own.
 
     Args:
         predictor: of the data of the fit.
@@ -85,10 +86,11 @@ def of_no_size(predictor: Predictor, fit: Fitted, trial_of: Array) -> list[str]:
     """
     found, sizes, at = [], dict[str, list[int]](), 0
     for effect, values in fit.hypothesis.pairs:
+        strengths = [at + k for k, q in enumerate(effect.free) if not q.grid]
         if effect.family.loose and "radius" in values:
             found += [effect.name] * (not _visited(predictor.data, values))
-        elif effect.family.loose:
-            sizes[effect.name] = [at + k for k, q in enumerate(effect.free) if not q.grid]
+        elif strengths and not isinstance(effect.family, ParamFamily):
+            sizes[effect.name] = strengths
         at += len(effect.free)
     if sizes:
         theta, stds = fit.hypothesis.theta, standard_deviations(predictor, fit, trial_of)[0]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from grounded.diagnosis.report import Estimate
-from grounded.diagnosis.tables import credit_of, error_table
+from grounded.diagnosis.tables import effect_table, error_table
 from grounded.errors import NextCommand
 from grounded.search.candidate import Tried
 from grounded.search.pictures import few
@@ -29,7 +28,6 @@ from grounded_trials.wording import (
     legend,
     per_second,
     rendered,
-    with_unit,
     wrapped,
 )
 from grounded_trials.workspace.next_step import DIAGNOSE
@@ -37,8 +35,6 @@ from grounded_trials.workspace.proposing import not_counted
 
 ROWS, SPARED = 12, 3  # candidates in the table; more than so many others are counted
 ITERATIONS = 5  # of the bias
-EFFECTS = 5
-VALUES = 34  # columns for an effect's parameters
 LEGEND = "alpha: the part of the step that was run; +-: standard error"
 
 Table = Callable[[Sequence[Sequence[str]], Sequence[str]], str]
@@ -166,26 +162,8 @@ def _diagnosis(findings: Findings, table: Table) -> str:
     if diagnosis.prediction_error and not diagnosis.no_cause:
         lines += ["", table(*error_table(diagnosis))]
     if diagnosis.ranking and not diagnosis.no_cause:
-        rows = [
-            (
-                r.effect[:30],
-                figure(r.evidence, 3),
-                credit_of(diagnosis, r.effect),
-                _fitting([_value(*one) for one in r.params.items()], VALUES).ljust(VALUES),
-            )
-            for r in diagnosis.ranking[:EFFECTS]
-        ]
-        lines.append("\n" + table(rows, ("effect", "nats", "credit", "parameters".ljust(VALUES))))
+        lines += ["", table(*effect_table(diagnosis))]
     return "\n".join(lines)
-
-
-def _fitting(values: list[str], width: int) -> str:
-    """As many of them as fit, and dots for the others: half a number would be a wrong one."""
-    for kept in range(len(values), 0, -1):
-        text = ", ".join(values[:kept]) + ", ..." * (kept < len(values))
-        if len(text) <= width:
-            return text
-    return "..." if values else ""
 
 
 def _logs(findings: Findings, table: Table) -> str:
@@ -196,11 +174,6 @@ def _logs(findings: Findings, table: Table) -> str:
     rows = by_state(findings.task.model, columns)
     title = f"data: what the {findings.plain}, set right every {ahead:.3g} s, misses by then, rms\n"
     return title + table(rows, ("state", "unit", *(log.trial.id for log in logs)))
-
-
-def _value(name: str, value: Estimate) -> str:
-    spread = f" +- {value.std:.2g}" if 0 < value.std < math.inf else ""
-    return with_unit(f"{name} = {value.value:.3g}{spread}", value.unit)
 
 
 def _wrapped(text: str, indent: str) -> list[str]:

@@ -250,8 +250,9 @@ def _probe(
     It is one that `run` and `export` hand over: inside today's [limits], and inside [safety] by as
     much as runs have strayed.
     """
+    none = f"{found.next_trial.rstrip('.')}. No probe is written"
     if found.no_cause:
-        return "", ""
+        return "", f"{none}: nothing can be named from these trials." * write
     from grounded.diagnosis.excitation import NOTHING, probe
     from grounded.diagnosis.verdict import sentence
     from grounded.search.safety import objections, spread
@@ -261,7 +262,7 @@ def _probe(
     now = standing_in(workspace)
     best = now.incumbent
     if best is None:
-        return "", ""
+        return "", f"{none}: it varies the best candidate, and none has run to its end." * write
     planner = workspace.planner
     task, strays = planner.task, spread(planner.task, now.history, best.candidate.model)
     own = best.candidate.policy
@@ -278,7 +279,8 @@ def _probe(
             break
         worth = not made.little or (write and (not ties or made.expected >= NOTHING))
         if not worth:  # asked for, the best of them is written nevertheless
-            return "", made.sentence if ties else f"{found.next_trial} {sentence([made.sentence])}"
+            said = made.sentence if ties else f"{found.next_trial} {sentence([made.sentence])}"
+            return "", f"{said.rstrip('.')}. No probe is written." if write else said
         if not offer:
             return "", f"{made.sentence} (`{rendered(PROBE)}` makes the candidate)"
         candidate = _candidate_of(workspace, planner.narrowed(made.policy), best.candidate.id)
