@@ -188,3 +188,13 @@ def test_a_table_wider_than_the_list_says_so(tmp_path):
         found = inspect_log(path)
         assert len(found.topics[0].fields) == min(columns, FIELD_LIMIT)
         assert any(str(FIELD_LIMIT) in remark for remark in found.remarks) == said
+
+
+def test_an_input_in_volts_is_sought_by_its_unit_too(tmp_path):
+    """A part of a quaternion was offered for `volts` before `/motor/voltage`."""
+    log, t = tmp_path / "log.csv", np.arange(0, 5, 0.01)
+    columns = np.column_stack([t, np.sin(t), 3 * np.sin(2 * t), np.sin(3 * t)])
+    np.savetxt(log, columns, "%.5f", ",", header="t,tilt,motor_voltage,orientation_x", comments="")
+    units = {"theta": "rad", "volts": "V"}
+    (theta,), (volts,) = guess_mapping(inspect_log(log), ["theta"], ["volts"], units)
+    assert (theta.path, volts.path) == ("/csv.tilt", "/csv.motor_voltage")

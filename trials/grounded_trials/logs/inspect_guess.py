@@ -28,7 +28,7 @@ DRIFT = 2e-4  # of a signal's range: the least deviation that is proposed for it
 SIMULATED_S = 1.0  # header stamps this far from the log's clock are not its time
 
 _YAW = ("@rpy.yaw", "yaw", "heading", "theta", "psi")
-_TURN = ("@rpy.pitch", "@rpy.yaw", "theta", "angle", "pitch")
+_TURN = ("@rpy.pitch", "@rpy.yaw", "theta", "angle", "pitch", "tilt", "lean")
 _MEANINGS: dict[str, tuple[str, ...]] = {
     "x": ("position.x", "translation.x", "x", "north", "northing", "east", "easting"),
     "y": ("position.y", "translation.y", "y", "east", "easting", "north", "northing"),
@@ -57,6 +57,12 @@ _MEANINGS: dict[str, tuple[str, ...]] = {
     "thrust": ("thrust", "force.z", "throttle"),
     "brake": ("brake",),
     "torque": ("torque", "effort", "tau"),
+}
+_BY_UNIT: dict[str, tuple[str, ...]] = {  # what an input is called for what it is
+    "V": ("voltage", "volts", "volt"),
+    "A": ("current", "amps", "ampere"),
+    "N m": ("torque", "effort", "tau"),
+    "N": ("force", "thrust"),
 }
 _BESIDE_U = ("linear.y", "v", "sway")  # what v is where u is a state, too: not the speed
 _COMPASS = (("north", "northing"), ("east", "easting"))  # a plane's axes, whichever x is
@@ -121,7 +127,8 @@ def guess_mapping(
     taken = {guess.path for guess in found}
     rest = []
     for name in inputs:
-        found_for = _candidates(log, name, _MEANINGS.get(name, (name,)), is_input=True)
+        meanings = (*_MEANINGS.get(name, (name,)), *_BY_UNIT.get(units.get(name, ""), ()))
+        found_for = _candidates(log, name, meanings, is_input=True)
         candidates = [c for c in found_for if c.field.path not in taken]
         guess = _choose(log, name, candidates, {})
         rest.append(guess if guess.path or guess.others else _commands_of(log, guess, taken))
