@@ -265,7 +265,7 @@ class _Bench:
             if clear:
                 yield from self.unit(relation, clear)
                 yield from self.late(relation, clear)
-            if relation.exact:
+            if relation.exact or clear:
                 yield from self.constant(relation)
             over = clear.mean if clear and clear.mean >= SMOOTH * self.dt else copied * self.dt
             if relation.exact and over > 0:
