@@ -52,7 +52,7 @@ def test_text_without_a_diagnosis_says_how_to_get_one(car):
 def test_text_shows_the_diagnosis(cart):
     out = grounded("-C", cart, "report").out
     assert "90 %" in out
-    assert "k = 0.3 +- 0.01 1/s" in out
+    assert "k = 0.300 +- 0.010 1/s" in out
 
 
 def test_text_and_status_explain_their_columns(cart):
@@ -93,8 +93,9 @@ def test_half_a_number_is_never_shown(cart, tmp_path):
     entry = {"effect": "patch:v", "params": params, "evidence": 9.0, "gap_after": 1.0}
     document = DIAGNOSIS | {"ranking": [entry]}
     write_document(folder / "reports" / "diagnosis.json", document)
-    (line,) = [x for x in grounded("-C", folder, "report").out.splitlines() if "patch:v" in x]
-    assert line.endswith("k0 = 0.123 +- 0.01 m/s, ...")
+    (shown,) = re.findall(r"patch:v +9\.0 +(k0 .*?)\n\S", grounded("-C", folder, "report").out, re.S)
+    values = [re.sub(r"\s+", " ", one).strip() for one in shown.split(",")]
+    assert values == [f"k{i} = 0.123 +- 0.010 m/s" for i in range(4)]
 
 
 def test_json_holds_what_the_contract_says(cart):

@@ -17,7 +17,6 @@ import numpy as np
 from grounded.instruments.finding import Finding, late_effects
 from grounded_trials.logs.log_table import log_mapping
 from grounded_trials.workspace.identity import READ_BY
-from grounded_trials.workspace.intake.log_faults import no_angles
 from grounded_trials.workspace.task_file import seen_in
 
 if TYPE_CHECKING:
@@ -42,6 +41,8 @@ def where_to_mend(
     workspace: Folder, used: Sequence[Trial], findings: Sequence[Finding]
 ) -> tuple[Finding, ...]:
     """Findings with the whole key of [log], or with advice where it read none of the trials."""
+    from grounded_trials.workspace.intake.log_faults import no_angles  # and with it all of effects
+
     about = {one.stored.id: one.meta for one in workspace.trials()}
     findings = _at_limits(workspace, used, findings)
     feedback = workspace.config.task.feedback
