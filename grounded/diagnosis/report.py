@@ -127,7 +127,7 @@ class Unconfirmed(Document):
         few, all_ = self.seen
         if self.repeats:
             made = f"{few} of {all_}" if few < all_ else f"all {all_}"
-            rest = f"or whatever else repeats with the motion of {made} trials"
+            rest = f"or anything else that repeats with the motion of {made} trials"
             return f"unconfirmed: {self.meaning}, {rest}"
         where = "" if self.region is None else f", mostly where {self.region.told}"
         start, end = number(self.start), number(self.end)
