@@ -242,8 +242,8 @@ def test_sentences_are_english():
         "The throttle acts the other way round (with 50 % of the modelled strength)."
     )
     assert said("input_gain:throttle", g=-2.1) == (
-        "The throttle acts the other way round: turn its sign in model.py, or if only the log "
-        "counts so, with [log] scale = -1."
+        "The throttle acts the other way round: flip its sign in model.py, or, if only the log "
+        "has it so, set [log] scale = -1."
     )
     assert said("rate_gain:v", g=-2.0) == "The speed v changes the other way round."
     assert said("input_fade:throttle", k=-0.05) == "The throttle gets 5 % stronger every second."
