@@ -261,8 +261,15 @@ def _effects(found: Diagnosis, *, details: bool) -> None:
         _note(
             "credit: share of the improvement lost without it; evidence: log-likelihood lost "
             "without it" + "; of rivals, gained by it alone" * details + "; +-: one standard "
-            "deviation, if the equations are right"
+            "deviation" + _if_right(found)
         )
     for group in found.indistinguishable:
         if (text := told_apart(group, found.equivalent)) not in found.sentence:
             show(field("tied", text))
+
+
+def _if_right(found: Diagnosis) -> str:
+    """Say what standard deviations leave out: errors of the equations themselves."""
+    if found.leftover:
+        return ", but a gap remains, so true values may be further off"
+    return ", if the equations are right"
