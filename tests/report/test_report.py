@@ -90,7 +90,7 @@ def test_text_says_how_utilities_are_predicted_and_what_acts_alike(cart):
 def test_half_a_number_is_never_shown(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     params = {f"k{i}": {"value": 0.123456, "std": 0.01, "unit": "m/s"} for i in range(4)}
-    entry = {"effect": "patch:v", "params": params, "evidence": 9.0, "gap_after": 1.0}
+    entry = {"effect": "patch:v", "params": params, "evidence": 9.0, "claimed": True}
     document = DIAGNOSIS | {"ranking": [entry]}
     write_document(folder / "reports" / "diagnosis.json", document)
     (shown,) = re.findall(
