@@ -130,10 +130,10 @@ def test_inputs_of_missed_calls_count_as_held():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"dt": 0.0}, "don't fit"),
+        ({"dt": 0.0}, "inconsistent"),
         ({"past": np.array([np.nan])}, "not finite"),
-        ({"low": np.array([2.0])}, "exclude each other"),
-        ({"gain": np.zeros((H, 1, 2))}, "don't fit"),
+        ({"low": np.array([2.0])}, "lower limit above"),
+        ({"gain": np.zeros((H, 1, 2))}, "inconsistent"),
         ({"format": "other"}, "not a candidate"),
     ],
     ids=str,
