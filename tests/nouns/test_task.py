@@ -31,7 +31,7 @@ REWARD = Reward(np.array([10.0, 0.0]), np.zeros(2), np.array([0.01]), np.array([
             r"\[limits\] force: the lower limit 5 must be below the upper limit 5",
         ),
         ({"low": np.array([np.nan])}, r"\[limits\] force"),
-        ({"past": np.array([9.0])}, r"force = 9 N is held before the start, beyond its limits"),
+        ({"past": np.array([9.0])}, r"force = 9 N is held before the start, outside its limits"),
         (
             {"latency": np.array([-0.1])},
             r"latency of force must be 0 to 50 control steps \(2.5 s\)",

@@ -195,7 +195,7 @@ def test_what_a_user_gets_wrong_in_python_is_said():
             "in this order",
         ),
         (lambda: gr.Search(replace(TASK, model=two)).ask(), r"\(s, a, p\)"),
-        (lambda: gr.learn(TASK, lambda candidate: None), "returns a Trial"),
+        (lambda: gr.learn(TASK, lambda candidate: None), "expected a Trial"),
     ):
         with pytest.raises(gr.GroundedError, match=told):
             mistake()
