@@ -1,33 +1,34 @@
-"""Teach a real system a manoeuvre in a few trials from a crude model; say what the model lacks.
+"""Learn a manoeuvre on a real system in a few trials from a crude model; diagnose model errors.
 
     import grounded as gr
 
     search = gr.Search(gr.Task(model=gr.Model(...), ...))
     while (candidate := search.ask()) is not None:
-        search.tell(run(candidate))                # a gr.Trial of the real system
+        search.tell(run(candidate))                # run returns a gr.Trial of the real system
     found = gr.diagnose(search.task, search.trials)
 
 The algorithm is that of Abbeel, Quigley & Ng, "Using Inaccurate Models in Reinforcement Learning",
-ICML 2006; start reading in `grounded.search.improve`. The files of this folder are the nouns:
+ICML 2006; start reading in `grounded.search.improve`. The modules of this package define the data
+types:
 
 model, task, utility    the crude model, the manoeuvre, its quadratic reward
-trial, rollout, plant   a real run, a simulated one, a simulated real system
-policy, onboard         what a robot runs, and the one file that runs it with numpy alone
-result, errors, frozen  what results, mistakes and arrays have in common; `figures`, what they show
-engine                  where independent pieces of work run: here, on threads, on a cluster
+trial, rollout, plant   a real run, a simulated run, a simulated real system
+policy, onboard         what a robot runs, and the single file that runs it with numpy alone
+result, errors, frozen  base classes of results, errors and read-only arrays; `figures` draws them
+engine                  where independent pieces of work run: in this process, threads, a cluster
 
-Its rooms, from the paper's loop down:
+The subpackages, in the order of the paper's loop:
 
-search       what to run next, from stored trials
-solve        optimal control in the model, and the bias that makes it replay a trial
-compile      a model in NumPy, differentiated and compiled
-diagnosis    what the model lacks; `effects` it may be; `challenge`, blind cases for it
-instruments  sensors, judged from their own signals before any physics
-estimate     states and noise from measurements; `fit`, parameters from trials
-models       systems that come with grounded; `adapters`, models that other software computes
+search       chooses what to run next from stored trials
+solve        optimal control in the model, and the bias that makes the model replay a trial
+compile      differentiates and compiles a model written in NumPy
+diagnosis    finds what the model lacks; `effects` lists candidates; `challenge` makes blind tests
+instruments  checks sensors by their own signals, without a model of the dynamics
+estimate     estimates states and noise from measurements; `fit` estimates parameters from trials
+models       models that come with grounded; `adapters` wraps models of other software
 experiments  the paper's studies
 
-What `__all__` names is imported when it is first used.
+The names in `__all__` are imported on first use.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ _HOMES = {
     "grounded.utility": ("Reward",),
 }
 
-if not TYPE_CHECKING:  # or any misspelt name would pass for an attribute
+if not TYPE_CHECKING:  # else type checkers would accept any misspelt attribute
 
     def __getattr__(name: str) -> Any:
         from importlib import import_module
@@ -92,7 +93,7 @@ def __dir__() -> list[str]:
 
 
 class _Door(ModuleType):
-    """`grounded.fit` is the function, also after the room of that name was imported."""
+    """Module type that keeps `grounded.fit` the function after the subpackage is imported."""
 
     def __setattr__(self, name: str, value: object) -> None:
         if not (name == "fit" and isinstance(value, ModuleType)):

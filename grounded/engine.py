@@ -1,15 +1,15 @@
-"""Engine: where independent pieces of work run; how many workers there are changes no bit.
+"""Engine: where independent pieces of work run. Results do not depend on the number of workers.
 
-The jobs of a study are joblib's: processes on this machine (extra `studies`), or tasks of an
-existing Dask cluster through Dask's own joblib backend (extra `cluster`). The pieces of one
-computation (`each`: records of a fit, hypotheses of a diagnosis) are many and short and share their
-data: on this machine they are threads, which need no extra, because compiled passes leave Python's
-lock; on a cluster what all of them read is sent once (`SentOnce`).
+The jobs of a study run through joblib: as processes on this machine (extra `studies`), or as tasks
+of an existing Dask cluster through Dask's joblib backend (extra `cluster`). The pieces of one
+computation (`each`: records of a fit, hypotheses of a diagnosis) are short, numerous and share
+their data. On this machine they run in threads, which need no extra, because compiled code releases
+the GIL. On a cluster, data that all of them read is sent once (`SentOnce`).
 
-Either uses one BLAS thread, and keeps its pages (`steady`). Matrices here are small: the threads
-that OpenBLAS starts by itself wait for one another and burn a core each (three times the CPU of a
-diagnosis on two busy cores), and sum in another order. Arrays are large enough that the C library
-hands each back to the system, which then clears every page of the next one: 40 % of a diagnosis.
+Both use one BLAS thread and keep freed memory (`steady`). The matrices are small, so OpenBLAS's own
+threads wait for each other (three times the CPU of a diagnosis on two busy cores) and change the
+order of summation. The arrays are large enough that the C library returns each to the system,
+which then clears every page of the next one: 40 % of the time of a diagnosis.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ import numpy as np
 
 from grounded.errors import GroundedError, needs
 
-STACK = 16 * 2**20  # [bytes] of a thread: kernels keep their matrices there
-CONNECT_S = 10.0  # for a cluster's scheduler to answer
+STACK = 16 * 2**20  # [bytes] stack size of a thread: kernels keep their matrices there
+CONNECT_S = 10.0  # [s] timeout for a cluster's scheduler to answer
 TRIM, MAP = -1, -3  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of the GNU C library
-LARGE = 2**28  # [bytes] blocks up to here are reused
+LARGE = 2**28  # [bytes] freed blocks up to this size are reused
 T = TypeVar("T")
 
 
 @contextmanager
 def steady() -> Iterator[None]:
-    """One BLAS thread for NumPy and SciPy, and pages kept; also a decorator, `@steady()`."""
-    import scipy.linalg  # noqa: F401  SciPy's BLAS is another one, loaded with it
+    """Use one BLAS thread and keep freed memory; also a decorator, `@steady()`."""
+    import scipy.linalg  # noqa: F401  loads SciPy's own BLAS, so that it is limited as well
     from threadpoolctl import threadpool_limits
 
     _keep_pages()
@@ -50,7 +50,7 @@ def steady() -> Iterator[None]:
 def _keep_pages() -> None:
     try:
         mallopt = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError, TypeError):  # another C library
+    except (AttributeError, OSError, TypeError):  # not the GNU C library
         return
     mallopt(MAP, LARGE)
     mallopt(TRIM, LARGE)
@@ -58,12 +58,16 @@ def _keep_pages() -> None:
 
 @dataclass(frozen=True)
 class Engine:
-    """Where pieces of work run.
+    """Where independent pieces of work run.
 
     Args:
-        jobs: workers on this machine; 1 runs all in this process.
+        jobs: number of workers on this machine; 1 runs everything in this process.
         name: "local", or "dask" for a running cluster.
-        address: the cluster's scheduler, such as "tcp://10.0.0.1:8786".
+        address: address of the cluster's scheduler, such as "tcp://10.0.0.1:8786"; required with
+            "dask" only.
+
+    Raises:
+        GroundedError: if `jobs` is below 1, `name` is unknown, or `address` does not match `name`.
     """
 
     jobs: int = 1
@@ -77,27 +81,27 @@ class Engine:
             raise GroundedError(f"--engine must be 'local' or 'dask', got '{self.name}'")
         if (self.name == "dask") != (self.address is not None):
             raise GroundedError(
-                "--engine dask needs the scheduler's --address (tcp://host:8786), and only it does"
+                "--address (tcp://host:8786) is required with --engine dask and only valid there"
             )
 
     @property
     def alone(self) -> bool:
-        """Whether all runs in this process, one after the other."""
+        """Whether everything runs in this process, one piece after the other."""
         return self.name == "local" and self.jobs == 1
 
     @contextmanager
     def pool(self, **settings: Any) -> Iterator[Any]:
-        """A `joblib.Parallel` on these workers; the cluster stays, the connection is closed.
+        """Open a `joblib.Parallel` on these workers; closes the connection, not the cluster.
 
         Args:
-            settings: of joblib's.
+            settings: passed on to `joblib.Parallel`.
 
         Raises:
             GroundedError: if joblib or Dask is missing, or no scheduler answers.
         """
         joblib = needs("joblib", "studies")
         if self.name == "local":
-            # One BLAS thread a worker: results don't depend on how many share the machine.
+            # One BLAS thread per worker: results don't depend on how many share the machine.
             here = joblib.parallel_config(backend="loky", inner_max_num_threads=1)
             with here, joblib.Parallel(n_jobs=self.jobs, **settings) as pool:
                 yield pool
@@ -122,7 +126,7 @@ _pool: ContextVar[Any] = ContextVar("pool", default=None)
 
 @contextmanager
 def running(engine: Engine | None) -> Iterator[None]:
-    """What `each` is called for inside runs on this engine; None: in this process.
+    """Make `each` use this engine inside the block; None: run in this process.
 
     Raises:
         GroundedError: as `Engine.pool`.
@@ -146,19 +150,20 @@ def running(engine: Engine | None) -> Iterator[None]:
 
 
 def _sent(pool: Any, functions: Iterable[Any], *columns: Iterable[Any]) -> Iterable[Any]:
-    """What a cluster makes of each row."""
+    """Run the functions on the cluster; yield the result of each row."""
     return pool((_steadily, row, {}) for row in zip(functions, *columns, strict=True))  # type: ignore[no-any-return]
 
 
 def each(
     function: Callable[..., T], *columns: Sequence[Any], done: Callable[[], None] | None = None
 ) -> list[T]:
-    """[function(*row) for row in zip(*columns)], wherever `running` says.
+    """Return [function(*row) for row in zip(*columns)], computed on the engine of `running`.
 
     Args:
-        function: of a module, so that a cluster knows it; it changes nothing that is shared.
-        columns: its arguments, of one length each.
-        done: called as pieces end, in their order.
+        function: a module-level function, so that it can be pickled; it must not modify shared
+            data.
+        columns: sequences of arguments, all of the same length.
+        done: called after each piece, in order.
     """
     results, many, call = list[T](), len(columns[0]), _pool.get()
     if call is None or many < 2:
@@ -173,17 +178,20 @@ def each(
 
 
 def _quietly(function: Callable[..., T], *row: Any) -> T:
-    with np.errstate(all="ignore"):  # a worker does not inherit it
+    with np.errstate(all="ignore"):  # workers do not inherit this setting
         return function(*row)
 
 
 @steady()
 def _steadily(function: Callable[..., T], *row: Any) -> T:
-    return _quietly(function, *row)  # another process has settings of its own
+    return _quietly(function, *row)
 
 
 class SentOnce:
-    """What many pieces read: Dask's backend sends arguments that look large to a worker once."""
+    """Base class of data that many pieces read.
+
+    Dask's backend sends an argument only once to each worker if its reported size is large.
+    """
 
     def __sizeof__(self) -> int:
         return 2**20

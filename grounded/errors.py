@@ -1,7 +1,7 @@
-"""The one error that is the user's to mend.
+"""GroundedError, the error for wrong user input, and helpers for its messages.
 
-Its text says what was found, what was expected, and what to do next. Anything else that is raised
-is a mistake of ours and keeps its traceback.
+The message says what was found, what was expected and what to do next. Any other exception is a
+bug in grounded and keeps its traceback.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
-MOST, COMPARED = 40, 2000  # names that a message lists, and that are compared with a wrong one
+MOST, COMPARED = 40, 2000  # most names listed in a message; most names compared with a wrong one
 
 
 @dataclass(frozen=True)
 class NextCommand:
-    """A command of `grounded` that helps now, as data: the command line renders it, with its -C.
+    """A `grounded` command to run next; the command line prints it, with the -C in use.
 
     Args:
-        verb: the command, `diagnose`.
-        arguments: its words, unquoted.
+        verb: the command, such as `diagnose`.
+        arguments: its arguments, unquoted.
     """
 
     verb: str
@@ -28,11 +28,11 @@ class NextCommand:
 
 
 class GroundedError(Exception):
-    """A misuse or a bad input; the message is complete and meant for a person.
+    """Raised for misuse or invalid input; the message is complete and meant for the user.
 
     Args:
         message: what was found, what was expected, what to do.
-        then: the command that mends it, where there is one; the message doesn't repeat it.
+        then: a command that fixes the problem, if there is one; the message does not repeat it.
     """
 
     def __init__(self, message: str, then: NextCommand | None = None) -> None:
@@ -41,11 +41,11 @@ class GroundedError(Exception):
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:
-    """Returns ", did you mean 'x'?" for the valid name closest to `name`, or the list of names.
+    """Return "did you mean 'x'?" for the valid name closest to `name`, or list the valid names.
 
     Args:
-        name: what was found.
-        valid: the names that would have been right.
+        name: the name that was given.
+        valid: the names that are accepted.
     """
     from difflib import get_close_matches
 
@@ -61,17 +61,17 @@ def nearest(name: str, valid: Iterable[str]) -> str:
 
 
 def needs(module: str, extra: str) -> Any:
-    """Imports a library that comes with an extra, so that a plain install stays small.
+    """Import a library that comes with an optional extra of grounded.
 
     Args:
-        module: its import name, such as "rerun".
-        extra: of grounded, such as "view".
+        module: the import name, such as "rerun".
+        extra: the extra of grounded, such as "view".
 
     Returns:
         The module.
 
     Raises:
-        GroundedError: if it can't be imported, with the command that installs it.
+        GroundedError: if the module can't be imported; the message says how to install it.
     """
     try:
         return import_module(module)

@@ -1,4 +1,4 @@
-"""Arrays: read-only ones for frozen dataclasses, and differences of angles."""
+"""Read-only arrays for frozen dataclasses, checks of user input, and wrapped angles."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 
 def readonly(values: ArrayLike, dtype: Any = np.float64) -> Any:
-    """A read-only, C-contiguous copy; the same array when it is one already."""
+    """Return a read-only, C-contiguous copy, or the array itself if it is one already."""
     array = np.asarray(values, dtype=dtype)
     if array.flags.writeable or not array.flags.c_contiguous:
         array = np.array(array, dtype=dtype, order="C")
@@ -22,10 +22,10 @@ def readonly(values: ArrayLike, dtype: Any = np.float64) -> Any:
 
 
 def numbers(values: Any, what: str) -> Any:
-    """The same of what a user gave.
+    """Return user input as a read-only array of floats.
 
     Raises:
-        GroundedError: if it isn't an array of numbers; the sentence begins with `what`.
+        GroundedError: if it is not an array of numbers; the message begins with `what`.
     """
     try:
         return readonly(values)
@@ -34,21 +34,21 @@ def numbers(values: Any, what: str) -> Any:
 
 
 def positive(what: str, value: Any) -> None:
-    """Checks a number that a user gave.
+    """Check that user input is a positive, finite number of seconds.
 
     Raises:
-        GroundedError: if it isn't a positive, finite number; the sentence begins with `what`.
+        GroundedError: if it is not; the message begins with `what`.
     """
     if not isinstance(value, (int, float, np.number)) or not (np.isfinite(value) and value > 0):
         raise GroundedError(f"{what} must be a positive number of seconds, got {value!r:.60}")
 
 
 def wrapped(d: Array, angles: ArrayLike) -> Array:
-    """`d` (..., >= n) with the angles among its first n entries wrapped to [-pi, pi], in place.
+    """Wrap the angles among the first n entries of `d` to [-pi, pi], in place, and return `d`.
 
     Args:
-        d: differences.
-        angles: (n,) of bool.
+        d: differences (..., >= n).
+        angles: (n,) bool, which entries are angles.
     """
     for i in np.flatnonzero(angles):
         d[..., i] -= 2 * np.pi * np.rint(d[..., i] / (2 * np.pi))

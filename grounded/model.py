@@ -1,12 +1,12 @@
-"""Model: the user's crude model, with names, units and the facts its arrays need.
+"""Model and Param: the crude dynamics model, with named states, inputs and parameters.
 
 A model is a function of named states `s`, inputs `a` and parameters `p` in plain NumPy,
 
     derivative(s, a, p) -> ds/dt        or        step(s, a, p, dt) -> next state,
 
-both returning a dict of state names. Inside, states and inputs are arrays in the order in which
-they were declared; `x` and `u` are those arrays (the control literature's letters), `s` and `a`
-the user's (the paper's).
+both returning a dict by state name. Internally, states and inputs are arrays in the order of their
+declaration: `x` and `u` as in the control literature. `s` and `a` (the paper's letters) are the
+named values that the user's function receives.
 """
 
 from __future__ import annotations
@@ -30,24 +30,29 @@ ROLES = (
     *("position", "altitude", "heading", "attitude", "heading_rate", "rates", "speed"),
     *("steering_angle", "hanging", "upright", "level", "rail"),
 )
-BELIEVED = 3.0  # standard deviations, as the user gave them, that a parameter may be off
-LEAST = 0.2  # of a parameter without a bound on the side of zero: its sign is known
-MAX_SIZE = 200  # states and inputs: a step costs their cube, and minutes from here on
+BELIEVED = 3.0  # prior standard deviations (as given by the user) that a parameter may move
+LEAST = 0.2  # smallest fraction of its value, without a bound towards zero: the sign is known
+MAX_SIZE = 200  # states plus inputs: the cost of a step grows with the cube of this number
 
 
 @dataclass(frozen=True)
 class Param:
-    """A model parameter: a constant by its value alone; uncertain with bounds or a `std`.
+    """A model parameter: constant if only a value is given, uncertain with bounds or a `std`.
 
-    A constant (a mass on a scale, g) is never fitted, never blamed, never adopted. An uncertain
-    parameter may move inside its bounds (None: none), about as far as its prior allows.
+    A constant (a mass that was weighed, g) is never fitted or changed by a diagnosis. An uncertain
+    parameter is estimated within its bounds, with its prior as a regulariser.
 
     Args:
-        value: nominal value.
-        unit: as printed.
-        low: lower bound.
-        high: upper bound.
-        std: prior standard deviation, in the unit; None: that of an even chance between the bounds.
+        value: nominal value, in `unit`.
+        unit: unit for display, "1" if dimensionless.
+        low: lower bound, in `unit`; None for no bound.
+        high: upper bound, in `unit`; None for no bound.
+        std: prior standard deviation, in `unit`; None for that of a uniform distribution between
+            the bounds.
+
+    Raises:
+        GroundedError: if a number is not finite, the bounds are reversed, the value lies outside
+            them, or `std` is not positive.
     """
 
     value: float
@@ -75,21 +80,22 @@ class Param:
 
     @property
     def uncertain(self) -> bool:
-        """Whether it may move at all."""
+        """Whether the parameter may be estimated: it has bounds that differ, or a `std`."""
         given = self.low is not None or self.high is not None or self.std is not None
         return given and self.low != (np.nan if self.high is None else self.high)
 
     def at_bound(self, value: float) -> bool:
-        """Whether a value is one of its bounds, which it would pass if it could."""
+        """Return whether a value lies on one of the bounds."""
         ends = [end for end in (self.low, self.high) if self.uncertain and end is not None]
         return any(abs(value - end) <= 1e-6 * self.spread for end in ends)
 
     @property
     def reach(self) -> tuple[float, float]:
-        """The least and the most that it may be: where no bound is given its sign stays.
+        """Lowest and highest value that an estimate may take.
 
-        Nor does it go further than three of its own standard deviations: thousands of nats of a
-        model that is wrong elsewhere would carry a measured length to a fifth of itself.
+        Without a bound towards zero the sign is kept. If `std` is given, the value also stays
+        within three standard deviations of the nominal one. Otherwise evidence of model errors
+        elsewhere could change a measured length by a factor of five.
         """
         far = np.inf if self.std is None else BELIEVED * self.std
         low = (LEAST * self.value if self.value > 0 else -np.inf) if self.low is None else self.low
@@ -99,7 +105,7 @@ class Param:
         return max(low, self.value - far), min(high, self.value + far)
 
     def stopped(self, value: float) -> str:
-        """What keeps a fitted value from going on: "bound", "prior" (its `reach`), "" nothing."""
+        """Return what stopped a fitted value: "bound", "prior" (its `reach`) or "" for nothing."""
         if self.at_bound(value):
             return "bound"
         ended = any(abs(value - end) <= 1e-6 * self.spread for end in self.reach)
@@ -107,7 +113,11 @@ class Param:
 
     @property
     def spread(self) -> float:
-        """Prior standard deviation [unit]: 0 of a constant; half its value beside one bound."""
+        """Prior standard deviation, in `unit`.
+
+        0 for a constant, `std` if given, half of the absolute value if only one bound is given,
+        else that of a uniform distribution between the bounds.
+        """
         if not self.uncertain:
             return 0.0
         if self.std is not None:
@@ -118,36 +128,42 @@ class Param:
 
 
 def is_clock(state: str) -> bool:
-    """Whether a memory state is the time since the start, which goes on where all else rests."""
+    """Return whether a memory state is the time since the start; it advances even at rest."""
     return state.endswith("_clock")
 
 
 def all_at_bounds(params: Mapping[str, Param], values: Mapping[str, float]) -> bool:
-    """Whether there are values, and each is one of its parameter's bounds (`Param.at_bound`)."""
+    """Return whether there are values and each lies on a bound of its parameter."""
     return bool(values) and all(params[n].at_bound(v) for n, v in values.items())
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Named states and inputs with units, parameters, and the dynamics.
+    """A dynamics model: named states and inputs with units, parameters and their equations.
+
+    Give either `derivative` (continuous time) or `step` (discrete time).
 
     Args:
-        states: name -> unit.
-        inputs: name -> unit.
-        params: name -> Param.
-        angles: states whose differences wrap to [-pi, pi].
-        roles: optional meaning of states (position, heading, speed ...), for effects and pictures;
-            a position is one state along an axis, two in a plane, or three.
-        derivative: ds/dt, integrated over a control step by `integrator` under a zero-order hold.
-        step: the next state itself, any Python callable; instead of `derivative`.
-        integrator: "rk4" or "euler".
-        name: for messages and files.
-        substeps: steps of the integrator within a control step; more where the model is stiff.
-        jacobian: derivatives beside `step`: (s, a, p, dt) -> f_x (n, n), f_u (n, m), or with a
-            first axis of samples where the states are arrays; None: they are found.
+        states: unit of each state by name; n states.
+        inputs: unit of each input by name; m inputs.
+        params: `Param` by name.
+        angles: names of states in rad whose differences wrap to [-pi, pi].
+        roles: optional meaning of states, as role -> state name (`position`, `heading`, `speed`
+            ...), used by effects and plots. `position` names one state along an axis, two in a
+            plane (horizontal first) or three.
+        derivative: function (s, a, p) -> dict of ds/dt by state name, in the state's unit per
+            second; integrated over a control step with the inputs held (zero-order hold).
+        step: function (s, a, p, dt) -> dict of the next state by name; any Python callable.
+        integrator: "rk4" or "euler"; used with `derivative`.
+        name: name of the model in messages and files.
+        substeps: integrator steps within a control step; increase it for stiff models.
+        jacobian: function (s, a, p, dt) -> (f_x (n, n), f_u (n, m)), the derivatives of `step`;
+            with a leading sample axis if the states are arrays. None to differentiate
+            automatically.
 
     Raises:
-        GroundedError: for a name used twice, an unknown angle or role, neither or both functions.
+        GroundedError: for a name that is used twice or is not a Python identifier, an unknown angle
+            or role, or if not exactly one of `derivative` and `step` is given.
     """
 
     states: Mapping[str, str]
@@ -167,7 +183,7 @@ class Model:
             given = getattr(self, attribute)
             if not isinstance(given, Mapping):
                 raise GroundedError(
-                    f"a model's {attribute} are a dict by name, as in states={{'x': 'm', 'v': "
+                    f"a model's {attribute} must be a dict by name, as in states={{'x': 'm', 'v': "
                     f"'m/s'}}, got {given!r:.60}"
                 )
             value = dict(given)
@@ -185,21 +201,21 @@ class Model:
         if not (isinstance(self.substeps, int) and 1 <= self.substeps <= MAX_SUBSTEPS):
             raise GroundedError(f"substeps must be 1 to {MAX_SUBSTEPS}, got {self.substeps}")
         if self.step is not None and self.substeps > 1:
-            raise GroundedError("substeps divide a derivative; a step= makes its own")
+            raise GroundedError("substeps only apply to derivative=; a step= chooses its own")
         if self.step is None and self.jacobian is not None:
-            raise GroundedError("jacobian= goes beside step=; a derivative= finds its own")
+            raise GroundedError("jacobian= is only for step=; derivative= is differentiated here")
         if not self.states or not self.inputs:
             raise GroundedError(f"model '{self.name}' needs at least one state and one input")
         if self.n + self.m > MAX_SIZE:
             raise GroundedError(
                 f"model '{self.name}' has {self.n} states and {self.m} inputs; at most {MAX_SIZE} "
-                "of both together can be planned with and fitted: model those that the reward and "
-                "the inputs act on, and leave the rest out"
+                "of both together can be planned with and fitted: keep those that the reward and "
+                "the inputs act on, and leave out the rest"
             )
         self._check_names()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Another process makes it again from what it was made of."""
+        """Pickle the arguments; another process builds the model from them."""
         given = {f.name: getattr(self, f.name) for f in fields(self)}
         given |= {key: dict(given[key]) for key in ("states", "inputs", "params", "roles")}
         return partial(Model, **given), ()
@@ -235,8 +251,8 @@ class Model:
             )
         for role, targets in self.roles.items():
             meant = "" if role in ROLES else nearest(role, ROLES)
-            if meant.startswith("did you"):  # others may serve own effects
-                raise GroundedError(f"role '{role}' is none that is known: {meant}")
+            if meant.startswith("did you"):  # other roles may be for user-defined effects
+                raise GroundedError(f"unknown role '{role}': {meant}")
             for name in (targets,) if isinstance(targets, str) else targets:
                 if name not in self.states and name not in self.inputs:
                     raise GroundedError(
@@ -256,38 +272,38 @@ class Model:
 
     @cached_property
     def state_names(self) -> tuple[str, ...]:
-        """States in array order."""
+        """Names of the states in array order."""
         return tuple(self.states)
 
     @cached_property
     def input_names(self) -> tuple[str, ...]:
-        """Inputs in array order."""
+        """Names of the inputs in array order."""
         return tuple(self.inputs)
 
     @cached_property
     def param_names(self) -> tuple[str, ...]:
-        """Parameters in array order."""
+        """Names of the parameters in array order."""
         return tuple(self.params)
 
     @cached_property
     def uncertain(self) -> tuple[str, ...]:
-        """The parameters that may move, in array order."""
+        """Names of the uncertain parameters in array order."""
         return tuple(name for name, param in self.params.items() if param.uncertain)
 
     @cached_property
     def values(self) -> Array:
-        """Parameter values (k,)."""
+        """Parameter values (k,), in array order."""
         values: Array = readonly([param.value for param in self.params.values()])
         return values
 
     @cached_property
     def angle_mask(self) -> Any:
-        """Which states are angles, (n,) of bool."""
+        """Which states are angles, (n,) bool."""
         return readonly([name in self.angles for name in self.states], dtype=np.bool_)
 
     @cached_property
     def system(self) -> System:
-        """The model as numbers: compiled where it can be traced, differenced where not."""
+        """The numerical model: compiled if it can be traced, else with finite differences."""
         function = self.derivative if self.derivative is not None else self.step
         assert function is not None
         return system_of(
@@ -302,11 +318,14 @@ class Model:
         )
 
     def difference(self, a: Array, b: Array) -> Array:
-        """The difference a - b of arrays (..., n) of states; angles wrapped to [-pi, pi]."""
+        """Return the difference a - b of states (..., n), with angles wrapped to [-pi, pi]."""
         return wrapped(np.asarray(a, float) - np.asarray(b, float), self.angle_mask)
 
     def with_values(self, values: Mapping[str, float]) -> Model:
-        """A copy with other parameter values; bounds are widened where a value lies outside.
+        """Return a copy with other parameter values; bounds are widened to include them.
+
+        Args:
+            values: new values by parameter name, in the parameter's unit.
 
         Raises:
             GroundedError: for a name that is not a parameter.

@@ -1,4 +1,4 @@
-"""Runs an exported policy on the robot. Needs Python 3.8 and numpy, and nothing of grounded.
+"""Run an exported policy on the robot. Needs only Python 3.8 and numpy, not grounded.
 
     u_t = clip( ubar_t + K_t (z_t - zbar_t) ),     z_t = [x_t, inputs already sent]
 
@@ -6,18 +6,19 @@
     while not runner.done(t):
         send(runner.action(t, state))          # array (m,), inside the hard limits
 
-`grounded export ID --runner` copies this file beside the candidate. Inside the control loop nothing
-is raised; what can't be used is left out, and `runner.blind` counts it:
+`grounded export ID --runner` copies this file beside the candidate. `action` never raises an
+exception inside the control loop. It ignores invalid states and times, and `runner.blind` counts
+the calls concerned:
 
-  - the controller for the step nearest to t is used, so `action` may be called at the rate of the
-    state estimate; inputs of calls that were missed count as held;
-  - a state that is not finite, has another length or is no array of numbers switches the feedback
-    off for that call: the feed-forward alone is sent;
-  - a time that runs backwards is taken as the latest one; one that is not a number sends the last
-    input again;
-  - after the last step the input that was held before the start is sent, inside the limits;
-    `done` is true then. Keep recording for a second more: the last state is part of the run;
-  - a run that is over stays over, also where the time begins anew: a second run needs a new runner.
+  - The controller of the step nearest to t is used, so `action` may be called at the rate of the
+    state estimate. If calls were missed, the input counts as held in between.
+  - A state that is not finite, has the wrong length or is not an array of numbers switches the
+    feedback off for that call: only the feed-forward is sent.
+  - If the time goes backwards, the latest step is used. If it is not a number, the last input is
+    sent again.
+  - After the last step, `done` is true and the input held before the start is sent, clipped to the
+    limits. Keep recording for one more second: the last state is part of the run.
+  - A finished run stays finished, even if the time restarts: use a new runner for each run.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ from zipfile import ZipFile
 
 import numpy as np
 
-EARLY = 0.1  # of a step: what a timer may be early by at the end of the run
-LIMIT = 2**28  # [bytes] of an exported policy when decompressed
+EARLY = 0.1  # fraction of a step by which a timer may be early at the end of the run
+LIMIT = 2**28  # [bytes] largest decompressed size of an exported policy
 
 FORMAT = "grounded-policy-1"
 NUMBERS = ("feedforward", "low", "high", "past")
@@ -43,8 +44,11 @@ class Runner:
     """Executes one run of a policy; make a new one for each run.
 
     Args:
-        policy: anything with the fields of an exported policy: feedforward (H, m), low, high and
-            past (m,), dt [s], state_names, depths, angles, gain (H, m, nz), reference (H, nz).
+        policy: a `Policy`, or any object with its fields: feedforward (H, m), low, high and past
+            (m,), dt [s], state_names, depths, angles, gain (H, m, nz), reference (H, nz).
+
+    Attributes:
+        blind: number of calls so far whose state or time could not be used.
     """
 
     def __init__(self, policy: Any) -> None:
@@ -63,11 +67,16 @@ class Runner:
         self._z = np.empty(self._n + len(columns))
 
     def done(self, t: float) -> bool:
-        """Whether t [s] since the start is the end of the last control step."""
+        """Return whether the run is over at t seconds after the start."""
         return self._step(t) >= self._H
 
     def action(self, t: float, s: Any) -> Any:
-        """The inputs to send, (m,), for the state s (n,) at t seconds after the start."""
+        """Return the inputs to send, (m,), inside the hard limits.
+
+        Args:
+            t: time since the start of the run [s].
+            s: measured state (n,), in the policy's order and units.
+        """
         policy, step = self.policy, self._step(t)
         if step < 0:  # the time is not a number
             self.blind += 1
@@ -93,9 +102,10 @@ class Runner:
         return u
 
     def _step(self, t: float) -> int:
-        """The control step nearest to t; -1 where t is not a number, H where the run is over.
+        """Return the control step nearest to t; -1 if t is not a number, H if the run is over.
 
-        The last one lasts to the end of the horizon; once it was sent, no time far back counts.
+        The last step lasts to the end of the horizon. Once it was sent, a time in the first half of
+        the run means that the clock has restarted: the run is over.
         """
         try:
             where = float(t) / self.policy.dt + 0.5
@@ -108,7 +118,7 @@ class Runner:
         return self._H if self._latest == self._H - 1 and step < self._H // 2 else step
 
     def _correction(self, step: int, base: int, s: Any) -> Any:
-        """K_t (z - zbar), (m,); None where the state can't be used."""
+        """Return the feedback K_t (z - zbar), (m,); None if the state can't be used."""
         z = self._z
         try:
             state: Any = np.ma.filled(np.ma.asarray(s, dtype=float), np.nan)
@@ -130,22 +140,22 @@ class Runner:
 def load(
     path: Any, states: Names = None, inputs: Names = None, task: Optional[str] = None
 ) -> Runner:
-    """A runner from an exported candidate, an .npz file; nothing in it is executed.
+    """Load a runner from an exported candidate; nothing in the file is executed.
 
     Args:
-        path: the file.
-        states: the robot's state names in the order in which it will pass them.
-        inputs: the robot's input names in the order in which it will send them.
-        task: the task hash that the robot is set up for.
+        path: the .npz file.
+        states: the robot's state names in the order in which it passes them; None for no check.
+        inputs: the robot's input names in the order in which it sends them; None for no check.
+        task: the task hash that the robot is set up for; None for no check.
 
     Raises:
-        ValueError: if the file is no exported candidate, or one for another robot or task.
+        ValueError: if the file is not an exported candidate, or is for another robot or task.
     """
     return Runner(SimpleNamespace(**read(path, states, inputs, task)))
 
 
 def read(path: Any, states: Names, inputs: Names, task: Optional[str]) -> dict[str, Any]:
-    """The fields of an exported policy, checked; see `load`."""
+    """Read and check the fields of an exported policy; see `load` for the arguments."""
     data = _archive(path)
     if str(data.get("format", "")) != FORMAT:
         raise ValueError(f"{path} is not a candidate exported by `grounded export --format npz`")
@@ -160,7 +170,7 @@ def read(path: Any, states: Names, inputs: Names, task: Optional[str]) -> dict[s
     except KeyError as error:
         raise ValueError(f"{path} lacks {error}; export it again") from None
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path} is garbled: {error}; export it again") from None
+        raise ValueError(f"{path} is damaged: {error}; export it again") from None
     check_robot(path, SimpleNamespace(**found), states, inputs)
     check_task(path, str(data.get("task", "")), task)
     _check(path, found)
@@ -168,7 +178,7 @@ def read(path: Any, states: Names, inputs: Names, task: Optional[str]) -> dict[s
 
 
 def check_robot(path: Any, policy: Any, states: Names, inputs: Names) -> None:
-    """That a policy is for a robot with these names, in this order."""
+    """Raise ValueError unless the policy has these state and input names, in this order."""
     for kind, names, own in (
         ("states", states, policy.state_names),
         ("inputs", inputs, policy.input_names),
@@ -178,13 +188,13 @@ def check_robot(path: Any, policy: Any, states: Names, inputs: Names) -> None:
 
 
 def check_task(path: Any, made_for: str, task: Optional[str]) -> None:
-    """That a policy is for the task with this hash."""
+    """Raise ValueError unless the policy was made for the task with this hash."""
     if task is not None and made_for != task:
         raise ValueError(f"{path} is for task {made_for}; this robot is set up for {task}")
 
 
 def _check(path: Any, found: dict[str, Any]) -> None:
-    """That the arrays fit each other and hold numbers."""
+    """Raise ValueError unless sizes, limits and dt are consistent and the arrays are finite."""
     ubar, gain, reference = found["feedforward"], found["gain"], found["reference"]
     H, m = ubar.shape if ubar.ndim == 2 else (0, 0)
     n, nz = len(found["state_names"]), len(found["state_names"]) + sum(found["depths"])
@@ -195,12 +205,12 @@ def _check(path: Any, found: dict[str, Any]) -> None:
     if gain is not None and reference is not None:
         fits = fits and gain.shape == (H, m, nz) and reference.shape == (H, nz)
     if not fits:
-        raise ValueError(f"{path} is garbled: its arrays don't fit each other; export it again")
+        raise ValueError(f"{path} is damaged: its fields are inconsistent; export it again")
     parts = [found[name] for name in ("feedforward", "past", "gain", "reference")]
     finite = all(np.isfinite(part).all() for part in parts if part is not None)
     if not (finite and (found["low"] <= found["high"]).all()):  # NaN is not below anything
         raise ValueError(
-            f"{path} holds numbers that are not finite, or limits that exclude each other; "
+            f"{path} holds numbers that are not finite, or a lower limit above the upper one; "
             "export it again"
         )
 
@@ -215,16 +225,16 @@ def _archive(path: Any) -> dict[str, Any]:
     try:
         size = sum(part.file_size for part in ZipFile(BytesIO(content)).infolist())
         if size > LIMIT:
-            raise ValueError(f"it claims {size} bytes when decompressed, the limit is {LIMIT}")
+            raise ValueError(f"its decompressed size is {size} bytes, the limit is {LIMIT}")
         with np.load(BytesIO(content), allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except Exception as error:  # numpy, zipfile and zlib each have errors of their own
         raise ValueError(
-            f"{path} is damaged, or no exported candidate (.npz): {error}; export it again"
+            f"{path} is damaged, or not an exported candidate (.npz): {error}; export it again"
         ) from None
 
 
-if __name__ == "__main__":  # what a file holds, before it is trusted with a robot
+if __name__ == "__main__":  # check a file and print its contents
     if len(sys.argv) != 2:
         sys.exit(f"usage: python {sys.argv[0]} CANDIDATE.npz")
     try:

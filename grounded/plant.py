@@ -1,9 +1,9 @@
-"""Plant: a simulated REAL system, for examples and studies. The search never sees inside it.
+"""Plant: a simulated REAL system for examples and studies. The search never sees inside it.
 
-It differs from a model's rollout where reality does: commands reach the actuators after their true
-delay, resolved finer than the control step; the policy sees measured states; starts scatter; and
-its model may have states and effects that the crude model has no names for. What comes back is a
-Trial of MEASURED states and COMMANDED inputs, as from a robot.
+Unlike a rollout of the model, commands reach the actuators after their true delay, which is
+resolved more finely than the control step; the policy receives measured states; start states
+scatter; and the plant's model may have states and effects that the crude model lacks. A run returns
+a Trial of MEASURED states and COMMANDED inputs, as a robot does.
 """
 
 from __future__ import annotations
@@ -23,10 +23,12 @@ from grounded.trial import Trial
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations by state name, zero where not named.
+    """Standard deviations by state name, in the state's unit; zero for states not named.
 
-    start: scatter of the start state; process: disturbance added each control step;
-    measurement: error of each measured sample.
+    Args:
+        start: scatter of the start state.
+        process: disturbance added at each control step.
+        measurement: error of each measured sample.
     """
 
     start: Mapping[str, float] = field(default_factory=dict)
@@ -39,9 +41,9 @@ class Plant:
     """A simulated real system.
 
     Args:
-        model: its true dynamics; every state and input of the policy must be among its own.
-        latency: true transport delay of each input [s], zero where not named.
-        noise: what differs from run to run.
+        model: the true dynamics; it must have every state and input of the policies it runs.
+        latency: true transport delay by input name [s]; zero for inputs not named.
+        noise: random variation of the start, the process and the measurements.
         substeps: integration steps within a control step.
     """
 
@@ -51,7 +53,12 @@ class Plant:
     substeps: int = 5
 
     def run(self, policy: Policy, start: Mapping[str, float], rng: np.random.Generator) -> Trial:
-        """Executes a policy once from a start state given by name; ends early if it diverges.
+        """Run a policy once; the trial ends early if the run diverges.
+
+        Args:
+            policy: what to run.
+            start: start state by name; zero for states not named.
+            rng: source of the noise.
 
         Raises:
             GroundedError: if the policy's states or inputs are not the plant's.
@@ -89,13 +96,15 @@ class Plant:
     def advance(
         self, x: Array, commands: Array, t: int, policy: Policy, order: Sequence[int]
     ) -> Array:
-        """Control step t of N runs in substeps, each with what has arrived by its middle.
+        """Return the states (N, n) of N runs after control step t.
+
+        Each substep uses the command that has arrived by its middle.
 
         Args:
-            x: states (N, n).
-            commands: sent so far, (N, H, m) in the policy's order.
-            t: the step.
-            policy: that was run.
+            x: states (N, n) before the step.
+            commands: commands sent so far, (N, H, m), in the policy's order of inputs.
+            t: index of the step.
+            policy: the policy that is run.
             order: index of each of the policy's inputs among the plant's.
         """
         h = policy.dt / self.substeps

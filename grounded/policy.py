@@ -1,13 +1,13 @@
-"""Policies: what a robot runs, and the runner that runs it. numpy alone.
+"""Policies: the feed-forward, gains and reference that a robot runs. Needs numpy alone.
 
     u_t = clip( ubar_t + K_t (z_t - zbar_t) ),     z_t = [x_t, inputs already sent]
 
-The past inputs in z (newest first, input by input, see `grounded.compile.problem`) are known to
-whoever runs the policy: `Runner` keeps them. theta, the paper's policy parameters, are all
-feed-forwards and gains; `theta + alpha d` is `toward(other, alpha)`.
+`Runner` keeps the past inputs in z (input by input, newest first, see `grounded.compile.problem`).
+The paper's policy parameters theta are all feed-forwards and gains; `theta + alpha d` is
+`toward(other, alpha)`.
 
-`load` gives a `Runner` of an exported policy; how it acts in the control loop is told in
-`onboard.py`, which is a file of its own so that it can be copied to a robot.
+`load` returns a `Runner` of an exported policy. `onboard.py` documents how it behaves in the
+control loop; it is a separate file so that it can be copied to a robot.
 """
 
 from __future__ import annotations
@@ -27,23 +27,40 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """Feed-forward, gain and reference for each control step.
+    """Feed-forward, feedback gain and reference for each control step.
 
-    An open-loop policy (the paper's turn) has no gain and no reference. Sizes: H steps, m inputs,
-    n states, nz = n + sum(depths).
+    The command at step t is clip(feedforward_t + gain_t (z_t - reference_t), low, high), where
+    z_t holds the measured state and the inputs sent before. An open-loop policy has no gain and
+    no reference. Sizes: H steps, m inputs, n states, nz = n + sum(depths).
+
+    Args:
+        feedforward: (H, m) ubar, in the inputs' units.
+        low: (m,) hard lower limits of the inputs.
+        high: (m,) hard upper limits of the inputs.
+        dt: control interval [s].
+        state_names: n names, in the order of z.
+        input_names: m names, in column order.
+        depths: (m,) number of past inputs in z, for each input; at least 1.
+        angles: (n,) whether the difference of a state wraps to [-pi, pi].
+        past: (m,) input held before t = 0.
+        gain: (H, m, nz) feedback gains, or None.
+        reference: (H, nz) zbar, or None.
+
+    Raises:
+        GroundedError: if the shapes do not match.
     """
 
-    feedforward: Array  # (H, m) ubar
-    low: Array  # (m,) hard limits of the inputs
-    high: Array  # (m,)
-    dt: float  # [s]
+    feedforward: Array
+    low: Array
+    high: Array
+    dt: float
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
-    depths: tuple[int, ...]  # past inputs in z, for each input
-    angles: tuple[bool, ...]  # (n,) differences that wrap
-    past: Array  # (m,) the input held before t = 0
-    gain: Array | None = None  # (H, m, nz)
-    reference: Array | None = None  # (H, nz) zbar
+    depths: tuple[int, ...]
+    angles: tuple[bool, ...]
+    past: Array
+    gain: Array | None = None
+    reference: Array | None = None
 
     def __post_init__(self) -> None:
         for name in ("feedforward", "low", "high", "past", "gain", "reference"):
@@ -84,7 +101,7 @@ class Policy:
 
     @property
     def z_names(self) -> tuple[str, ...]:
-        """Names of z: the states, then the past inputs as `steering[t-1]`."""
+        """Names of the entries of z: the states, then past inputs such as `steering[t-1]`."""
         past = [
             f"{name}[t-{i + 1}]"
             for name, depth in zip(self.input_names, self.depths, strict=True)
@@ -95,7 +112,9 @@ class Policy:
     def laid_out(
         self, state_names: tuple[str, ...], angles: tuple[bool, ...], depths: tuple[int, ...]
     ) -> Policy:
-        """The same policy over another z: columns go by name, new ones have no gain, others go.
+        """Return the policy over another z: columns are matched by name.
+
+        Columns that are new get zero gain; columns that the new z lacks are dropped.
 
         Args:
             state_names: states of the new z, in order.
@@ -117,7 +136,7 @@ class Policy:
         return replace(layout, gain=gain, reference=reference)
 
     def about(self, reference: Array) -> Policy:
-        """The same policy, written about another reference (H, nz)."""
+        """Return the same control law written about another reference (H, nz)."""
         if self.gain is None or self.reference is None:
             return self
         shift = z_difference(reference, self.reference, self.angles)
@@ -125,7 +144,12 @@ class Policy:
         return replace(self, feedforward=moved, reference=reference)
 
     def toward(self, other: Policy, alpha: float) -> Policy:
-        """Theta + alpha d with d = theta' - theta (footnote 11): alpha = 1 is `other` itself."""
+        """Return theta + alpha (theta' - theta) (footnote 11), with theta' the other policy.
+
+        Args:
+            other: the policy at alpha = 1, returned as it is there.
+            alpha: step size.
+        """
         if alpha == 1.0:
             return other
         if self.z_names != other.z_names:
@@ -141,15 +165,15 @@ class Policy:
         return replace(other, feedforward=mixed, gain=gain)
 
     def commands(self, states: Array, past: Array, sent: Array | None = None) -> Array:
-        """What it sends on given states, (B, T, m); T is at most H.
+        """Return the commands (B, T, m) of the policy for given states; T is at most H.
 
-        It remembers what it sent itself: a gain on the last inputs would make any smooth log look
-        alike if they were the logged ones.
+        Past inputs in z are the policy's own commands unless `sent` is given. With the logged
+        inputs, a gain on the last inputs would make the commands follow any smooth log.
 
         Args:
-            states: (B, T, n), B runs.
-            past: (m,) the inputs held before the first step.
-            sent: (B, T, m) what it remembers instead, many times quicker.
+            states: (B, T, n) states of B runs.
+            past: (m,) the input held before the first step.
+            sent: (B, T, m) past inputs to use instead of the policy's own; many times faster.
         """
         T, n = states.shape[1:]
         asked: Array = np.repeat(self.feedforward[None, :T], len(states), 0)
@@ -176,12 +200,17 @@ class Policy:
 
 
 def z_difference(a: Array, b: Array, angles: tuple[bool, ...]) -> Array:
-    """The difference a - b of augmented states (..., nz), angles wrapped."""
+    """Return the difference a - b of augmented states (..., nz), with angles wrapped."""
     return wrapped(np.asarray(a, float) - np.asarray(b, float), angles)
 
 
 def to_arrays(policy: Policy, **about: str) -> dict[str, Any]:
-    """A policy as arrays and strings for `numpy.savez`; `about` adds what a reader may check."""
+    """Return a policy as arrays and strings for `numpy.savez`.
+
+    Args:
+        policy: the policy.
+        about: further strings to store, such as `task`, which a reader may check.
+    """
     from grounded.onboard import FORMAT, NUMBERS
 
     arrays: dict[str, Any] = {name: getattr(policy, name) for name in NUMBERS}
@@ -206,17 +235,21 @@ def load(
     inputs: tuple[str, ...] | None = None,
     task: str | None = None,
 ) -> Runner:
-    """A runner from a candidate: exported (`grounded export ID --format npz`), or as proposed.
+    """Load a runner from a candidate file: an exported .npz, or the .mcap as proposed.
 
     Args:
-        path: the .npz or .mcap file; it is data, nothing in it is executed. The .mcap needs
-            `grounded_trials`, found by its entry point in the group `grounded.policies`.
-        states: the robot's state names in the order in which it will pass them.
-        inputs: the robot's input names in the order in which it will send them.
-        task: the task hash that the robot is set up for.
+        path: the .npz (`grounded export ID --format npz`) or .mcap file; nothing in it is executed.
+            An .mcap needs `grounded_trials`, found by its entry point in the group
+            `grounded.policies`.
+        states: the robot's state names in the order in which it passes them; None for no check.
+        inputs: the robot's input names in the order in which it sends them; None for no check.
+        task: the task hash that the robot is set up for; None for no check.
+
+    Returns:
+        A `Runner` for one run.
 
     Raises:
-        GroundedError: if the file is no exported candidate, or one for another robot or task.
+        GroundedError: if the file is not a candidate, or is for another robot or task.
     """
     from grounded import onboard
 
@@ -231,7 +264,7 @@ def load(
 def _proposed(
     path: Path, states: tuple[str, ...] | None, inputs: tuple[str, ...] | None, task: str | None
 ) -> Policy:
-    """A policy from a file whose format is registered by its suffix, checked as an .npz is."""
+    """Read a policy with the reader registered for the file's suffix, with the checks of `load`."""
     from importlib.metadata import entry_points
 
     from grounded import onboard
@@ -239,8 +272,8 @@ def _proposed(
     readers = [p for p in entry_points(group="grounded.policies") if p.name == path.suffix[1:]]
     if not readers:
         raise GroundedError(
-            f"{path}: nothing here reads {path.suffix}; install grounded with its trials, or "
-            "export the candidate with --format npz"
+            f"{path}: no installed package reads {path.suffix}; install grounded with "
+            "grounded_trials, or export the candidate with --format npz"
         )
     policy, made_for = readers[0].load()(path)
     assert isinstance(policy, Policy)

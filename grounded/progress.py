@@ -1,4 +1,4 @@
-"""Long computations talk: stage, share done, time left; and what was found so far on Ctrl-C."""
+"""Progress of long computations: stage, share done, time left; partial results on Ctrl-C."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from dataclasses import dataclass, field
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C, with the answer so far as its text."""
+    """Raised on Ctrl-C; its text is the result so far."""
 
 
 @contextmanager
 def interruptible(so_far: Callable[[], str]) -> Iterator[None]:
-    """Turns Ctrl-C into `Interrupted`, with what had been found by then.
+    """Turn Ctrl-C into `Interrupted` with the result so far.
 
     Args:
-        so_far: says it; called only then.
+        so_far: returns that text; called only on Ctrl-C.
     """
     try:
         yield
@@ -30,24 +30,24 @@ def interruptible(so_far: Callable[[], str]) -> Iterator[None]:
 
 @dataclass
 class Stages:
-    """Adds to each stage's name the share done and the time left, from how many are usual.
+    """Reports each stage with the share done and the time left, from the usual number of calls.
 
-    Where nearly as many are done and it goes on, nobody knows when it ends: the time taken so far.
+    Close to the usual number, the end is uncertain: the time taken so far is shown instead.
 
     Args:
-        tell: shows a line; None: nobody listens.
-        usual: calls until the end.
+        tell: shows a line; None for no output.
+        usual: usual number of calls until the end.
     """
 
     tell: Callable[[str], None] | None
     usual: int
     began: float = field(default_factory=time.monotonic)
     count: int = 0
-    left: float = math.inf  # seconds, as last guessed
-    so_far: str = "nothing was found yet"  # the answer, for Ctrl-C
+    left: float = math.inf  # last estimate of the time left [s]
+    so_far: str = "nothing was found yet"  # the result so far, for Ctrl-C
 
     def __call__(self, stage: str) -> None:
-        """A stage begins, or goes on."""
+        """Report that a stage begins or continues."""
         self.count += 1
         if self.tell is None:
             return
@@ -55,14 +55,14 @@ class Stages:
         if share > NEARLY:
             return self.tell(f"{stage}, longer than usual, {_told(taken)} so far")
         left = taken * (1 - share) / share
-        shrinks, self.left = left < self.left, left  # where the end recedes, nobody knows when
+        shrinks, self.left = left < self.left, left  # no estimate is shown if the end recedes
         about = f", about {_told(left)} left" if self.count > 10 and shrinks else ""
         self.tell(f"{stage}, {100 * share:.0f} % done{about}")
 
 
-NEARLY = 0.9  # of what is usual: what is left then may be as long again
+NEARLY = 0.9  # share of the usual number of calls from which on no estimate is shown
 
 
 def _told(seconds: float) -> str:
-    """A time as a person says it: 40 s, 7 min."""
+    """Format a duration: 40 s, 7 min."""
     return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"

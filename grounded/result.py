@@ -1,7 +1,7 @@
-"""What every result offers: one JSON document, and a table and a plot of it for a notebook.
+"""Base classes of results: a JSON document, and a table and a plot for notebooks.
 
-`Result` is the base of all of them. A `Document` is a result whose fields are the keys of its
-document, so that it can be read back from it.
+`Result` is the base class. A `Document` is a result whose fields are the keys of its JSON document,
+so that it can be read back.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from grounded.errors import GroundedError
 if TYPE_CHECKING:
     from grounded.figures.figure import Figure
 
-SCALED = ("m", "rad", "s")  # units, and their rates, of which thousandths have a name
-SMALL = 1e-3  # below which they are used
-FIXED = 1e-4  # from which on values that are compared are written without a power of ten
-# what reading a document of another shape may raise
+SCALED = ("m", "rad", "s")  # units that may get the prefixes m and µ, as may their rates
+SMALL = 1e-3  # values below this get a prefix
+FIXED = 1e-4  # values from here on are shown without a power of ten when they are compared
+# exceptions that reading a malformed document may raise
 MALFORMED = (ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError)
 
 
 def figure(value: float | None, digits: int = 4) -> str:
-    """`digits` significant digits; "failed" for minus infinity, "-" where there is none."""
+    """Format a value in significant digits; "failed" for minus infinity, "-" for None or NaN."""
     if value is None or math.isnan(value):
         return "-"
     if value == 0:
@@ -41,13 +41,13 @@ def figure(value: float | None, digits: int = 4) -> str:
 
 
 def listed(names: Iterable[str]) -> str:
-    """`a`, `a and b`, `a, b and c`."""
+    """Join names as in `a`, `a and b` or `a, b and c`."""
     *most, last = [*names] or [""]
     return f"{', '.join(most)} and {last}" if most else last
 
 
 def percent(share: float) -> str:
-    """A share as a percentage; a tenth of a percent where it is small or nearly all."""
+    """Format a share as a percentage, with one decimal below 10 % and above 90 %."""
     if math.isnan(share):
         return "-"
     value = 100 * share if abs(share) >= 5e-4 or share > 0 else 0.0
@@ -57,27 +57,27 @@ def percent(share: float) -> str:
 
 
 def number(value: float) -> str:
-    """Three digits; a dash for what is no number."""
+    """Format a number in three significant digits; "-" for NaN."""
     return "-" if math.isnan(value) else f"{value:.3g}"
 
 
 def shown(unit: str) -> str:
-    """A unit for a table: nothing where there is none, for a "1" beside a number is a digit."""
+    """Return the unit as shown in a table: "" for "1", which would look like a digit."""
     return "" if unit == "1" else unit
 
 
 def with_unit(text: str, unit: str) -> str:
-    """A number and its unit."""
+    """Join a number and its unit."""
     return f"{text} {shown(unit)}".rstrip()
 
 
 def measured(value: float, unit: str) -> str:
-    """An error in two digits: in cm, mm, mrad ... where it is small in its own unit."""
+    """Format an error in two digits, in cm, mm, mrad ... where it is small in its own unit."""
     return _told(value, *_scale(value, unit))
 
 
 def measured_alike(values: Sequence[float], unit: str) -> list[str]:
-    """Errors that are compared, as `measured` tells one, all in one unit: that of their middle."""
+    """Format errors that are compared, like `measured`, in the unit of their geometric mean."""
     known = [v for v in values if 0 < v < math.inf]
     middle = math.exp(sum(map(math.log, known)) / len(known)) if known else 0.0
     in_mm = unit == "m" and known and min(known) < SMALL and max(known) < 1.0
@@ -86,7 +86,7 @@ def measured_alike(values: Sequence[float], unit: str) -> list[str]:
 
 
 def _scale(value: float, unit: str) -> tuple[float, str]:
-    """By how much to multiply errors of this size, and in what unit they are then."""
+    """Return the factor and the scaled unit for values of this size."""
     if unit == "m" and SMALL <= value < 1.0:
         return 100.0, "cm"
     if unit.startswith(SCALED) and 0 < value < SMALL:
@@ -96,7 +96,7 @@ def _scale(value: float, unit: str) -> tuple[float, str]:
 
 
 def _told(value: float, scale: float, unit: str, least: float = SMALL) -> str:
-    """Two digits of a value in its unit, without a power of ten from `least` on."""
+    """Format a value in two digits with its unit, without a power of ten from `least` on."""
     value *= scale
     shape = ",.0f" if 9.95 <= value < 1e6 else "#.2g" if least <= value < 1e6 else ".1e"
     text = "-" if math.isnan(value) else f"{value:{shape}}" if value else "0"
@@ -104,57 +104,57 @@ def _told(value: float, scale: float, unit: str, least: float = SMALL) -> str:
 
 
 class Result:
-    """Base of frozen results, dataclasses with `repr=False`: what a notebook shows of them."""
+    """Base class of results (frozen dataclasses with `repr=False`), with display in notebooks."""
 
     def summary(self) -> str:
-        """What it is, in a few words: its name, its utility."""
+        """Return a short summary, such as the name and the utility."""
         return ""
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.summary()}".rstrip() + ">"
 
     def to_json(self) -> dict[str, Any]:
-        """What the command's --json prints: finite numbers, None where there is none."""
+        """Return the document that the command's --json prints; None for non-finite numbers."""
         raise NotImplementedError
 
     def figures(self) -> Sequence[Figure]:
-        """What there is to draw of it."""
+        """Return the figures of this result, which may be none."""
         return ()
 
     def plot(self) -> Any:
-        """A Plotly figure of it, for a notebook (extra `notebook`).
+        """Return a Plotly figure for notebooks (extra `notebook`).
 
         Raises:
-            GroundedError: if it has nothing to draw, or Plotly is not installed.
+            GroundedError: if there is nothing to draw, or Plotly is not installed.
         """
         from grounded.figures.interactive import notebook_figure
 
         figures = self.figures()
         if not figures:
-            raise GroundedError(f"there is nothing to draw of this {type(self).__name__} yet")
+            raise GroundedError(f"this {type(self).__name__} has nothing to draw yet")
         return notebook_figure(figures)
 
     def _repr_html_(self) -> str:
-        """The document as a table, for Jupyter."""
+        """Return the document as an HTML table, for Jupyter."""
         return f"<b>{type(self).__name__}</b>{_table(self.to_json())}"
 
 
 def document(**values: Any) -> dict[str, Any]:
-    """A document of these keys, `plain`."""
+    """Return a JSON document with these keys, its values converted by `plain`."""
     return {key: plain(value) for key, value in values.items()}
 
 
 @dataclass(frozen=True, eq=False)
 class Document(Result):
-    """Base of frozen dataclasses that are written to JSON field by field, and read back.
+    """Base class of frozen dataclasses that are written to JSON field by field and read back.
 
-    A field's metadata may name another `key` than its own name ("": it is not written), or leave
-    the key out (`brief`) where the value is None, not finite or "". Two are equal where
-    their documents are: a number that is not finite is null in both.
+    A field's metadata may set the JSON `key` ("": the field is not written), or `brief`, which
+    omits the key if the value is None, not finite or "". Two documents are equal if their JSON is
+    equal; numbers that are not finite are null there.
     """
 
     def to_json(self) -> dict[str, Any]:
-        """The fields by their keys, plain."""
+        """Return the fields by JSON key."""
         found = {}
         for one in fields(self):
             value = getattr(self, one.name)
@@ -166,18 +166,20 @@ class Document(Result):
 
     @classmethod
     def from_json(cls, document: Any) -> Self:
-        """Reads what `to_json` wrote: null is NaN, or empty; a missing key is the field's default.
+        """Read what `to_json` wrote; null becomes NaN or an empty value.
+
+        A missing key gets the field's default.
 
         Args:
-            document: parsed JSON, of this version, of an older one, or of a stranger.
+            document: parsed JSON, which may be from an older version or not valid.
 
         Raises:
-            GroundedError: if it has another shape.
+            GroundedError: if the document is malformed.
         """
         try:
             return _read(cls, document)  # type: ignore[no-any-return]
         except MALFORMED as error:
-            raise GroundedError(f"not the document of a {cls.__name__}: {error}") from None
+            raise GroundedError(f"not a JSON document of a {cls.__name__}: {error}") from None
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, type(self)) and self.to_json() == other.to_json()
@@ -189,7 +191,7 @@ def _types(kind: type) -> dict[str, Any]:
 
 
 def _read(kind: Any, value: Any) -> Any:
-    """A value of JSON as a field's type has it; null is its empty value."""
+    """Convert a JSON value to the type of a field; null becomes its empty value."""
     origin, of = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):  # X | None
         optional = isinstance(of[0], type) and issubclass(of[0], Document)
@@ -211,7 +213,7 @@ def _read(kind: Any, value: Any) -> Any:
 
 
 def _given(kind: Any, document: dict[str, Any]) -> dict[str, Any]:
-    """The fields that a document holds, by name."""
+    """Return the field values that a document holds, by field name."""
     found = {}
     for one in fields(kind):
         key = one.metadata.get("key", one.name)
@@ -223,10 +225,11 @@ def _given(kind: Any, document: dict[str, Any]) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON can hold it: arrays as lists, results as dicts, NaN and infinity as None.
+    """Convert a value for JSON: arrays to lists, results to dicts, NaN and infinity to None.
 
     Args:
-        value: nested mappings, sequences, arrays, numbers, strings; anything else by its `str`.
+        value: nested mappings, sequences, arrays, numbers, strings; anything else becomes its
+            `str`.
     """
     if isinstance(value, Result):
         return value.to_json()

@@ -1,4 +1,4 @@
-"""Rollout: a simulated run, in the model as it is or with a bias. A real run is a Trial."""
+"""Rollout: a simulated run of the model, with or without a bias. A real run is a `Trial`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ Run = tuple[Array, Array]  # states (H + 1, n) and inputs (H, m)
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """Augmented states z (H + 1, nz), inputs (H, m) and the utility (minus infinity: diverged)."""
+    """A simulated run: augmented states z (H + 1, nz), inputs (H, m) and the utility.
+
+    The utility is minus infinity if the run diverged. `n` is the number of states in z.
+    """
 
     z: Array
     inputs: Array
@@ -37,7 +40,7 @@ class Rollout:
 
 
 def simulate(problem: Problem, policy: Policy) -> Rollout:
-    """Runs a policy in the problem's model, closed loop, inputs clipped to the limits."""
+    """Simulate a policy in the problem's model, closed loop, with inputs clipped to the limits."""
     swarm = problem.system.rollout(problem, policy.feedforward, policy.gain, policy.reference)
     cost = float(swarm.cost[0])
     utility = -cost if np.isfinite(cost) else -np.inf
@@ -45,7 +48,7 @@ def simulate(problem: Problem, policy: Policy) -> Rollout:
 
 
 def each_stepped(model: Model, x: Array, u: Array, p: Array, dt: float) -> Array:
-    """The model's step of rows that each have their own parameters.
+    """Step the model for N rows that each have their own parameters.
 
     Args:
         model: of n states, m inputs and k parameters.
@@ -57,7 +60,7 @@ def each_stepped(model: Model, x: Array, u: Array, p: Array, dt: float) -> Array
     Returns:
         The next states (N, n).
     """
-    together = getattr(model.step, "rows", None)  # a simulator's
+    together = getattr(model.step, "rows", None)  # simulators step all rows at once
     if together is not None:
         return np.asarray(together(x, u, p, dt))
     alike: dict[bytes, list[int]] = {}
@@ -70,10 +73,10 @@ def each_stepped(model: Model, x: Array, u: Array, p: Array, dt: float) -> Array
 
 
 def augmented(problem: Problem, states: Array, inputs: Array, past: Array) -> Array:
-    """z_0 .. z_T of a recorded run: states (T + 1, n) beside the inputs sent before each.
+    """Return z_0 .. z_T (T + 1, nz) of a recorded run: each state with the inputs sent before it.
 
     Args:
-        problem: gives the history depths.
+        problem: has the number of past inputs in z.
         states: (T + 1, n).
         inputs: commands (T, m).
         past: the input held before t = 0, (m,).
@@ -89,7 +92,13 @@ def augmented(problem: Problem, states: Array, inputs: Array, past: Array) -> Ar
 
 
 def apart(problem: Problem, a: Run, b: Run) -> float:
-    """The cost of the difference of two runs, in the states that both have."""
+    """Return the cost of the difference of two runs, over the states that both have.
+
+    Args:
+        problem: has the weights.
+        a: states (H + 1, n) and inputs (H, m).
+        b: the other run.
+    """
     n = min(a[0].shape[1], b[0].shape[1])
     with np.errstate(all="ignore"):
         x = wrapped(a[0][:, :n] - b[0][:, :n], problem.angles[:n]) ** 2

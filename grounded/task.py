@@ -1,7 +1,7 @@
-"""Task: what is to be done, by which model, and how it is judged.
+"""Task: the manoeuvre, the model and the reward that judges a run.
 
-Everything is checked here, once, so that inner code need not. `Task.problem` turns a task into the
-plain arrays that the kernels work on.
+All checks are made here once, so that inner code does not repeat them. `Task.problem` converts a
+task to the plain arrays that the kernels use.
 """
 
 from __future__ import annotations
@@ -22,33 +22,34 @@ from grounded.result import with_unit
 from grounded.trial import Trial
 from grounded.utility import Reward, step_rewards
 
-MAX_HORIZON = 200_000  # a control step is a few kB of gains: a bound against nonsense
-HELD = 1e-6  # of an input's range: a value held before the start that was rounded is inside
+MAX_HORIZON = 200_000  # control steps; each needs a few kB for its gains
+HELD = 1e-6  # tolerance, as a fraction of an input's range, for a rounded held input at its limit
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A manoeuvre: follow `target` for `horizon` steps of `dt` from `start`.
+    """A manoeuvre: follow `target` for H steps of `dt`, from the state `start`.
 
     Args:
         model: the crude model (n states, m inputs).
         dt: control interval [s].
-        target: (H + 1, n), angles unwrapped; NaN for a state that is not tracked.
+        target: (H + 1, n) desired states in their units, angles unwrapped; NaN for a state that is
+            not tracked.
         reward: quadratic weights.
-        start: s_0 (n,).
-        past: the input held before t = 0 (m,).
-        low: hard lower limits of the inputs (m,), infinite where there is none.
-        high: hard upper limits, likewise.
-        feedback: False for an open-loop sequence of inputs.
-        latency: transport delay of each input [s] (m,).
-        input_target: (H, m), what the input penalty compares with; None for zero.
-        safety_low: lower bounds on predicted states (n,), infinite where there is none.
-        safety_high: upper bounds, likewise.
-        smoothing: width over which the PLANNING model blends indicator terms (`np.where`, `abs`).
+        start: (n,) initial state s_0.
+        past: (m,) input held before t = 0.
+        low: (m,) hard lower limits of the inputs; -inf for no limit.
+        high: (m,) hard upper limits of the inputs; inf for no limit.
+        feedback: whether policies have feedback gains; False for open-loop input sequences.
+        latency: (m,) transport delay of each input [s]; None for zero.
+        input_target: (H, m) inputs that the input penalty is relative to; None for zero.
+        safety_low: (n,) lower bounds on predicted states; -inf for no bound.
+        safety_high: (n,) upper bounds on predicted states; inf for no bound.
+        smoothing: width over which the PLANNING model blends non-smooth terms (`np.where`, `abs`).
 
     Raises:
-        GroundedError: for sizes that do not fit, limits the wrong way round or that exclude what is
-            held before the start, a target that is not finite where it is weighted.
+        GroundedError: if shapes do not match, lower limits are not below the upper ones, the held
+            input lies outside its limits, or a weighted state has no finite target.
     """
 
     model: Model
@@ -76,8 +77,8 @@ class Task:
         if target.ndim != 2 or target.shape[1] != n:
             turned = ": transpose it" * (target.ndim == 2 and len(target) == n)
             raise GroundedError(
-                f"task: target must have shape (H + 1, {n}), a row for each control step and one "
-                f"for the end, a column for each state; got {target.shape}{turned}"
+                f"task: target must have shape (H + 1, {n}), one row for each control step and one "
+                f"for the end, one column for each state; got {target.shape}{turned}"
             )
         H = len(target) - 1
         if not 1 <= H <= MAX_HORIZON:
@@ -93,7 +94,7 @@ class Task:
         for name, shape in shapes.items():
             given = getattr(self, name)
             if given is None and name not in defaults:
-                free = ", infinite where there is none" if name in ("low", "high") else ""
+                free = ", infinite for no limit" if name in ("low", "high") else ""
                 raise GroundedError(f"task: {name} must have shape {shape}{free}, got None")
             value = numbers(defaults[name] if given is None else given, f"task: {name}")
             if value.shape != shape:
@@ -143,9 +144,9 @@ class Task:
             if weighted[i] and bad.any():
                 raise GroundedError(
                     f"[reward] weighs state '{name}', but the target has no value for it at "
-                    f"step {int(np.argmax(bad))}: add the column '{name}' to the target (a "
-                    f"line has one with `--to {name}=0`; where only `terminal` weighs it, the last "
-                    "value counts, the others may be anything) or drop the weight"
+                    f"step {int(np.argmax(bad))}: add the column '{name}' to the target (for a "
+                    f"line: `--to {name}=0`; if only `terminal` weighs it, only the last value "
+                    "counts, the others may be anything) or drop the weight"
                 )
         if not np.isfinite(self.start).all():
             raise GroundedError(f"task: the start state must be finite, got {self.start.tolist()}")
@@ -158,9 +159,9 @@ class Task:
             room = HELD * (high - low if np.isfinite(high - low) else abs(held))
             if not low - room <= held <= high + room:
                 raise GroundedError(
-                    f"{name} = {with_unit(f'{held:g}', unit)} is held before the start, beyond its "
-                    f"limits, {low:g} to {high:g}: hold a value inside ([task] start; in Python "
-                    "past), or widen the limits if the robot may get that"
+                    f"{name} = {with_unit(f'{held:g}', unit)} is held before the start, outside "
+                    f"its limits, {low:g} to {high:g}: hold a value inside ([task] start; in "
+                    "Python past), or widen the limits if the robot may receive that value"
                 )
 
     @property
@@ -170,9 +171,9 @@ class Task:
 
     @cached_property
     def hash(self) -> str:
-        """16 hex digits over all that the utility of a real trial depends on.
+        """Hash of everything that the utility of a real trial depends on, 16 hex digits.
 
-        Not the model's parameters, which may change while the task stays.
+        The model's parameters are not part of it: they may change while the task stays the same.
         """
         digest = hashlib.sha256()
         digest.update(repr((self.model.state_names, self.model.input_names)).encode())
@@ -185,11 +186,16 @@ class Task:
         return digest.hexdigest()[:16]
 
     def with_model(self, model: Model) -> Task:
-        """The same task with another model of the same states and inputs."""
+        """Return the task with another model of the same states and inputs."""
         return dataclasses.replace(self, model=model)
 
     def problem(self, bias: Array | None = None, *, exact: bool = False) -> Problem:
-        """The arrays for the kernels; `exact` switches off the smoothing of indicator terms."""
+        """Return the arrays for the kernels.
+
+        Args:
+            bias: (H, n) added to the model's next state at each step; None for zero.
+            exact: switch off the smoothing of non-smooth terms.
+        """
         model, H = self.model, self.horizon
         weight = np.tile(self.reward.state, (H + 1, 1))
         weight[-1] += self.reward.terminal
@@ -214,7 +220,13 @@ class Task:
         )
 
     def policy(self, ubar: Array, gain: Array | None, reference: Array | None) -> Policy:
-        """A policy for this task: feed-forward (H, m), gain (H, m, nz), reference (H, nz)."""
+        """Return a policy for this task.
+
+        Args:
+            ubar: (H, m) feed-forward.
+            gain: (H, m, nz) feedback gains; None for none.
+            reference: (H, nz) states that the gains refer to; None for none.
+        """
         return Policy(
             feedforward=ubar,
             low=self.low,
@@ -230,12 +242,16 @@ class Task:
         )
 
     def rewards(self, trial: Trial, reward: Reward | None = None) -> Array:
-        """The reward of every step of a trial, (T + 1,); NaN where the trial is not finite.
+        """Return the reward of every step of a trial, (T + 1,); NaN where it is not finite.
 
-        What a log holds after the horizon is not judged. With `reward`, by other weights.
+        Samples after the horizon are ignored.
+
+        Args:
+            trial: a run of this task, with the model's states and inputs.
+            reward: other weights; None for the task's.
 
         Raises:
-            GroundedError: if it has other states or inputs than the model.
+            GroundedError: if the trial has other states or inputs than the model.
         """
         names = (self.model.state_names, self.model.input_names)
         if (trial.state_names, trial.input_names) != names:
@@ -253,15 +269,16 @@ class Task:
         return step_rewards(reward, error, trial.inputs, self.input_target[:T], past)
 
     def utility(self, trial: Trial) -> float:
-        """U of a real trial (section 2); -inf for one that ended early or is not finite.
+        """Return the utility of a real trial (section 2 of the paper): the sum of its rewards.
 
-        A run that was not recorded for its last step or two did not end early: `Trial.whole`.
+        It is -inf for a trial that ended early or is not finite. A recording that lacks the last
+        step or two is extrapolated and does not count as ended early, see `Trial.whole`.
         """
         judge = lambda: self._utility(trial.whole(self.horizon))  # noqa: E731
         return trial.worth(f"{self.hash}{self.model.angles}whole", judge)
 
     def terms(self, trial: Trial) -> dict[str, float]:
-        """What each table of [reward] takes from a trial's utility, which is their sum; <= 0."""
+        """Return the contribution (<= 0) of each [reward] entry to a trial's utility, by name."""
         none = {one.name: 0 * getattr(self.reward, one.name) for one in fields(Reward)}
         return {
             name: float(self.rewards(trial, Reward(**none | {name: own})).sum())
@@ -273,4 +290,4 @@ class Task:
         if trial.steps < self.horizon or trial.finite_steps < self.horizon:
             return -np.inf
         total = float(self.rewards(trial).sum())
-        return total if np.isfinite(total) else -np.inf  # flew off beyond what a number holds
+        return total if np.isfinite(total) else -np.inf  # overflow: the run diverged

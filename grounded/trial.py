@@ -1,10 +1,9 @@
-"""Trial: one real run on the control grid. A simulated run is a Rollout, never a Trial.
+"""Trial: one real run, sampled on the control grid. A simulated run is a `Rollout`.
 
-Samples get lost: a camera that misses the car for half a second loses states, not the trial. Short
-gaps are interpolated (`interpolate_gaps`), and with them the bias (2 % lost samples are harmless);
-long ones end the trial. Inputs are never invented: a trial ends before its first unknown
-input. A recording that stops a step or two before the end of the run is judged as if it had gone on
-(`Trial.whole`).
+Samples may be missing, for instance when a camera loses the car for half a second. Short gaps in
+the states are interpolated (`interpolate_gaps`); 2 % of lost samples do no harm. A long gap ends
+the trial. Inputs are never interpolated: a trial ends before its first unknown input. A recording
+that stops one or two steps early is extrapolated to the end of the run (`Trial.whole`).
 """
 
 from __future__ import annotations
@@ -19,30 +18,41 @@ from grounded.errors import GroundedError
 from grounded.frozen import Array, numbers, positive, wrapped
 
 MAX_GAP_S = 1.0  # a longer gap ends a trial
-LAST = 2  # steps that may be missing at the end of a run,
-ENOUGH = 10  # if it has this many times as many
-RECENT = 4  # steps whose mean rate goes on there
-HUGE = 1e100  # from here on a number is as good as infinite: squares and products must be numbers
+LAST = 2  # steps at the end of a run that may be missing and are extrapolated,
+ENOUGH = 10  # if the trial has at least this many times as many steps
+RECENT = 4  # steps whose mean rate is used to extrapolate
+HUGE = 1e100  # treated as infinite: squares and products must stay finite
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """States s_0 .. s_T and the COMMANDED inputs a_0 .. a_{T-1}, sampled every dt.
+    """A recorded run: states s_0 .. s_T and COMMANDED inputs a_0 .. a_{T-1}, sampled every dt.
 
-    T is the horizon, or less when the run ended early. Angles are unwrapped.
+    T is the horizon, or less when the run ended early. NaN marks a missing sample.
+
+    Args:
+        states: (T + 1, n) measured states in the model's units, angles unwrapped.
+        inputs: (T, m) commanded inputs in the model's units.
+        dt: control interval [s].
+        state_names: n names, in column order.
+        input_names: m names, in column order.
+        id: content hash of the stored file; "" before it is stored.
+        candidate: id of the candidate that was run; "" for a log that ran none.
+        start_inputs: (m,) input held before t = 0; None if unknown, then the task's `past` is used,
+            or zero without a task.
 
     Raises:
-        GroundedError: if the arrays do not fit each other.
+        GroundedError: if the shapes do not match.
     """
 
-    states: Array  # (T + 1, n)
-    inputs: Array  # (T, m)
-    dt: float  # [s]
+    states: Array
+    inputs: Array
+    dt: float
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
-    id: str = ""  # content hash of the stored file, "" before it is stored
-    candidate: str = ""  # the candidate that was run; "" for a log that ran none
-    start_inputs: Array | None = None  # (m,) held before t = 0; None: zero
+    id: str = ""
+    candidate: str = ""
+    start_inputs: Array | None = None
 
     def __post_init__(self) -> None:
         states = numbers(self.states, "trial: states")
@@ -57,8 +67,8 @@ class Trial:
         if states.ndim != 2 or states.shape[1] != n or not rows:
             turned = ": transpose it" * (states.ndim == 2 and rows == n)
             raise GroundedError(
-                f"a trial of {n} states needs an array (T+1, {n}), a row for each control step and "
-                f"one for the end; got {states.shape}{turned}"
+                f"a trial of {n} states needs an array (T+1, {n}), one row for each control step "
+                f"and one for the end; got {states.shape}{turned}"
             )
         if inputs.shape != (rows - 1, m):
             mend = {
@@ -89,7 +99,7 @@ class Trial:
 
     @property
     def finite_steps(self) -> int:
-        """Steps whose states and inputs are all finite numbers; -1 if the first state isn't."""
+        """Number of steps before the first non-finite value; -1 if the first state has one."""
         states = ~(np.abs(self.states) < HUGE).all(axis=1)
         inputs = ~(np.abs(self.inputs) < HUGE).all(axis=1)
         known = int(np.argmax(states)) - 1 if states.any() else self.steps
@@ -97,9 +107,10 @@ class Trial:
 
     @property
     def known_steps(self) -> int:
-        """Steps whose inputs are known, up to the last state of which anything is; none diverged.
+        """Number of steps up to the last state with any known value, before divergence.
 
-        What needs no whole states (a diagnosis) loses the samples of a gap, not what follows it.
+        All inputs up to there are known. For uses that tolerate gaps in the states (a diagnosis):
+        they lose the samples in a gap, but not those after it.
         """
         known = np.flatnonzero(np.isfinite(self.states).any(axis=1))
         wild = (np.abs(self.states) >= HUGE).any(axis=1)
@@ -109,22 +120,22 @@ class Trial:
         return max(0, min(last, int(np.argmax(bad))) if bad.any() else last)
 
     def worth(self, task: str, compute: Callable[[], float]) -> float:
-        """The utility in a task; a trial that remembers it computes it once.
+        """Return the utility in a task; subclasses may cache it.
 
         Args:
-            task: stands for all that the utility depends on.
-            compute: gives it.
+            task: cache key that identifies everything the utility depends on.
+            compute: computes the utility.
         """
         return compute()
 
     def repeats(self, other: Trial) -> bool:
-        """Whether the other has the very same states."""
+        """Return whether the other trial has exactly the same states, bit for bit."""
         return np.array_equal(self.states, other.states, equal_nan=True)
 
     def whole(self, steps: int) -> Trial:
-        """The trial up to so many steps; one that ends a step or two before goes on to there.
+        """Cut the trial to `steps` steps, or extrapolate it if only one or two are missing.
 
-        The input is held meanwhile, and the states move as they did in the last steps.
+        For missing steps the last input is held and the states continue at their recent mean rate.
         """
         missing = steps - self.steps
         if not (0 < missing <= LAST and self.steps >= ENOUGH * missing):
@@ -141,16 +152,16 @@ class Trial:
         )
 
     def until(self, steps: int) -> Trial:
-        """The trial up to so many steps; a log may go on after the horizon."""
+        """Return the trial cut to at most `steps` steps."""
         if steps >= self.steps:
             return self
         return replace(self, states=self.states[: steps + 1], inputs=self.inputs[:steps])
 
 
 def scattered(trials: Sequence[Trial]) -> bool:
-    """Whether a candidate, or the same commands, came out differently when run again.
+    """Return whether repeats of a candidate, or of the same commands, gave different states.
 
-    Then the system has noise, and two trials that agree to the last bit are one and its copy.
+    If so, the system has noise, and two trials that agree to the last bit must be copies.
     """
     first: dict[str | bytes, Trial] = {}
     return any(
@@ -160,9 +171,12 @@ def scattered(trials: Sequence[Trial]) -> bool:
 
 
 def mean_trial(trials: Sequence[Trial], angles: NDArray[np.bool_] | None = None) -> Trial:
-    """The mean of repeated whole trials: states, inputs, the held input; one trial is itself.
+    """Return the mean of repeated trials of equal length: states, inputs and held input.
 
-    Angles (n,) are taken near the first trial's: one log may be a full turn off another.
+    Args:
+        trials: at least one; a single trial is returned as it is.
+        angles: (n,) bool, which states are angles; they are unwrapped relative to the first trial,
+            since logs may differ by full turns.
     """
     if len(trials) == 1:
         return trials[0]
@@ -184,19 +198,20 @@ def mean_trial(trials: Sequence[Trial], angles: NDArray[np.bool_] | None = None)
 
 @dataclass(frozen=True, eq=False)
 class Interpolated:
-    """A trial without gaps: samples that were interpolated, and the state of the longest gap."""
+    """A trial with its short gaps filled, and a summary of them."""
 
     trial: Trial
-    samples: int
-    longest_s: float
-    state: str  # where the longest gap was, "" if there was none
-    at_s: float
+    samples: int  # number of interpolated samples
+    longest_s: float  # duration of the longest gap [s]
+    state: str  # the state with the longest gap, "" if there was none
+    at_s: float  # start of the longest gap [s]
 
 
 def interpolate_gaps(trial: Trial) -> Interpolated:
-    """Interpolates gaps of at most MAX_GAP_S between known samples; the first state must be known.
+    """Interpolate gaps in the states of at most MAX_GAP_S, linearly between known samples.
 
-    A longer gap, or one that reaches the end, stays: the trial then counts as ended there.
+    A longer gap, or one that reaches the end, stays: the trial then counts as ended there. Nothing
+    is changed if the first state is not fully known.
     """
     bad = ~np.isfinite(trial.states)
     if not bad.any() or bad[0].any():
@@ -216,6 +231,6 @@ def interpolate_gaps(trial: Trial) -> Interpolated:
 
 
 def stretches(true: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """[first, last) of each run of True."""
+    """Return [first, last) of each run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], true.astype(int), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

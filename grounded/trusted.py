@@ -1,9 +1,8 @@
-"""Whose code is executed: the user's own, that nobody else can have changed.
+"""Check that code to be executed can't have been changed by another user.
 
 Compiled kernels, a workspace's model.py and its `[system] command` run with the user's rights. So
-their files, and the folders that they are found in, must belong to the user (or to root) and must
-not be writable for anybody else. A group counts as nobody else where it is the user's private one,
-as many Linux distributions make it.
+these files and their folders must belong to the user (or root) and must not be writable by anybody
+else. Write access of the user's private group, which many Linux distributions create, is allowed.
 """
 
 from __future__ import annotations
@@ -16,36 +15,36 @@ from pathlib import Path
 
 from grounded.errors import GroundedError
 
-TRUST = "GROUNDED_TRUST"  # folders whose code is executed whoever could have written it
+TRUST = "GROUNDED_TRUST"  # environment variable: folders whose code is executed without this check
 
 
 def suspicion(path: Path) -> str:
-    """Why somebody else may have changed a file or the names in a folder; "" where none can.
+    """Return why another user may have changed a file or folder; "" if none can.
 
     Raises:
-        OSError: if it can't be looked at.
+        OSError: if the path can't be read.
     """
-    if not hasattr(os, "getuid"):  # Windows: its rights are others
+    if not hasattr(os, "getuid"):  # Windows has another permission model
         return ""
     status = path.stat()
     if status.st_uid not in (os.getuid(), 0):
         return f"{path} belongs to another user ({status.st_uid})"
     if status.st_mode & stat.S_IWOTH:
-        return f"{path} is writable for everybody"
+        return f"{path} is writable by everybody"
     if status.st_mode & stat.S_IWGRP and not _private(status.st_gid):
-        return f"{path} is writable for its group ({status.st_gid})"
+        return f"{path} is writable by its group ({status.st_gid})"
     return ""
 
 
 def check_own(folder: Path, paths: Iterable[Path]) -> None:
-    """Refuses to execute what is in a folder if somebody else may have changed it.
+    """Refuse to execute code in a folder that another user may have changed.
 
     Args:
         folder: a workspace.
-        paths: what is executed or says what is; those that don't exist are left out.
+        paths: files that are executed or that name what is executed; missing files are skipped.
 
     Raises:
-        GroundedError: naming the first of them that isn't the user's own, and the remedy.
+        GroundedError: for the first of them that another user may have changed.
     """
     trusted = [Path(name).resolve() for name in os.environ.get(TRUST, "").split(os.pathsep) if name]
     if any(folder.resolve().is_relative_to(known) for known in trusted):
@@ -53,11 +52,11 @@ def check_own(folder: Path, paths: Iterable[Path]) -> None:
     for path in (folder, *paths):
         try:
             found = suspicion(path)
-        except OSError:  # it isn't there, or will not be readable either
+        except OSError:  # missing, or unreadable and hence not executed either
             continue
         if found:
             raise GroundedError(
-                f"{found}, so what it says may be somebody else's program; nothing of {folder} is "
+                f"{found}, so another user may have changed its code; nothing in {folder} is "
                 f"executed. If it is yours: chown -R $USER and chmod -R go-w, or name the folder "
                 f"in {TRUST}"
             )
@@ -65,7 +64,7 @@ def check_own(folder: Path, paths: Iterable[Path]) -> None:
 
 @cache
 def _private(group: int) -> bool:
-    """Whether a group is the user's own, of whom no other is a member."""
+    """Return whether a group is the user's private group, without other members."""
     import grp
     import pwd
 

@@ -1,4 +1,4 @@
-"""The quadratic reward: penalties on the distance to a target, on inputs and on their changes.
+"""Quadratic reward: penalties on the distance to a target, on inputs and on input changes.
 
     U = - sum_{t=0}^{H} |s_t - target_t|^2_W  - |s_H - target_H|^2_{W_H}
         - sum_{t=0}^{H-1} |a_t - a_target_t|^2_R + |a_t - a_{t-1}|^2_S
@@ -19,7 +19,13 @@ from grounded.frozen import Array, numbers
 
 @dataclass(frozen=True, eq=False)
 class Reward:
-    """Weights per step: state (n,), terminal (n,) on the last state, input (m,), input_change (m,).
+    """Weights of the quadratic reward; each multiplies a squared error, without a factor 1/2.
+
+    Args:
+        state: (n,) weight of each state's distance to the target, at every step [1/unit^2].
+        terminal: (n,) additional weight on the last state [1/unit^2].
+        input: (m,) weight of each input's distance to the input target (zero by default).
+        input_change: (m,) weight of the change of each input from one step to the next.
 
     Raises:
         GroundedError: if a weight is negative or not finite.
@@ -48,17 +54,17 @@ def step_rewards(
     input_target: Array,
     past: Array,
 ) -> Array:
-    """The reward of every step, (H + 1,): negative penalties, summing to the utility.
+    """Return the reward of every step, (H + 1,): negative penalties that sum to the utility.
 
     Args:
         reward: the weights.
         error: s_t - target_t with angles wrapped, (H + 1, n); NaN where not tracked.
         inputs: a_0 .. a_{H-1}, (H, m).
-        input_target: what inputs are compared with, (H, m); zero for the paper's penalty.
+        input_target: target of the inputs, (H, m); zero for the paper's penalty.
         past: the input held before t = 0, (m,).
     """
     tracked = np.where(np.isnan(error) & (reward.state + reward.terminal == 0), 0.0, error)
-    with np.errstate(over="ignore", invalid="ignore"):  # a run that flew off: `Task.utility`
+    with np.errstate(over="ignore", invalid="ignore"):  # diverged runs: see `Task.utility`
         penalty = tracked**2 @ reward.state
         penalty[-1] += tracked[-1] ** 2 @ reward.terminal
         change = np.diff(np.vstack([past, inputs]), axis=0)

@@ -1,9 +1,9 @@
-"""Files that a model file names: found beside it, from whatever folder it is loaded.
+"""Find files that a model.py names, relative to the model.py itself.
 
-A workspace's model.py says `mujoco.model("arm.xml")`; commands come from anywhere (`-C DIR`), and a
-workspace may be moved. While a model file is being loaded, a relative path leads to the file beside
-it; where there is none, to one in the current folder, as everywhere else. Who makes a workspace
-asks what was read, to copy it.
+A workspace's model.py may call `mujoco.model("arm.xml")`, while commands run in any folder
+(`-C DIR`) and workspaces are moved. While a model.py is loaded, a relative path is looked up beside
+it first, then in the current folder. `recorded` lists the files that were read, so that they can be
+copied to a new workspace.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _READ: ContextVar[list[tuple[Path, Path]] | None] = ContextVar("what model files
 
 @contextmanager
 def beside(folder: Path) -> Iterator[None]:
-    """Relative paths lead to files of this folder first."""
+    """Look up relative paths in this folder first, inside the block."""
     before = _FOLDER.set(folder)
     try:
         yield
@@ -30,7 +30,10 @@ def beside(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def recorded() -> Iterator[list[tuple[Path, Path]]]:
-    """All files that models read meanwhile, and the folder that each was named from; absolute."""
+    """Record the files that models read inside the block, as absolute (folder, file) pairs.
+
+    The folder is the one that the model's relative path refers to.
+    """
     found: list[tuple[Path, Path]] = []
     before = _READ.set(found)
     try:
@@ -40,16 +43,16 @@ def recorded() -> Iterator[list[tuple[Path, Path]]]:
 
 
 def located(path: str | Path) -> Path:
-    """The file that a path names."""
+    """Return the file that a path in a model.py refers to."""
     return _root(path) / path
 
 
 def remember(named: str | Path, files: Callable[[Path], Iterable[Path]]) -> None:
-    """Adds to what is recorded.
+    """Add files to those recorded by `recorded`, if it is active.
 
     Args:
-        named: the path that the model file has.
-        files: what is read for it; asked only where somebody records.
+        named: the path as written in the model.py.
+        files: returns all files that belong to it; called only if `recorded` is active.
     """
     if (read := _READ.get(None)) is not None:
         root = os.path.abspath(_root(named))  # noqa: PTH100 (links are kept as they are)

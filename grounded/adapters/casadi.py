@@ -29,18 +29,18 @@ def model(
     angles: tuple[str, ...] = (),
     name: str = "casadi",
 ) -> Model:
-    """The Model of a CasADi function.
+    """Return the Model of a CasADi function.
 
     Args:
-        function: casadi.Function of x (n), u (m) [, p (k) [, dt]] -> the next state (n).
-        states: name -> unit, in the order of x.
-        inputs: name -> unit, in the order of u.
-        params: name -> Param, in the order of p.
-        angles: states whose differences wrap.
-        name: for messages.
+        function: casadi.Function of x (n), u (m) [, p (k) [, dt]] -> next state (n).
+        states: unit by name, in the order of x.
+        inputs: unit by name, in the order of u.
+        params: `Param` by name, in the order of p.
+        angles: states whose differences wrap to [-pi, pi].
+        name: name of the model, for messages.
 
     Raises:
-        GroundedError: without casadi, or if the function's sizes are not those of the names.
+        GroundedError: if casadi is not installed, or the function's sizes do not match the names.
     """
     params = params or {}
     found = [function.numel_in(i) for i in range(function.n_in())]
@@ -58,7 +58,7 @@ def model(
 
 
 class CasadiStepper(Stepper):
-    """A CasADi function over batches."""
+    """Evaluates a CasADi function on batches."""
 
     def __init__(self, function: Any, *names: Iterable[str]) -> None:
         super().__init__(*names)
@@ -70,12 +70,12 @@ class CasadiStepper(Stepper):
         self._slopes = ca.Function("slopes", given, slopes)
 
     def advance(self, x: Array, u: Array, p: Array, dt: float) -> Array:
-        """The next states (N, n)."""
+        """Return the next states (N, n)."""
         moved = self.function.map(len(x))(*self._given(x, u, p, dt))
         return np.ascontiguousarray(np.array(moved, dtype=float).T)
 
     def derivatives(self, x: Array, u: Array, p: Array, dt: float) -> tuple[Array, Array]:
-        """f_x and f_u by algorithmic differentiation."""
+        """Return f_x and f_u by algorithmic differentiation."""
         N, n = x.shape
         found = self._slopes.map(N)(*self._given(x, u, p, dt))  # N blocks (n, ...) side by side
         f_x, f_u = (

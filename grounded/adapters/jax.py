@@ -28,18 +28,18 @@ def model(
     angles: tuple[str, ...] = (),
     name: str = "jax",
 ) -> Model:
-    """The Model of a JAX function.
+    """Return the Model of a JAX function.
 
     Args:
-        step: (x (n,), u (m,), p (k,), dt) -> the next state (n,), traceable by JAX.
-        states: name -> unit, in the order of x.
-        inputs: name -> unit, in the order of u.
-        params: name -> Param, in the order of p.
-        angles: states whose differences wrap.
-        name: for messages.
+        step: function (x (n,), u (m,), p (k,), dt) -> next state (n,), traceable by JAX.
+        states: unit by name, in the order of x.
+        inputs: unit by name, in the order of u.
+        params: `Param` by name, in the order of p.
+        angles: states whose differences wrap to [-pi, pi].
+        name: name of the model, for messages.
 
     Raises:
-        GroundedError: without jax.
+        GroundedError: if jax is not installed.
     """
     params = params or {}
     stepper = JaxStepper(step, states, inputs, params)
@@ -48,7 +48,7 @@ def model(
 
 
 class JaxStepper(Stepper):
-    """A JAX function over batches."""
+    """Evaluates a JAX function on batches."""
 
     def __init__(self, step: Callable[..., Any], *names: Iterable[str]) -> None:
         super().__init__(*names)
@@ -69,19 +69,19 @@ class JaxStepper(Stepper):
         self._prepare()
 
     def advance(self, x: Array, u: Array, p: Array, dt: float) -> Array:
-        """The next states (N, n)."""
+        """Return the next states (N, n)."""
         with _double():
             return np.array(self._steps(x, u, p, dt), dtype=float)
 
     def derivatives(self, x: Array, u: Array, p: Array, dt: float) -> tuple[Array, Array]:
-        """f_x and f_u by forward-mode differentiation."""
+        """Return f_x and f_u by forward-mode differentiation."""
         with _double():
             f_x, f_u = self._slopes(x, u, p, dt)
             return np.array(f_x, dtype=float), np.array(f_u, dtype=float)
 
 
 def _double() -> Any:
-    """JAX in double precision; an older JAX has the switch under `experimental`."""
+    """Return a context with double precision; older JAX has the switch in `experimental`."""
     jax = library("jax")
     if hasattr(jax, "enable_x64"):
         return jax.enable_x64(True)

@@ -10,14 +10,14 @@
 |                        | frame of that pose; `wrist_wx _wy _wz`: angular velocity, body frame   |
 | free joint `torso`     | `torso_x _y _z`, `torso_rx ...`, `torso_vx ...`, `torso_wx ...`        |
 | actuator activation    | `motor_act`                                                            |
-| actuator `motor`       | input `motor` (`motor_ctrl` where a state has that name); in N m or N  |
-|                        | where it is the force itself: gear and gain 1                          |
+| actuator `motor`       | input `motor` (`motor_ctrl` if a state has that name); in N m or N if  |
+|                        | the control is the force itself: gear and gain 1                       |
 | joint torque           | input `elbow_torque`, `slider_force`                                   |
 | parameter "pole.mass"  | `pole_mass`                                                            |
 
-Velocities are MuJoCo's qvel. The state is all that a step depends on: the constraint solver starts
-cold at every control step, so equal samples give equal results, bit for bit, alone or in a batch.
-A sample that MuJoCo finds unstable becomes NaN.
+Velocities are MuJoCo's qvel. A step depends only on the state: the constraint solver starts without
+a warm start at every control step, so equal samples give bit-identical results, alone or in a
+batch. A sample that MuJoCo finds unstable becomes NaN.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
 from grounded.model import Model, Param
 
-SHIFT = 1e-6  # relative step of the forward differences, as mjd_transitionFD uses it
+SHIFT = 1e-6  # relative step of the forward differences, as in mjd_transitionFD
 CHUNK = 4096  # samples stepped in one call
-EXACT = 1e-6  # of a control step: it is a whole multiple of the simulation's step
-NEAR = 1e-3  # of a control step: a simulation step so much longer or shorter is as exact, as stable
-MOST_THREADS, SHARED = 8, 64  # so many threads at most, and samples from which they pay
-MOST_COPIES = 20  # of the model with other parameters, side by side
-PRIVATE = ("_lock", "_data", "_base", "_copies", "_pools")  # to a process
-HUGE = 1e9  # MuJoCo calls 1e10 unstable, warns and stops there
+EXACT = 1e-6  # relative tolerance for a control step that is a multiple of the simulation's step
+NEAR = 1e-3  # relative change of the simulation's step that may be made to fit the control step
+MOST_THREADS, SHARED = 8, 64  # most threads; samples from which on threads are used
+MOST_COPIES = 20  # most copies of the model with other parameters at a time
+PRIVATE = ("_lock", "_data", "_base", "_copies", "_pools")  # attributes private to a process
+HUGE = 1e9  # MuJoCo treats 1e10 as unstable: it warns and stops
 
 
 def model(
@@ -71,29 +71,30 @@ def model(
     threads: int | None = None,
     name: str = "",
 ) -> Model:
-    """The Model of an MJCF or URDF file.
+    """Return the Model of an MJCF or URDF file.
 
     Args:
-        xml: path of the file, or MJCF text. In a model file, a relative path leads to what lies
-            beside that file, or else in the current folder.
-        params: what may be set, fitted or diagnosed, "element.field": `mass` of a body (its inertia
-            scales with it); `damping`, `frictionloss`, `armature`, `stiffness` of a joint; `gear`,
-            `kp`, `kv`, `gain`, `tau` of an actuator; `friction` of a geom. A
-            sequence of names: all uncertain, not below zero. A mapping: a number is a constant of
-            that value, (low, high) bounds what is uncertain, (value, low, high) says both. Nominal
-            values are else the file's.
+        xml: path of the file, or MJCF text. In a model.py, a relative path is looked up beside that
+            file, then in the current folder.
+        params: parameters that can be set, fitted or diagnosed, as "element.field": `mass` of a
+            body (its inertia scales with it); `damping`, `frictionloss`, `armature`, `stiffness` of
+            a joint; `gear`, `kp`, `kv`, `gain`, `tau` of an actuator; `friction` of a geom. In a
+            sequence of names, all are uncertain with a lower bound of zero. In a mapping, a number
+            is a constant, (low, high) are the bounds of an uncertain parameter, and
+            (value, low, high) also sets its value. Other values are taken from the file.
         inputs: "actuators", "torques" (generalised forces on all hinges and slides), the names of
-            the joints that get a torque, or "auto": actuators where there are any.
-        timestep: of the simulation [s], instead of the file's; dt must be a whole multiple, to
-            0.1 %: what is left is shared among its steps.
-        reference: qpos (nq,), or the name of a keyframe, that rotation vectors are about.
-        threads: threads that step a batch, all cores (8 at most) where None; the result does not
-            depend on them.
-        name: the model's name; the file's without one.
+            joints driven by a torque, or "auto": actuators if there are any, else torques.
+        timestep: simulation step [s] in place of the file's; dt must be a whole multiple of it to
+            within 0.1 %, and the rest is distributed over its steps.
+        reference: pose that rotation vectors refer to: qpos (nq,) or the name of a keyframe; None
+            for the file's qpos0.
+        threads: number of threads for a batch; None for all cores, at most 8. The result does not
+            depend on it.
+        name: name of the model; by default the file's.
 
     Raises:
-        GroundedError: without mujoco, for a file it can't load, for unknown names, and for
-            simulator memory that qpos, qvel and act do not hold (actuator delays, plugins).
+        GroundedError: if mujoco is not installed or can't load the file, for unknown names, and for
+            simulator state beyond qpos, qvel and act (actuator delays, plugins).
     """
     mj = library("mujoco")
     compiled = load(xml)
@@ -123,7 +124,7 @@ def model(
 
 
 def _param(setting: Setting, given: float | tuple[float, ...] | None) -> Param:
-    """A number: a constant; (low, high) or (value, low, high): uncertain; None: not below zero."""
+    """Return the Param: a number gives a constant, a tuple bounds, None a lower bound of zero."""
     if given is None:
         return Param(setting.nominal, setting.unit, 0.0)
     if isinstance(given, int | float):
@@ -138,14 +139,14 @@ def _param(setting: Setting, given: float | tuple[float, ...] | None) -> Param:
 
 
 def limits(xml: str | Path, inputs: str | Sequence[str] = "auto") -> dict[str, tuple[float, float]]:
-    """The limits of each input by name, for [limits]: ctrlrange, or a joint's actuatorfrcrange.
+    """Return the limits of the inputs for [limits]: ctrlrange, or a joint's actuatorfrcrange.
 
     Args:
         xml: path of the file, or MJCF text.
         inputs: as for `model`.
 
     Returns:
-        (low, high) of every input that has a limit.
+        (low, high) by name of every input that has limits.
     """
     compiled = load(xml)
     return _limits(compiled, controls_of(compiled, inputs, states_of(compiled)))
@@ -165,7 +166,7 @@ def _limits(compiled: Any, controls: Controls) -> dict[str, tuple[float, float]]
 
 
 class MujocoStepper(Stepper):
-    """Control steps of MuJoCo, many samples at a time."""
+    """Computes control steps of MuJoCo for many samples at a time."""
 
     def __init__(
         self,
@@ -183,7 +184,7 @@ class MujocoStepper(Stepper):
         self._model = copy.deepcopy(compiled)  # private: parameters are written into it
         self._own = float(compiled.opt.timestep)
         self._model.opt.disableflags |= mj.mjtDisableBit.mjDSBL_AUTORESET.value
-        self._made = np.array([s.nominal for s in settings])  # the parameters that it has now
+        self._made = np.array([s.nominal for s in settings])  # its current parameters
         self._prepare()
 
     def _prepare(self) -> None:
@@ -197,9 +198,9 @@ class MujocoStepper(Stepper):
         mj.mj_getState(compiled, self._data[0], self._base, whole)
         if len(self._base) != 1 + compiled.nq + compiled.nv + compiled.na:
             raise GroundedError(
-                "the MuJoCo model remembers more than qpos, qvel and act (an actuator delay, a "
-                "plugin), which the states can't hold: remove it from the file; a delay of an "
-                "input belongs in [task] latency"
+                "the MuJoCo model has state beyond qpos, qvel and act (an actuator delay, a "
+                "plugin), which the model's states can't hold: remove it from the file; a delay of "
+                "an input belongs in [task] latency"
             )
 
     def __getstate__(self) -> dict[str, Any]:
@@ -211,7 +212,7 @@ class MujocoStepper(Stepper):
 
     @property
     def timestep(self) -> float:
-        """The simulation's own step [s]; a control step is a whole multiple of it."""
+        """The simulation's step [s]; a control step is a whole multiple of it."""
         return self._own
 
     @property
@@ -221,13 +222,13 @@ class MujocoStepper(Stepper):
 
     @property
     def body(self) -> MujocoBody:
-        """What it looks like, for pictures."""
+        """The body to draw in pictures."""
         mj = library("mujoco")
         compiled = copy.deepcopy(self._model)
         return MujocoBody(compiled, mj.MjData(compiled), self.coordinates, mj.mj_kinematics)
 
     def advance(self, x: Array, u: Array, p: Array, dt: float) -> Array:
-        """The next states (N, n); NaN where a sample is unstable."""
+        """Return the next states (N, n); NaN for unstable samples."""
         steps, h = self._substeps(dt)
         with self._lock, _quiet():
             self._set(p)
@@ -242,9 +243,9 @@ class MujocoStepper(Stepper):
         return np.concatenate(parts) if parts else np.zeros((0, len(self.states)))
 
     def rows(self, x: Array, u: Array, p: Array, dt: float) -> Array:
-        """The same of samples with parameters of their own, (N, k): a copy of the model for each.
+        """Return the next states (N, n) of samples with their own parameters p (N, k).
 
-        In few batches: the folds of a prediction differ in their numbers alone.
+        Each set of parameters gets a copy of the model, and all of them are stepped in few batches.
         """
         steps, h = self._substeps(dt)
         each, which = np.unique(p, axis=0, return_inverse=True)
@@ -263,7 +264,7 @@ class MujocoStepper(Stepper):
         return after
 
     def _copy(self, p: Array) -> Any:
-        """The model with some parameters, (k,): the last that were asked for are kept."""
+        """Return the model with parameters p (k,); the most recent copies are cached."""
         found = self._copies.pop(p.tobytes(), None)
         if found is None:
             found = copy.deepcopy(self._model)
@@ -274,21 +275,21 @@ class MujocoStepper(Stepper):
         return found
 
     def derivatives(self, x: Array, u: Array, p: Array, dt: float) -> tuple[Array, Array]:
-        """f_x and f_u by forward differences: n + m + 1 steps a sample, all in one batch."""
+        """Return f_x and f_u by forward differences: n + m + 1 steps per sample, in one batch."""
         (N, n), d = x.shape, x.shape[1] + u.shape[1]
         points = np.tile(np.hstack([x, u]), (d + 1, 1, 1))
         i = np.arange(d)
         points[i + 1, :, i] += SHIFT * np.maximum(1.0, np.abs(points[0, :, i]))
-        width = points[i + 1, :, i] - points[0, :, i]  # what was really stepped (d, N)
+        width = points[i + 1, :, i] - points[0, :, i]  # the difference after rounding (d, N)
         flat = points.reshape(-1, d)
         y = self.advance(flat[:, :n], flat[:, n:], p, dt).reshape(d + 1, N, n)
         J = ((y[1:] - y[0]) / width[:, :, None]).transpose(1, 2, 0)
         return np.ascontiguousarray(J[:, :, :n]), np.ascontiguousarray(J[:, :, n:])
 
     def _substeps(self, dt: float) -> tuple[int, float]:
-        """How many simulation steps make a control step, and how long each is [s].
+        """Return the number of simulation steps in a control step, and their length [s].
 
-        An interval that was taken from a log's stamps is off by their jitter: it is made exactly.
+        A control step estimated from time stamps is slightly off; the steps are adjusted to it.
         """
         h = self.timestep
         steps = round(dt / h)
@@ -297,12 +298,12 @@ class MujocoStepper(Stepper):
             raise GroundedError(
                 f"the control step of {dt:g} s is not a whole multiple of the simulation's "
                 f"timestep of {h:g} s: give timestep={dt / max(1, steps):.12g}, "
-                "or another dt (a simulated real system takes `substeps = 1` in real.py)"
+                "or another dt (a simulated real system needs `substeps = 1` in real.py)"
             )
         return steps, h if off <= EXACT * dt else dt / steps
 
     def _set(self, p: Array) -> None:
-        """Writes parameters into the private model, and what MuJoCo derives from them."""
+        """Write parameters into the private model and update the constants derived from them."""
         if np.array_equal(p, self._made):
             return
         self._write(self._model, p)
@@ -314,15 +315,15 @@ class MujocoStepper(Stepper):
         library("mujoco").mj_setConst(model, self._data[0])
 
     def _pool(self, threads: int) -> Any:
-        """MuJoCo's pool of threads, kept: a new one for each batch takes as long as the batch."""
-        key = (os.getpid(), threads)  # a forked process has none of its parent's threads
+        """Return MuJoCo's thread pool, cached: creating one takes as long as a batch."""
+        key = (os.getpid(), threads)  # a forked process does not inherit threads
         if key not in self._pools:
             pool = library("mujoco.rollout").Rollout
             self._pools[key] = pool(nthread=threads if threads > 1 else 0)
         return self._pools[key]
 
     def _step(self, x: Array, u: Array, steps: int, models: Any) -> Array:
-        """Samples through simulation steps; models: one of all, or a list of each one's."""
+        """Run simulation steps; `models` is one model, or a list with one for each sample."""
         mj, compiled, nv = library("mujoco"), self._model, self._model.nv
         given = np.hstack([x, u])
         wild = ~(np.abs(given) < HUGE).all(axis=1, keepdims=True)
@@ -345,14 +346,14 @@ class MujocoStepper(Stepper):
             [self.coordinates.from_qpos(last[:, 1 : ends[1]], x[:, :nv]), last[:, ends[1] :]]
         )
         h = (models[0] if isinstance(models, list) else models).opt.timestep
-        stopped = last[:, :1] < (steps - 0.5) * h  # unstable: it went no further
+        stopped = last[:, :1] < (steps - 0.5) * h  # MuJoCo stopped an unstable sample
         wild = wild | stopped | ~(np.abs(moved) < HUGE).all(axis=1, keepdims=True)
         return np.where(wild, np.nan, moved)
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Drops MuJoCo's warnings of what a search tries; it writes MUJOCO_LOG.TXT where it stands."""
+    """Suppress MuJoCo's warnings, which would write MUJOCO_LOG.TXT to the current folder."""
     mj = library("mujoco")
     heard = mj.get_mju_user_warning()
     mj.set_mju_user_warning(lambda _: None)

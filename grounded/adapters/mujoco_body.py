@@ -1,7 +1,6 @@
-"""A MuJoCo model as it looks: the geoms that its file shows, moved by its own kinematics.
+"""The body of a MuJoCo model for pictures: its visible geoms, moved by MuJoCo's kinematics.
 
-What a file leaves without a shape is drawn all the same: a body without geoms as the box of its
-inertia, with a rod from its joint.
+A body without geoms is drawn as the box of its inertia, with a rod from its joint.
 """
 
 from __future__ import annotations
@@ -14,10 +13,10 @@ from grounded.adapters.tangent import Coordinates
 from grounded.figures.body import Part, Pose
 from grounded.frozen import Array
 
-SHOWN = 3  # geom groups from here on are hidden, as in MuJoCo's own viewer
+SHOWN = 3  # geom groups from here on are hidden, as in MuJoCo's viewer
 PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = 0, 2, 3, 4, 5, 6, 7  # mjtGeom
-THIN = 0.012  # of the model's extent: the radius of a rod
-LEAST = 1e-6  # [m] of a box's half edge
+THIN = 0.012  # radius of a rod, as a fraction of the model's extent
+LEAST = 1e-6  # [m] smallest half edge of a box
 
 
 class MujocoBody:
@@ -43,7 +42,7 @@ class MujocoBody:
         self._watched = moving[-1] if moving else 0
 
     def poses(self, states: Array) -> list[Pose]:
-        """Of each part, for states (T, n)."""
+        """Return the poses of each part, for states (T, n)."""
         compiled, data = self._model, self._data
         frames = []
         for qpos in self._positions(states):
@@ -61,13 +60,13 @@ class MujocoBody:
         for k, part in enumerate(self.parts):
             turned = np.array([f[k][1] for f in frames]).reshape(-1, 3, 3)
             origin = np.array([f[k][0] for f in frames]).reshape(-1, 3)
-            if part.shape == "capsule" and k < len(self._geoms):  # MuJoCo's origin is its middle
+            if part.shape == "capsule" and k < len(self._geoms):  # MuJoCo's origin is the centre
                 origin = origin - 0.5 * part.size[1] * turned[:, :, 2]
             found.append((origin, turned))
         return found
 
     def path(self, states: Array) -> Array:
-        """Positions (T, 3) of the last body's centre of mass; NaN where a joint is unknown."""
+        """Return positions (T, 3) of the last body's centre of mass; NaN if a joint is unknown."""
         found = np.full((len(states), 3), np.nan)
         nv = self._model.nv
         for t in np.flatnonzero(np.isfinite(states[:, :nv]).all(axis=1)):
@@ -80,7 +79,7 @@ class MujocoBody:
         return self._coordinates.to_qpos(np.asarray(states, float)[:, : self._model.nv])
 
     def _along(self, body: int) -> Array:
-        """Axes whose z points from a body's frame to its centre of mass."""
+        """Return axes (3, 3) whose z points from a body's frame to its centre of mass."""
         along = self._data.xipos[body] - self._data.xpos[body]
         return _axes(along / np.linalg.norm(along))
 
@@ -121,7 +120,7 @@ def _geom(compiled: Any, geom: int) -> Part:
 
 
 def _inertia(compiled: Any, body: int) -> Part:
-    """The box that has a body's mass and inertia."""
+    """Return the box with the body's mass and inertia."""
     a, b, c = (float(v) for v in compiled.body_inertia[body])
     mass = float(compiled.body_mass[body])
     edges = [np.sqrt(max(1.5 * v / mass, 0.0)) for v in (b + c - a, a + c - b, a + b - c)]
@@ -134,7 +133,7 @@ def _rod(compiled: Any, body: int) -> Part:
 
 
 def _axes(along: Array) -> Array:
-    """A rotation (3, 3) whose third column is a unit vector."""
+    """Return a rotation matrix (3, 3) whose third column is the unit vector `along`."""
     aside = np.eye(3)[int(np.argmin(np.abs(along)))]
     first = np.cross(aside, along)
     first /= np.linalg.norm(first)

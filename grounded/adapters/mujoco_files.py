@@ -1,4 +1,4 @@
-"""An MJCF or URDF file: loaded; and the files it is made of: what it includes, meshes, textures."""
+"""Load an MJCF or URDF file, and list the files it uses: includes, meshes, textures."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from grounded.errors import GroundedError
 
 
 def load(xml: str | Path) -> Any:
-    """The compiled file (an MjModel).
+    """Return the compiled file (an MjModel).
 
     Raises:
-        GroundedError: if the file is missing or MuJoCo refuses it, with MuJoCo's reason.
+        GroundedError: if the file is missing or MuJoCo can't load it, with MuJoCo's reason.
     """
     mj = library("mujoco")
     if str(xml).lstrip().startswith("<"):
@@ -34,11 +34,13 @@ def load(xml: str | Path) -> Any:
 
 
 def files_of(path: Path) -> list[Path]:
-    """The file and all that it names, as far as MuJoCo tells.
+    """Return the file and all files it uses, as far as MuJoCo lists them.
+
+    MuJoCo does not list the meshes of a URDF, nor, before version 3.3, those of an MJCF file: they
+    are looked up where MuJoCo looks for them.
 
     Args:
-        path: of an MJCF or URDF file that MuJoCo can load. Of a URDF MuJoCo lists no meshes: they
-            are sought where it seeks them. Versions before 3.3 list none of an MJCF either.
+        path: an MJCF or URDF file that MuJoCo can load.
     """
     mj = library("mujoco")
     listed = getattr(mj, "mju_getXMLDependencies", lambda name: [name])(str(path))

@@ -1,9 +1,9 @@
-"""What the joints and actuators of a MuJoCo model are called in a Model, and where they stand.
+"""Names of a MuJoCo model's joints and actuators in a Model, and its parameters by name.
 
-Parameters of a MuJoCo model by name: "pole.mass", "elbow.frictionloss", "motor.gear".
+Parameters are named "element.field": "pole.mass", "elbow.frictionloss", "motor.gear".
 
-A parameter is one number of the file; it stands in one or several places of an MjModel, and setting
-it gives the model that MuJoCo would compile from a file with that number.
+A parameter is one number in the file. It occurs in one or several places of an MjModel; setting all
+of them gives the model that MuJoCo would compile from a file with that number.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FREE, BALL, SLIDE, HINGE = 0, 1, 2, 3  # mjtJoint
 
 
 class Controls:
-    """The inputs: names, units, and columns of ctrl (nu) or of qfrc_applied (nv)."""
+    """The inputs: names, units, and indices in ctrl (nu) or in qfrc_applied (nv)."""
 
     def __init__(
         self, names: Sequence[str], units: Sequence[str], columns: Sequence[int], torques: bool
@@ -31,7 +31,7 @@ class Controls:
 
 
 def states_of(compiled: Any) -> dict[str, str]:
-    """Units by state: positions in the order of the degrees of freedom, velocities, activations."""
+    """Return units by state: positions in the order of qvel, then velocities, activations."""
     positions: dict[str, str] = {}
     velocities: dict[str, str] = {}
     for j in range(compiled.njnt):
@@ -56,7 +56,7 @@ def states_of(compiled: Any) -> dict[str, str]:
 
 
 def controls_of(compiled: Any, inputs: str | Sequence[str], states: Mapping[str, str]) -> Controls:
-    """The inputs that were asked for."""
+    """Return the inputs selected by `inputs`, see `mujoco.model`."""
     single = [j for j in range(compiled.njnt) if compiled.jnt_type[j] >= SLIDE]
     by_name = {joint_name(compiled, j): j for j in single}
     if inputs == "auto":
@@ -100,7 +100,7 @@ def controls_of(compiled: Any, inputs: str | Sequence[str], states: Mapping[str,
 
 
 def joint_name(compiled: Any, j: int) -> str:
-    """The joint's name; without one, its body's name for the only joint of a body."""
+    """Return the joint's name; for an unnamed only joint of a body, the body's name."""
     name, body = compiled.joint(j).name, int(compiled.jnt_bodyid[j])
     if not name and compiled.body_jntnum[body] == 1:
         name = compiled.body(body).name
@@ -112,7 +112,7 @@ def _actuator_name(compiled: Any, i: int) -> str:
 
 
 def _effort(compiled: Any, i: int) -> str:
-    """The unit of an actuator's control: N m or N where it is the force on one hinge or slide."""
+    """Return the unit of an actuator's control: N m or N if it is the force on a joint, else 1."""
     import mujoco  # type: ignore[import-untyped]
 
     single = compiled.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
@@ -131,7 +131,7 @@ def _actuators(compiled: Any) -> int:
 
 
 def identifier(name: str) -> str:
-    """A name of the file as a Python name: what can't stand in one becomes an underscore."""
+    """Convert a name in the file to a Python name; invalid characters become underscores."""
     plain = re.sub(r"\W", "_", name)
     return f"_{plain}" if plain[:1].isdigit() else plain
 
@@ -141,9 +141,9 @@ Place = tuple[str, Any, Any]
 
 @dataclass(frozen=True)
 class Field:
-    """What a field of an element means: kind of element, unit, and places in MjModel.
+    """A field of an element: kind of element, unit, and places in MjModel.
 
-    places: (array, column or None for the whole entry, factor), the first one gives the value.
+    places: (array, column or None for the whole entry, factor); the first one has the value.
     """
 
     element: str  # body, joint, actuator, geom
@@ -169,7 +169,7 @@ SLIDE_UNITS = {"N m s/rad": "N s/m", "N m": "N", "kg m^2": "kg", "N m/rad": "N/m
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """One parameter: its name in the Model, its unit, the file's value, where it is written."""
+    """A parameter: its name in the Model, its unit, its value in the file, and its places."""
 
     name: str
     unit: str
@@ -177,16 +177,16 @@ class Setting:
     places: tuple[Place, ...]  # array of MjModel, index, factor (of the shape of the entry)
 
     def write(self, compiled: Any, value: float) -> None:
-        """Sets the parameter in an MjModel; `mj_setConst` must follow."""
+        """Set the parameter in an MjModel; call `mj_setConst` afterwards."""
         for array, index, factor in self.places:
             getattr(compiled, array)[index] = factor * value
 
 
 def setting_of(mj: Any, compiled: Any, spec: str) -> Setting:
-    """The parameter that "element.field" names.
+    """Return the parameter named "element.field".
 
     Raises:
-        GroundedError: for a name of another shape, an unknown field, or an unknown element.
+        GroundedError: for a malformed name, an unknown field, or an unknown element.
     """
     element, dot, name = spec.rpartition(".")
     if not dot or name not in FIELDS:
@@ -211,14 +211,14 @@ def setting_of(mj: Any, compiled: Any, spec: str) -> Setting:
     nominal = float(np.ravel(getattr(compiled, array)[index])[0]) / factor
     if name == "mass":
         if nominal <= 0:
-            raise GroundedError(f"'{spec}': the body '{element}' has no mass of its own")
+            raise GroundedError(f"'{spec}': the body '{element}' has no mass")
         inertia = np.array(compiled.body_inertia[at]) / nominal
         places = (*places, ("body_inertia", at, inertia))
     return Setting(identifier(f"{element}_{name}"), unit, nominal, places)
 
 
 def _places(compiled: Any, field: Field, at: int) -> tuple[Place, ...]:
-    """Where MjModel keeps a field of one element; a joint's numbers stand at each dof."""
+    """Return where MjModel stores a field of an element; a joint has an entry for each dof."""
     index: Any = at
     if field.places[0][0].startswith("dof_"):
         first = int(compiled.jnt_dofadr[at])

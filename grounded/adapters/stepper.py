@@ -1,7 +1,7 @@
-"""A step on whole arrays, called with names: what the adapters of other software share.
+"""Base class of the adapters: a step on arrays, called with named values.
 
-Model calls `step(s, a, p, dt)` with one sample (numbers) or N samples (arrays (N,)) a name. A
-library steps arrays: states (N, n), inputs (N, m). `Stepper` translates between the two, for the
+Model calls `step(s, a, p, dt)` with one sample (numbers) or N samples (arrays (N,)) per name.
+Libraries step arrays: states (N, n), inputs (N, m). `Stepper` converts between the two, for the
 step and for its derivatives.
 """
 
@@ -19,25 +19,25 @@ from grounded.model import Model
 
 
 class Stepper:
-    """Steps and derivatives of software that computes on arrays; subclasses do the computing."""
+    """Steps and derivatives computed on arrays; subclasses implement the computation."""
 
     def __init__(self, states: Iterable[str], inputs: Iterable[str], params: Iterable[str]) -> None:
         self.states, self.inputs, self.params = tuple(states), tuple(inputs), tuple(params)
 
     @property
     def body(self) -> Body | None:
-        """What it looks like, for pictures; None where it doesn't know."""
+        """The body to draw in pictures; None if there is none."""
         return None
 
     @property
     def limits(self) -> Mapping[str, tuple[float, float]]:
-        """What its file says that inputs may get, (low, high) by name; of those that it limits."""
+        """Limits (low, high) by name, of those inputs that the model's file limits."""
         return {}
 
     def __call__(
         self, s: Mapping[str, Any], a: Mapping[str, Any], p: Mapping[str, Any], dt: float
     ) -> dict[str, Any]:
-        """The next state by name: numbers for one sample, arrays (N,) for N samples."""
+        """Return the next state by name: numbers for one sample, arrays (N,) for N samples."""
         x, u, single = self._arrays(s, a)
         moved = self.advance(x, u, self._values(p), float(dt))
         columns = moved[0].tolist() if single else moved.T
@@ -46,21 +46,21 @@ class Stepper:
     def jacobian(
         self, s: Mapping[str, Any], a: Mapping[str, Any], p: Mapping[str, Any], dt: float
     ) -> tuple[Array, Array]:
-        """f_x (N, n, n) and f_u (N, n, m); without the first axis for one sample."""
+        """Return f_x (N, n, n) and f_u (N, n, m), without the first axis for one sample."""
         x, u, single = self._arrays(s, a)
         f_x, f_u = self.derivatives(x, u, self._values(p), float(dt))
         return (f_x[0], f_u[0]) if single else (f_x, f_u)
 
     def advance(self, x: Array, u: Array, p: Array, dt: float) -> Array:
-        """The next states (N, n) of states x (N, n), inputs u (N, m), parameters p (k,)."""
+        """Return the next states (N, n) for states x (N, n), inputs u (N, m), parameters p (k,)."""
         raise NotImplementedError
 
     def derivatives(self, x: Array, u: Array, p: Array, dt: float) -> tuple[Array, Array]:
-        """f_x (N, n, n) and f_u (N, n, m) at N samples."""
+        """Return f_x (N, n, n) and f_u (N, n, m) at N samples."""
         raise NotImplementedError
 
     def _arrays(self, s: Mapping[str, Any], a: Mapping[str, Any]) -> tuple[Array, Array, bool]:
-        """States (N, n), inputs (N, m), and whether they were plain numbers."""
+        """Return states (N, n), inputs (N, m), and whether they were plain numbers."""
         columns = [s[name] for name in self.states] + [a[name] for name in self.inputs]
         both = np.stack(np.broadcast_arrays(*(np.asarray(c, dtype=float) for c in columns)), -1)
         single = both.ndim == 1
@@ -73,7 +73,7 @@ class Stepper:
 
 
 def model_of(stepper: Stepper, **fields: Any) -> Model:
-    """The Model of a stepper, with its derivatives.
+    """Return the Model of a stepper, with its derivatives.
 
     Args:
         stepper: computes steps and derivatives.
@@ -83,7 +83,7 @@ def model_of(stepper: Stepper, **fields: Any) -> Model:
 
 
 def library(name: str) -> Any:
-    """An optional library, imported now.
+    """Import an optional library.
 
     Raises:
         GroundedError: if it is not installed, with the command that installs it.

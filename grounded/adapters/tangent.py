@@ -1,14 +1,14 @@
-"""Positions of joints as plain coordinates: rotations as rotation vectors about a reference.
+"""Joint positions as plain coordinates: rotations as rotation vectors about a reference.
 
-A ball or free joint keeps its orientation as a unit quaternion, which has four numbers for three
-degrees of freedom. A Model needs plain coordinates, so the orientation becomes the rotation vector
-r (axis times angle [rad]) from a reference orientation,
+A ball or free joint stores its orientation as a unit quaternion, with four numbers for three
+degrees of freedom. A Model needs plain coordinates, so the orientation is expressed by the rotation
+vector r (axis times angle [rad]) from a reference orientation,
 
     q = q_ref exp(r),        exp(r) = [cos |r|/2, sin |r|/2 r/|r|],
 
-the tangent that `mj_integratePos` and `mj_differentiatePos` use. Of the vectors r + 2 pi k r/|r|
-that mean the same orientation the one nearest to the state before the step is taken, so that a
-step is continuous and a full turn counts on.
+as in `mj_integratePos` and `mj_differentiatePos`. All vectors r + 2 pi k r/|r| describe the same
+orientation; the one nearest to the state before the step is used, so that a step is continuous and
+full turns are counted.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """Which numbers of qpos (nq) are plain, which are quaternions, and their columns (nv)."""
+    """Mapping between qpos (nq), with quaternions, and plain coordinates (nv)."""
 
-    plain: Indices  # places in qpos
+    plain: Indices  # indices in qpos that are not part of a quaternion
     plain_columns: Indices  # their coordinates
-    quaternions: tuple[int, ...]  # first place in qpos of each quaternion
+    quaternions: tuple[int, ...]  # first index in qpos of each quaternion
     rotations: tuple[int, ...]  # first coordinate of each rotation vector
-    reference: Array  # (nq,) the pose that rotation vectors are about
+    reference: Array  # (nq,) the pose that rotation vectors refer to
 
     def to_qpos(self, r: Array) -> Array:
-        """Coordinates (N, nv) -> positions (N, nq)."""
+        """Convert coordinates (N, nv) to positions (N, nq)."""
         qpos = np.tile(self.reference, (len(r), 1))
         qpos[:, self.plain] = r[:, self.plain_columns]
         for place, column in zip(self.quaternions, self.rotations, strict=True):
@@ -45,7 +45,7 @@ class Coordinates:
         return qpos
 
     def from_qpos(self, qpos: Array, near: Array) -> Array:
-        """Positions (N, nq) -> coordinates (N, nv), rotation vectors nearest to `near` (N, nv)."""
+        """Convert positions (N, nq) to coordinates (N, nv) nearest to `near` (N, nv)."""
         r = np.zeros((len(qpos), len(self.plain) + 3 * len(self.rotations)))
         r[:, self.plain_columns] = qpos[:, self.plain]
         for place, column in zip(self.quaternions, self.rotations, strict=True):
@@ -56,14 +56,14 @@ class Coordinates:
         return r
 
     def _about(self, place: int) -> Any:
-        """The reference orientation of the quaternion at a place in qpos, a scipy Rotation."""
+        """Return the reference orientation of the quaternion at an index in qpos, as a Rotation."""
         from scipy.spatial.transform import Rotation
 
         return Rotation.from_quat(np.roll(self.reference[place : place + 4], -1))
 
 
 def nearest_turn(r: Array, near: Array) -> Array:
-    """The vector of the same orientation as r (N, 3) that lies nearest to `near` (N, 3)."""
+    """Return the vector of the same orientation as r (N, 3) that is nearest to `near` (N, 3)."""
     angle = np.linalg.norm(r, axis=-1, keepdims=True)
     axis = r / np.where(angle > 1e-12, angle, 1.0)
     along = np.sum(axis * near, axis=-1, keepdims=True)

@@ -4,12 +4,12 @@
     noise_of        process and measurement noise by maximum likelihood
     Tracker         predict and update while the robot runs (footnotes 15 and 18)
 
-Everything works for any model (also a black-box simulator), any measurement function, lost samples,
-sensors and controllers of different rates, transport delays of any fraction of a step.
+All of it works for any model (including black-box simulators), any measurement function, lost
+samples, sensors and controllers of different rates, and transport delays of any fraction of a step.
 
-Read `trials` first (the front door), then `measurement` and `record` (what goes in), `extended`
-(the Kalman filter about a track) with `steps` (the model in it), `likelihood` (the noise). The
-linear filter below is `grounded.filter`. `tracker` stands by itself.
+Read `trials` first (the public functions), then `measurement` and `record` (their input),
+`extended` (the Kalman filter along a track) with `steps` (the model in it), `likelihood` (the
+noise). The linear filter is in `grounded.filter`. `tracker` is independent of the rest.
 """
 
 from __future__ import annotations

@@ -1,18 +1,19 @@
-"""The extended Kalman filter along all trials at once, the smoother, and their likelihood.
+"""The extended Kalman filter over all trials at once, the smoother, and their likelihood.
 
     x^-_{t+1} = f(x_t, u_t),      A = f_x(x_t, u_t);      e_t = y_t - h(x^-_t),      H = h_x(x^-_t)
 
-The equations between are those of `grounded.filter.kalman`. How the whitened innovations react to a
-change of the model by a small theta is the same recursion, driven by f_theta, so that a fit is a
-least-squares problem in them (`sensitivity`).
+The linear equations are those of `grounded.filter.kalman`. The derivative of the whitened
+innovations by parameters theta of the model follows the same recursion, driven by f_theta, so a fit
+is a least-squares problem in the innovations (`sensitivity`).
 
-A pass is either step by step (`recursion`), linearising at each state that it reaches, or its fixed
-point: the model is evaluated along a whole track in one call, the linear filter runs about that
-track, and the filtered states are the next track. Sweep s is exact for the first s steps, and in
-practice everywhere after two or three, because a track of a neighbouring fit is at hand.
+A pass either runs step by step (`recursion`), linearising at each state that it reaches, or it
+iterates to the same result: the model is evaluated along a whole track in one call, the linear
+filter runs about that track, and the filtered states are the next track. Sweep s is exact for the
+first s steps. In practice two or three sweeps suffice if they start from the track of a similar
+fit.
 
-The linear filter begins a step before the trial, one that changes nothing: so the first sample is
-used like any other. Arrays are time first, (T + 1, B, ...): see `grounded.estimate.record`.
+The linear filter begins with an identity step before the trial, so that the first sample is used
+like any other. Arrays have time first, (T + 1, B, ...): see `grounded.estimate.record`.
 Source: Särkkä, Bayesian Filtering and Smoothing (2013), ch. 5; Ljung, System Identification, ch. 7.
 """
 
@@ -39,15 +40,15 @@ from grounded.filter.kalman import (
 )
 from grounded.frozen import Array
 
-SWEEPS = 20
-CLOSE = 1e-2  # standard deviations: a sweep that moves the track less is the last,
-STILL = 1e-3  # [nats] or the likelihood; at a kink a track may flip for ever,
-ENOUGH = 0.05  # [nats] and then this is enough after SWEEPS
+SWEEPS = 20  # most sweeps
+CLOSE = 1e-2  # change of the track, in standard deviations, at which sweeps end,
+STILL = 1e-3  # [nats] or change of the likelihood; at a kink a track may alternate for ever,
+ENOUGH = 0.05  # [nats] so this change is accepted after SWEEPS
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Where a pass went, and where the next one may begin."""
+    """The estimated states of a pass, from which another pass may start."""
 
     x: Array  # (T + 1, B, n) filtered
     std: Array  # (T + 1, B, n) of x
@@ -56,23 +57,23 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class Filtered(Track):
-    """Arrays time first; `loglik` is minus infinity when the pass did not get through."""
+    """The result of a pass, arrays with time first; `loglik` is minus infinity if it diverged."""
 
     e: Array  # (T + 1, B, ny) innovations, zero where not seen
     eps: Array  # (T + 1, B, ny) the same whitened
     more: Array  # (T, B, n) variance added to the process noise, see `steps`
-    gains: Gains  # of T + 1 steps, the first of which changes nothing; with covariances
+    gains: Gains  # of T + 1 steps, the first an identity step; with covariances
     loglik: float
     status: str = "filtered"
 
     @property
     def A(self) -> Array:
-        """Slope of every step (T, B, n, n)."""
+        """Jacobian of every step (T, B, n, n)."""
         return self.gains.system.A[1:]
 
     @cached_property
     def columns(self) -> tuple[Array, Array]:
-        """What drives the linear filter about this pass, see `_columns`."""
+        """Input of the linear filter about this pass, see `_columns`."""
         apart = np.zeros_like(self.x)
         apart[1:] = (self.A @ (self.x_prior - self.x)[:-1, ..., None])[..., 0]
         return _columns(apart, self.e)
@@ -85,14 +86,14 @@ def filter_batch(
     steps: ModelSteps,
     about: Track | None = None,
 ) -> Filtered:
-    """One pass over a batch. Never raises for numbers that run away: see `Filtered.status`.
+    """Filter a batch. Divergence does not raise an exception: see `Filtered.status`.
 
     Args:
         batch: the records.
         measurement: ny channels.
-        noise: of process and measurements.
+        noise: process and measurement noise.
         steps: the model.
-        about: a pass with nearly the same model and noise, where sweeps begin.
+        about: a pass with nearly the same model and noise, from which sweeps start.
     """
     (T, B), n = batch.dt.shape, batch.start.shape[1]
     if T > 0 and kernels.available(measurement.ny, n):
@@ -121,9 +122,9 @@ def _sweeps(
     std: Array,
     xbar: Array,
 ) -> Filtered | None:
-    """The fixed point, from a track and its std (T, B, n) and predictions (T + 1, B, n).
+    """Iterate to the fixed point from a track, its std (T, B, n) and predictions (T + 1, B, n).
 
-    None if it is not found.
+    Returns None if it is not found.
     """
     last = -np.inf
     with np.errstate(all="ignore"):
@@ -158,9 +159,10 @@ def _about(
     track: Array,
     xbar: Array,
 ) -> Filtered | None:
-    """The linear filter about a track: f + A (x - track), h + H (x - xbar); None: not finite.
+    """Run the linear filter about a track: f + A (x - track), h + H (x - xbar).
 
-    `direct`, the last of `seen`: channel i measures state i.
+    `direct`, the last item of `seen`, says whether channel i measures state i. Returns None if the
+    result is not finite.
     """
     (f, A, more), (H, e0, direct) = step, seen
     d = np.empty_like(xbar)
@@ -190,7 +192,7 @@ def _about(
 def _system(
     batch: RecordBatch, noise: NoiseStd, A: Array, more: Array, H: Array | None
 ) -> LinearSystem:
-    """Of A (T + 1, B, n, n) with the step that changes nothing before the others."""
+    """Return the linear system with Jacobians A (T + 1, B, n, n), the first an identity step."""
     R, seen = noise.measurement**2, np.zeros((len(A) + 1, *batch.seen.shape[1:]))
     seen[1:] = batch.seen
     Q = np.zeros(A.shape[:-1])
@@ -201,12 +203,12 @@ def _system(
 
 
 def _durations(batch: RecordBatch) -> Array:
-    """Of every step (T, B) [s], zero where it is not valid."""
+    """Return the duration of every step (T, B) [s], zero for steps that are not valid."""
     return np.where(batch.valid, batch.dt, 0.0)
 
 
 def _columns(d: Array, r: Array) -> tuple[Array, Array]:
-    """One column (T + 1, B, n), (T + 1, B, ny) as the linear filter takes it."""
+    """Pad one column, d (T + 1, B, n) and r (T + 1, B, ny), for the linear filter."""
     wide = whole(1, r.shape[-1])
     columns_d, columns_r = np.zeros((*d.shape, wide)), np.zeros((len(r) + 1, *r.shape[1:], wide))
     columns_d[..., 0], columns_r[1:, ..., 0] = d, r
@@ -214,7 +216,7 @@ def _columns(d: Array, r: Array) -> tuple[Array, Array]:
 
 
 def _seen(batch: RecordBatch, measurement: Measurement, x: Array) -> tuple[Array, Array]:
-    """H (T + 1, B, ny, n) and y - h(x) (T + 1, B, ny) along a track, zero where not seen."""
+    """Return H (T + 1, B, ny, n) and y - h(x) (T + 1, B, ny) on a track, zero where not seen."""
     flat = x.reshape(-1, x.shape[-1])
     e = measurement.innovation(batch.y, measurement.function(flat).reshape(batch.y.shape))
     H = measurement.jacobian(flat).reshape(*batch.y.shape, x.shape[-1])
@@ -222,16 +224,19 @@ def _seen(batch: RecordBatch, measurement: Measurement, x: Array) -> tuple[Array
 
 
 def likelihood(g: Gains, eps: Array, batch: RecordBatch) -> float:
-    """Log-likelihood of whitened innovations (T + 1, B, ny); minus infinity for no number."""
+    """Return the log-likelihood of whitened innovations; minus infinity if it is not finite."""
     total = float(np.sum(eps**2) + g.logdet.sum()) + batch.count * np.log(2 * np.pi)
     return -0.5 * total if np.isfinite(total) else -np.inf
 
 
 def relinked(about: Filtered, batch: RecordBatch, noise: NoiseStd) -> tuple[Gains, Array, float]:
-    """Another noise about the same linearisation: gains, whitened innovations, log-likelihood.
+    """Filter with another noise and the same linearisation.
+
+    Returns:
+        The gains, the whitened innovations (T + 1, B, ny) and the log-likelihood.
 
     Raises:
-        numpy.linalg.LinAlgError: when a covariance is not finite.
+        numpy.linalg.LinAlgError: if a covariance is not finite.
     """
     system = about.gains.system
     g = gains(_system(batch, noise, system.A, about.more, system.H))
@@ -242,7 +247,7 @@ def relinked(about: Filtered, batch: RecordBatch, noise: NoiseStd) -> tuple[Gain
 def recursion(
     batch: RecordBatch, measurement: Measurement, noise: NoiseStd, advance: Advance
 ) -> Filtered:
-    """One pass over a batch, linearising at each state that it reaches."""
+    """Filter a batch step by step, linearising at each state that is reached."""
     T, B, n, ny = len(batch.dt), len(batch.lengths), batch.start.shape[1], measurement.ny
     A, more, H = np.zeros((T + 1, B, n, n)), np.zeros((T, B, n)), np.zeros((T + 1, B, ny, n))
     A[0] = np.eye(n)
@@ -270,18 +275,18 @@ def recursion(
                     raise np.linalg.LinAlgError
                 P[t + 1] = predicted(after, A[t + 1], system.Q[t + 1] + more[t])
         except np.linalg.LinAlgError:
-            status = f"the filter left the finite numbers at step {t + 1}"
+            status = f"the filter diverged to non-finite numbers at step {t + 1}"
         loglik = likelihood(g, eps, batch) if status == "filtered" else -np.inf
     system.Q[1:] += more
     return Filtered(x, std, x_prior, e, eps, more, g, loglik, status)
 
 
 def sensitivity(filtered: Filtered, f_theta: Array) -> Array:
-    """How the whitened innovations react to small changes theta of the model.
+    """Return the derivative of the whitened innovations by parameters theta of the model.
 
     Args:
         filtered: the pass about which to linearise.
-        f_theta: change of the next state, (T, B, n, k).
+        f_theta: derivative of the next state, (T, B, n, k).
 
     Returns:
         d eps / d theta, (T + 1, B, ny, k).
@@ -296,19 +301,20 @@ def sensitivity(filtered: Filtered, f_theta: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """Arrays time first, as in the batch."""
+    """Smoothed states and covariances, with time first."""
 
     x: Array  # (T + 1, B, n)
     P: Array  # (T + 1, B, n, n)
 
 
 def smooth(filtered: Filtered) -> Smoothed:
-    """One pass backwards over a filter pass that got through.
+    """Smooth a finite filter pass by a backward pass.
 
-    What disturbs a step acts all along it, while the filter adds it at the end. A state that no
-    channel measures is a saw then, seen at its teeth: where the model is off for long, each sample
-    is off by half a disturbance, which grows as a time constant comes near the step. Halfway up
-    the jump, x_t - w_t / 2, a rate fits what integrates it: the trapezoidal rule.
+    A disturbance acts throughout a step, but the filter adds it at the end of the step. For a state
+    that no channel measures this gives a sawtooth: if the model is wrong for some time, each sample
+    is off by half a disturbance, which matters when a time constant is close to the step. So the
+    middle of the jump is returned for such states, x_t - w_t / 2, with which a rate is consistent
+    with its integral (trapezoidal rule).
     """
     g, P = filtered.gains, filtered.gains.P
     back = smoother(g, filtered.eps, covariances=True)
@@ -326,7 +332,7 @@ def smooth(filtered: Filtered) -> Smoothed:
 
 
 def variance_slopes(g: Gains, eps: Array, batch: RecordBatch, noise: NoiseStd) -> Array:
-    """Slope of the log-likelihood by the log variances of process and measurements, (n + ny,)."""
+    """Return the gradient of the log-likelihood by the log variances, (n + ny,)."""
     back = smoother(g, eps)
     state = 0.5 * (back.r**2 - back.N)
     by_q = np.einsum("tbi,tb->i", state[1:], _durations(batch)) / noise.dt

@@ -1,12 +1,12 @@
-"""Process and measurement noise by maximum likelihood of the innovations.
+"""Estimate process and measurement noise by maximum likelihood of the innovations.
 
-The likelihood is that of `grounded.estimate.extended`; its slopes by the variances come from one
-pass of the smoother; L-BFGS climbs in the logarithms of the variances, in which they cannot turn
-negative. The linearisation is held fixed while the noise moves and renewed between climbs: a track
-filtered with the wrong noise is not where to linearise.
+The likelihood is that of `grounded.estimate.extended`; its gradient by the variances comes from one
+pass of the smoother. L-BFGS optimises the logarithms of the variances, so that they stay positive.
+The linearisation is fixed while the noise is optimised and renewed between rounds, since a track
+that was filtered with the wrong noise is a poor linearisation point.
 
-A variance that the data do not see (a sensor without noise, a state that strays in no trial) would
-sink for ever; it stops at a floor far below what is visible.
+A variance without effect on the data (a sensor without noise, a state that is never disturbed)
+would decrease for ever; it stops at a floor far below the visible scatter.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from grounded.estimate.record import Record, RecordBatch
 from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
 
-FLOOR = 1e-4  # of the visible scatter: below it a std is zero
-ROUNDS = 4  # of linearising anew
+FLOOR = 1e-4  # smallest std, as a fraction of the visible scatter
+ROUNDS = 4  # most linearisations
 ENOUGH = 0.2  # [nats] a round that gains less is the last
-FIRST_STEPS = 4  # of expectation-maximisation
-ROWS = 8_000  # more samples than this teach the noise little
+FIRST_STEPS = 4  # steps of expectation-maximisation
+ROWS = 8_000  # samples; more add little information about the noise
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseEstimate:
-    """The noise, its log-likelihood, and how the search ended."""
+    """The estimated noise, its log-likelihood, and how the search ended."""
 
     noise: NoiseStd
     loglik: float
@@ -50,17 +50,17 @@ def maximum_likelihood(
     wide: bool = False,
     held: bool = False,
 ) -> NoiseEstimate:
-    """Climbs from `start` to the most likely noise.
+    """Search for the most likely noise from `start`.
 
     Args:
         system: the dynamics (n states).
         p: its parameters (k,).
         batch: the trials.
         measurement: ny channels.
-        start: where to begin, see `first_noise`.
-        rounds: how often to linearise anew at most.
+        start: initial noise, see `first_noise`.
+        rounds: most linearisations.
         wide: see `grounded.estimate.steps`.
-        held: the measurement noise of `start` is known.
+        held: whether the measurement noise of `start` is known and kept.
     """
     steps = ModelSteps(system, p, batch, wide)
     noise, best = _expectation(batch, measurement, start, steps, FIRST_STEPS, held)
@@ -89,9 +89,9 @@ def _expectation(
     rounds: int,
     held: bool,
 ) -> tuple[NoiseStd, Filtered]:
-    """Expectation-maximisation: each variance becomes what the smoother expects of it.
+    """Run expectation-maximisation: each variance becomes its expectation by the smoother.
 
-    Slow near the end, but sure-footed far from it, where it also mends the track.
+    It is slow near the optimum, but robust far from it, where it also improves the track.
     """
     best = filter_batch(batch, measurement, noise, steps)
     steps_seen = max(int(batch.valid.sum()), 1)
@@ -117,11 +117,11 @@ def _expectation(
 def first_noise(
     batch: RecordBatch, measurement: Measurement, sizes: Array | float = 1.0
 ) -> NoiseStd:
-    """A rough noise, from how smooth the measurements are: robust, and only a place to begin.
+    """Return a rough estimate of the noise from the smoothness of the measurements, as a start.
 
-    Second differences of a smooth signal are measurement noise (times sqrt 6), fourth differences
-    (times sqrt 70) also of one that turns; a tenth of the first differences is what the model may
-    miss in a step. `sizes` (n,) are those of the states that nothing measures.
+    The second differences of a smooth signal are measurement noise (times sqrt 6); the fourth
+    (times sqrt 70) also those of a signal that curves. Process noise is taken as a tenth of the
+    first differences. `sizes` (n,) are the typical magnitudes of states that nothing measures.
     """
     n, dt = batch.start.shape[1], round(float(np.median(batch.dt[batch.valid])), 9)
     r, q = np.empty(measurement.ny), 0.05 * np.sqrt(dt) * np.broadcast_to(sizes, n)
@@ -138,7 +138,7 @@ def first_noise(
 
 
 def enough(records: Sequence[Record], rng: np.random.Generator | None = None) -> list[Record]:
-    """As many records as the noise can learn from: all, or a draw of about `ROWS` samples."""
+    """Return all records, or a random selection with about `ROWS` samples."""
     total = sum(r.steps for r in records)
     if total <= ROWS:
         return list(records)
@@ -154,7 +154,7 @@ def enough(records: Sequence[Record], rng: np.random.Generator | None = None) ->
 def _climb(
     batch: RecordBatch, noise: NoiseStd, about: Filtered, start: NoiseStd, held: bool
 ) -> NoiseStd:
-    """The best noise for a fixed linearisation."""
+    """Return the most likely noise for a fixed linearisation."""
     from scipy.optimize import minimize
 
     n, dt = len(noise.process), noise.dt
@@ -185,7 +185,7 @@ def _climb(
 
 
 def _spread(values: Array) -> float:
-    """A robust standard deviation; the plain one where more than half of the values are equal."""
+    """Return a robust standard deviation; the plain one if more than half of the values agree."""
     finite = values[np.isfinite(values)]
     if len(finite) == 0:
         return 0.0

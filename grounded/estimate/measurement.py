@@ -1,10 +1,10 @@
-"""Measurement: what the sensors see of a state, and how far noise makes both stray.
+"""Measurement: the measurement function of the sensors; NoiseStd: process and measurement noise.
 
     x_{t+1} = f(x_t, u_t) + w_t,  w ~ N(0, diag(process^2)),     y = h(x) + v,  v ~ N(0, diag(r^2))
 
-The default measures states as they are. A camera that sees two markers, a gyroscope, an encoder
-are a function h of states (N, n) -> (N, ny), with its Jacobian or without (then it is differenced).
-The noise is the data's to say: see `grounded.estimate.likelihood`.
+By default the states themselves are measured. A camera that sees two markers, a gyroscope or an
+encoder is a function h of states (N, n) -> (N, ny), with a Jacobian or without (then finite
+differences are used). `grounded.estimate.likelihood` estimates the noise.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ DIFFERENCE = 1e-6  # step of the central difference, relative to max(1, |x|)
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """ny channels y = h(x).
+    """A measurement function y = h(x) with ny channels.
 
     Args:
-        names: of the channels.
+        names: names of the channels.
         function: h, states (N, n) -> (N, ny).
         jacobian: h_x, (N, n) -> (N, ny, n).
-        angles: channels whose innovations wrap, (ny,).
-        states: index of the state that a channel measures directly, -1 where none, (ny,).
+        angles: whether the innovation of a channel wraps to [-pi, pi], (ny,).
+        states: index of the state that a channel measures directly, -1 for none, (ny,).
     """
 
     names: tuple[str, ...]
@@ -45,7 +45,7 @@ class Measurement:
         return len(self.names)
 
     def innovation(self, y: Array, predicted: Array) -> Array:
-        """The innovation y - predicted, (..., ny); angles wrapped to [-pi, pi]."""
+        """Return the innovation y - predicted, (..., ny), with angles wrapped to [-pi, pi]."""
         e = y - predicted
         if any(self.angles):
             mask = np.array(self.angles)
@@ -54,7 +54,11 @@ class Measurement:
 
 
 def of_states(model: Model, names: Sequence[str] | None = None) -> Measurement:
-    """States measured as they are; all of them unless `names` says which.
+    """Return the measurement of the states themselves.
+
+    Args:
+        model: n states.
+        names: the measured states; None for all.
 
     Raises:
         GroundedError: for a name that is not a state.
@@ -80,13 +84,13 @@ def of_function(
     jacobian: Callable[[Array], Array] | None = None,
     angles: Sequence[str] = (),
 ) -> Measurement:
-    """Any measurement function h.
+    """Return the measurement with any function h.
 
     Args:
-        names: of the ny channels.
+        names: names of the ny channels.
         function: h, states (N, n) -> (N, ny).
-        jacobian: h_x (N, n) -> (N, ny, n); None: central differences.
-        angles: channels whose innovations wrap.
+        jacobian: h_x (N, n) -> (N, ny, n); None for central differences.
+        angles: names of channels whose innovations wrap to [-pi, pi].
 
     Raises:
         GroundedError: for an angle that is not a channel.
@@ -118,15 +122,15 @@ def _differenced(function: Callable[[Array], Array]) -> Callable[[Array], Array]
 
 @dataclass(frozen=True, eq=False)
 class NoiseStd:
-    """Standard deviations, in the units of the states and of the channels.
+    """Standard deviations of the noise, in the units of the states and of the channels.
 
     Args:
-        process: of w over `dt`, (n,); over another step h it is process * sqrt(h / dt).
-        measurement: of v, (ny,).
-        dt: [s].
+        process: process noise w over `dt`, (n,); over a step h it is process * sqrt(h / dt).
+        measurement: measurement noise v, (ny,).
+        dt: step that `process` refers to [s].
 
     Raises:
-        GroundedError: for a value that is negative or not finite, or a measurement without noise.
+        GroundedError: if a value is negative or not finite, or a measurement noise is zero.
     """
 
     process: Array
@@ -140,6 +144,4 @@ class NoiseStd:
                 raise GroundedError(f"{name} noise must be finite standard deviations, got {value}")
             object.__setattr__(self, name, value)
         if (self.measurement == 0).any():
-            raise GroundedError(
-                "a measurement without noise can't be filtered: give it a small std"
-            )
+            raise GroundedError("a measurement noise of zero can't be filtered: give a small std")

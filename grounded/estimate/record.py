@@ -1,16 +1,16 @@
-"""Record: what was measured and what was commanded, each on its own clock; and many side by side.
+"""Record: measurements and commands of a run, each with its own times; and batches of records.
 
     y_i = h(x(t_i)) + v_i,         u_j(t) = command_j(t - latency_j)
 
-A camera at 30 Hz and a controller at 20 Hz are one record: states are estimated at the instants
-`times`, and the input that acts over [t_i, t_i+1] is the mean of the held commands over
-[t_i - latency, t_i+1 - latency]. On a common grid this is the delay queue of
-`grounded.compile.problem`, any fraction of a step included; it is piecewise linear in the latency,
-whose derivative is therefore known. A sample that was lost is NaN.
+A record may combine a camera at 30 Hz and a controller at 20 Hz: states are estimated at the
+instants `times`, and the input over [t_i, t_i+1] is the mean of the held commands over
+[t_i - latency, t_i+1 - latency]. On a common grid this equals the delay queue of
+`grounded.compile.problem`, including fractions of a step. It is piecewise linear in the latency, so
+its derivative is known. A lost sample is NaN.
 
-A filter is a recursion over time; running it over all trials at once is what makes it fast. So
-records become a `RecordBatch`: time first, then trial, padded to the longest. Padding and lost
-samples are rows that are not `seen`, steps that are not `valid`.
+A filter is a recursion over time; it is fast if it runs over all trials at once. So records are
+combined to a `RecordBatch`: time first, then trial, padded to the longest. Padding and lost samples
+are not `seen`; steps in the padding are not `valid`.
 """
 
 from __future__ import annotations
@@ -32,21 +32,22 @@ from grounded.trial import Trial
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """One run. ny measured channels, m inputs, n states.
+    """One run with ny measured channels, m inputs and n states.
 
     Args:
         times: instants at which states are estimated, ascending [s], (T + 1,).
-        measured: y, NaN where nothing was measured, (T + 1, ny).
-        command_times: when each command was sent, ascending [s], (M,).
-        commands: held from its time on, (M, m).
-        past: held before the first command, (m,); None: zero.
-        start: mean of the first state where no channel measures it, (n,), or of the state at each
-            of the times, (T + 1, n), so that a part of the record knows its own; None: zero.
-        start_std: its standard deviation, (n,); None: 1 in the state's unit.
-        id: of the trial it came from.
+        measured: measurements y, NaN where nothing was measured, (T + 1, ny).
+        command_times: times at which commands were sent, ascending [s], (M,).
+        commands: commands, each held from its time on, (M, m).
+        past: command held before the first one, (m,); None for zero.
+        start: prior mean of the first state, used for states that no channel measures, (n,); or of
+            the state at each time, (T + 1, n), so that parts of the record have one too; None for
+            zero.
+        start_std: prior standard deviation of the first state, (n,); None for 1 in each unit.
+        id: id of the trial it came from.
 
     Raises:
-        GroundedError: if the arrays do not fit each other or times do not ascend.
+        GroundedError: if the shapes do not match or times do not ascend.
     """
 
     times: Array
@@ -79,14 +80,14 @@ class Record:
 
     @property
     def steps(self) -> int:
-        """T."""
+        """T, the number of steps."""
         return len(self.times) - 1
 
     def received(self, latency: Array) -> tuple[Array, Array]:
-        """What the actuators receive over each step (T, m), and its derivative by the latency.
+        """Return the inputs received over each step (T, m), and their derivative by the latency.
 
         Args:
-            latency: of each input [s], (m,).
+            latency: latency of each input [s], (m,).
         """
         m = self.commands.shape[1]
         mean, slope = np.empty((self.steps, m)), np.empty((self.steps, m))
@@ -98,10 +99,10 @@ class Record:
         return mean, slope
 
     def _integral(self, t: Array, j: int) -> tuple[Array, Array]:
-        """Integral of command j from the first command to t, and the command at t itself.
+        """Return the integral of command j from the first command to t, and the command at t.
 
-        At the instant of a change the command is the mean of both sides: a whole number of steps
-        of latency then has the two-sided derivative.
+        At the instant of a change, the command is the mean of both sides. This gives the two-sided
+        derivative for latencies of a whole number of steps.
         """
         past = np.asarray(self.past)
         knots, values = self.command_times, np.append(past[j], self.commands[:, j])
@@ -116,7 +117,7 @@ class Record:
 
 
 def _held(commands: Array, past: Array) -> Array:
-    """Commands with lost samples replaced by the one before."""
+    """Replace lost samples of commands by the previous ones."""
     whole = np.vstack([past, commands])
     bad = ~np.isfinite(whole)
     row = np.where(bad, 0, np.arange(len(whole))[:, None])
@@ -125,9 +126,9 @@ def _held(commands: Array, past: Array) -> Array:
 
 
 def record_of(model: Model, trial: Trial) -> Record:
-    """A trial as a record that measures every state of the model the trial has.
+    """Convert a trial to a record that measures the model's states.
 
-    States are matched by name; one the trial does not have is NaN: not measured.
+    States are matched by name; states that the trial lacks are NaN, that is, not measured.
 
     Raises:
         GroundedError: if the trial lacks an input of the model or has none of its states.
@@ -162,9 +163,9 @@ def record_of(model: Model, trial: Trial) -> Record:
 
 
 def cut(record: Record, seconds: float) -> list[Record]:
-    """The record in pieces of about `seconds`, each with an unknown start of its own.
+    """Cut a record into pieces of about `seconds`, each with its own unknown start state.
 
-    Filters run over many pieces at once, so that half an hour costs little more than a minute.
+    Filters run over many pieces at once, so half an hour takes little longer than a minute.
     """
     span = record.times[-1] - record.times[0]
     pieces = max(1, round(span / seconds))
@@ -173,7 +174,7 @@ def cut(record: Record, seconds: float) -> list[Record]:
 
 
 def part(record: Record, first: int, last: int) -> Record:
-    """Rows first .. last of a record; the commands stay whole, so that latency needs no start."""
+    """Return rows first .. last of a record with all commands (latency needs earlier ones)."""
     rows = slice(first, last + 1)
     start = record.start
     if start is not None and start.ndim == 2:
@@ -184,16 +185,16 @@ def part(record: Record, first: int, last: int) -> Record:
 
 
 def records_of(model: Model, trials: Sequence[Trial | Record]) -> list[Record]:
-    """Trials and records, all as records.
+    """Convert trials to records; records are kept.
 
     Raises:
-        GroundedError: if there is none, or one that does not fit the model.
+        GroundedError: if there are none, or one does not match the model.
     """
     trials = [trials] if isinstance(trials, Trial | Record) else list(trials)
     for one in trials:
         if not isinstance(one, Trial | Record):
             raise GroundedError(
-                f"expected a list of Trials, one of them is of type {type(one).__name__}: make it "
+                f"expected a list of Trials, one of them is of type {type(one).__name__}: use "
                 "Trial(states, inputs, dt, state_names, input_names)"
             )
     records = [t if isinstance(t, Record) else record_of(model, t) for t in trials]
@@ -208,7 +209,7 @@ def records_of(model: Model, trials: Sequence[Trial | Record]) -> list[Record]:
     return records
 
 
-START_STD = 1.0  # of a first state that nothing measures, in its unit
+START_STD = 1.0  # prior standard deviation of an unmeasured first state, in its unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,23 +218,23 @@ class RecordBatch:
 
     y: Array  # (T + 1, B, ny), zero where not seen
     seen: NDArray[np.bool_]  # (T + 1, B, ny)
-    u: Array  # (T, B, m) as received
+    u: Array  # (T, B, m) inputs as received
     u_latency: Array  # (T, B, m) derivative of u by the input's latency
     dt: Array  # (T, B) [s]
     valid: NDArray[np.bool_]  # (T, B)
     lengths: NDArray[np.int64]  # (B,) steps of each record
-    start: Array  # (B, n)
-    start_var: Array  # (B, n) without the measurement noise
-    start_channel: NDArray[np.int64]  # (B, n) the channel whose noise the start has; -1: none
+    start: Array  # (B, n) mean of the first state
+    start_var: Array  # (B, n) its variance, without the measurement noise
+    start_channel: NDArray[np.int64]  # (B, n) channel that measured the start; -1 for none
 
     @cached_property
     def count(self) -> int:
-        """Samples that enter the likelihood."""
+        """Number of samples in the likelihood."""
         return int(self.seen.sum())
 
     @cached_property
     def steps_of(self) -> tuple[tuple[float, NDArray[np.bool_] | None], ...]:
-        """Step sizes in use, each with its steps (T, B); None: all of them."""
+        """Step sizes in use [s], each with a mask of its steps (T, B); None for all steps."""
         sizes = np.unique(np.round(self.dt[self.valid], 9))
         if len(sizes) == 1:
             return ((float(sizes[0]), None),)
@@ -243,13 +244,13 @@ class RecordBatch:
 def batch_of(
     records: Sequence[Record], measurement: Measurement, n: int, latency: Array
 ) -> RecordBatch:
-    """Records side by side.
+    """Combine records to a batch.
 
     Args:
-        records: at least one.
+        records: at least one record.
         measurement: what `Record.measured` measures.
         n: number of states.
-        latency: of each input [s], (m,).
+        latency: latency of each input [s], (m,).
 
     Raises:
         GroundedError: if a record has another number of channels than the measurement.
@@ -281,10 +282,10 @@ def batch_of(
 def _start(
     record: Record, measurement: Measurement, n: int
 ) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Mean (n,), variance beside the measurement noise (n,) and channel (n,) of the first state.
+    """Return mean (n,), variance without measurement noise (n,) and channel (n,) of the start.
 
-    A state that is measured starts at its first sample, with that sample's noise; the sample is
-    then not used a second time.
+    A measured state starts at its first sample, with that sample's noise; the sample is then not
+    used a second time.
     """
     mean = np.zeros(n) if record.start is None else np.array(np.atleast_2d(record.start)[0])
     given = np.full(n, START_STD) if record.start_std is None else np.array(record.start_std)
@@ -296,6 +297,6 @@ def _start(
         mean[i] = record.measured[finite[0], c]
         if finite[0] == 0:
             channel[i], var[i] = c, 0.0
-        else:  # first seen later: it may have moved as far as it ever does in this record
+        else:  # measured only later: it may have changed by as much as it varies in this record
             var[i] = max(float(np.var(record.measured[finite, c])), 1e-12)
     return mean, var, channel

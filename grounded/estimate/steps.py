@@ -1,16 +1,16 @@
-"""The model as a filter sees it: the next state and its slopes, at one time or along a track.
+"""The linearised model for a filter: the next state and its Jacobian, at a time or along a track.
 
-Two ways to linearise about a state known to within sigma:
+There are two ways to linearise about a state with standard deviation sigma:
 
     narrow   f(x), f_x(x): the extended Kalman filter
     wide     differences over h sigma_i on either side of each state, c_i = f_i+ + f_i- - 2 f:
              f(x) + sum_i c_i / (2 h^2),         A_i = (f_i+ - f_i-) / (2 h sigma_i);
-             what a straight line misses is process noise: sum_i c_i^2 (h^2 - 1) / (4 h^4)
+             the linearisation error is process noise: sum_i c_i^2 (h^2 - 1) / (4 h^4)
 
-The wide one sees what lies within reach: where a model has a kink (friction at rest, brakes that
-are faster than the motor), the mean of f is not f of the mean, and a filter that does not know it
-pulls the parameters off. h = sqrt(pi/2) makes the mean right for a kink and for a parabola alike,
-and the variance for a kink.
+The wide one takes the uncertainty into account. At a kink of the model (friction at rest, brakes
+that are faster than the motor), the mean of f differs from f of the mean, and a filter that
+neglects this biases the parameters. With h = sqrt(pi/2) the mean is right both for a kink and for a
+parabola, and the variance for a kink.
 Source: Noergaard, Poulsen & Ravn, Automatica 36 (2000), with another h.
 """
 
@@ -29,19 +29,19 @@ from grounded.frozen import Array
 Advance = Callable[[int, Array, Array], tuple[Array, Array, Array]]
 REACH = float(np.sqrt(np.pi / 2))  # h
 MISSED = (REACH**2 - 1) / (4 * REACH**4)
-TOGETHER = 1000  # samples whose differences go in one call
-LEAST = 1e-6  # of max(1, |x|): no difference is taken over less
+TOGETHER = 1000  # most samples whose differences are evaluated in one call
+LEAST = 1e-6  # smallest difference, relative to max(1, |x|)
 
 
 @dataclass(frozen=True, eq=False)
 class ModelSteps:
-    """f and A = f_x of a system at the inputs of a batch; a step that is not valid changes nothing.
+    """f and A = f_x of a system with the inputs of a batch; identity for steps not valid.
 
     Args:
         system: the dynamics.
         p: parameter values (k,).
-        batch: gives inputs and step sizes.
-        wide: differences over the uncertainty instead of derivatives.
+        batch: has the inputs and step sizes.
+        wide: use differences over the uncertainty instead of derivatives.
     """
 
     system: System
@@ -50,12 +50,12 @@ class ModelSteps:
     wide: bool = False
 
     def at(self, t: int, x: Array, std: Array) -> tuple[Array, Array, Array]:
-        """From x (B, n), known to within std, at time t: f, A and added variance (B, n)."""
+        """Return f, A and added variance (B, n) at step t from x (B, n) with its std (B, n)."""
         f, A, more = self._rows(x[None], std[None], slice(t, t + 1))
         return f[0], A[0], more[0]
 
     def along(self, x: Array, std: Array) -> tuple[Array, Array, Array]:
-        """From a track x (T, B, n) and its std: f, A (T, B, n, n), added variance (T, B, n)."""
+        """Return f, A (T, B, n, n), added variance (T, B, n) along a track x (T, B, n), std."""
         return self._rows(x, std, slice(None))
 
     def _rows(self, x: Array, std: Array, times: slice) -> tuple[Array, Array, Array]:
@@ -87,7 +87,7 @@ class ModelSteps:
     def _pairs(
         self, x: Array, std: Array, u: Array, h: float
     ) -> Iterator[tuple[Array, Array, Array]]:
-        """For each state: f a reach above and below it, and the reach (N,)."""
+        """Yield for each state f with the state moved up and down, and by how much (N,)."""
         reach = np.maximum(REACH * std, LEAST * np.maximum(1.0, np.abs(x)))
         n = x.shape[1]
         if len(x) <= TOGETHER:

@@ -1,11 +1,11 @@
-"""Tracker: the filter while the robot runs (footnotes 15 and 18).
+"""Tracker: an extended Kalman filter that runs with the robot (footnotes 15 and 18).
 
-    tracker.sent(t, u)             a command left for the actuators at time t
-    tracker.update(t, y)           the camera saw y at time t
+    tracker.sent(t, u)             a command was sent at time t
+    tracker.update(t, y)           the sensors measured y at time t
     tracker.state_at(t)            the state at time t, for the controller
 
-The clocks are independent: the camera may run at 30 Hz, the controller at 20 Hz; a policy's runner
-takes the controller of the nearest control step (`grounded.onboard`).
+The rates are independent: the camera may run at 30 Hz, the controller at 20 Hz. A policy's runner
+uses the controller of the nearest control step (`grounded.onboard`).
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from grounded.filter.kalman import predicted
 from grounded.frozen import Array
 from grounded.model import Model
 
-LONGEST_STEP = 0.1  # [s] predictions over more are made in several steps
+LONGEST_STEP = 0.1  # [s] longer predictions are made in several steps
 
 
 class Tracker:
-    """State and covariance of one running robot.
+    """State and covariance of a running robot.
 
     Args:
         model: n states, m inputs.
         noise: process and measurement noise.
         start: the state at `time`, (n,).
         start_std: its standard deviation, (n,).
-        measurement: what is measured; None: the states as they are.
-        latency: transport delay of each input [s], (m,); None: zero.
-        past: the input held before the first command, (m,); None: zero.
-        time: of the start [s].
+        measurement: what is measured; None for the states themselves.
+        latency: transport delay of each input [s], (m,); None for zero.
+        past: the input held before the first command, (m,); None for zero.
+        time: start time [s].
 
     Raises:
-        GroundedError: for sizes that do not fit.
+        GroundedError: if sizes do not match.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Tracker:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def sent(self, t: float, u: Sequence[float] | Array) -> None:
-        """A command (m,) was sent at time t and is held until the next.
+        """Add a command (m,) sent at time t [s], which is held until the next one.
 
         Raises:
             GroundedError: if t is before the last command.
@@ -95,21 +95,21 @@ class Tracker:
             self._times.pop(0)
 
     def predict(self, t: float) -> Array:
-        """Moves the estimate on to time t and returns the state (n,); a time gone by: stays."""
+        """Advance the estimate to time t [s] and return the state (n,); ignores earlier times."""
         self.state, self.covariance = self._predicted(t)
         self.time = max(self.time, float(t))
         return self.state
 
     def state_at(self, t: float) -> Array:
-        """The state (n,) expected at time t; the estimate stays where it is."""
+        """Return the state (n,) predicted for time t [s], without changing the estimate."""
         return self._predicted(t)[0]
 
     def update(self, t: float, y: Sequence[float] | Array) -> float:
-        """Corrects the estimate by a measurement (ny,) at time t; NaN entries were not seen.
+        """Correct the estimate with a measurement (ny,) at time t [s]; NaN for missing channels.
 
         Returns:
-            The normalised innovation squared, about 1 on average; NaN if nothing was used, because
-            nothing was seen or the measurement is older than the estimate.
+            The normalised innovation squared, about 1 on average. NaN if the measurement was not
+            used, because all of it is missing or it is older than the estimate.
         """
         y = np.array(y, float)
         seen = np.isfinite(y)
@@ -143,7 +143,7 @@ class Tracker:
         return x, P
 
     def _received(self, times: Array) -> Array:
-        """What the actuators receive over each step, (T, m)."""
+        """Return what the actuators receive over each step, (T, m)."""
         if not self._times:
             return np.tile(self.past, (len(times) - 1, 1))
         nothing = np.zeros((len(times), 0))

@@ -1,4 +1,4 @@
-"""The front door for stored trials: a model and trials in, states with their certainty out."""
+"""Estimate states and noise from stored trials: the public functions of this package."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from grounded.trial import Trial
 
 @dataclass(frozen=True, eq=False)
 class Estimated:
-    """States of one trial as a filter or a smoother sees them.
+    """Estimated states of one trial, by the filter or the smoother.
 
-    Innovations are those of the filter in both cases: NaN where nothing was measured.
+    Innovations are the filter's in both cases; NaN where nothing was measured.
     """
 
     times: Array  # (T + 1,) [s]
@@ -30,7 +30,7 @@ class Estimated:
     covariance: Array  # (T + 1, n, n)
     innovations: Array  # (T + 1, ny)
     innovation_covariance: Array  # (T + 1, ny, ny)
-    loglik: float  # of this trial's innovations
+    loglik: float  # log-likelihood of this trial's innovations
     status: str
 
     @property
@@ -49,26 +49,27 @@ def smooth_trials(
     measurement: Measurement | None = None,
     forward: bool = False,
 ) -> list[Estimated]:
-    """The smoother along each trial: what is known afterwards.
+    """Estimate the states of each trial with the smoother, from all of its measurements.
 
-    A state that no channel measures is given halfway up what disturbs it at each instant, so that
-    a rate fits what integrates it (`grounded.estimate.extended.smooth`).
+    For a state that no channel measures, the middle of the disturbance at each instant is returned,
+    so that a rate is consistent with its integral (`grounded.estimate.extended.smooth`).
 
     Args:
         model: n states, m inputs.
-        trials: real trials, or records with clocks of their own.
-        noise: see `noise_of`.
-        latency: transport delay of each input [s], (m,); None: zero.
-        measurement: what the records measure; None: the states as they are.
-        forward: the extended Kalman filter alone: what was known at each instant.
+        trials: real trials, or records with separate times of measurements and commands.
+        noise: process and measurement noise, see `noise_of`.
+        latency: transport delay of each input [s], (m,); None for zero.
+        measurement: what the records measure; None for the states themselves.
+        forward: use the extended Kalman filter alone, so that each estimate depends only on
+            measurements up to its time.
 
     Raises:
-        GroundedError: if a trial does not fit the model or the measurement.
+        GroundedError: if a trial does not match the model or the measurement.
     """
     measurement = of_states(model) if measurement is None else measurement
     if len(noise.process) != model.n or len(noise.measurement) != measurement.ny:
         raise GroundedError(
-            f"noise for {model.n} states and {measurement.ny} channels is needed, got "
+            f"noise is needed for {model.n} states and {measurement.ny} channels, got "
             f"{len(noise.process)} and {len(noise.measurement)}"
         )
     records = records_of(model, trials)
@@ -92,15 +93,22 @@ def noise_of(
     sizes: Array | float = 1.0,
     rng: np.random.Generator | None = None,
 ) -> NoiseEstimate:
-    """Process and measurement noise of a model on trials, by maximum likelihood.
+    """Estimate process and measurement noise of a model on trials, by maximum likelihood.
 
-    What the model gets wrong counts as process noise here: fit the model first, or take it as a
-    measure of the model. Of more than 8,000 samples a draw of whole trials is used (`rng`).
-    `known`: the measurement noise, (ny,), where only the process noise is to be found. `sizes`:
-    about how large the states are that nothing measures, (n,). Other arguments as `smooth_trials`.
+    Errors of the model count as process noise: fit the model first, or use the process noise as a
+    measure of its error.
+
+    Args:
+        model: n states, m inputs.
+        trials: real trials, or records.
+        latency: transport delay of each input [s], (m,); None for zero.
+        measurement: what the records measure; None for the states themselves.
+        known: known measurement noise, (ny,); None to estimate it.
+        sizes: typical magnitude of the states that nothing measures, (n,) or one number.
+        rng: selects whole trials if there are more than 8,000 samples.
 
     Raises:
-        GroundedError: if a trial does not fit the model, or no trial has two samples.
+        GroundedError: if a trial does not match the model, or no trial has more than two samples.
     """
     measurement = of_states(model) if measurement is None else measurement
     records = records_of(model, trials)

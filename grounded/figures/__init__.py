@@ -1,4 +1,5 @@
-"""What is drawn, as plain values: page, pictures, recording and notebook show the same figures.
+"""Figures as plain values, shared by the page, pictures, recordings and notebooks.
 
-Read `figure.py` first (the values), then `interactive.py` (the same for Plotly).
+Read `figure.py` first (the values), then `interactive.py` (their Plotly form); `body.py` has the
+moving bodies.
 """

@@ -1,6 +1,6 @@
-"""Bodies as plain values: the parts of a robot, and where they are in each of its states.
+"""Bodies as plain values: the parts of a robot and their poses in each state.
 
-A recording draws the parts in space; `motion` is the same body seen from the side, for a page.
+A recording draws the parts in space; `motion` is the side view of a body, for a page.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from grounded.frozen import Array
 
 Pose = tuple[Array, Array]  # origins (T, 3), rotation matrices (T, 3, 3)
 NONE: Array = np.zeros((0, 3))
-FRAMES = 400  # poses of all parts together in one motion
-SEEN = [0, 2]  # from the side one sees x and z
+FRAMES = 400  # most poses in a motion, over all parts
+SEEN = [0, 2]  # the side view shows x and z
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,10 +24,10 @@ class Part:
     """A rigid part in its own frame.
 
     shape     size
-    box       half an edge each
-    ellipsoid half an axis each
+    box       half of each edge
+    ellipsoid half of each axis
     capsule   radius, length from the origin along z
-    cylinder  radius, length, the origin in its middle
+    cylinder  radius, length, centred at the origin
     mesh      none: `points` and `faces`
     lines     none: `strips`
     dot       none
@@ -42,34 +42,34 @@ class Part:
 
 
 class Body(Protocol):
-    """What moves: its parts, their poses, the path of the point that is watched."""
+    """A moving body: its parts, their poses, and the path of a watched point."""
 
     @property
     def unit(self) -> str:
-        """Of its positions; "" where nothing says how large it is."""
+        """Unit of positions; "" if its size is unknown."""
 
     @property
     def watched(self) -> str:
-        """What the path is of: `the tip`."""
+        """Name of the watched point, such as `the tip`."""
 
     @property
     def parts(self) -> Sequence[Part]:
-        """What it is made of."""
+        """The parts of the body."""
 
     def poses(self, states: Array) -> list[Pose]:
-        """Of each part, for states (T, n)."""
+        """Return the poses of each part, for states (T, n)."""
 
     def path(self, states: Array) -> Array:
-        """Positions (T, 3) of the point that is watched; NaN where a state is unknown."""
+        """Return positions (T, 3) of the watched point; NaN where a state is unknown."""
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A body seen from the side while it moves: x to the right, z up.
+    """The side view of a moving body: x to the right, z up.
 
-    times: (T,) [s] of the poses.
-    wires: of each part its polylines (k, 3) in its own frame, and how thick they are.
-    poses: (T, parts, 2, 4): what turns a point of a part, and where its origin is, in x and z.
+    times: (T,) times of the poses [s].
+    wires: for each part its polylines (k, 3) in its own frame, and their thickness.
+    poses: (T, parts, 2, 4): rotation and origin of each part, for x and z.
     """
 
     times: Array
@@ -78,12 +78,12 @@ class Motion:
 
     @property
     def reached(self) -> Array:
-        """Points (k, 2) that hold all that it touches."""
+        """Points (k, 2) that the body passes through, for the range of the axes."""
         every = range(0, len(self.times), -(-len(self.times) // 60))
         return np.vstack([line for row in every for line, _ in self.lines(row)])
 
     def lines(self, row: int) -> list[tuple[Array, float]]:
-        """The polylines (k, 2) at one of the times, each with its thickness."""
+        """Return the polylines (k, 2) at one of the times, each with its thickness."""
         return [
             (strip @ pose[:, :3].T + pose[:, 3], thick)
             for (strips, thick), pose in zip(self.wires, self.poses[row], strict=True)
@@ -92,7 +92,7 @@ class Motion:
 
 
 def motion(body: Body, states: Array, dt: float) -> Motion | None:
-    """A body along states (T, n), where its place is known; None where it never is."""
+    """Return the motion of a body along states (T, n); None if its position is never known."""
     rows = np.flatnonzero(np.isfinite(body.path(states)).all(axis=1))
     rows = rows[:: -(-len(rows) * len(body.parts) // FRAMES) or 1]
     if not len(rows) or not body.parts:
@@ -104,7 +104,7 @@ def motion(body: Body, states: Array, dt: float) -> Motion | None:
 
 
 def wires(part: Part) -> tuple[tuple[Array, ...], float]:
-    """Polylines that show a part from any side, and how thick they are; 0 for thin ones."""
+    """Return polylines that show a part from any side, and their thickness (0: thin)."""
     if part.shape == "capsule":
         return (np.array([[0, 0, 0], [0, 0, part.size[1]]], float),), 2 * part.size[0]
     if part.shape in ("lines", "dot"):

@@ -1,8 +1,8 @@
-"""Figures as plain values: what is drawn, before it is known how.
+"""Figures as plain values, independent of the library that draws them.
 
-A figure is a title, a caption and panels; a panel has axes and what lies in them. Plotly draws them
-in a page and a notebook, matplotlib in a picture. Colours are roles ("best", "desired"), so that a
-page follows the reader's light or dark.
+A figure has a title, a caption and panels; a panel has axes, curves and marks. Plotly draws them in
+a page and a notebook, matplotlib in a picture. Colours are roles ("best", "desired"), so that a
+page follows the reader's light or dark mode.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from grounded.figures.body import Motion
 from grounded.frozen import Array
 
-# Okabe & Ito (2008), told apart by colour-blind people too: role -> (on white, on black)
+# Okabe & Ito (2008), distinguishable with colour blindness: role -> (on white, on black)
 COLOURS = {
     "desired": ("#000000", "#ffffff"),
     "real": ("#000000", "#ffffff"),
@@ -33,7 +33,7 @@ COLOURS = {
     "step3": ("#6f6f6f", "#8d8d8d"),
 }
 STEPS = ("step1", "step2", "step3")  # roles of iterations, in order
-WIDTHS = {"best": 2.5, "desired": 1.0}  # of paths; 1.5 for the other roles
+WIDTHS = {"best": 2.5, "desired": 1.0}  # line widths of paths; 1.5 for the other roles
 DASHES = {
     "desired": (6.0, 3.0),
     "predicted": (2.0, 2.0),
@@ -41,14 +41,14 @@ DASHES = {
     "step2": (5.0, 2.0),
 }
 TYPESET = {"^2": "²", "^3": "³", "->": "→", "+-": "±"}
-LEAST = 1e-12  # a range below which differences are rounding
-FEW = 300  # dots up to which each is drawn large
-LETTER = 0.045  # of a bar's text, as a share of the longest bar
-FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # by which deviations are enlarged
+LEAST = 1e-12  # range below which differences are rounding errors
+FEW = 300  # most dots that are drawn large
+LETTER = 0.045  # width of a letter of a bar's text, as a share of the longest bar
+FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # factors by which deviations may be enlarged
 
 
 def typeset(value: Any) -> Any:
-    """Plain text as it is printed; anything else, such as text that is escaped already, stays."""
+    """Replace plain notation by typographic signs; values other than plain str are unchanged."""
     if type(value) is str:
         for plain, sign in TYPESET.items():
             value = value.replace(plain, sign)
@@ -56,18 +56,18 @@ def typeset(value: Any) -> Any:
 
 
 def rgb(colour: str) -> tuple[int, int, int]:
-    """Red, green and blue of "#rrggbb"."""
+    """Return red, green and blue of "#rrggbb"."""
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A line through points; NaN breaks it. Context has no name.
+    """A line through points; NaN breaks it. Curves for context have no name.
 
-    times: [s] of each point of a path.
-    shade: a value for each point, shown as its colour; `shade_name` says what it is.
-    trial: whose path it is, so that an animation finds a trial's parts.
-    motion: the body that moves along a path.
+    times: time of each point of a path [s].
+    shade: a value for each point, shown as its colour; `shade_name` is its name.
+    trial: the trial whose path it is, so that an animation finds a trial's parts.
+    motion: the body that moves along the path.
     """
 
     x: Array
@@ -80,18 +80,18 @@ class Curve:
     shade_name: str = ""
     trial: str = ""
     style: str = "line"  # line, steps (each y holds until the next x), points,
-    # or ghost: not drawn, for the animation alone
+    # or ghost: not drawn, only used by the animation
     motion: Motion | None = None
 
     def spread(self, axis: int) -> list[Array]:
-        """What must fit along x (0) or y (1)."""
+        """Return the values that must fit on the x axis (0) or the y axis (1)."""
         moved = [] if self.motion is None else [self.motion.reached[:, axis]]
         return [(self.x, self.y)[axis], *moved]
 
 
 @dataclass(frozen=True)
 class Dot:
-    """A point with what hovering says of it."""
+    """A point with the text shown on hovering."""
 
     x: float
     y: float
@@ -125,8 +125,8 @@ class Band:
 class Panel:
     """Axes with curves and marks.
 
-    loss: y by the logarithm of its distance from 0.
-    log: x and y by their logarithms.
+    loss: the y axis is logarithmic in -y.
+    log: both axes are logarithmic.
     """
 
     title: str
@@ -136,17 +136,17 @@ class Panel:
     dots: tuple[Dot, ...] = ()
     rules: tuple[Rule, ...] = ()
     bands: tuple[Band, ...] = ()
-    equal: bool = False  # one scale for both axes
+    equal: bool = False  # equal scales on both axes
     loss: bool = False
     log: bool = False
-    whole: bool = False  # x counts
-    x_ticks: tuple[tuple[float, str], ...] = ()  # where on x what is written; () leaves it open
+    whole: bool = False  # x values are whole numbers
+    x_ticks: tuple[tuple[float, str], ...] = ()  # positions and labels of ticks; () for automatic
     y_range: tuple[float, float] | None = None
-    note: str = ""  # inside, top right
-    kind: str = ""  # time: x is the time of a run; path: where a run was
+    note: str = ""  # text inside, top right
+    kind: str = ""  # time: x is the time of a run; path: positions of a run
 
     def height(self, y: float | Array) -> Array:
-        """Where a value lies on the y axis: itself, log10(y), or -log10(-y) of a loss."""
+        """Return the position of a value on the y axis: y, log10(y), or -log10(-y) of a loss."""
         y = np.asarray(y, float)
         if self.log:
             return _log10(y)
@@ -170,7 +170,7 @@ class Panel:
         return [c for c in named if c.style != "ghost"]
 
     def ranges(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Of x, and of y in `height`: they hold all that has a name, with some room."""
+        """Return the ranges of x and of y (as `height`) that contain everything with a name."""
         xs = [_log10(x) if self.log else x for c in self._seen for x in c.spread(0)] + [
             np.array([d.x for d in self.dots])
         ]
@@ -184,7 +184,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Bar:
-    """A horizontal bar with its label, and what stands behind it."""
+    """A horizontal bar with its label and the text behind it."""
 
     label: str
     value: float
@@ -201,12 +201,12 @@ class Bars:
 
     @property
     def values(self) -> Array:
-        """How long each is."""
+        """Length of each bar."""
         return np.array([bar.value if np.isfinite(bar.value) else 0.0 for bar in self.bars])
 
     @property
     def ends(self) -> tuple[float, float]:
-        """What the axis holds: the bars, and the text behind each."""
+        """Range of the axis, with room for the bars and the text behind each."""
         most = float(np.abs(self.values).max(initial=0.0)) or 1.0
         room = np.array([most * (0.05 + LETTER * len(bar.text)) for bar in self.bars])
         ends = self.values + np.where(self.values < 0, -room, room)
@@ -215,7 +215,7 @@ class Bars:
 
 @dataclass(frozen=True)
 class Key:
-    """An entry of a figure's legend; `trial` where it is one of the others' path."""
+    """An entry of a figure's legend; `trial` is set for the path of a trial of role "other"."""
 
     role: str
     name: str
@@ -225,7 +225,7 @@ class Key:
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """Panels that belong together, with one legend; `name` is its file's."""
+    """Panels that belong together, with one legend; `name` is the name of its file."""
 
     name: str
     title: str
@@ -235,12 +235,12 @@ class Figure:
 
 
 def _log10(values: Array) -> Array:
-    """NaN where a value has no logarithm."""
+    """Return log10; NaN for values without a logarithm."""
     return np.log10(np.where(values > 0, values, np.nan))
 
 
 def legend(panels: Sequence[Panel | Bars]) -> tuple[Key, ...]:
-    """What the named curves, rules and bands of panels are, each once."""
+    """Return a legend entry for each named curve and rule of the panels, without duplicates."""
     found: dict[tuple[str, str], Key] = {}
     for panel in panels:
         if isinstance(panel, Bars):
@@ -256,7 +256,7 @@ def legend(panels: Sequence[Panel | Bars]) -> tuple[Key, ...]:
 
 
 def fitted(values: Iterable[Array], margin: float = 0.06) -> tuple[float, float]:
-    """A range around finite values, with some room."""
+    """Return a range around the finite values, with a margin."""
     kept = [v[np.isfinite(v)] for v in values]
     kept = [v for v in kept if len(v)]
     if not kept:
@@ -269,9 +269,10 @@ def fitted(values: Iterable[Array], margin: float = 0.06) -> tuple[float, float]
 
 
 def without_astray(kept: list[Array], more: list[Array], most: float = 3.0) -> list[Array]:
-    """`kept`, and of `more` what does not leave their range by more than `most` times its size.
+    """Return `kept`, and `more` with values far outside the range of `kept` set to NaN.
 
-    A first run that crashed must not flatten the picture of those that did not.
+    Far is more than `most` times the size of the range. So a crashed first run does not flatten
+    the picture of the others.
     """
     low, high = fitted(kept, 0.0)
     span = (high - low) * most
@@ -280,7 +281,7 @@ def without_astray(kept: list[Array], more: list[Array], most: float = 3.0) -> l
 
 
 def loss_ticks(low: float, high: float, most: int = 5) -> list[float]:
-    """Losses for an axis whose `height` runs from low to high: -1, -2, -5, -10 ..., or fewer."""
+    """Return ticks for an axis of losses with `height` from low to high: -1, -2, -5, -10 ..."""
     powers = range(math.floor(-high) - 1, math.ceil(-low) + 2)
     for factors in ((1, 1.5, 2, 3, 5, 7), (1, 2, 5), (1, 3), (1,)):
         values = [-f * 10.0**k for k in powers for f in factors]
@@ -293,12 +294,12 @@ def loss_ticks(low: float, high: float, most: int = 5) -> list[float]:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """The same for values from 10^low to 10^high: 1, 2, 5, 10 ..., or fewer."""
+    """Return ticks for an axis of values from 10^low to 10^high: 1, 2, 5, 10 ..."""
     return sorted(-loss for loss in loss_ticks(-high, -low))
 
 
 def enlarging(path: Array, desired: Array) -> float:
-    """A round factor that makes the deviation of a path (T, 2) visible beside the desired one."""
+    """Return a round factor that makes the deviation of a path (T, 2) from the desired visible."""
     off = np.abs(path - desired[: len(path)])[:, :2]
     off = off[np.isfinite(off)]
     room = 0.2 * np.ptp(desired[:, :2], axis=0).max()
@@ -306,10 +307,10 @@ def enlarging(path: Array, desired: Array) -> float:
 
 
 def thinned(x: Array, y: Array, most: int) -> NDArray[np.intp]:
-    """Which of many points are enough, in order.
+    """Return indices of at most about `most` points that represent the curve, in order.
 
-    Where x rises, the first, lowest, highest and last of each column, so that no peak is lost;
-    else every so many.
+    If x ascends, these are the first, lowest, highest and last point of each column, so that no
+    peak is lost; otherwise the points are thinned evenly.
     """
     count = len(x)
     if count <= most:

@@ -1,7 +1,7 @@
-"""Figures for Plotly: a page draws what `plotted` gives, a notebook gets `notebook_figure`.
+"""Figures for Plotly: `plotted` for a page, `notebook_figure` for a notebook.
 
-Colours are written as roles ("@best", "@best/0.15" for a faint one), which `coloured` or the page's
-script turns into colours, light or dark. Building the values needs no Plotly.
+Colours are written as roles ("@best", or "@best/0.15" with an opacity), which `coloured` or the
+page's script replaces by colours for light or dark mode. Building the values does not need Plotly.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from grounded.figures.figure import (
 )
 from grounded.frozen import Array
 
-MOST = 1600  # points of a curve, fewer of one that is only context
-CONTEXT = 300
-STEPS = 65535  # of a packed number's range
-COARSE = 50.0  # times the range of nearly all values from which on two bytes are too few
+MOST = 1600  # most points of a curve
+CONTEXT = 300  # most points of a curve that is only context
+STEPS = 65535  # steps in the range of a packed number
+COARSE = 50.0  # ratio of the range to that of nearly all values above which two bytes are too few
 FAINT = 0.15  # opacity of a band
 PAPER = {
     "text": ("#1a1a1a", "#e8e8e8"),
@@ -44,11 +44,11 @@ FONT = 12
 
 
 def plotted(panel: Panel | Bars, axis: str = "") -> dict[str, Any]:
-    """A panel as Plotly's data and layout, in plain values and arrays.
+    """Return a panel as Plotly's data and layout, in plain values and arrays.
 
     Args:
-        panel: what is drawn.
-        axis: the number of its axes where several panels share a figure: "", "2", "3" ...
+        panel: the panel.
+        axis: number of its axes if several panels share a figure: "", "2", "3" ...
     """
     if isinstance(panel, Bars):
         return _bars(panel, axis)
@@ -138,7 +138,7 @@ def _shaded(values: Array, name: str) -> dict[str, Any]:
 
 
 def _dots(panel: Panel, dots: Sequence[Dot]) -> dict[str, Any]:
-    """Marks of one look; those without a height lie on the lower edge."""
+    """Return the trace of marks of one style; those without a finite y are on the lower edge."""
     heights = np.array([float(panel.height(d.y)) for d in dots])
     low, high = panel.ranges()[1]
     y = np.where(np.isfinite(heights), heights, low + 0.04 * (high - low))
@@ -204,7 +204,7 @@ def _bars(panel: Bars, axis: str) -> dict[str, Any]:
 
 
 def coloured(value: Any, dark: bool = False) -> Any:
-    """A plotted value with its roles turned into colours."""
+    """Replace the roles in a plotted value by colours."""
     if isinstance(value, dict):
         return {key: coloured(item, dark) for key, item in value.items()}
     if isinstance(value, list):
@@ -217,14 +217,14 @@ def coloured(value: Any, dark: bool = False) -> Any:
 
 
 def palette() -> dict[str, tuple[str, str]]:
-    """Every role's colour on white and on black."""
+    """Return every role's colour on white and on black."""
     return COLOURS | PAPER
 
 
 def packed(array: Array) -> dict[str, Any]:
-    """An array as text: two bytes a number, in 65,535 steps of its range, the last is NaN.
+    """Encode an array as text, with two bytes a number: 65,535 steps of its range, the last is NaN.
 
-    Four or eight bytes where those steps would be too coarse, because few values lie far out.
+    Four or eight bytes are used if those steps are too coarse because of a few outliers.
     """
     values = np.where(np.isfinite(array), array, np.nan)
     known = values[np.isfinite(values)]
@@ -242,7 +242,11 @@ def packed(array: Array) -> dict[str, Any]:
 
 
 def notebook_figure(figures: Sequence[Figure], height: int = 300) -> Any:
-    """All panels of some figures as one Plotly figure, two side by side.
+    """Return all panels of some figures as one Plotly figure, two side by side.
+
+    Args:
+        figures: the figures.
+        height: height of a row of panels [px].
 
     Raises:
         GroundedError: if Plotly is not installed.

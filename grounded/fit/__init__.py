@@ -1,11 +1,11 @@
-"""Parameters of any model from trials, with intervals.
+"""Estimate the parameters of a model from trials, with confidence intervals.
 
     fit                parameters, latencies and thresholds by maximum likelihood
     prediction_error   one step and a second ahead, open loop
 
-Read `parameters` first (the front door), then `search` (what is moved in turn), `gauss_newton` (the
-climb), `point` (the likelihood and its slopes), `unknowns`, `result` (values and intervals),
-`prediction`. The likelihood is that of `grounded.estimate`.
+Read `parameters` first (the function `fit`), then `search` (the alternating search), `gauss_newton`
+(the optimiser), `point` (the likelihood and its derivatives), `unknowns`, `result` (values and
+intervals), `prediction`. The likelihood is that of `grounded.estimate`.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Sensors that filter, in a fit: what a log shows of a state is one state, its true value another.
+"""Low-pass filters in sensors, in a fit: the filtered and the true value are separate states.
 
-    tau y' = s - y        y: measured,  s: what moves; tau is known from the instruments, not fitted
+    tau y' = s - y        y: measured,  s: true value; tau is known from `instruments`, not fitted
 
-A filter of speeds that a fit takes for the speeds themselves is fitted as friction, or as a lag of
-the drive. `behind_filters` gives the model whose first states are the logs, as a sensor's lag that
-was adopted does (`grounded.effects.sensed`), and records that know about where the true values are.
+If a fit took filtered speeds for the true ones, it would attribute the filter to friction or to a
+lag of the drive. `behind_filters` returns a model whose first states are the logged values, like an
+adopted sensor lag (`grounded.effects.sensed`), and records with approximate true values.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ def behind_filters(
     measurement: Measurement,
     filters: Mapping[str, float],
 ) -> tuple[Model, list[Record], Measurement]:
-    """Model, records and measurement with the true values of filtered states beside their logs.
+    """Return model, records and measurement with added states for the true values.
 
     Args:
         model: n states.
-        records: of it.
-        measurement: what they measure, each channel a state.
-        filters: time constants by state [s]; nothing is said of a state that no channel measures,
-            or that the model has a lag of already.
+        records: records of that model.
+        measurement: what they measure; each channel is a state.
+        filters: time constants by state [s]; states that no channel measures, or that already have
+            a sensor lag in the model, are ignored.
 
     Raises:
-        GroundedError: where a channel measures something else than a state.
+        GroundedError: if a channel measures something other than a state.
     """
     if any(i < 0 for i in measurement.states):
         raise GroundedError(
-            "filters are known of sensors that measure states themselves: expected of_states(model)"
+            "filters apply only to sensors that measure states: expected of_states(model)"
         )
     channels = [model.state_names[i] for i in measurement.states]
     known = {
@@ -65,7 +65,7 @@ def behind_filters(
 def _with_true(
     record: Record, n: int, columns: Sequence[int], taus: Sequence[float], angles: Sequence[bool]
 ) -> Record:
-    """A record that starts anywhere with true values near y + tau y'."""
+    """Return the record with start values of the true states near y + tau y'."""
     start = np.zeros((record.steps + 1, n))
     if record.start is not None:
         whole = record.start.ndim == 2
@@ -78,7 +78,7 @@ def _with_true(
 
 
 def _ahead(times: Array, shown: Array, tau: float, angle: bool) -> tuple[Array, float]:
-    """Y + tau y' along a record, and the rms of what that adds: how far it may be off."""
+    """Return y + tau y' along a record, and the rms of tau y' as its uncertainty."""
     seen = np.isfinite(shown)
     if seen.sum() < 2:
         return np.zeros(len(times)), START_STD

@@ -1,18 +1,19 @@
-"""Levenberg and Marquardt's climb of the likelihood for a given noise, within bounds.
+"""Levenberg-Marquardt maximisation of the likelihood for a given noise, within bounds.
 
-The least-squares problem are the whitened innovations and their slopes (`point`),
+The least-squares residuals are the whitened innovations eps, with the Jacobian W (`point`):
 
     delta = -(W'W + lambda diag(W'W))^-1 W' eps,     theta <- clip(theta + delta)
 
-Because every step of a trial starts from what the filter knows, noise of the measurements does not
-bias the fit, as it does in one-step least squares (errors in variables).
+Every step of a trial starts from the filter's estimate, so measurement noise does not bias the fit,
+as it does in one-step least squares (errors in variables).
 
-Gauss and Newton leave out that the filter's gains depend on theta too, and where the model stiffens
-with theta the step then leads down and theta would stay where it began. So a climb that rises no
-further goes on with the exact slope (`exact`), and ends where that has none.
+Gauss-Newton neglects that the filter's gains depend on theta too. If the model gets stiffer with
+theta, its steps may then decrease the likelihood, and theta would stay at its start. So when no
+step increases the likelihood, the search continues with the exact gradient (`exact`) until that
+gives no increase either.
 
-A step counts if the log-likelihood rises; else lambda grows. Unknowns at a bound that would leave
-it are held; directions of which the data say nothing are not moved.
+A step is accepted if the log-likelihood increases; else lambda grows. Unknowns at a bound that the
+step would leave are held; directions without information in the data are not moved.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ from grounded.estimate import NoiseStd
 from grounded.fit.point import FitData, Linear, Point, exact, linear, point
 from grounded.frozen import Array
 
-ENOUGH = 0.002  # [nats] a step that promises less, a sixteenth of a std, is the last
-WHOLE = 1e-9  # of a step: rounding
-NOTHING = 1e-9  # of the largest eigenvalue (scaled): below it the data say nothing
+ENOUGH = 0.002  # [nats] predicted gain below which the search ends; 1/16 of a standard deviation
+WHOLE = 1e-9  # rounding tolerance, as a fraction of a step
+NOTHING = 1e-9  # eigenvalue, relative to the largest (scaled), treated as no information
 
 
 @dataclass(frozen=True, eq=False)
 class Climb:
-    """Where a climb ended and why."""
+    """The result of a climb: the last point, its derivatives, and why it ended."""
 
     at: Point
     slopes: Linear
@@ -49,14 +50,14 @@ def climb(
     free: NDArray[np.bool_],
     max_steps: int = 20,
 ) -> Climb:
-    """Climbs from a point; only `free` unknowns (k,) move.
+    """Maximise the likelihood from a point; only `free` unknowns move.
 
     Args:
         data: the records.
-        noise: held fixed.
-        start: a point at this noise, whose filter got through.
+        noise: the noise, held fixed.
+        start: a point with this noise and a finite likelihood.
         free: which unknowns may move, (k,).
-        max_steps: steps that count, at most.
+        max_steps: most accepted steps.
     """
     at, damping, last = start, 1e-3, max_steps
     slopes_at: Callable[[FitData, Point], Linear] = linear
@@ -101,10 +102,10 @@ def _step(
 def marquardt_step(
     data: FitData, theta: Array, slopes: Linear, free: NDArray[np.bool_], damping: float
 ) -> tuple[Array, float]:
-    """The damped step (k,) and the gain in nats that the linear problem promises of it.
+    """Return the damped step (k,) and the gain [nats] that the linear problem predicts for it.
 
-    An unknown that would leave its bounds stops there, and the others step as is best with it
-    there: clipped afterwards, they would rely on a move that is not made.
+    An unknown that would leave its bounds stops there, and the step of the others is solved again
+    with it held. If the step were clipped afterwards, the others would not be optimal.
     """
     unknowns = data.unknowns
     N, g = slopes.N, slopes.g
@@ -123,7 +124,7 @@ def marquardt_step(
 
 
 def _damped(N: Array, g: Array, damping: float) -> Array:
-    """(N + damping diag(N))^-1 g, zero in directions of which the data say nothing."""
+    """Return (N + damping diag(N))^-1 g, zero in directions without information."""
     scale = 1 / np.sqrt(np.diag(N))
     values, vectors = np.linalg.eigh(N * np.outer(scale, scale))
     said = values > NOTHING * values[-1]

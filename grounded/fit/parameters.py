@@ -1,7 +1,7 @@
-"""fit: the parameters of any model from trials, by maximum likelihood of the innovations.
+"""fit: estimate the parameters of a model from trials, by maximum likelihood of the innovations.
 
-The last quarter of the time judges a fit: the model before and after predicts it, one step and a
-second ahead. Then it joins the rest for the final values.
+The last quarter of the time is held out: the model before and after the fit predicts it, one step
+and a second ahead. The final values are then fitted to all of the data.
 """
 
 from __future__ import annotations
@@ -42,25 +42,33 @@ def fit(
     engine: Engine | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Fit:
-    """Parameters of a model from trials, with intervals.
+    """Estimate the parameters of a model from trials, with confidence intervals.
 
     Args:
-        model: where to begin, with bounds; a task also says the latency.
-        trials: real trials, or records with clocks of their own.
-        names: parameters to fit; None: all uncertain ones.
-        latency: of each input [s], known, or where to begin, (m,); None: zero (or the task's).
-        fit_latency: "known", "common" (fit one for all inputs) or "each".
-        measurement: what the records measure; None: the states as they are.
-        filters: time constants of the sensors that filter, by state [s], as `Preflight.filters`.
-        hold_out: share of the time that judges the fit.
-        horizon_s: how far ahead predictions are judged [s].
-        rng: draws the trials that the noise is estimated on, if there are very many.
-        engine: workers for the records' likelihoods; the same comes out on any number.
-        progress: told of the stage, the share done and the time left, for a display.
+        model: the model with start values and bounds of its n states and m inputs; a `Task` also
+            gives the latency.
+        trials: real trials, or records with separate clocks for measurements and commands.
+        names: parameters to fit; None for all uncertain ones.
+        latency: (m,) transport delay of each input [s], fixed or the start value; None for zero,
+            or the task's.
+        fit_latency: "known" (fixed), "common" (fit one value for all inputs) or "each".
+        measurement: what the records measure; None for the states themselves.
+        filters: time constants [s] of low-pass filters in sensors by state, as
+            `Preflight.filters`.
+        hold_out: share of the time that is held out to judge the fit.
+        horizon_s: prediction horizon on held-out time [s].
+        rng: draws the records used to estimate the noise if there are very many.
+        engine: workers for the records' likelihoods; the result does not depend on them.
+        progress: called with a line on the stage, the share done and the time left.
+
+    Returns:
+        A `Fit`: values with intervals, the model with these values, and prediction errors on
+        held-out time before and after.
 
     Raises:
         Interrupted: on Ctrl-C, with the values so far.
-        GroundedError: for an unknown name, trials that do not fit the model, or too short ones.
+        GroundedError: for an unknown or constant parameter, trials that do not match the model or
+            are too short, or a model with too many states.
     """
     if isinstance(model, Task):
         latency = model.latency if latency is None else latency
@@ -68,8 +76,8 @@ def fit(
     if model.n > MOST_STATES:
         raise GroundedError(
             f"model '{model.name}' has {model.n} states; a fit filters the trials with at most "
-            f"{MOST_STATES}, each step costs their cube: fit the parameters in a model of the part "
-            "that they belong to, and write them into this one"
+            f"{MOST_STATES}, since a step costs their cube: fit the parameters in a model of the "
+            "part that they belong to, and copy them into this one"
         )
     delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
     measurement = of_states(model) if measurement is None else measurement
@@ -93,15 +101,15 @@ def fit(
 
 
 def _of(found: Fit, model: Model) -> Fit:
-    """The fit of the model that was given, without the true values beside filtered logs."""
+    """Return the fit for the original model, without the states added for filtered sensors."""
     if found.model.n == model.n:
         return found
     values = {name: found.model.params[name].value for name in model.param_names}
     return replace(found, model=model.with_values(values))
 
 
-USUAL = 25  # rounds and scans of a fit
-MOST_STATES = 50  # 200 steps of twice as many take minutes
+USUAL = 25  # usual number of rounds and scans of a fit
+MOST_STATES = 50  # with twice as many, 200 steps take minutes
 
 
 def _fitted(
@@ -114,7 +122,7 @@ def _fitted(
     rng: np.random.Generator,
     tick: Stages,
 ) -> Fit:
-    """One search on a part of the time, judged on the rest; the values from all of it."""
+    """Search on a part of the time, judge on the rest, then fit the values to all of it."""
     train, test = split_in_time(records, hold_out, horizon_s, measurement)
     first = first_search(data_of(model, train, measurement, unknowns), rng, tick)
     before, after, last = None, None, first
@@ -129,9 +137,10 @@ def _fitted(
 def split_in_time(
     records: Sequence[Record], share: float, horizon_s: float, measurement: Measurement
 ) -> tuple[list[Record], list[Record]]:
-    """The first and the last part of every record.
+    """Split records into a training and a held-out part.
 
-    Whole records where they are short, or where the state in their middle is not measured.
+    Long records are split in time. Short ones, and those whose state is not fully measured, are
+    kept whole, and some of them are held out.
     """
     train, test = [], []
     if any(i < 0 for i in measurement.states):
@@ -159,7 +168,7 @@ def judged(
     found: SearchEnd,
     horizon_s: float,
 ) -> tuple[PredictionError, PredictionError]:
-    """Held-out prediction errors of the model before and after, each with its own noise."""
+    """Return held-out prediction errors of the model before and after, each with its own noise."""
 
     def error(theta: Array, noise: NoiseStd) -> PredictionError:
         p, latency = unknowns.unpack(theta)

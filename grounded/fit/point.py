@@ -1,17 +1,17 @@
-"""The likelihood at one theta, with its slopes: a pass of the filter over each part of the records.
+"""The likelihood at one theta and its derivatives: one pass of the filter over the records.
 
     eps(theta): the whitened innovations;        W = d eps / d theta  (`extended.sensitivity`)
-    g = -W' eps: the slope of the log-likelihood, but for the gains;       N = W'W: information
+    g = -W' eps: gradient of the log-likelihood for fixed gains;       N = W'W: information
 
-The sum of squares of eps is what is left unexplained, measured in the noise; the log-likelihood
-adds the log-determinants; N is the information that the data hold about theta. The filter's gains
-depend on theta too, through A = f_x; `exact` adds what that does to the slope,
+The sum of squares of eps is the residual in units of the noise; the log-likelihood adds the
+log-determinants; N is the information of the data about theta. The filter's gains depend on theta
+too, through A = f_x; `exact` adds their contribution to the gradient,
 
     sum_t <(q q' - N) A P, dA / d theta>                           q, N: the smoother's
 
-Records are independent, so a part is a piece of work of its own (`grounded.engine.each`). Which
-records make a part depends on them alone, and parts are summed in their order: the same comes out
-on any number of workers.
+Records are independent, so parts of them run in parallel (`grounded.engine.each`). The division
+into parts depends on the records alone, and parts are summed in order, so the result does not
+depend on the number of workers.
 """
 
 from __future__ import annotations
@@ -34,30 +34,30 @@ from grounded.filter.kalman import smoother
 from grounded.fit.unknowns import Unknowns
 from grounded.frozen import Array
 
-PART = 8  # records: as many runs as the widest vector has lanes
-SMALL = 8_000  # steps of all records that are not worth taking apart
-BLOCKS = 60  # pieces of time, about, whose slopes are kept apart for intervals
+PART = 8  # records in a part: the lanes of the widest vector registers
+SMALL = 8_000  # total steps up to which records are not divided
+BLOCKS = 60  # approximate number of time blocks whose gradients are kept for intervals
 Wanted = Literal["value", "slopes", "exact"]
 
 
 @dataclass(frozen=True, eq=False)
 class FitData(SentOnce):
-    """Records with what measures them: all that a likelihood needs beside theta and the noise."""
+    """Everything that a likelihood needs except theta and the noise."""
 
     system: System
     records: tuple[Record, ...]
     measurement: Measurement
     unknowns: Unknowns
-    last: dict[bytes, RecordBatch] = field(default_factory=dict, init=False)  # by latency, one
+    last: dict[bytes, RecordBatch] = field(default_factory=dict, init=False)  # last one, by latency
 
     @property
     def steps(self) -> int:
-        """Of all records."""
+        """Total number of steps."""
         return sum(record.steps for record in self.records)
 
     @cached_property
     def parts(self) -> tuple[FitData, ...]:
-        """The records, a few together."""
+        """The data divided into parts of a few records each."""
         if self.steps <= SMALL or len(self.records) <= PART:
             return (self,)
         starts = range(0, len(self.records), PART)
@@ -65,11 +65,11 @@ class FitData(SentOnce):
 
     @property
     def pieces(self) -> int:
-        """Blocks of time that a record is divided into, for intervals."""
+        """Number of time blocks of each record, for intervals."""
         return max(1, round(BLOCKS / len(self.records)))
 
     def batch(self, theta: Array) -> RecordBatch:
-        """The records side by side, inputs delayed as theta says."""
+        """Return the records as a batch, with inputs delayed by theta's latencies."""
         latency = self.unknowns.unpack(theta)[1]
         if (found := self.last.get(latency.tobytes())) is None:
             found = batch_of(self.records, self.measurement, self.system.n, latency)
@@ -80,20 +80,20 @@ class FitData(SentOnce):
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """Slopes at a point, of all samples."""
+    """Derivatives at a point, over all samples."""
 
     N: Array  # (k, k) W'W
-    g: Array  # (k,) slope of the log-likelihood
-    scores: Array  # (blocks, k) W' eps of each piece of time
+    g: Array  # (k,) gradient of the log-likelihood
+    scores: Array  # (blocks, k) W' eps of each time block
 
 
 @dataclass(frozen=True, eq=False)
 class Pass:
-    """What a filter's pass over one part leaves behind."""
+    """The result of a filter's pass over one part."""
 
     track: Track
-    loglik: Array  # (B,) of each record; minus infinity where the filter did not get through
-    count: int  # samples that were seen
+    loglik: Array  # (B,) of each record; minus infinity where the filter diverged
+    count: int  # number of measured samples
     slopes: Linear | None
     status: str
 
@@ -108,17 +108,17 @@ class Point:
 
     @property
     def loglik(self) -> float:
-        """Of the innovations; minus infinity where the filter did not get through."""
+        """Log-likelihood of the innovations; minus infinity if the filter diverged."""
         return float(sum(one.loglik.sum() for one in self.passes))
 
     @property
     def count(self) -> int:
-        """Samples that were seen."""
+        """Number of measured samples."""
         return sum(one.count for one in self.passes)
 
     @property
     def status(self) -> str:
-        """How the filter ended, in the first part that it did not get through."""
+        """Status of the filter, that of the first part in which it diverged, if any."""
         stopped = [one.status for one in self.passes if not np.isfinite(one.loglik).all()]
         return (stopped or [self.passes[0].status])[0]
 
@@ -130,14 +130,14 @@ def point(
     near: Point | None = None,
     wanted: Wanted = "slopes",
 ) -> Point:
-    """One pass of the filter at theta.
+    """Run the filter once at theta.
 
     Args:
         data: the records.
-        noise: of process and measurements.
+        noise: process and measurement noise.
         theta: (k,).
-        near: a point not far from it, which saves time.
-        wanted: the likelihood alone, or slopes too.
+        near: a nearby point, which saves time.
+        wanted: the likelihood alone ("value"), or derivatives too ("slopes", "exact").
     """
     about = [None] * len(data.parts) if near is None else [one.track for one in near.passes]
     asked = (noise, theta, data.pieces, wanted)
@@ -146,22 +146,22 @@ def point(
 
 
 def linear(data: FitData, at: Point) -> Linear:
-    """Slopes at a point whose filter got through."""
+    """Return the derivatives at a point of finite likelihood."""
     if any(one.slopes is None for one in at.passes):
         at = point(data, at.noise, at.theta, at)
     return _sum([one.slopes for one in at.passes if one.slopes is not None])
 
 
 def exact(data: FitData, at: Point) -> Linear:
-    """Slopes with what a change of the parameters does to the filter's gains."""
+    """Return the derivatives including the dependence of the filter's gains on the parameters."""
     passes = point(data, at.noise, at.theta, at, "exact").passes
     return _sum([one.slopes for one in passes if one.slopes is not None])
 
 
 def fall(data: FitData, at: Point, i: int, value: float) -> float:
-    """What the log-likelihood loses with another value of unknown i.
+    """Return the loss of log-likelihood with another value of unknown i.
 
-    A threshold acts on few samples: only the records that it changes are filtered again.
+    Only the records that the change affects are filtered again: a threshold acts on few samples.
     """
     theta = at.theta.copy()
     theta[i] = value
@@ -201,12 +201,12 @@ def _slopes(part: FitData, batch: RecordBatch, theta: Array, f: Filtered, pieces
 
 
 def whitened(part: FitData, batch: RecordBatch, theta: Array, f: Filtered) -> Array:
-    """W, the slopes of the whitened innovations of a pass, (T + 1, B, ny, k)."""
+    """Return W, the derivative of a pass's whitened innovations, (T + 1, B, ny, k)."""
     return sensitivity(f, _change_of_the_next_state(part, batch, theta, f))
 
 
 def _by_gains(part: FitData, batch: RecordBatch, theta: Array, f: Filtered) -> Array:
-    """What the gains add to the slope of the log-likelihood, (k,)."""
+    """Return the gains' contribution to the gradient of the log-likelihood, (k,)."""
     unknowns, more = part.unknowns, np.zeros(part.unknowns.k)
     p, back = unknowns.unpack(theta)[0], smoother(f.gains, f.eps, covariances=True)
     assert back.whole is not None
@@ -227,7 +227,7 @@ def _by_gains(part: FitData, batch: RecordBatch, theta: Array, f: Filtered) -> A
 def _change_of_the_next_state(
     part: FitData, batch: RecordBatch, theta: Array, f: Filtered
 ) -> Array:
-    """f_theta along the filtered track, (T, B, n, k)."""
+    """Return f_theta along the filtered track, (T, B, n, k)."""
     unknowns, (T, B, n) = part.unknowns, f.more.shape
     p = unknowns.unpack(theta)[0]
     out = np.zeros((T, B, n, unknowns.k))
@@ -246,7 +246,7 @@ def _change_of_the_next_state(
 
 
 def _blocks(batch: RecordBatch, pieces: int) -> NDArray[np.int64]:
-    """A block number for each sample, (T + 1, B, ny): contiguous in time, within one record."""
+    """Return a block number for each sample, (T + 1, B, ny): contiguous in time, in one record."""
     T1, B, ny = batch.seen.shape
     within = np.arange(T1)[:, None] * pieces // np.maximum(batch.lengths + 1, 1)
     number = np.minimum(within, pieces - 1) + pieces * np.arange(B)
@@ -267,7 +267,7 @@ def _fall(part: FitData, here: Pass, asked: tuple[NoiseStd, Array, Array]) -> fl
 
 
 def _acts(part: FitData, track: Track, as_it_is: Array, theta: Array) -> NDArray[np.bool_]:
-    """The records (B,) along whose tracks the model at theta is another one."""
+    """Return which records (B,) are affected by the change to theta, along their tracks."""
     (p, latency), (here, before) = part.unknowns.unpack(theta), part.unknowns.unpack(as_it_is)
     if (latency != before).any():
         return np.ones(len(part.records), dtype=bool)

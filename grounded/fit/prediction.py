@@ -1,8 +1,8 @@
-"""How well a model predicts: one step and a second ahead, open loop.
+"""Prediction errors of a model: one step and a second ahead, open loop.
 
-Every window starts from the smoothed state, not from a raw sample: a noisy start would be counted
-as the model's error. The inputs are the recorded ones, delayed as the model says; errors are
-against the samples themselves, so their noise is the floor of both figures.
+Every window starts from the smoothed state, not from a raw sample, whose noise would count as an
+error of the model. The inputs are the recorded ones with the model's delay. Errors are relative to
+the raw samples, so measurement noise is the floor of both errors.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.trial import Trial
 
-STARTS = 4000  # windows at most: more change no figure
+STARTS = 4000  # most windows; more would not change the result
 
 
 @dataclass(frozen=True, eq=False)
 class PredictionError:
-    """Root mean square errors per channel; NaN for one never seen at the end of a window."""
+    """Root mean square errors per channel; NaN for a channel never seen at a window's end."""
 
     names: tuple[str, ...]
-    one_step: Array  # (ny,)
+    one_step: Array  # (ny,) in the channels' units
     ahead: Array  # (ny,) after `horizon_s`
-    horizon_s: float
-    windows: int  # that reach `horizon_s`; 0: no trial is long enough
+    horizon_s: float  # [s]
+    windows: int  # number of windows of `horizon_s`; 0 if no trial is long enough
 
 
 def prediction_error(
@@ -44,18 +44,19 @@ def prediction_error(
     measurement: Measurement | None = None,
     noise: NoiseStd | None = None,
 ) -> PredictionError:
-    """One-step and `horizon_s` open-loop prediction error of a model on trials.
+    """Return the open-loop prediction errors of a model on trials, one step and `horizon_s` ahead.
 
     Args:
         model: n states, m inputs.
         trials: real trials, or records.
-        horizon_s: how far ahead [s].
-        latency: transport delay of each input [s], (m,); None: zero.
-        measurement: what the records measure; None: the states.
-        noise: of this model on these trials, for the start states; None: estimated.
+        horizon_s: prediction horizon [s].
+        latency: transport delay of each input [s], (m,); None for zero.
+        measurement: what the records measure; None for the states.
+        noise: noise of this model on these trials, used to smooth the start states; None to
+            estimate it.
 
     Raises:
-        GroundedError: if a trial does not fit the model.
+        GroundedError: if a trial does not match the model.
     """
     measurement = of_states(model) if measurement is None else measurement
     delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
@@ -76,7 +77,7 @@ def prediction_error(
 def _windows(
     model: Model, batch: RecordBatch, measurement: Measurement, x: Array, steps: int
 ) -> tuple[Array, Array, int]:
-    """Rms after one step and after `steps`, from as many starts as there are."""
+    """Return the rms errors after one step and after `steps`, and the number of windows."""
     first, trial = np.nonzero(batch.valid)
     error = _error(model, batch, measurement, x, first, trial, 1)
     one = _rms(error)
@@ -98,7 +99,7 @@ def _error(
     trial: NDArray[np.int64],
     steps: int,
 ) -> Array:
-    """Errors (windows, ny) after `steps`; NaN where nothing was seen there."""
+    """Return the errors (windows, ny) after `steps`; NaN for lost samples."""
     state = x[first, trial]
     with np.errstate(all="ignore"):
         for i in range(steps):

@@ -1,14 +1,13 @@
-"""What a fit found, each value with its interval, and the sentence that says how it ended.
+"""The result of a fit: values with intervals, and a sentence that says how it ended.
 
-How sure a fit is of each unknown is judged twice:
+The covariance of the unknowns is estimated in two ways:
 
     information I = W'W,            covariance I^-1                 (noise as modelled)
     sandwich    I^-1 (sum_b g_b g_b') I^-1,   g_b = W_b' eps_b      (blocks b of time)
 
-The sandwich does not believe that innovations are independent within a block; of the two the larger
-is reported, so that an interval is not narrower than either says. A direction in which I is zero is
-one that the data don't identify: its unknowns have an infinite standard deviation. An unknown that
-ended at a bound has no direction left.
+The sandwich does not assume that innovations are independent within a block. The larger of the two
+is reported. If I is zero in a direction, the data do not identify it, and the unknowns that take
+part in it have an infinite standard deviation. An unknown at a bound is held there.
 Source: White, Estimation, Inference and Specification Analysis (1994); Newey & West (1987).
 """
 
@@ -34,7 +33,7 @@ from grounded.result import Result, document
 
 @dataclass(frozen=True, eq=False)
 class FittedValue:
-    """One fitted quantity with its 95 % interval; `std` is infinite where not identified."""
+    """A fitted quantity with its 95 % interval; `std` is infinite if it is not identified."""
 
     value: float
     std: float
@@ -47,19 +46,19 @@ class FittedValue:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit(Result):
-    """What a fit found.
+    """The result of a fit.
 
     `params` holds the model's parameters and, if fitted, `latency` or `latency:<input>` [s].
     """
 
     params: Mapping[str, FittedValue]
-    model: Model  # with the fitted values
+    model: Model  # the model with the fitted values
     latency: Array  # (m,) [s]
     noise: NoiseStd
     loglik: float
     status: str  # converged, still rising, or why it stopped
     sentence: str
-    before: PredictionError | None  # on held-out time; None: too little data to hold any out
+    before: PredictionError | None  # on held-out time; None if there was too little data for that
     after: PredictionError | None
     samples: int
     covariance: Array = field(repr=False)  # (k, k), in the order of params
@@ -68,7 +67,7 @@ class Fit(Result):
         object.__setattr__(self, "params", MappingProxyType(dict(self.params)))
 
     def beside(self, asked: Unknowns) -> Fit:
-        """The same with the unknowns that were held since the data don't identify them."""
+        """Return the fit with the unknowns added that were held because they are unidentified."""
         lost = [i for i, name in enumerate(asked.names) if name not in self.params]
         if not lost:
             return self
@@ -90,24 +89,24 @@ class Fit(Result):
 
     @property
     def helps(self) -> bool:
-        """Whether held-out time is predicted better by more than a tie's TIE.
+        """Whether held-out time is predicted better by more than TIE.
 
-        True where none was held out.
+        True if none was held out.
         """
         return _change(self.before, self.after) < -TIE
 
     @property
     def worse(self) -> bool:
-        """Whether held-out time is predicted worse than before, by more than a tie's TIE."""
+        """Whether held-out time is predicted worse than before by more than TIE."""
         return _change(self.before, self.after) > TIE
 
     def summary(self) -> str:
-        """The values with their standard deviations."""
+        """Return the status and the values with their standard deviations."""
         found = ", ".join(f"{name} {e.value:.4g} +- {e.std:.2g}" for name, e in self.params.items())
         return f"{self.status}: {found}"
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `grounded fit --json`; "applied" is for whoever writes the values."""
+        """Return the document of `grounded fit --json`; the command sets "applied"."""
         found = document(
             params={name: vars(e) for name, e in self.params.items()},
             status=self.status,
@@ -126,7 +125,7 @@ class Fit(Result):
 
 
 def least_known(model: Model, found: Fit) -> str | None:
-    """Of what the data don't identify, the one that its user is surest of; None: all are known."""
+    """Return the unidentified unknown with the narrowest relative prior; None if there is none."""
     if not np.isfinite(found.loglik):
         return None
 
@@ -145,14 +144,14 @@ def report(
     before: PredictionError | None,
     after: PredictionError | None,
 ) -> Fit:
-    """A search's end as a `Fit`.
+    """Build the `Fit` of a finished search.
 
     Args:
-        model: where it began.
+        model: the model with start values.
         unknowns: what was fitted.
-        last: where it ended.
-        before: how well the model predicted held-out time, if any was held out.
-        after: how well the model of the first search predicts it.
+        last: the end of the search.
+        before: prediction error of the start model on held-out time; None if none was held out.
+        after: prediction error of the model of the first search on held-out time.
     """
     at = last.climb.at
     params, wide = _estimates(unknowns, last)
@@ -173,13 +172,13 @@ def report(
     )
 
 
-TIE = 0.01  # of held-out errors: as much more, or less, says nothing
+TIE = 0.01  # relative change of held-out errors that is not significant
 
 
 def _change(before: PredictionError | None, after: PredictionError | None) -> float:
-    """Mean logarithm of what errors grew by, over the states, as far ahead as is known.
+    """Return the mean log ratio of errors, after over before, at the longest known horizon.
 
-    Minus infinity where nothing was held out, infinity where predictions diverge.
+    It is minus infinity if nothing was held out, and infinity if predictions diverge.
     """
     if before is None or after is None:
         return -np.inf
@@ -240,37 +239,38 @@ def _sentence(
 
 
 def _edge(unknowns: Unknowns, theta: Array) -> NDArray[np.bool_]:
-    """Unknowns (k,) that ended at a bound."""
+    """Return which unknowns (k,) ended at a bound."""
     return np.asarray(np.isclose(theta, unknowns.low) | np.isclose(theta, unknowns.high))
 
 
-FLAT = np.sqrt(12)  # standard deviations in the range of what may be anything within bounds
-NULL = 1e-10  # of the largest eigenvalue of the scaled information
-LOADING = 0.05  # a share of a null direction above which an unknown takes part in it
+FLAT = np.sqrt(12)  # width of a uniform distribution in standard deviations
+NULL = 1e-10  # eigenvalue, relative to the largest of the scaled information, that counts as zero
+LOADING = 0.05  # component of a null direction above which an unknown takes part in it
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """Standard deviations (k,), infinite where not identified, and which go together in that."""
+    """Standard deviations (k,), infinite if not identified, and groups of tied unknowns."""
 
     std: Array
     covariance: Array  # (k, k) of the identified ones; zero rows elsewhere
-    together: tuple[tuple[int, ...], ...]  # unknowns that only a combination of is identified
+    together: tuple[tuple[int, ...], ...]  # groups of which only a combination is identified
 
 
 def beside_bounds(
     slopes: Linear, free: NDArray[np.bool_], unknowns: Unknowns, theta: Array
 ) -> Uncertainty:
-    """The same where some ended at a bound: they stay there, the others are judged beside them.
+    """Return the uncertainty if some unknowns ended at a bound.
 
-    What only ties with one that can't go further is known. How far that one may be from its bound
-    is asked with the others free, or, where these could make up for it, with them held.
+    Those at a bound are held for the uncertainty of the others; an unknown that is only tied with
+    one of them thus counts as identified. Their own uncertainty is computed with the others free,
+    or, if the others could compensate for it, with them held.
 
     Args:
-        slopes: at the end of a climb.
-        free: unknowns that slopes speak about, (k,).
-        unknowns: with their bounds.
-        theta: where the climb ended, (k,).
+        slopes: derivatives at the end of a climb.
+        free: unknowns that the derivatives apply to, (k,).
+        unknowns: the unknowns with their bounds.
+        theta: values at the end of the climb, (k,).
     """
     edge, most = _edge(unknowns, theta), (unknowns.high - unknowns.low) / FLAT
     found = uncertainty(slopes, free & ~edge)
@@ -284,11 +284,11 @@ def beside_bounds(
 
 
 def uncertainty(slopes: Linear, free: NDArray[np.bool_]) -> Uncertainty:
-    """Standard deviations at the end of a climb.
+    """Return the standard deviations at the end of a climb.
 
     Args:
-        slopes: there.
-        free: unknowns that slopes speak about, (k,); the others get an infinite std.
+        slopes: derivatives there.
+        free: unknowns that the derivatives apply to, (k,); the others get an infinite std.
     """
     N = slopes.N
     k = len(N)
@@ -315,11 +315,11 @@ def uncertainty(slopes: Linear, free: NDArray[np.bool_]) -> Uncertainty:
 
 
 def inflation(slopes: Linear, free: NDArray[np.bool_]) -> float:
-    """How much less a nat is worth than it says: mean ratio of sandwich to information, >= 1.
+    """Return the factor by which log-likelihood differences are too large, >= 1.
 
-    Where innovations are correlated (quantised encoders, an effect that the model has no term for),
-    log-likelihoods differ by more than they should; an interval read off them must drop further
-    (Kent, Biometrika 69, 1982).
+    It is the mean ratio of sandwich to information. If innovations are correlated (quantised
+    encoders, effects that the model lacks), log-likelihoods differ by more than they should, and
+    the drop that defines an interval must be larger (Kent, Biometrika 69, 1982).
     """
     use = np.flatnonzero(free & (np.diag(slopes.N) > 0))
     if len(use) == 0:
@@ -331,13 +331,13 @@ def inflation(slopes: Linear, free: NDArray[np.bool_]) -> float:
 
 
 def _meat(slopes: Linear, use: NDArray[np.int64]) -> Array:
-    """The sum over blocks of g_b g_b', with the correction for few blocks."""
+    """Return the sum over blocks of g_b g_b', with the correction for few blocks."""
     count, scores = len(slopes.scores), slopes.scores[:, use]
     return np.asarray(scores.T @ scores * count / max(count - 1, 1))
 
 
 def _larger(inverse: Array, meat: Array) -> Array:
-    """The modelled covariance, widened for each unknown to what the sandwich says."""
+    """Return the modelled covariance, widened for each unknown to the sandwich's variance."""
     robust = inverse @ meat @ inverse
     ratio = np.diag(robust) / np.maximum(np.diag(inverse), 1e-300)
     widen = np.sqrt(np.maximum(ratio, 1.0))

@@ -1,15 +1,15 @@
-"""The search for the most likely parameters, delays, thresholds and noise.
+"""Search for the most likely parameters, delays, thresholds and noise.
 
-Three kinds of unknown are moved in turn until the likelihood stops rising: parameters and delays
-(Gauss-Newton, `gauss_newton`), thresholds (scanned), the noise (`grounded.estimate.likelihood`).
-The noise is not a nuisance: it decides what is an error of the model and what is not. It starts
-large, while the model is wrong, and shrinks with it.
+Three kinds of unknowns are optimised in turn until the likelihood stops increasing: parameters and
+delays (`gauss_newton`), thresholds (by scanning), and the noise (`grounded.estimate.likelihood`).
+The noise decides which errors are the model's. It starts large, while the model is wrong, and
+shrinks as the model improves.
 
-A threshold (the car's stall) changes the likelihood in steps: its slope is zero almost everywhere,
-and Gauss and Newton can't move it. It is scanned over its bounds, coarse first, then between the
-neighbours of the best; so are delays that may start far off. At each value the other unknowns are
-credited with what their own linear problem promises, so that a delay is compared with the best lag
-beside it, not with the lag of another delay.
+The likelihood is piecewise constant in a threshold (the car's stall): its derivative is zero almost
+everywhere, so Gauss-Newton can't move it. A threshold is scanned over its bounds, coarsely first,
+then between the neighbours of the best value; so are delays, whose start may be far off. At each
+value the predicted gain of the other unknowns' linear problem is added, so that each value of a
+delay, for instance, is compared with the lag that suits it best.
 
 The interval of a threshold is the set of values whose log-likelihood lies within DROP of the best:
 3.67 nats, the 95 % point for a threshold (Hansen 2000), more than the 1.92 of a smooth unknown.
@@ -33,31 +33,31 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.progress import Stages
 
-ROUNDS = 8  # of parameters, thresholds, noise
-STIRRED = 0.5  # [nats] a climb that gains less leaves thresholds and noise where they are
-STUCK = 1.0  # [nats] a climb that ends though its slopes promise more has not converged
-REVIVE = 0.2  # of the rough noise: where each search for the noise begins at least
-LONG = 400  # steps; longer records are cut, so that the filter runs over the pieces at once
+ROUNDS = 8  # most rounds of parameters, thresholds, noise
+STIRRED = 0.5  # [nats] gain of a climb below which thresholds and noise are not searched again
+STUCK = 1.0  # [nats] predicted gain above which a climb that ended has not converged
+REVIVE = 0.2  # least start of each noise search, as a fraction of the rough noise
+LONG = 400  # steps; longer records are cut, so that the filter runs over the pieces in parallel
 
 
 @dataclass(frozen=True, eq=False)
 class SearchEnd:
-    """Where a search ended: the last climb, the noise then and at its start, and why."""
+    """The result of a search: the last climb, the noise at its end and start, and the status."""
 
     data: FitData
     climb: Climb
     noise: NoiseStd
     start_noise: NoiseStd
-    thresholds: NDArray[np.bool_]  # (k,) unknowns that a scan has moved
+    thresholds: NDArray[np.bool_]  # (k,) unknowns that were moved by a scan
     status: str
 
 
 def data_of(
     model: Model, records: Sequence[Record], measurement: Measurement, unknowns: Unknowns
 ) -> FitData:
-    """Records for a search; long ones whose states are measured directly are cut into pieces."""
+    """Return the data of a search; long records of directly measured states are cut to pieces."""
     pieces: list[Record] = []
-    direct = all(i >= 0 for i in measurement.states)  # else a piece would not know its start
+    direct = all(i >= 0 for i in measurement.states)  # else the start of a piece is unknown
     for record in records:
         span = float(record.times[-1] - record.times[0])
         many = -(-record.steps // LONG) if direct else 1
@@ -66,7 +66,7 @@ def data_of(
 
 
 def first_search(data: FitData, rng: np.random.Generator, tick: Stages) -> SearchEnd:
-    """From the start values; of much data on a draw, from where the whole is soon climbed."""
+    """Search from the start values; with much data, on a random part of the records."""
     draw = enough(data.records, rng)
     if 2 * sum(r.steps for r in draw) <= data.steps:
         data = replace(data, records=tuple(draw))
@@ -80,7 +80,7 @@ def search_parameters(
     rng: np.random.Generator,
     tick: Stages,
 ) -> SearchEnd:
-    """Parameters, thresholds and noise in turn until the likelihood stops rising."""
+    """Optimise parameters, thresholds and noise in turn until the likelihood stops increasing."""
     new = noise is None
     tick("noise")
     noise = _noise(data, theta, None, rng) if noise is None else noise
@@ -105,11 +105,11 @@ def search_parameters(
                 thresholds[i] |= moved is not at
                 at = moved
         if at.loglik - before < STIRRED and round_ > 0:
-            both = (end.slopes, linear(data, at))  # at a kink the exact ones can be far off
+            both = (end.slopes, linear(data, at))  # at a kink the exact gradient can be far off
             promise = min(marquardt_step(data, at.theta, each, ~still, 1e-3)[1] for each in both)
             status = "converged"
             if at is end.at and promise > STUCK:
-                status = f"no step rises, though slopes promise {promise:.1f} nats"
+                status = f"no step improves, though derivatives promise {promise:.1f} nats"
             break
         later = _noise(data, at.theta, noise, rng)
         there = point(data, later, at.theta, at)
@@ -120,11 +120,11 @@ def search_parameters(
 
 
 def _tell(tick: Stages, data: FitData, at: Point) -> None:
-    """A round begins; what would be said if it were the last."""
+    """Report that a round begins, and set the text for an interruption."""
     values = zip(data.unknowns.names, at.theta, data.unknowns.units, strict=True)
     told = ", ".join(f"{name} = {value:.5g} {unit}" for name, value, unit in values)
-    tick.so_far = f"so far, not at the top yet: {told}"
-    tick(f"climb, {at.count} samples")
+    tick.so_far = f"so far, not converged yet: {told}"
+    tick(f"fit, {at.count} samples")
 
 
 def _stopped(at: Point) -> Climb:
@@ -136,14 +136,14 @@ def _stopped(at: Point) -> Climb:
 def _noise(
     data: FitData, theta: Array, noise: NoiseStd | None, rng: np.random.Generator
 ) -> NoiseStd:
-    """The most likely noise at theta, from where it was or from scratch."""
+    """Return the most likely noise at theta, starting from `noise` or from scratch."""
     p, latency = data.unknowns.unpack(theta)
     records = enough(data.records, rng)
     batch = batch_of(records, data.measurement, data.system.n, latency)
     rough = first_noise(batch, data.measurement)
     if noise is None:
         noise = rough
-    else:  # a variance that sank while the model was wrong would not rise again by itself
+    else:  # a variance that became tiny while the model was wrong would not grow again
         noise = NoiseStd(
             np.maximum(noise.process, REVIVE * rough.process),
             np.maximum(noise.measurement, REVIVE * rough.measurement),
@@ -154,7 +154,7 @@ def _noise(
 
 
 def _delays(data: FitData, at: Point) -> Point:
-    """Each fitted latency from a scan over whole steps: it may begin far off."""
+    """Scan each fitted latency over whole steps, since its start may be far off."""
     first = len(data.unknowns.columns)
     free = ~quiet(data, linear(data, at))
     for i in range(first, data.unknowns.k):
@@ -163,15 +163,15 @@ def _delays(data: FitData, at: Point) -> Point:
     return at
 
 
-COARSE, FINE, ZOOMS = 21, 5, 4
-DROP = 3.67  # [nats]
-GRID = 10  # points between a value that is as good and one that is not
-LEVEL = 0.05  # [nats] as good as equal
-QUIET = 1e-2  # information over the whole range below which a slope says nothing
+COARSE, FINE, ZOOMS = 21, 5, 4  # points of the first grid, half of the later ones; zooms
+DROP = 3.67  # [nats] drop of the log-likelihood at the ends of a threshold's interval
+GRID = 10  # points between a value inside an interval and one outside
+LEVEL = 0.05  # [nats] difference treated as equal
+QUIET = 1e-2  # information over the whole range below which a derivative counts as zero
 
 
 def quiet(data: FitData, slopes: Linear) -> NDArray[np.bool_]:
-    """Unknowns (k,) on which the innovations do not depend to first order."""
+    """Return which unknowns (k,) do not change the innovations to first order."""
     information = np.diag(slopes.N) * data.unknowns.scale**2
     return np.asarray(information < QUIET)
 
@@ -183,16 +183,16 @@ def profile_of(
     grid: Array,
     free: NDArray[np.bool_] | None,
 ) -> tuple[Point, Array]:
-    """The best point with unknown i on a grid, and the profile (len(grid),) [nats].
+    """Return the best point with unknown i on a grid, and the profile (len(grid),) [nats].
 
-    The other unknowns are moved by one step of theirs if that is better than leaving them.
+    The other unknowns are moved by one step if that is better than leaving them.
 
     Args:
         data: the records.
-        at: where the others are.
+        at: the values of the others.
         i: the unknown that is scanned.
         grid: its values.
-        free: which others may move, (k,); None: none.
+        free: which others may move, (k,); None for none.
     """
     others = np.zeros(data.unknowns.k, dtype=bool) if free is None else free.copy()
     others[i] = False
@@ -225,18 +225,16 @@ def coarse_to_fine(
     free: NDArray[np.bool_],
     width: float | None = None,
 ) -> Point:
-    """The best value of unknown i: over its bounds, or within `width` of where it is.
+    """Return the point with the best value of unknown i, over its bounds or within `width`.
 
-    Stays where it is if nothing is better.
+    The point is unchanged if no value is better.
     """
     low, high = data.unknowns.low[i], data.unknowns.high[i]
     if width is not None:
         low, high = max(low, at.theta[i] - width), min(high, at.theta[i] + width)
     grid, best = np.linspace(low, high, COARSE), at
     for round_ in range(ZOOMS):
-        others = (
-            free if round_ == 0 and width is None else None
-        )  # small steps hardly matter to them
+        others = free if round_ == 0 and width is None else None  # small steps hardly affect them
         best, profile = profile_of(data, best, i, grid, others)
         top = np.flatnonzero(profile > profile.max() - LEVEL)
         step = grid[1] - grid[0]
@@ -250,9 +248,10 @@ def coarse_to_fine(
 
 
 def _centred(data: FitData, best: Point, i: int, level: Array) -> Point:
-    """The middle of the values that are as good as the best: the likelihood is flat between them.
+    """Return the point in the middle of the values that are as good as the best.
 
-    An end of the level is where the next sample lies, and nothing says that it is the threshold.
+    The likelihood is flat between them. The ends of the flat part are where the next samples lie,
+    and are no more likely than the middle.
     """
     beside = level[np.argsort(np.abs(level - np.median(level)))]
     for value in beside:
@@ -264,16 +263,16 @@ def _centred(data: FitData, best: Point, i: int, level: Array) -> Point:
 def likelihood_interval(
     data: FitData, at: Point, i: int, inflation: float = 1.0
 ) -> tuple[float, float]:
-    """The values of unknown i around the best whose log-likelihood is within DROP of it.
+    """Return the interval of unknown i in which the log-likelihood is within DROP of the best.
 
-    The likelihood of a threshold is rough: the outermost such value counts, sought as far as it has
-    fallen for good. A bound of the unknown is returned where it never falls that far.
+    The likelihood of a threshold is rough, so the outermost such values are searched for, until the
+    likelihood has dropped by three times as much. If it never drops that far, the end is a bound.
 
     Args:
         data: the records.
         at: the best point.
         i: the unknown.
-        inflation: what DROP is multiplied by where innovations are correlated.
+        inflation: factor on DROP for correlated innovations.
     """
     drop = DROP * inflation
     ends = (float(data.unknowns.low[i]), float(data.unknowns.high[i]))
@@ -309,7 +308,7 @@ def _end(data: FitData, at: Point, i: int, bound: float, drop: float) -> float:
 
 
 def _with(data: FitData, at: Point, i: int, value: float) -> Point:
-    """The same point but for unknown i."""
+    """Return the point with another value of unknown i."""
     theta = at.theta.copy()
     theta[i] = value
     return point(data, at.noise, theta, at)

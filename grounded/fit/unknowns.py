@@ -1,4 +1,4 @@
-"""What is fitted: parameters of the model and delays of its inputs, as one vector theta."""
+"""Unknowns of a fit: parameters of the model and delays of its inputs, as one vector theta."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from grounded.frozen import Array
 from grounded.model import BELIEVED, Model
 
 Latency = Literal["known", "common", "each"]
-LONGEST = 0.5  # [s] no latency is sought beyond
+LONGEST = 0.5  # [s] largest latency that is fitted
 BOUNDS = (
-    "what may move has bounds, Param(value, unit, low, high), or a prior, Param(value, unit, std=s)"
+    "to fit a parameter, give bounds, Param(value, unit, low, high), or a prior, "
+    "Param(value, unit, std=s)"
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """theta = [parameters, latencies]: names, bounds, scales, and the way back to the model.
+    """theta = [parameters, latencies]: names, bounds, scales, and the mapping to the model.
 
-    The scale is a natural size of a change: the width of the bounds where both are given.
+    The scale is the typical size of a change: the width of the bounds if both are given.
     """
 
     names: tuple[str, ...]
@@ -32,9 +33,9 @@ class Unknowns:
     low: Array  # (k,) may be -inf
     high: Array  # (k,) may be inf
     scale: Array  # (k,)
-    columns: tuple[int, ...]  # of the model's parameters that are fitted
-    delayed: tuple[tuple[int, ...], ...]  # inputs that each fitted latency delays
-    values: Array  # all parameters of the model
+    columns: tuple[int, ...]  # indices of the fitted parameters of the model
+    delayed: tuple[tuple[int, ...], ...]  # inputs that each fitted latency applies to
+    values: Array  # values of all parameters of the model
     latency: Array  # (m,) [s] of all inputs
 
     @property
@@ -43,7 +44,7 @@ class Unknowns:
         return len(self.names)
 
     def unpack(self, theta: Array) -> tuple[Array, Array]:
-        """All parameter values and all latencies [s] at theta."""
+        """Return all parameter values and all latencies [s] at theta."""
         p, latency = self.values.copy(), self.latency.copy()
         p[list(self.columns)] = theta[: len(self.columns)]
         for value, inputs in zip(theta[len(self.columns) :], self.delayed, strict=True):
@@ -51,7 +52,7 @@ class Unknowns:
         return p, latency
 
     def less(self, index: int) -> Unknowns:
-        """The same without one unknown, which stays at its start."""
+        """Return the unknowns without one, which stays at its start value."""
         kept = np.delete(np.arange(self.k), index)
         names, units = (tuple(each[i] for i in kept) for each in (self.names, self.units))
         columns = tuple(c for i, c in enumerate(self.columns) if i != index)
@@ -61,19 +62,19 @@ class Unknowns:
         return replace(self, names=names, units=units, columns=columns, delayed=delayed, **arrays)
 
     def clipped(self, theta: Array) -> Array:
-        """Theta within the bounds."""
+        """Clip theta to the bounds."""
         return np.asarray(np.clip(theta, self.low, self.high))
 
 
 def unknowns_of(
     model: Model, names: Sequence[str] | None, latency: Array, fit_latency: Latency
 ) -> Unknowns:
-    """Checks the names and gathers bounds.
+    """Check the names and collect values and bounds.
 
     Args:
-        model: gives values and bounds.
-        names: parameters to fit; None: all uncertain ones.
-        latency: of each input [s], known or where to begin, (m,).
+        model: has the values and bounds.
+        names: parameters to fit; None for all uncertain ones.
+        latency: latency of each input [s], fixed or the start value, (m,).
         fit_latency: "known" (not fitted), "common" (one for all inputs), or "each".
 
     Raises:
@@ -102,7 +103,7 @@ def unknowns_of(
         labels = [f"latency:{name}" for name in model.input_names]
     if not names and not labels:
         raise GroundedError(f"model '{model.name}' has no uncertain parameter to fit: {BOUNDS}")
-    far = [np.inf if p.std is None else BELIEVED * p.std for p in params]  # where no bound is given
+    far = [np.inf if p.std is None else BELIEVED * p.std for p in params]  # if there is no bound
     low = [p.value - f if p.low is None else p.low for p, f in zip(params, far, strict=True)]
     high = [p.value + f if p.high is None else p.high for p, f in zip(params, far, strict=True)]
     low, high = low + [0.0] * len(delayed), high + [LONGEST] * len(delayed)

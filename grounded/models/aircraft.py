@@ -13,9 +13,9 @@ beyond the stall (Beard & McLain, *Small Unmanned Aircraft*, Eq. 4.8 to 4.11).
     inputs   throttle                    0 to 1
              aileron, elevator, rudder   surface angles [rad]
 
-Body velocities, not airspeed and its two angles: polynomial force equations, and no division by
-the airspeed or by cos(beta) on the left-hand side. Signs as in Stevens & Lewis: a positive
-elevator or rudder pitches the nose down, yaws it left; here a positive aileron rolls right.
+The states are body velocities, not airspeed and its two angles, so that no equation of motion is
+divided by the airspeed or by cos(beta). Signs are those of Stevens & Lewis: a positive elevator
+pitches the nose down, a positive rudder yaws it left; here a positive aileron rolls right.
 
     alpha = atan2(w, u),  beta = asin(v / V),  V = |(u, v, w)|,  qbar = rho V^2 / 2
     T = rho S_prop C_prop ((k_motor throttle)^2 - V^2) / 2
@@ -33,7 +33,7 @@ GRAVITY = 9.81  # [m/s2]
 
 
 def about(value: float, unit: str) -> Param:
-    """A number of a textbook or a scaled one: 30 % is what it may be off."""
+    """Return a parameter from a textbook, or scaled, with a standard deviation of 30 %."""
     return Param(value, unit, std=0.3 * abs(value))
 
 
@@ -88,7 +88,7 @@ PARAMS: dict[str, Param] = {
 
 
 def lift_coefficient(alpha: Any, p: Any) -> Any:
-    """Lift of the wing at an angle of attack [rad]: linear, a flat plate's beyond the stall.
+    """Return the wing's lift coefficient at an angle of attack [rad]; a flat plate's past stall.
 
     Beard & McLain, Eq. 4.9 and 4.10: sigma rises from 0 to 1 around +-alpha_s.
     """
@@ -100,7 +100,7 @@ def lift_coefficient(alpha: Any, p: Any) -> Any:
 
 
 def forces_and_moments(s: Any, a: Any, p: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """Aerodynamics and propulsion in body axes: X, Y, Z [N] and L, M, N [N m]."""
+    """Return forces X, Y, Z [N] and moments L, M, N [N m] in body axes, with propulsion."""
     V = np.sqrt(s.u**2 + s.v**2 + s.w**2)
     alpha = np.arctan2(s.w, s.u)
     beta = np.arcsin(s.v / V)
@@ -131,7 +131,7 @@ def forces_and_moments(s: Any, a: Any, p: Any) -> tuple[Any, Any, Any, Any, Any,
 
 
 def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
-    """ds/dt: the flat-Earth body-axes equations (Stevens & Lewis 2003, Table 2.4-1)."""
+    """Return ds/dt by the flat-Earth body-axes equations (Stevens & Lewis 2003, Table 2.4-1)."""
     X, Y, Z, L, M, N = forces_and_moments(s, a, p)
     cphi, sphi = np.cos(s.phi), np.sin(s.phi)
     cth, sth = np.cos(s.theta), np.sin(s.theta)

@@ -1,4 +1,4 @@
-"""Trim: the states and inputs that an aircraft holds in steady level flight, straight or turning.
+"""Trim: states and inputs of an aircraft in steady level flight, straight or turning.
 
 Level flight at airspeed V and turn rate omega without sideslip: twelve equations for the eight
 states u, v, w, phi, theta, p, q, r and the four inputs (Stevens & Lewis 2003, section 3.6; the
@@ -6,9 +6,9 @@ turn is coordinated by beta = 0),
 
     u' = v' = w' = phi' = theta' = p' = q' = r' = altitude' = 0,  psi' = omega,  |V| = V,  v = 0,
 
-written on the discrete model, x_{t+1} - x_t over one control step, so that the trim is exact where
-it is flown and holds for any model with an aircraft's states, also one with adopted effects. All
-flight conditions are solved at once by Newton's method on the linearised model.
+solved for the discrete model, x_{t+1} - x_t over one control step, so that the trim is exact in the
+simulation and works for any model with an aircraft's states, including adopted effects. All flight
+conditions are solved at once by Newton's method on the linearised model.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ FREE = ("u", "v", "w", "phi", "theta", "p", "q", "r")
 
 @dataclass(frozen=True, eq=False)
 class Trim:
-    """States (N, 12) at the origin, flying along a track of zero (due north), inputs (N, 4)."""
+    """States (N, 12) at the origin with a track due north, and inputs (N, 4)."""
 
     states: Array
     inputs: Array
@@ -39,10 +39,10 @@ class Trim:
 
 
 def level_trim(model: Model, speed: Array, turn_rate: Array, dt: float = 0.02) -> Trim:
-    """Steady level flight for each pair of airspeed and turn rate.
+    """Return the trim of steady level flight for each pair of airspeed and turn rate.
 
     Args:
-        model: an aircraft, by its state and input names (`grounded.models.aircraft`).
+        model: a model with the state and input names of `grounded.models.aircraft`.
         speed: airspeed V [m/s], (N,).
         turn_rate: omega [rad/s], positive to the right, (N,).
         dt: control step [s].
@@ -53,7 +53,7 @@ def level_trim(model: Model, speed: Array, turn_rate: Array, dt: float = 0.02) -
     speed, turn_rate = np.broadcast_arrays(np.atleast_1d(speed), np.atleast_1d(turn_rate))
     names = model.state_names
     if not {*FREE, "north", "east", "altitude", "psi"} <= set(names):
-        raise GroundedError(f"'{model.name}' has not the states of an aircraft: {', '.join(names)}")
+        raise GroundedError(f"'{model.name}' lacks the states of an aircraft: {', '.join(names)}")
     x, a = _first_guess(model, speed, turn_rate)
     free = [names.index(name) for name in FREE]
     worst = np.inf
@@ -64,7 +64,7 @@ def level_trim(model: Model, speed: Array, turn_rate: Array, dt: float = 0.02) -
             break
         try:
             step = np.linalg.solve(slope, -error[..., None])[..., 0]
-        except np.linalg.LinAlgError:  # no air: no surface turns it
+        except np.linalg.LinAlgError:  # without air the control surfaces have no effect
             break
         scale = np.minimum(1.0, 0.5 / np.maximum(np.abs(step / (1 + speed[:, None])).max(1), 1e-12))
         x[:, free] += scale[:, None] * step[:, : len(free)]
@@ -72,13 +72,13 @@ def level_trim(model: Model, speed: Array, turn_rate: Array, dt: float = 0.02) -
     if not worst < 1e-6:
         raise GroundedError(
             f"no level flight was found at {speed.min():.2f} to {speed.max():.2f} m/s and turn "
-            f"rates up to {np.abs(turn_rate).max():.2f} rad/s: the best is off by {worst:.1e}"
+            f"rates up to {np.abs(turn_rate).max():.2f} rad/s: the residual is {worst:.1e}"
         )
     return Trim(_due_north(model, x, a, dt), a)
 
 
 def _first_guess(model: Model, speed: Array, turn_rate: Array) -> tuple[Array, Array]:
-    """A coordinated turn by the point-mass equations, with a few degrees of attack."""
+    """Return a coordinated turn by the point-mass equations, at an angle of attack of 0.1 rad."""
     bank = np.arctan(speed * turn_rate / GRAVITY)
     attack = np.full_like(speed, 0.1)
     pitch = attack * np.cos(bank)
@@ -100,7 +100,7 @@ def _first_guess(model: Model, speed: Array, turn_rate: Array) -> tuple[Array, A
 def _equations(
     model: Model, x: Array, a: Array, speed: Array, turn_rate: Array, dt: float
 ) -> tuple[Array, Array]:
-    """The twelve equations (N, 12) and their derivative by the free states and inputs."""
+    """Return the residuals (N, 12) and their derivative by the free states and inputs."""
     names = model.state_names
     free = [names.index(name) for name in FREE]
     rows = [names.index(name) for name in (*STEADY, "psi")]
@@ -121,7 +121,7 @@ def _equations(
 
 
 def _due_north(model: Model, x: Array, a: Array, dt: float) -> Array:
-    """Turns each heading so that the track, not the nose, points north at the step's middle."""
+    """Turn each heading so that the track (not the nose) points north in the middle of the step."""
     names = model.state_names
     moved = model.system.step(x, a, model.values, dt)
     north, east, psi = (names.index(name) for name in ("north", "east", "psi"))

@@ -12,7 +12,7 @@ G = 9.81  # [m/s^2]
 
 
 def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
-    """ds/dt of two uniform rods and a mass at the tip; angles from the horizontal, upwards."""
+    """Return ds/dt of two uniform rods with a load at the tip; angles up from the horizontal."""
     l1, c1, c2, m1, l2 = 0.5, 0.25, 0.2, 1.5, 0.4
     cos, sin = np.cos(s.q2), np.sin(s.q2)
     first, second = p.m2 * c2 + p.load * l2, p.m2 * c2**2 + p.load * l2**2 + 0.013333333333

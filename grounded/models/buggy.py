@@ -3,7 +3,7 @@
 v'   = (top drive - v) / tau,    tau = tau_drive where it drives, tau_brake where it brakes
 psi' = v sin(a1 steering) / L
 
-At constant speed it stands on the kink: noise drives and brakes by turns.
+At constant speed it is exactly at the kink: noise makes it drive and brake alternately.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from grounded.model import Model, Param
 
 
 def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
-    """ds/dt."""
+    """Return ds/dt."""
     wanted = p.top * a.drive - s.v
     delta = p.a1 * a.steering
     return {

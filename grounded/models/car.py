@@ -7,17 +7,17 @@
 
 delta is the steering angle, v the speed of the FRONT wheels, (x, y) the middle of the rear axle,
 psi the heading; u1 is the steering and u2 the throttle, both in [-1, 1]. The heading rate is the
-sixth state: it starts at v sin(delta) / L and is carried along by the chain rule, so that it can be
-tracked and measured.
+sixth state, so that it can be tracked and measured: it starts at v sin(delta) / L and is integrated
+by the chain rule.
 
 Two details of footnote 17 and one of physics:
   - the motor stalls: a throttle below `stall` acts as zero;
-  - braking at a4 ends at v_ss and doesn't cross it: a4 is approached through a short first-order
-    response (TAU_BRAKE), without which v chatters around v_ss at any finite step;
-  - a car that is not driven stands still (v_ss >= 0), friction doesn't push it backwards.
-The latency of 0.1 s from input to camera is the task's (`latency`), a queue in the state.
+  - braking at a4 ends at v_ss and does not cross it: near v_ss, a4 is replaced by a short
+    first-order response (TAU_BRAKE), without which v chatters around v_ss at any finite step;
+  - a car that is not driven stands still (v_ss >= 0): friction does not push it backwards.
+The latency of 0.1 s from input to camera belongs to the task (`latency`), as a queue in the state.
 
-Values: fitted to no particular car; chosen in the range of the XRAY M18's (section 5.2).
+The values are not fitted to a particular car, but in the range of the XRAY M18's (section 5.2).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TAU_BRAKE = 0.05  # [s]
 
 
 def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
-    """ds/dt, section 5.2."""
+    """Return ds/dt (section 5.2)."""
     throttle = np.where(a.throttle > p.stall, a.throttle, 0.0)
     delta_ss = p.a1 * a.steering + p.b1
     v_ss = np.maximum(p.a2 * throttle + p.a3 * np.abs(a.steering) + p.b2, 0.0)

@@ -12,7 +12,7 @@ G = 9.81  # [m/s^2]
 
 
 def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
-    """ds/dt of a cart and a uniform pole; theta is zero upright."""
+    """Return ds/dt of a cart and a uniform pole; theta is zero upright."""
     sin, cos = np.sin(s.theta), np.cos(s.theta)
     inertia = p.m * p.l**2 * 4 / 3
     force = a.force - p.b * s.x_vel + p.m * p.l * s.theta_vel**2 * sin

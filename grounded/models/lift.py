@@ -1,4 +1,4 @@
-"""A lift's drive: another gain upwards than downwards, and dry friction in its guides.
+"""A lift's drive with different gains upwards and downwards, and dry friction in its guides.
 
 w' = (up or down) volts - b w - c sign(w)
 """
@@ -11,11 +11,11 @@ import numpy as np
 
 from grounded.model import Model, Param
 
-WIDTH = 0.05  # [m/s] over which the friction builds up
+WIDTH = 0.05  # [m/s] speed over which the friction builds up
 
 
 def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
-    """ds/dt."""
+    """Return ds/dt."""
     push = np.where(a.volts > 0, p.up, p.down) * a.volts
     dry = np.minimum(np.maximum(s.w / WIDTH, -1.0), 1.0)
     return {"z": s.w, "w": push - p.b * s.w - p.c * dry}

@@ -13,7 +13,7 @@ from grounded.model import Model, Param
 
 
 def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
-    """ds/dt."""
+    """Return ds/dt."""
     inertia = p.m * p.l**2
     return {
         "theta": s.omega,

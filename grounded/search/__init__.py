@@ -1,11 +1,19 @@
-"""The search on the REAL system, derived from stored trials: what to run next.
+"""The search on the REAL system: choose what to run next from the stored trials.
 
-Read `improve.py` first: the paper's loop, one proposal at a time; `ask_tell.py` is the loop around
-it. `making.py` makes a `candidate.py`; `limit_cycle.py` says whether feedback swung the inputs to
-and fro, `margin.py` whether it holds with noise and on old samples; `mispredictions.py` corrects
-the model's slopes by earlier trials, `corrected.py` is the model with them.
-`standing.py` says where the search stands and why it ended, `certainty.py` how sure an improvement
-is, `step_size.py` how far to go (damping, alpha), `first_policy.py` where it starts (DDP from many
-runs, the first of them by `first_guess.py`), `planner.py` by which model it plans, `safety.py` what
-may be handed out; `pictures.py` draws it.
+Read `improve.py` first: it makes one proposal of the paper's loop.
+
+ask_tell        the loop around the proposals
+standing        the state of the search, and why it ended
+certainty       how certain an improvement is, from `scatter`, the noise of utilities
+first_policy    the first policy: DDP from many starts, the first of them from `first_guess`
+step_size       damping and alpha of the next step
+directions      the direction of the step, by DDP or policy gradient
+making          builds a `candidate`
+limit_cycle     detects feedback that makes the inputs oscillate
+margin          checks gains under noise and with old samples
+mispredictions  corrects the model's derivatives from earlier trials; `corrected` is that model
+feedback        compares gains in several models that explain the trials
+planner         the model used for planning, with adopted effects
+safety          checks a candidate before it is handed out
+pictures        figures of the search
 """

@@ -1,12 +1,12 @@
-"""Steps 1 to 7 as a loop: ask for a candidate, run it on the real system, tell the trial.
+"""Steps 1 to 7 as a loop: ask for a candidate, run it on the real system, tell the result.
 
     search = Search(task)
     while (candidate := search.ask()) is not None:
         search.tell(run(candidate))
 
-A `Search` holds the candidates that were asked for and the trials that were told, nothing else;
-where it stands is derived from them (`propose`, `standing`). `learn` is this loop for a real system
-that is a function call.
+A `Search` stores only the candidates it has proposed and the trials it was given; its state is
+derived from them (`propose`, `standing`). `learn` runs this loop for a real system that can be
+called as a function.
 """
 
 from __future__ import annotations
@@ -30,14 +30,19 @@ if TYPE_CHECKING:
 
 
 class Search:
-    """A search that is asked and told, without a disk.
+    """A search with an ask-and-tell interface, kept in memory.
+
+    `ask` returns the candidate to run next; `tell` adds the trial of its run.
 
     Args:
         task: the manoeuvre and the crude model.
-        options: the [search] table; None: its defaults.
-        candidates: those of a search that goes on, in the order in which they were asked for.
+        options: settings of the search; None for the defaults.
+        candidates: candidates of an earlier search to continue, in the order of their proposal.
         trials: their trials, in the order in which they were told.
-        planner: plans with a better model (`adopt`); None: with the task's own.
+        planner: plans with a better model (see `adopt`); None for the task's own model.
+
+    Raises:
+        GroundedError: if `task` is not a `Task`, or a trial does not fit it.
     """
 
     def __init__(
@@ -56,32 +61,32 @@ class Search:
         self._candidates, self._trials = list(candidates), list(trials)
         for trial in self._trials:
             self._fits(trial)
-        self._planned: Proposal | None = None  # what follows from them, once that is asked for
+        self._planned: Proposal | None = None  # cache of `proposal`
 
     def __repr__(self) -> str:
         return f"<Search: candidates {len(self._candidates)}, trials {len(self._trials)}>"
 
     def _repr_html_(self) -> str:
-        """Where it stands, for Jupyter."""
+        """Return the standing as an HTML table, for Jupyter."""
         return self.standing._repr_html_()
 
     def plot(self) -> Any:
-        """Utilities of the candidates as a Plotly figure; see `Result.plot`."""
+        """Return a Plotly figure of the candidates' utilities; see `Result.plot`."""
         return self.standing.plot()
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
-        """The candidates that were asked for."""
+        """The candidates proposed so far, in order."""
         return tuple(self._candidates)
 
     @property
     def trials(self) -> tuple[Trial, ...]:
-        """The trials that were told."""
+        """The trials told so far, in order."""
         return tuple(self._trials)
 
     @property
     def proposal(self) -> Proposal:
-        """What `ask` would return, or why there is nothing more to run."""
+        """The proposal that `ask` would return a candidate of; computed on first use."""
         if self._planned is None:
             whole = [interpolate_gaps(trial).trial for trial in self._trials]
             self._planned = propose(
@@ -91,21 +96,27 @@ class Search:
 
     @property
     def standing(self) -> Standing:
-        """Where the search stands; plans the next candidate, which alone tells whether it ends."""
+        """The state of the search. Plans the next candidate, which decides whether it has ended."""
         return self.proposal.standing
 
     @property
     def best(self) -> Tried | None:
-        """The best candidate so far with its trials; None before the first whole trial."""
+        """The best candidate so far with its trials; None before the first complete trial."""
         return self.standing.incumbent
 
     @property
     def policy(self) -> Policy | None:
-        """The best policy so far; None before the first whole trial."""
+        """The best policy so far; None before the first complete trial."""
         return self.best.candidate.policy if self.best else None
 
     def ask(self) -> Candidate | None:
-        """The candidate to run next, the same one until its trial is told; None at the end."""
+        """Return the candidate to run next, or None if the search has ended.
+
+        Repeated calls return the same candidate until its trial is told.
+
+        Raises:
+            GroundedError: if the model gives no plan to start from.
+        """
         proposal = self.proposal
         if proposal.candidate is not None and proposal.is_new:
             self._candidates.append(proposal.candidate)
@@ -118,16 +129,18 @@ class Search:
         params: Mapping[str, float] | None = None,
         library: Library | None = None,
     ) -> Search:
-        """The search from here on with a better model, whatever memory its effects have.
+        """Return a search that continues from here with effects added to the model.
+
+        Effects may have memory (a delay, a lag). This search is not changed.
 
         Args:
-            effects: quantities by effect, in the order in which they act, `joining` of a diagnosis
-                of this search's task and trials; in place of those adopted before.
-            params: the model's own parameters that were calibrated beside them.
-            library: where the families are; None: the built-in ones.
+            effects: values of each effect's quantities by effect name, in the order in which the
+                effects act, as in `Diagnosis.joining`. They replace effects adopted earlier.
+            params: new values of the model's own parameters, calibrated with the effects.
+            library: the library of effect families; None for the built-in families.
 
         Raises:
-            GroundedError: for an unknown effect or parameter, or a quantity that is missing.
+            GroundedError: for an unknown effect or parameter, or a missing quantity.
         """
         task = self.task.with_model(self.task.model.with_values(params or {}))
         planner = planner_with(task, list(effects.items()), library)
@@ -137,9 +150,7 @@ class Search:
 
     def _fits(self, trial: Trial) -> None:
         if not isinstance(trial, Trial):
-            raise GroundedError(
-                f"a robot returns a Trial of what it ran, got one of type {type(trial).__name__}"
-            )
+            raise GroundedError(f"expected a Trial of the run, got a {type(trial).__name__}")
         model = self.task.model
         has = (trial.state_names, trial.input_names, trial.dt)
         expected = (model.state_names, model.input_names, self.task.dt)
@@ -149,15 +160,16 @@ class Search:
             )
 
     def tell(self, trial: Trial) -> None:
-        """Adds a real trial.
+        """Add a trial of the real system.
 
         Args:
-            trial: its `candidate` says what was run; without one, it was the outstanding candidate.
-                Short gaps (NaN) are bridged for the search, and stay gaps in `trials`.
+            trial: the recorded run. Its `candidate` is the id of the candidate that was run; if it
+                is empty, the outstanding candidate is assumed. Gaps (NaN) of up to 1 s are
+                interpolated for the search; `trials` keeps them.
 
         Raises:
-            GroundedError: for a trial of no candidate of this search, of other states or inputs, or
-                on another time grid.
+            GroundedError: if the trial's candidate is not one of this search, or its states, inputs
+                or dt differ from the task's.
         """
         ids = [c.id for c in self._candidates]
         self._fits(trial)
@@ -185,18 +197,22 @@ def learn(
     max_iterations: int | None = None,
     check: bool = True,
 ) -> Search:
-    """Runs a search to its end on a real system that is a function call.
+    """Run a search to its end on a real system that can be called as a function.
 
     Args:
         task: the manoeuvre and the crude model.
-        run: executes a candidate once and returns its trial; its `candidate` field is set here.
-        options: the [search] table; None: its defaults.
-        max_iterations: ends after so many accepted improvements.
-        check: look whether the columns of the first trial are what the model calls by their names.
+        run: executes a candidate once and returns the trial; its `candidate` field is set here.
+        options: settings of the search; None for the defaults.
+        max_iterations: stop after this many accepted improvements; None for no limit.
+        check: check the columns of the first trial for wrong units, signs or exchanged names.
+
+    Returns:
+        The finished search; `best` and `policy` are its result, `standing.sentence` says why it
+        ended.
 
     Raises:
-        GroundedError: if they are in other units, turned or exchanged, as far as they tell: every
-            further plan would be made of such trials.
+        GroundedError: if that check finds an error, since all further plans would rest on wrong
+            data, or as `Search.ask` and `Search.tell`.
     """
     search = Search(task, options)
     while True:
@@ -213,12 +229,12 @@ def learn(
 
 
 def _check_columns(task: Task, trial: Trial) -> None:
-    """Raises for a trial that its own columns, or the model, say is in other units."""
+    """Raise GroundedError if the trial's columns have wrong units, signs or exchanged names."""
     from grounded.instruments.finding import in_the_log
     from grounded.instruments.sound_trials import sound_trials
 
-    first = "the first trial can't be learned from"
-    mend = "Mend the function that runs the robot, or pass check=False where this is mistaken"
+    first = "the first trial can't be used"
+    mend = "Correct the function that runs the robot, or pass check=False if this is mistaken"
     try:
         looked = sound_trials(task.model, [replace(interpolate_gaps(trial).trial, id="")])
     except GroundedError as error:

@@ -1,4 +1,4 @@
-"""A candidate: a policy to run and how it came about; and what became of it, with its trials."""
+"""Candidate, a policy to run and how it was made, and Tried, a candidate with its trials."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from grounded.trial import Trial
 
 Way = Literal[
     "",  # a step along the direction of the model that replays the incumbent's trial
-    "recorded inputs",  # the same, the bias as the paper has it (`bias`: no matched inputs)
-    "gentler gains",  # the incumbent's plan with gains designed more gently (`Maker.gentler`)
-    "own plan",  # of a model that was changed since the incumbent was planned (`About.own_plan`)
+    "recorded inputs",  # the same with the paper's bias alone (`bias`: no matched inputs)
+    "gentler gains",  # the incumbent's plan with lower gains (`Maker.gentler`)
+    "own plan",  # the plan of a model changed since the incumbent was planned (`About.own_plan`)
 ]
 
 Slopes = Literal[
     "",  # the model's own
-    "corrected",  # by what earlier trials were mispredicted by, see `mispredictions`
+    "corrected",  # from the mispredictions of earlier trials, see `mispredictions`
 ]
 
-LITTLE = 0.1  # of the best one's cost: a doubtful promise below it is no reason to go on
-UNLIKE = 0.2  # of a promised gain: how much luckier a trial is than the model says, to be told
+LITTLE = 0.1  # fraction of the best cost below which a doubtful gain is no reason to continue
+UNLIKE = 0.2  # fraction of a predicted gain: a difference of the base's utility that matters
 
 if TYPE_CHECKING:
     from grounded.figures.figure import Figure
@@ -35,28 +35,28 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Candidate(Result):
-    """A policy to run, and how it came about."""
+    """A policy to run, and how it was made."""
 
-    id: str  # c0001, c0002 ...: the order of proposal
+    id: str  # c0001, c0002 ... in the order of proposal
     policy: Policy
-    iteration: int  # i of theta^(i) that it tries to be; 0 is the model's own policy
+    iteration: int  # i of the theta^(i) that it would become; 0 for the model's own policy
     alpha: float
-    base: str  # the candidate whose trials it was derived from, "" for the model's own
-    model: str  # fingerprint of the model it was planned in
+    base: str  # id of the candidate that it was derived from, "" for the model's own policy
+    model: str  # fingerprint of the planning model
     predicted_states: Array  # (H + 1, n) in the (biased) model
     predicted_inputs: Array  # (H, m)
     predicted_utility: float
     damping: float = 1.0  # lambda of `step_size`
-    predicted_gain: float = float("nan")  # over the mean trial of its base
-    caution: float = 0  # how often the first policy, or its gains, were designed more gently
+    predicted_gain: float = float("nan")  # predicted utility less that of its base in the model
+    caution: float = 0  # how often the first policy, or its gains, were made gentler
     way: Way = ""  # how it was made
-    slopes: Slopes = ""  # of the model that it was planned in
-    base_as_run: float = float("nan")  # what the model gives its base from where its trials began
-    likely_off: float = 0.0  # of predicted_gain, as trials that were left out say; 0: not known
+    slopes: Slopes = ""  # derivatives of the model that it was planned in
+    base_as_run: float = float("nan")  # model's utility of the base from where its trials began
+    likely_off: float = 0.0  # likely error of predicted_gain, from held-out trials; 0: unknown
 
     @property
     def predicted_run(self) -> Trial:
-        """What the model predicts, as a robot would log it."""
+        """The predicted run in the form of a robot's log."""
         made = self.policy
         names = (made.state_names, made.input_names)
         return Trial(
@@ -65,36 +65,37 @@ class Candidate(Result):
 
     @property
     def grounded(self) -> bool:
-        """Whether a model that replays a trial has predicted it: a step along a direction."""
+        """Whether it is a step along a direction, predicted by a model that replays a trial."""
         return bool(self.base) and self.way in ("", "recorded inputs")
 
     @property
     def expected_gain(self) -> float:
-        """The promised gain less what the model is likely to miss of it."""
+        """The predicted gain less its likely error."""
         return self.predicted_gain - self.likely_off
 
     @property
     def doubtful(self) -> bool:
-        """Whether its model is likely to be off by more than it promises."""
+        """Whether the likely error is at least the predicted gain."""
         return 0 < self.likely_off >= self.predicted_gain
 
     @property
     def expected_of_base(self) -> float:
-        """What the same model gives the candidate that the step started from.
+        """The utility of the base candidate in the same model.
 
-        Noise and a start that was off make a trial luckier or less so; the gain leaves them out.
+        It excludes the effects of noise and of a different start state on the base's trials.
         """
         return self.predicted_utility - self.predicted_gain
 
     def unlike(self, utility: float) -> bool:
-        """Whether the model gives its base clearly something else than it was worth in truth."""
+        """Return whether the base's utility in the model differs clearly from its real utility."""
         return abs(self.expected_of_base - utility) > UNLIKE * abs(self.predicted_gain)
 
     def promised_over(self, best: Tried) -> float:
-        """What it promises over the best so far: one number for all who tell it.
+        """Return the predicted gain over the best so far; every report uses this number.
 
-        By the model alone where that gives its base clearly something else than the runs were
-        worth, unless it promises more than can be had: no utility is above 0.
+        If the model's utility of the base differs clearly from the real one, this is the gain
+        within the model, unless that would exceed the largest possible gain (no utility is above
+        0).
         """
         own = best.candidate.id == self.base and self.predicted_gain <= -best.utility
         if own and self.unlike(best.utility):
@@ -102,27 +103,27 @@ class Candidate(Result):
         return self.predicted_utility - best.utility
 
     def doubt(self, best: Tried | None) -> str:
-        """Why one that is `doubtful` may well lose, a sentence."""
+        """Return a sentence that says why a `doubtful` candidate may lose."""
         gain = self.predicted_gain if best is None else self.promised_over(best)
         over = self.base if best is None else best.candidate.id
         cost = self.predicted_gain - self.predicted_utility  # of its base
-        off = f"{self.likely_off:.3g}"  # a model that is off by more than that knows no size
-        off = f"more than all that {self.base} costs" if self.likely_off > cost > 0 else off
+        off = f"{self.likely_off:.3g}"  # beyond the base's whole cost the size means nothing
+        off = f"more than the whole cost of {self.base}" if self.likely_off > cost > 0 else off
         stop = ""
         if best and self.predicted_gain < LITTLE * abs(best.utility):
             stop = f". You may stop here, with {best.candidate.id}, the best so far"
         return (
-            f"{self.id} may well lose: it promises {gain:.3g} over {over}, and its model is likely "
-            f"to be off by {off} there, as it was for earlier trials{stop}"
+            f"{self.id} may well lose: it promises {gain:.3g} over {over}, but judging by earlier "
+            f"trials the model's likely error there is {off}{stop}"
         )
 
     def summary(self) -> str:
-        """Its name, its step and what the model predicts."""
+        """Return the id, the step and the predicted utility."""
         predicted = f"predicted utility {self.predicted_utility:.4g}"
         return f"{self.id}: iteration {self.iteration}, alpha {self.alpha:g}, {predicted}"
 
     def to_json(self) -> dict[str, Any]:
-        """How it came about; its policy is what `grounded export` writes."""
+        """Return how it was made; `grounded export` writes the policy itself."""
         return document(
             candidate=self.id,
             iteration=self.iteration,
@@ -133,7 +134,7 @@ class Candidate(Result):
         )
 
     def figures(self) -> Sequence[Figure]:
-        """What the model predicts."""
+        """Return the figure of the predicted run."""
         from grounded.search.pictures import candidate_figure
 
         return (candidate_figure(self),)
@@ -141,46 +142,47 @@ class Candidate(Result):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tried(Result):
-    """A candidate with its trials: mean utility and, once repeats tell, its standard error."""
+    """A candidate with its trials: mean utility and, if repeats allow, its standard error."""
 
     candidate: Candidate
     trials: tuple[Trial, ...]
     utilities: tuple[float, ...]
-    accepted: bool | None  # None: not decided, trials are missing
-    in_doubt: bool = False  # its own trials are there: the incumbent's are missing
-    pieces: Array | None = None  # (runs, PIECES) of its utilities, see `scatter`; if repeated
-    noise_cost: float = 0.0  # of sensors, in its logs; of the best, and where `promised` needs it
-    deviation: float = float("nan")  # of a single run, as repeats near it tell (`scatter`)
+    accepted: bool | None  # None: undecided, trials are missing
+    in_doubt: bool = False  # undecided because the incumbent is to be run again
+    pieces: Array | None = None  # (runs, PIECES) parts of the utilities, see `scatter`; of repeats
+    noise_cost: float = 0.0  # cost of sensor noise in its logs; of the best, and for `promised`
+    deviation: float = float("nan")  # standard deviation of a single run, from repeats (`scatter`)
 
     @cached_property
     def utility(self) -> float:
-        """Mean utility of the trials; nan without a trial, -inf when one of them failed."""
+        """Mean utility of the trials; nan without a trial, -inf if one of them failed."""
         return float(np.mean(self.utilities)) if self.utilities else float("nan")
 
     @property
     def promised(self) -> float:
-        """The predicted utility of its logs: with sensors' noise, which a replayed trial has."""
+        """Predicted utility of its logs, including sensor noise (which a replayed trial has)."""
         noise = 0.0 if self.candidate.grounded else self.noise_cost
         return self.candidate.predicted_utility - noise
 
     @cached_property
     def standard_error(self) -> float:
-        """Of the mean; nan where nothing near it was repeated, or where one of its runs failed."""
+        """Standard error of the mean utility; nan without comparable repeats or if a run failed."""
         if not self.utilities or not np.isfinite(self.utilities).all():
             return float("nan")
         return float(self.deviation / np.sqrt(len(self.utilities)))
 
     @property
     def failed(self) -> tuple[str, ...]:
-        """The names of its trials that did not run to the end."""
+        """Ids of its trials that did not run to the end."""
         each = zip(self.trials, self.utilities, strict=True)
         return tuple(trial.id for trial, utility in each if utility == -np.inf)
 
     def verdict(self, last: bool = True) -> str:
-        """What became of the candidate: first, better, no better, crashed; or why not decided.
+        """Return the verdict: first, better, no better, crashed; or why it is undecided.
 
         Args:
-            last: whether it is the latest one; an earlier one without a trial will get none.
+            last: whether it is the latest candidate; an earlier one without a trial gets "no
+                trial" instead of "waiting".
         """
         if self.in_doubt:
             return "in doubt"
@@ -191,12 +193,12 @@ class Tried(Result):
         return "better" if self.candidate.base else "first"
 
     def summary(self) -> str:
-        """Its name, its utility and what became of it."""
+        """Return the id, the utility and the verdict."""
         mean = f"utility {self.utility:.4g}, trials {len(self.trials)}"
         return f"{self.candidate.id}: {mean}, {self.verdict()}"
 
     def to_json(self) -> dict[str, Any]:
-        """The candidate's document, and what its trials were worth."""
+        """Return the candidate's document with the utility of its trials and the verdict."""
         return self.candidate.to_json() | document(
             utility=self.utility,
             standard_error=self.standard_error,

@@ -1,4 +1,4 @@
-"""Which candidates improved, and how sure that is: real systems seldom do the same thing twice."""
+"""Decide which candidates improved and how certain that is, given the noise of real systems."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from grounded.trial import Trial, scattered
 if TYPE_CHECKING:
     from grounded.search.standing import SearchOptions
 
-FAR = 1e100  # in its unit: "noise" of a run that flew off
-PART = 0.3  # of a gain: less than that by where runs began is not told
-FEW = 4.0  # degrees of freedom, with which two standard errors are no certainty
+FAR = 1e100  # bound on the noise of a diverged run, in the state's unit
+PART = 0.3  # share of a gain due to different start states from which on it is reported
+FEW = 4.0  # degrees of freedom below which the sentence mentions the few repeats
 
 
 def judged(
@@ -37,7 +37,7 @@ def judged(
     options: SearchOptions,
     model: str,
 ) -> tuple[tuple[Tried, ...], Tried | None, int]:
-    """Every candidate with its trials, accepted or not; the incumbent; iterations done."""
+    """Return every candidate with its trials and verdict, the incumbent, and the iterations."""
     history: list[Tried] = []
     incumbent: Tried | None = None
     iteration = losses = 0  # accepted improvements; steps from the incumbent that did not improve
@@ -86,7 +86,7 @@ def judged(
 
 
 def _with_noise(task: Task, tried: Tried) -> Tried:
-    """The same with what the noise in its own logs costs in the mean; without a log as it is."""
+    """Return the candidate with the mean cost of the noise in its logs; unchanged without logs."""
     if not tried.trials:
         return tried
     each = np.minimum([white_noise(trial.states) for trial in tried.trials], FAR)
@@ -95,18 +95,18 @@ def _with_noise(task: Task, tried: Tried) -> Tried:
 
 
 def repeated_exactly(trials: Sequence[Trial]) -> bool:
-    """Whether two trials of a candidate have the very same states."""
+    """Return whether two successive trials have exactly the same states."""
     return any(a.repeats(b) for a, b in pairwise(trials))
 
 
 def in_doubt(incumbent: Tried, loser: Tried, history: Sequence[Tried], most: int) -> bool:
-    """Whether a loss may be luck: the incumbent's, whose trials were the best of several.
+    """Return whether a loss may be due to a lucky trial of the incumbent.
 
-    A lucky winner blocks every step from there on. So a loss within two standard errors sends the
-    incumbent out once more, until it has `most` trials: one for each loss. Where nothing near it
-    was repeated, a run is taken to scatter by half of its utility, that of chi-squared with eight
-    degrees of freedom: a loss by more than 1.4 times the best cost is believed at once. Where
-    trials repeat themselves exactly, it costs one trial a winner.
+    A lucky incumbent would block every further step. So after a loss within two standard errors the
+    incumbent is run again, until it has `most` trials: one for each loss. Without repeats at a
+    similar utility, the standard deviation is taken as half of the utility, as for chi-squared with
+    eight degrees of freedom; a loss of more than 1.4 times the best cost is then accepted at once.
+    On a deterministic system this costs one trial per incumbent.
     """
     if not np.isfinite(loser.utility) or len(incumbent.trials) >= most:
         return False
@@ -117,10 +117,10 @@ def in_doubt(incumbent: Tried, loser: Tried, history: Sequence[Tried], most: int
 
 
 def last_improvement(history: Sequence[Tried], again: str = "run the best one again") -> str:
-    """How sure the last accepted improvement is, as a sentence; "" before there is one.
+    """Return a sentence on how certain the last accepted improvement is; "" before there is one.
 
-    Student's t-test with the scatter of all repeats near the two (`scatter`), of which their
-    standard errors in the table are made.
+    Student's t-test with the scatter of all repeats at a similar utility (`scatter`), which also
+    gives the standard errors in the table.
     """
     accepted = [t for t in history if t.accepted]
     if len(accepted) < 2:
@@ -129,32 +129,31 @@ def last_improvement(history: Sequence[Tried], again: str = "run the best one ag
     gain, start = after.utility - before.utility, owed_to_start(before, after, history)
     if start:
         return (
-            f"the last gain is {gain:.3g}: where the runs of {before.candidate.id} and "
-            f"{after.candidate.id} began makes {start:.3g} of the difference, as the model sees "
-            f"it, and the policy {gain - start:.3g}; run {before.candidate.id} again from "
-            "[task] start to be sure"
+            f"the last gain is {gain:.3g}: according to the model, {start:.3g} of it is due to "
+            f"the different start states of {before.candidate.id} and {after.candidate.id}, and "
+            f"{gain - start:.3g} to the policy; run {before.candidate.id} again from [task] start "
+            "to be sure"
         )
     error, freedom = error_between(before, after, history)
     if not freedom:
         return (
-            f"the last gain is {gain:.3g}; all candidates near it were run once, so the noise of "
-            f"a trial is unknown: {again}"
+            f"the last gain is {gain:.3g}; candidates of similar utility were run only once, so "
+            f"the noise of a trial is unknown: {again}"
         )
     if error == 0:
         return f"the last gain is {gain:.3g}; repeated trials agree exactly"
     probability = student(gain / error, freedom)
     return (
         f"the last gain is {gain:.3g} +- {error:.2g}: an improvement with probability "
-        f"{probability:.2f}" + ", for so few repeats" * (freedom < FEW)
+        f"{probability:.2f}" + ", from few repeats" * (freedom < FEW)
     )
 
 
 def owed_to_start(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
-    """How much of a gain comes of where the runs of the two began; 0 where it is a small part.
+    """Return how much of a gain is due to different start states; 0 if it is a small part.
 
-    A run from elsewhere than s_0 costs more or less, whatever the policy. What that is worth, the
-    models say that were grounded on these trials: U^ of the run from s_0 less that of the run from
-    where the trials began.
+    The models that were grounded on these trials give the estimate: U^ of the run from s_0 less U^
+    of the run from where the trials began.
     """
 
     def worth(one: Tried) -> float:
@@ -172,7 +171,7 @@ def owed_to_start(before: Tried, after: Tried, history: Sequence[Tried]) -> floa
 
 
 def student(x: float, freedom: float) -> float:
-    """Student's t distribution, P(T <= x), to 1e-5; importing scipy takes longer than a command.
+    """Return Student's t distribution, P(T <= x), to 1e-5, without the slow import of scipy.
 
     T = sqrt(freedom) tan(a), and the density of the angle a goes with cos(a)^(freedom - 1).
     """
@@ -184,10 +183,11 @@ def student(x: float, freedom: float) -> float:
 
 
 def error_between(before: Tried, after: Tried, history: Sequence[Tried]) -> tuple[float, float]:
-    """Standard error of the difference of two means, and its degrees of freedom; 0 for unknown.
+    """Return the standard error of the difference of two means and its degrees of freedom.
 
-    The later one's scatter speaks for both where the earlier one has none near it. Two estimates
-    that differ are added as Welch (1947) does.
+    The degrees of freedom are 0 if the error is unknown. If no repeats are near the earlier
+    candidate, the scatter of the later one is used for both. Different estimates are combined as in
+    Welch (1947).
     """
     repeats = Repeats(history)
     later = repeats.near(after.utility)

@@ -1,11 +1,11 @@
-"""A model whose slopes about a trial are corrected (`mispredictions`), as a System of its own.
+"""Corrected: a System whose derivatives along a trial are corrected (see `mispredictions`).
 
     x_{t+1} = f(x_t, u_t) + bias_t + y_t,      y_t = C_t [dx_t, du_t, du_{t-1}, y_{t-1}]
 
-with dx, du what a run has moved away from the incumbent's trial, along which y is zero: the trial
-is still replayed exactly. y and the input before are memory that no sensor knows, so the state is
-[x, y, u before]; a policy's gains on them are dropped, their part of the feed-forward stays. f
-stays the compiled model; the sweep and the rollouts are NumPy's (`interpreted`).
+where dx, du are the differences from the incumbent's trial. Along that trial y is zero, so it is
+still replayed exactly. y and the previous input are not measured; the state is [x, y, u before].
+Gains on them are dropped from a policy, their part of the feed-forward stays. f is the compiled
+model; the backward sweep and the rollouts run in NumPy (`interpreted`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Corrected(System):
     Rows of `step`, `linearise` and `sensitivities` are the steps of the horizon, in order.
 
     Args:
-        base: f.
+        base: the system f.
         law: C (H, n, 2 n + 2 m).
         x: states of the incumbent's trial (H, n).
         u: what its actuators received (H, m).
@@ -46,7 +46,7 @@ class Corrected(System):
         self.states = (*base.states, *missed, *(f"input {i} before" for i in range(m)))
 
     def on(self, problem: Problem) -> Problem:
-        """The grounded problem of the base, in this system."""
+        """Return the base's grounded problem in this system."""
 
         def padded(a: Array) -> Array:
             return np.concatenate([a, np.zeros((*a.shape[:-1], self.n - self.base.n))], axis=-1)
@@ -62,13 +62,13 @@ class Corrected(System):
         )
 
     def along(self, z: Array) -> Array:
-        """The incumbent's trial in this system: z (H + 1, nz) of the base to (H + 1, nz)."""
+        """Convert the incumbent's trial, z (H + 1, nz) of the base, to this system's z."""
         n = self.base.n
         before = np.vstack([self.before, self.u[-1:]])
         return np.hstack([z[:, :n], np.zeros((len(z), n)), before, z[:, n:]])
 
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
-        """See `System.step`; u is taken as received, without a shift."""
+        """See `System.step`; u is what the actuators received, without an input shift."""
         moved = self.base.step(self._own(x), u, p, dt, smoothing)
         return self._next(moved, x, u, slice(None), np.zeros(self.base.n, bool))
 
@@ -121,11 +121,19 @@ class Corrected(System):
         return rolled_out(problem, step, ubar, K, zbar, k, alphas)
 
     def _own(self, x: Array) -> Array:
-        """The base's states (N, n) of x (N, 2 n + m)."""
+        """Return the base's states (N, n) of x (N, 2 n + m)."""
         return np.ascontiguousarray(x[:, : self.base.n])
 
     def _next(self, moved: Array, x: Array, u: Array, t: int | slice, angles: Flags) -> Array:
-        """[x, y, u before] a step later: base states `moved` (N, n), x (N, 2 n + m), u (N, m)."""
+        """Return the next [x, y, u before] (N, 2 n + m).
+
+        Args:
+            moved: the base's next states (N, n).
+            x: states (N, 2 n + m).
+            u: inputs (N, m).
+            t: index of the step, or all steps.
+            angles: (n,) which states are angles.
+        """
         n = self.base.n
         away = wrapped(x[:, :n] - self.x[t], angles)
         before = x[:, 2 * n :] - self.before[t]

@@ -1,4 +1,4 @@
-"""Step 5: the direction in which a policy improves in the model that replays a trial."""
+"""Step 5: the direction that improves a policy in the model that replays its trial."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from grounded.search.corrected import Corrected
     from grounded.solve.bias import Grounding
 
-PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
+PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # precise enough for a direction
 
 
 def direction(
@@ -31,18 +31,19 @@ def direction(
     corrected: Corrected | None = None,
     measured: int | None = None,
 ) -> Policy:
-    """Step 5: theta' such that d = theta' - theta improves the policy in the biased model.
+    """Step 5: return theta' such that d = theta' - theta improves the policy in the biased model.
 
     Args:
         task: the manoeuvre, with the ORIGINAL model.
         policy: theta, the policy that ran the trial.
         grounding: the trial as the biased model replays it (step 4).
-        options: which algorithm A.
-        damping: lambda of `step_size`, the share of mu that leaving the trial's inputs costs.
-        corrected: the model with slopes that trials have corrected; None: with its own.
-        measured: how many of the first states the robot measures; None: all of the task's. Gains
-            on an adopted effect's memory are made up for by those (`measured_gains`); on a
-            corrected model's alone they are dropped (`feedback` weighs that).
+        options: selects algorithm A.
+        damping: lambda of `step_size`, factor on the penalty mu for leaving the trial's inputs.
+        corrected: the model with derivatives corrected by trials; None for the original model.
+        measured: number of leading states that the robot measures; None for all of the task's.
+            Gains on the memory of an adopted effect are replaced by gains on those
+            (`measured_gains`). Gains on the memory of a corrected model are dropped (`feedback`
+            checks the effect).
     """
     if options.method == "policy-gradient":
         from grounded.solve.policy_gradient import ascent
@@ -64,19 +65,19 @@ def direction(
 
 
 def base_columns(problem: Problem, task: Task) -> list[int]:
-    """The columns of the problem's z that are the task's too."""
+    """Return the columns of the problem's z that the task's z has as well."""
     own = map(problem.system.states.index, task.model.state_names)
     return [*own, *range(problem.system.n, problem.nz)]
 
 
 def damped(problem: Problem, inputs: Array, factor: float = 1.0) -> Problem:
-    """The problem with a price mu |u_t - inputs_t|^2 on leaving the trial's inputs (H, m).
+    """Add a penalty mu |u_t - inputs_t|^2 on leaving the trial's inputs (H, m) to the problem.
 
-    The fully converged step goes to the optimum of the biased MODEL, and that need not be uphill in
-    the real system; with mu it turns towards the gradient, which is uphill while the
-    model's derivatives are within 90 degrees (section 3). mu = R + S, the problem's own weights on
-    inputs: the same idea as norm-optimal iterative learning control. Both quadratic penalties on
-    u_t are one: weight R + mu about (R u_target + mu inputs) / (R + mu).
+    A fully converged step goes to the optimum of the biased MODEL, which need not improve the real
+    system. The penalty turns the step towards the gradient, which does as long as it is within 90
+    degrees of the true one (section 3). mu is `factor` times R + S, the problem's own weights on
+    inputs and their changes, as in norm-optimal iterative learning control. The two quadratic
+    penalties on u_t combine to the weight R + mu about (R u_target + mu inputs) / (R + mu).
     """
     mu = factor * (problem.input_weight + problem.change_weight)
     weight = problem.input_weight + mu

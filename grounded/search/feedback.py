@@ -1,14 +1,15 @@
-"""What a candidate is worth in all models that explain the stored trials, not just in one.
+"""Evaluate a candidate in all models that explain the stored trials, not just in one.
 
-A predicted run follows its own reference, so that its utility doesn't show what the gains are worth
-once something disturbs it. New ones can be worse than those that have run: gains on states that no
-sensor knows (an effect's memory, `corrected`) are dropped, and corrected slopes may have been
-fitted to noise. So a policy is run in models that replay OTHER trials,
+A predicted run follows its own reference, so its utility does not show how good the gains are under
+disturbances. New gains can be worse than those of the incumbent: gains on unmeasured states (an
+effect's memory, `corrected`) are dropped, and corrected derivatives may have been fitted to noise.
+So a policy is run in models that are disturbed by the mispredictions y_j of OTHER trials,
 
-    x_{t+1} = f(x_t, u_t) + bias_t + y_jt,     y_j what the model mispredicts of trial j,
+    x_{t+1} = f(x_t, u_t) + bias_t + y_jt,
 
-the same for all policies (Ng & Jordan, "PEGASUS", UAI 2000), with the corrected slopes and with the
-model's own. Each counts the more, the less it misses of trials that were left out.
+with the same disturbances for all policies (Ng & Jordan, "PEGASUS", UAI 2000), once with the
+corrected derivatives and once with the model's own. The smaller a model's error on held-out trials,
+the larger its weight.
 """
 
 from __future__ import annotations
@@ -22,19 +23,19 @@ from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.planner import predicted
 
-WORST = 1e12  # a run that diverges costs so much
+WORST = 1e12  # cost of a run that diverges
 
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """A model that replays the incumbent's trial, and what it is off by along others."""
+    """A model that replays the incumbent's trial, and its mispredictions of other trials."""
 
     weight: float
     problem: Problem
     off: tuple[Array, ...]  # y_j (H, n)
 
     def cost(self, policy: Policy) -> float:
-        """The mean cost of a policy, by weight."""
+        """Return the mean cost of a policy over the disturbances, times the weight."""
         if self.weight == 0:
             return 0.0
         return self.weight * float(np.mean([self._disturbed(y, policy) for y in self.off]))

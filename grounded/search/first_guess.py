@@ -1,25 +1,23 @@
-"""Where DDP starts for the first policy: from the REFERENCE, not from zero inputs.
+"""The start of DDP for the first policy: a run near the REFERENCE instead of zero inputs.
 
-A long manoeuvre is rarely solved from an open-loop start: the first rollout wanders off and DDP
-never comes back. So the target itself is made a nominal run, in three moves:
+A long manoeuvre is rarely solved from an open-loop start: the first rollout drifts away from the
+target and DDP does not recover. So the target is turned into a nominal run in three steps:
 
-1. Fill. The target gives the states that the running reward weighs. A heading or speed that it
-   leaves out is read off its path
-   (roles `position`, `heading`, `speed`). The other states and the inputs are trimmed at each step
-   by itself, with f the model over one control step:
+1. Fill in. The target gives the states that the running reward weighs. A heading or speed that it
+   lacks is derived from its path (roles `position`, `heading`, `speed`). The other states and the
+   inputs are trimmed separately at each step, with f the model over one control step:
 
        f(x_t, u_t)_i = target_{t+1, i}  (known i),       f(x_t, u_t)_i = x_{t, i}  (free i)
 
-   Free states hold still while the known ones move (a quasi-steady turn: steering angle, bank,
-   surfaces).
-2. Ground the model on the filled target, as step 4 does on a trial, and take one LQR about it.
-3. Roll that policy out, closed loop, in the model as it is: the start for DDP.
+   Free states stay constant while the known ones move (a quasi-steady turn: steering angle, bank,
+   control surfaces).
+2. Ground the model on the filled target, as step 4 does on a trial, and design one LQR about it.
+3. Simulate that policy, closed loop, in the original model: the start for DDP.
 
-The trim is Levenberg-Marquardt on many steps at once, inputs inside their limits. It starts from
-several inputs, because a stalled motor has no slope to follow; then every step tries again with one
-input set back (of few: what one of many could do, the others do), and tries the solutions of its
-neighbours, because a manoeuvre is continuous and a bad local minimum seldom is. Where all starts
-end alike no input is set back.
+The trim is solved by Levenberg-Marquardt for many steps at once, with inputs inside their limits.
+It starts from several inputs, because a stalled motor has no slope. Then every step is tried again
+with one input reset (if there are few inputs and the starts ended in different minima), and from
+the solutions of its neighbours, because a manoeuvre is continuous and bad local minima rarely are.
 """
 
 from __future__ import annotations
@@ -37,12 +35,12 @@ from grounded.task import Task
 
 STARTS = (0.0, 0.35, 0.7, -0.35)  # fractions of the way from the held input to its limit
 ITERATIONS, MORE = 30, 12  # of Levenberg-Marquardt: from the starts, from a solution nearby
-ROUNDS = 3
-FEW = 8  # inputs that are set back one by one
-FREE_WEIGHT = 0.3  # what is prescribed goes first where both can't be had
-KNOTS = 250  # steps that are solved from scratch; those between start from their neighbours
-ALIKE = 1e-3  # of an error: ends that differ by less are one minimum
-EXACT = 1e-12  # of the mean squared rate: a trim this good is not tried again
+ROUNDS = 3  # passes over the neighbours' solutions
+FEW = 8  # inputs are reset one by one if there are at most so many
+FREE_WEIGHT = 0.3  # weight of the equations of free states, below that of prescribed ones
+KNOTS = 250  # steps that are solved from scratch; the others start from their neighbours
+ALIKE = 1e-3  # relative difference of errors below which two results are the same minimum
+EXACT = 1e-12  # squared error, relative to the mean squared rate, at which a trim is accepted
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +54,9 @@ class Guess:
 
 
 def first_guess(task: Task) -> Guess:
-    """A closed-loop run of the task's model that stays near the target.
+    """Return a closed-loop run of the task's model near the target.
 
-    The cost is infinite when even this run diverges: the model can't follow the target.
+    The cost is infinite if even this run diverges: the model can't follow the target.
     """
     x, u = filled_target(task)
     problem = task.problem()
@@ -78,7 +76,7 @@ def first_guess(task: Task) -> Guess:
 
 
 def filled_target(task: Task) -> tuple[Array, Array]:
-    """The target with every state and input filled in: x (H + 1, n), u (H, m)."""
+    """Return the target with every state and input filled in: x (H + 1, n), u (H, m)."""
     x, known = _read_off_path(task)
     trimmed, u = trim(task, x, known)
     last = np.where(known, x[-1], trimmed[-1])
@@ -86,7 +84,10 @@ def filled_target(task: Task) -> tuple[Array, Array]:
 
 
 def _read_off_path(task: Task) -> tuple[Array, NDArray[np.bool_]]:
-    """Target states where given, heading and speed from the path, the start state elsewhere."""
+    """Return x (H + 1, n) and which columns are prescribed (n,).
+
+    Columns are the target where given, heading and speed from the path, else the start state.
+    """
     model = task.model
     weighed = task.reward.state if task.reward.state.any() else task.reward.terminal
     given: NDArray[np.bool_] = np.isfinite(task.target).all(axis=0) & (weighed > 0)
@@ -116,11 +117,11 @@ def _read_off_path(task: Task) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def trim(task: Task, x: Array, known: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Free states and inputs along a nominal run.
+    """Solve for the free states and the inputs along a nominal run.
 
     Args:
         task: the model, the limits and the input held before the start.
-        x: (H + 1, n), prescribed columns as they are to be, the others as a first guess.
+        x: (H + 1, n), the prescribed columns; the others are a first guess.
         known: (n,), which columns are prescribed.
 
     Returns:
@@ -140,7 +141,7 @@ def trim(task: Task, x: Array, known: NDArray[np.bool_]) -> tuple[Array, Array]:
 
 
 def _steps(task: Task, x: Array, known: NDArray[np.bool_]) -> LeastSquares:
-    """The equations of every step in w = [free states, inputs], as rates."""
+    """Return the equations of every step in w = [free states, inputs], as rates."""
     problem, free, n = task.problem(), np.flatnonzero(~known), x.shape[1]
     weight = np.where(known, 1.0, FREE_WEIGHT) / problem.dt
     settings = (problem.p, problem.dt, problem.smoothing)
@@ -174,13 +175,13 @@ def _steps(task: Task, x: Array, known: NDArray[np.bool_]) -> LeastSquares:
 
 
 def _from_scratch(task: Task, batch: LeastSquares, states: Array, knots: Rows) -> Minimum:
-    """From several inputs, then with one input set back, then from the neighbours' solutions."""
+    """Solve from several inputs, then with one input reset, then from neighbouring solutions."""
     held = np.tile(np.clip(task.past, task.low, task.high), (len(knots), 1))
     starts = [_toward_limit(task, held, part) for part in STARTS]
     best = solve(batch, np.hstack([states, starts[0]]), knots, ITERATIONS)
 
     def again(w: Array, iterations: int, wanted: NDArray[np.bool_]) -> tuple[Minimum, Array]:
-        """The better of both, and what was reached from w: infinite where it was not tried."""
+        """Return the better solutions, and the errors reached from w (inf where not tried)."""
         reached = np.full(len(knots), np.inf)
         open_ = np.flatnonzero((best.error > batch.solved) & wanted)
         if not len(open_):
@@ -211,6 +212,6 @@ def _from_scratch(task: Task, batch: LeastSquares, states: Array, knots: Rows) -
 
 
 def _toward_limit(task: Task, held: Array, part: float) -> Array:
-    """Inputs that fraction of the way to the upper (negative: lower) limit, where there is one."""
+    """Move inputs by a fraction of the way to the upper (if negative: lower) limit, if any."""
     limit = task.high if part >= 0 else task.low
     return held + abs(part) * (np.where(np.isfinite(limit), limit, held) - held)

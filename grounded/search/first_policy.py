@@ -1,21 +1,22 @@
 """Steps 1 and 2 of the paper: the policy that is optimal in the crude model.
 
-A long manoeuvre is rarely solved from an open-loop start: the first rollout wanders off and DDP
-never comes back. A swing-up, on the other hand, is not near its target for most of its time, and a
-guess that stays there ends in a local optimum. So DDP starts from several runs, goes on from each
-until it has converged, and the plan with the lowest cost wins:
+A long manoeuvre is rarely solved from an open-loop start: the first rollout drifts away from the
+target and DDP does not recover. A swing-up, on the other hand, is far from its target most of the
+time, and a guess near the target ends in a local optimum. So DDP runs to convergence from several
+starts, and the plan with the lowest cost is taken:
 
-    the reference    a closed-loop run of the model near the target (`first_guess`)
-    zero inputs      and the inputs held before the start, where they are others
-    smooth inputs    random, by fixed seeds: only where a solve takes milliseconds
-    more of them     where those have shown local optima that are nearly as good: random ones, the
-                     best plan so far, kicked for a while, which leads to other valleys, and
-    early plans      every other one: to be where the task ends already on the way, and to stay
-                     there. A quick swing-up lies in a valley too narrow to be met by chance
-    a wider kink     of an adopted dry friction, narrowed step by step: what sticks has no slope
+    reference        a closed-loop run of the model near the target (`first_guess`)
+    constant inputs  zero, and the inputs held before the start if they differ
+    smooth inputs    random, with fixed seeds; only for compiled models, which solve in milliseconds
+    more starts      if those found several local optima of similar cost: random inputs, and the
+                     best plan so far with a disturbance ("kick"), which leads to other optima
+    early plans      every other one of these: plans that reach the final state early and stay
+                     there. The optimum of a quick swing-up is too narrow to be found by chance
+    wider friction   an adopted dry friction with a wider transition, narrowed step by step:
+                     a joint that sticks has no slope
 
-A plan is made in a model whose kinks are blended, and run in one where they are not. Where its run
-there costs much more, it is followed as the blend gets narrower (`_sharpened`).
+A plan is made in a model with smoothed kinks and run in one without smoothing. If its run there
+costs much more, it is re-solved while the smoothing is reduced (`_sharpened`).
 """
 
 from __future__ import annotations
@@ -32,27 +33,27 @@ from grounded.search.first_guess import first_guess
 from grounded.solve import ddp
 from grounded.task import Task
 
-CAUTION = 100.0  # factor on the input penalties each time the first policy crashed
-ITERATIONS = 1000  # of DDP at the most, from one start
+CAUTION = 100.0  # factor on the input penalties for each crash of the first policy
+ITERATIONS = 1000  # most iterations of DDP from one start
 AT_ONCE = 2e5  # control steps times iterations between two chances to interrupt: under a second
-STARTS = 24  # random ones
-MANY = 300  # more, where there are local optima
-KNOTS = (5, 8, 14)  # of a random start's inputs, in turn
-AMPLITUDES = (0.05, 0.15, 0.4)  # of its knots, standard deviation as a share of an input's range
-KICK, KICKED = 0.3, (5.0, 40.0)  # a kick: its height as AMPLITUDES, its width in steps
-EARLY = (0.3, 0.8)  # shares of the task after which a plan has to be where it ends
+STARTS = 24  # random starts
+MANY = 300  # further starts if there are local optima
+KNOTS = (5, 8, 14)  # knots of a random start's inputs, in turn
+AMPLITUDES = (0.05, 0.15, 0.4)  # standard deviation of the knots, as a share of the input's range
+KICK, KICKED = 0.3, (5.0, 40.0)  # height of a kick as in AMPLITUDES; range of its width in steps
+EARLY = (0.3, 0.8)  # shares of the task after which an early plan has to be in the final state
 STAYED = 100  # iterations for such a plan
-WORSE = 1.01  # times the best cost: a plan above it has converged somewhere else
-WORK = 4e7  # iterations x H x (n + m)^2 that all rivals of the reference may take
-SKETCH, PROMISING = 40, 1.3  # iterations after which a plan of so many times the cost is dropped
-MORE_WORK = 2e8  # the same for MANY
-WIDER = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0)  # times the speed a dry friction builds up over
+WORSE = 1.01  # factor of the best cost above which a plan counts as another optimum
+WORK = 4e7  # budget for all rivals of the reference: iterations x H x (n + m)^2
+SKETCH, PROMISING = 40, 1.3  # after so many iterations, a plan above this factor is dropped
+MORE_WORK = 2e8  # budget for MANY, in the same units
+WIDER = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0)  # factors on the speed a dry friction builds up over
 FOLLOWED = 200  # iterations of DDP for each of them
-BLUNT = 1.2  # times what a plan costs where kinks are blended: its run as written is another one
-SHARPER = (0.5, 0.25, 0.1, 0.03, 0.01, 0.0)  # of the blend's width
-FEWEST = 10  # iterations: a rival that gets no more is not started
-CHECKED = 4  # steps of the plan in which the model is asked once more, as it was written
-HOPELESS, HOPELESS_SLOW = 1e6, 1e3  # times the best cost: a start above it is not pursued
+BLUNT = 1.2  # cost ratio, unsmoothed over smoothed, above which a plan is re-solved
+SHARPER = (0.5, 0.25, 0.1, 0.03, 0.01, 0.0)  # factors on the smoothing width
+FEWEST = 10  # a rival is not started with fewer iterations than this
+CHECKED = 4  # steps of the plan at which the model's code is evaluated again to check it
+HOPELESS, HOPELESS_SLOW = 1e6, 1e3  # factor of the best cost above which a start is dropped
 
 Tick = Callable[[str], None]
 
@@ -60,20 +61,21 @@ Tick = Callable[[str], None]
 def first_policy(
     task: Task, caution: int = 0, tick: Tick | None = None, widths: Sequence[str] = ()
 ) -> tuple[Policy, ddp.Solution]:
-    """The best converged plan of the crude model, as a policy.
+    """Return the best converged plan of the crude model, as a policy.
 
     Args:
         task: the manoeuvre and the crude model.
-        caution: how often a first policy has crashed; each time penalises inputs CAUTION x more.
-        tick: told what is going on, about once a second.
-        widths: parameters of the model, speeds over which a dry friction builds up.
+        caution: how often a first policy has crashed; each crash multiplies the input penalties by
+            CAUTION.
+        tick: called with a line of progress about once a second.
+        widths: names of model parameters that are speeds over which a dry friction builds up.
 
     Returns:
-        The policy, and the result of DDP that it is made of: its `status` says whether the plan
-        has converged.
+        The policy, and the DDP result that it is made from; its `status` says whether the plan has
+        converged.
 
     Raises:
-        GroundedError: if the model computes other numbers than when it was read (random ones).
+        GroundedError: if the model's output differs from when it was compiled (random numbers).
     """
     task = cautious(task, caution)
     problem, guess = task.problem(), first_guess(task)
@@ -102,11 +104,11 @@ def first_policy(
 
 
 def _sharpened(task: Task, problem: Problem, best: ddp.Solution, tick: Tick | None) -> ddp.Solution:
-    """The plan that runs best with blended kinks, as the model is written, and between the two.
+    """Return the plan with the lowest total cost over all degrees of smoothing, down to none.
 
-    An arm with dry friction and a delay held its plan to 4 mrad where the friction was blended, and
-    whirled where it was not; a plan that relies on a kink as sharp as it is written is as fragile.
-    Doing nothing is a start, too: no plan may cost more than that.
+    A plan may hold only with smoothed friction (an arm with dry friction and a delay kept to its
+    plan within 4 mrad, but spun without smoothing), or only with the exact kink; both are fragile.
+    Constant inputs are one of the starts, so that no plan costs more than those.
     """
     exact = task.problem(exact=True)
     if not problem.smoothing or _cost(exact, best) <= BLUNT * best.cost:
@@ -126,13 +128,13 @@ def _sharpened(task: Task, problem: Problem, best: ddp.Solution, tick: Tick | No
 
 
 def _cost(problem: Problem, plan: ddp.Solution) -> float:
-    """What a plan's run costs under its feedback; infinite where it diverges."""
+    """Return the cost of a plan's run with its feedback; infinite if it diverges."""
     cost = float(problem.system.rollout(problem, plan.u, plan.K, plan.z[:-1]).cost[0])
     return cost if np.isfinite(cost) else np.inf
 
 
 def cautious(task: Task, caution: int) -> Task:
-    """The task with inputs that cost CAUTION times more for each crash of a first policy."""
+    """Return the task with input weights CAUTION times larger for each crash of a first policy."""
     if not caution:
         return task
     width = task.high - task.low
@@ -146,7 +148,7 @@ def cautious(task: Task, caution: int) -> Task:
 
 
 def _followed(task: Task, widths: Sequence[str], tick: Tick | None) -> ddp.Solution:
-    """The plan of a model whose dry friction builds up slowly, followed as that gets quicker."""
+    """Plan with dry friction that builds up slowly, and re-solve while it gets sharper."""
     found: ddp.Solution | None = None
     for factor in WIDER:
         wider = {name: factor * task.model.params[name].value for name in widths}
@@ -163,7 +165,7 @@ def _followed(task: Task, widths: Sequence[str], tick: Tick | None) -> ddp.Solut
 def _hopped(
     task: Task, problem: Problem, best: ddp.Solution, most: int, tick: Tick | None
 ) -> ddp.Solution:
-    """The best plan of many more starts, most of which are dropped before they have converged."""
+    """Return the best plan of many more starts; most are dropped before they converge."""
     rng, size = np.random.default_rng(STARTS), problem.horizon * (problem.nz + task.model.m) ** 2
     work = MORE_WORK
     for i in range(MANY):
@@ -196,15 +198,15 @@ def finished(
     most: int = ITERATIONS,
     tick: Tick | None = None,
 ) -> ddp.Solution:
-    """DDP until it has converged, in pieces short enough for Ctrl-C.
+    """Run DDP to convergence, in pieces short enough for Ctrl-C.
 
     Args:
         problem: what to solve.
-        inputs: (H, m) the first inputs.
+        inputs: (H, m) initial inputs.
         K: (H, m, nz) feedback of the first rollout, about `z`.
         z: (H, nz), see `K`.
-        most: iterations at the most.
-        tick: told how far it is, after each piece.
+        most: most iterations.
+        tick: called with a line of progress after each piece.
     """
     piece = int(np.clip(AT_ONCE / problem.horizon, 1, most))
     result = ddp.solve(problem, inputs, K, z, DescentOptions(max_iterations=piece))
@@ -225,7 +227,7 @@ def finished(
 def _pursued(
     problem: Problem, inputs: Array, best: ddp.Solution, most: int, tick: Tick | None
 ) -> ddp.Solution | None:
-    """DDP from a start; None where its own cost is hopeless."""
+    """Run DDP from a start; return None if the initial cost is hopelessly high."""
     cost = float(problem.system.rollout(problem, inputs).cost[0])
     cheap = problem.system.how == "compiled" and most > FEWEST
     most_cost = HOPELESS if cheap else HOPELESS_SLOW
@@ -241,7 +243,7 @@ def _better(found: ddp.Solution | None, best: ddp.Solution) -> ddp.Solution:
 
 
 def _other_optimum(found: ddp.Solution | None, best: ddp.Solution) -> bool:
-    """Whether two plans have converged to different costs, of which the worse may compete."""
+    """Return whether two plans have converged to different optima of similar cost."""
     if found is None or (found.status, best.status) != ("converged", "converged"):
         return False
     low, high = sorted((found.cost, best.cost))
@@ -249,7 +251,7 @@ def _other_optimum(found: ddp.Solution | None, best: ddp.Solution) -> bool:
 
 
 def _rivals(task: Task) -> Iterator[Array]:
-    """Inputs (H, m) from which DDP may find a better plan than from the reference."""
+    """Yield inputs (H, m) from which DDP may find a better plan than from the reference."""
     H, m = task.horizon, task.model.m
     zero = np.clip(np.zeros(m), task.low, task.high)
     yield np.tile(zero, (H, 1))
@@ -265,13 +267,13 @@ def _rivals(task: Task) -> Iterator[Array]:
 
 
 def _random(task: Task, rng: np.random.Generator, i: int) -> Array:
-    """Wilder random inputs (H, m), of four kinds in turn."""
+    """Return larger random inputs (H, m), of four kinds in turn."""
     smooth = _smooth(task, rng, KNOTS[1 + i % 2], AMPLITUDES[1 + i // 2 % 2])
     return np.clip(smooth, task.low, task.high)
 
 
 def _early(task: Task, problem: Problem, rng: np.random.Generator, i: int) -> ddp.Solution:
-    """A plan that pays for all states from some step on at least what it pays for the last."""
+    """Return a plan in which all states from a random step on have at least the final weights."""
     weight, begin = problem.state_weight.copy(), int(task.horizon * rng.uniform(*EARLY))
     weight[begin:] = np.maximum(weight[begin:], weight[-1])
     inputs = _random(task, rng, i)
@@ -279,7 +281,7 @@ def _early(task: Task, problem: Problem, rng: np.random.Generator, i: int) -> dd
 
 
 def _kicked(task: Task, rng: np.random.Generator, inputs: Array) -> Array:
-    """The same inputs (H, m) with a kick somewhere."""
+    """Return the inputs (H, m) with a smooth disturbance at a random time."""
     at, width = rng.uniform(0, task.horizon), rng.uniform(*KICKED)
     height = rng.normal(0.0, KICK, task.model.m) * _range(task)
     shape = np.exp(-0.5 * ((np.arange(task.horizon)[:, None] - at) / width) ** 2)
@@ -287,7 +289,7 @@ def _kicked(task: Task, rng: np.random.Generator, inputs: Array) -> Array:
 
 
 def _smooth(task: Task, rng: np.random.Generator, count: int, amplitude: float) -> Array:
-    """Random inputs (H, m) about zero, straight between `count` knots."""
+    """Return random inputs (H, m) about zero, piecewise linear between `count` knots."""
     knots = np.linspace(0, task.horizon - 1, count)
     drawn = rng.normal(0.0, amplitude, (count, task.model.m)) * _range(task)
     steps = np.arange(task.horizon)
@@ -295,7 +297,7 @@ def _smooth(task: Task, rng: np.random.Generator, count: int, amplitude: float) 
 
 
 def _range(task: Task) -> Array:
-    """The range of each input (m,), about zero and one wide to each side without a limit."""
+    """Return the range of each input (m,); without a limit, one unit from zero to that side."""
     zero = np.clip(np.zeros(task.model.m), task.low, task.high)
     low = np.where(np.isfinite(task.low), task.low, zero - 1.0)
     return np.asarray(np.where(np.isfinite(task.high), task.high, zero + 1.0) - low)

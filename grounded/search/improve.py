@@ -1,23 +1,23 @@
 """START HERE: the paper's algorithm as a function of stored trials.
 
 Abbeel, Quigley & Ng, "Using Inaccurate Models in Reinforcement Learning", ICML 2006, section 3.
-The idea: let the REAL system evaluate the policy, and ask the crude model only which way to change
-it. The model is made to replay the last trial exactly, so that its derivatives are taken along the
-true states.
+The idea: the REAL system evaluates the policy; the crude model only supplies the direction in which
+to change it. A bias makes the model replay the last trial exactly, so that its derivatives are
+taken along the true states.
 
     f_t^(i+1)(s, a) = f_t(s, a) + s_{t+1}^(i) - f_t(s_t^(i), a_t^(i))
 
 | step | paper                                          | here                                    |
 |------|------------------------------------------------|-----------------------------------------|
 | 1, 2 | optimal policy of the crude model              | `first_policy` (`first_guess`, `ddp`)   |
-| 3    | run it, record the trial                       | people, robots: `run`, `ingest`         |
+| 3    | run it, record the trial                       | the user: `run`, `ingest`               |
 | 4    | add a bias to the ORIGINAL model               | `bias.ground`                           |
 | 5    | direction d from algorithm A in that model     | `directions` (`mispredictions`)         |
 | 6    | theta + alpha d, line search on the real system| `Policy.toward`, `step_size`            |
 | 7    | none improves: return the current policy       | `standing`                              |
 
 `propose` is a pure function: the same candidates and trials give the same next candidate, bit for
-bit. `ask_tell` is the loop around it.
+bit. `ask_tell` has the loop around it.
 """
 
 from __future__ import annotations
@@ -61,21 +61,26 @@ def propose(
     refit: Callable[[Task, Sequence[Trial]], Model] | None = None,
     tick: Tick | None = None,
 ) -> Proposal:
-    """What to run next: the outstanding candidate, a new one, or nothing.
+    """Return what to run next: the outstanding candidate, a new one, or nothing.
+
+    This is a pure function of its arguments; `Search` keeps the candidates and trials for you.
 
     Args:
-        task: the manoeuvre; it judges the trials.
-        candidates: those proposed so far, in order.
-        trials: stored trials, in order.
-        options: the [search] table.
-        identity: the name of a new candidate; by default the next after those of this task.
-        planner: plans with adopted effects; None: with the task's own model.
-        refit: with options.refit, gives the model with parameters fitted to all trials; None: by
-            `grounded.fit`.
-        tick: told what is going on while planning takes its time.
+        task: the manoeuvre and the crude model; the task judges the trials.
+        candidates: the candidates proposed so far, in order.
+        trials: the trials so far, in order; `Trial.candidate` says which candidate was run.
+        options: settings of the search.
+        identity: id of a new candidate; by default the next number, such as "c0003".
+        planner: plans with a model that has adopted effects; None for the task's own model.
+        refit: with `options.refit`, function (task, trials) -> model with fitted parameters; None
+            for `grounded.fit`.
+        tick: called with a line of progress while planning.
+
+    Returns:
+        A `Proposal`: its `candidate` is None if the search has ended, and its `standing` says why.
 
     Raises:
-        GroundedError: where the model's own plan can't be made, with the place in the model.
+        GroundedError: if the model gives no plan to start from; the message says where it fails.
     """
     planner = planner or Planner(task, task)
     fingerprint = planner.fingerprint
@@ -91,23 +96,23 @@ def propose(
         policy, plan = planner.first_policy(now.caution, tick)
         if not plan.ok:
             raise GroundedError(
-                f"there is no plan to run: {plan.sentence}; mend the model there, or take a start "
-                "and a target at which it holds"
+                f"there is no plan to run: {plan.sentence}; correct the model there, or choose a "
+                "start and a target at which it is valid"
             )
         model = planner.plan.problem(exact=True)
         made = make.checked(make.with_margin(make.candidate(policy, model, Step()), model))
         if plan.status == "converged":
             return made
-        note = f"the plan is not at the model's optimum: {plan.sentence}"
+        note = f"the plan is not optimal in the model: {plan.sentence}"
         return replace(made, notes=(*made.notes, note))
     return _improvement(make, now.incumbent, options)
 
 
 def refitted(task: Task, trials: Sequence[Trial]) -> Model:
-    """The task's model with parameters fitted to all trials that are finite to their end.
+    """Return the task's model with parameters fitted to all trials without gaps.
 
-    What their instruments show is corrected first. Values that predict held-out time worse
-    than the model's own are not taken.
+    Sensor errors found in the trials are corrected first. The fitted values are rejected if they
+    predict held-out time worse than the model's own values.
     """
     from grounded.fit import fit
     from grounded.instruments.sound_trials import sound_trials
@@ -129,10 +134,10 @@ def refitted(task: Task, trials: Sequence[Trial]) -> Model:
 
 
 def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Proposal:
-    """Steps 4 to 6: the first step, from the one that is due on, that the model believes in.
+    """Steps 4 to 6: propose the first step, from the due one on, that gains in the model.
 
-    Another plan goes before it where there is reason for one (`gentler`, `own_plan`). A step
-    whose predicted run loses is passed over in the model, at no trial's cost: d must satisfy
+    Other candidates take precedence where they are due (`gentler`, `own_plan`). A step whose
+    predicted run loses is skipped without a trial: d must satisfy
     U^(theta + alpha d) >= U^(theta) for some alpha (step 5).
     """
     now = make.now
@@ -158,7 +163,7 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
         unsafe, ruinous = unsafe or found, ruinous or about.ruinous
         lost = losers_of(now.history, incumbent.candidate.id, make.fingerprint)
         if promised and not lost and 0 <= max(promised) <= least:
-            break  # at the optimum as far as the model can tell: no trial is spent on another way
+            break  # at the model's optimum: no trial is spent on another way
     return unsafe or Proposal(
         _ended(make, incumbent, promised, least, options.tolerance, ruinous), None, False
     )
@@ -172,7 +177,7 @@ def _ended(
     tolerance: float,
     ruinous: Candidate | None,
 ) -> Standing:
-    """The standing when no step is worth a trial, with the true reason."""
+    """Return the standing of a search in which no step is worth a trial, with the reason."""
     own, finite = incumbent.candidate.id, [gain for gain in promised if np.isfinite(gain)]
     phase: Phase = "stopped"
     ending: Ending
@@ -181,27 +186,27 @@ def _ended(
     if ruinous is not None:
         ending = "too doubtful"
         sentence = (
-            f"the model promises {figure(ruinous.predicted_gain)} from a step and is likely to be "
-            f"off by more than all that {own} cost: no trial is spent on it; another trial of "
-            f"{own}, or a diagnosis, tells more"
+            f"the model promises a gain of {figure(ruinous.predicted_gain)} from a step, but its "
+            f"likely error is larger than the whole cost of {own}: no trial is spent on it; run "
+            f"{own} again or diagnose the model"
         )
     elif promised and not finite:
         ending = "model diverges"
         sentence = (
-            f"the model diverges when it is grounded on {own}, whatever the step: it is too far "
-            "off there to say how to improve; a diagnosis may say what it lacks"
+            f"the model grounded on {own} diverges for every step: it is too inaccurate there to "
+            "improve with; a diagnosis may show what it lacks"
         )
     elif finite and max(finite) < -least and not lost:
         ending = "every step loses"
         sentence = (
             f"every step from {own} loses in the grounded model, by at least {-max(finite):.4g}: "
-            "its slopes don't hold along this trial; a diagnosis may say what it lacks"
+            "its derivatives are wrong along this trial; a diagnosis may show what it lacks"
         )
     elif lost:
         phase, then, ending = "converged", None, "no step improved"
         sentence = (
             f"{lost} step{'s' * (lost > 1)} from {own} did not improve, and the model promises "
-            f"less than {100 * tolerance:g} % from smaller ones: {own} is the result (step 7)"
+            f"less than {100 * tolerance:g} % from smaller steps: {own} is the result (step 7)"
         )
     else:
         phase, then, ending = "converged", None, "nothing promised"

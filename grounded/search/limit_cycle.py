@@ -1,4 +1,4 @@
-"""Inputs that swing: a trial that was a limit cycle about its plan, a plan that jumps."""
+"""Detect oscillating inputs: limit cycles in trials, and jumps in plans."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from grounded.frozen import Array
 from grounded.search.candidate import Tried
 from grounded.task import Task
 
-NEAR, OFTEN = 0.01, 0.3  # of its range; of the steps
-SWINGS = 6  # of an input about its plan, each as large as the plan's own range: a limit cycle
+# fraction of an input's range within which it counts as at its limit; share of steps that is often
+NEAR, OFTEN = 0.01, 0.3
+SWINGS = 6  # swings of an input about its plan by at least the plan's range: a limit cycle
 
 
 def limit_cycle(tried: Tried, task: Task) -> bool:
-    """Whether feedback swung an input to and fro about its plan, each time by the plan's range.
+    """Return whether feedback made an input oscillate about its plan by at least the plan's range.
 
-    And by more than it is off lastingly: a load that sags, or friction that holds a joint, needs
-    the gains that it has, whatever noise they carry.
+    Each swing must also exceed the median offset from the plan: a sagging load, or friction that
+    holds a joint, needs its gains despite the noise that they amplify.
     """
     made = tried.candidate
     range_ = np.minimum(np.ptp(made.predicted_inputs, axis=0), task.high - task.low)
@@ -29,7 +30,7 @@ def limit_cycle(tried: Tried, task: Task) -> bool:
 
 
 def between_limits(tried: Tried, task: Task) -> bool:
-    """Whether feedback held an input at one limit or the other for much of a trial."""
+    """Return whether an input was at its limits, at both of them, for much of a trial."""
     range_ = task.high - task.low
     near = np.where(np.isfinite(range_), NEAR * range_, 0.0)
     for trial in tried.trials:
@@ -41,12 +42,12 @@ def between_limits(tried: Tried, task: Task) -> bool:
 
 
 def jumps(inputs: Array, range_: Array) -> Array:
-    """How often inputs (T, m) go over half their range (m,) or more within one step, (m,)."""
+    """Count the steps in which each of the inputs (T, m) changes by over half its range, (m,)."""
     return np.asarray((np.abs(np.diff(inputs, axis=0)) > 0.5 * range_).sum(axis=0))
 
 
 def _swings(values: Array, size: float) -> int:
-    """How often a signal moves by `size` or more, each time against the time before."""
+    """Count how often a signal reverses and moves by `size` or more."""
     found, way, last = 0, 0.0, values[0]
     for value in values:
         if (value - last) * way > 0:

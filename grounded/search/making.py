@@ -1,4 +1,4 @@
-"""Making a candidate: of a step, of gentler gains, or of the plan of a model that was changed."""
+"""Make a candidate: from a step, from gentler gains, or from the plan of a changed model."""
 
 from __future__ import annotations
 
@@ -28,18 +28,19 @@ if TYPE_CHECKING:
     from grounded.search.corrected import Corrected
     from grounded.search.feedback import Alternative
 
-GENTLER = 1e3  # factor on the price of inputs from which gentler gains are designed
-HALF, FINE = 0.5, 12  # of the mean gain is left where no limit is met; parts of a caution
-NEAR = 0.2  # of the way that one that lost would go: a step that ends so near is the same one
-REFUTED = 2  # steps by corrected slopes that lost too much: then the model's own are believed
-FORETOLD = 0.2  # of the incumbent's cost: a plain model that is off by more there is no judge
+GENTLER = 1e3  # factor on the input weights for each unit of caution
+HALF, FINE = 0.5, 12  # share of the mean gain to fall below; parts of a unit of caution
+NEAR = 0.2  # relative distance to a run that lost within which a step counts as the same
+REFUTED = 2  # bad losses of steps with corrected derivatives before those are given up
+FORETOLD = 0.2  # largest error of the plain model at the incumbent, as a fraction of its cost
 
 
 class About:
-    """The model grounded on the incumbent's trial, and what it promises of other policies.
+    """The model grounded on the incumbent's trial, and its predictions for other policies.
 
-    Where a trial started off s_0, its utility is no measure for runs that start there: theta's own
-    run in the grounded model is (`already`). It replays the trial when the start was s_0.
+    If a trial did not start at s_0, its utility can't be compared with predicted runs from s_0. So
+    gains are relative to theta's own run in the grounded model (`already`), which equals the trial
+    if it started at s_0.
     """
 
     def __init__(self, make: Maker, incumbent: Tried, options: SearchOptions, way: Way) -> None:
@@ -56,7 +57,7 @@ class About:
         self.theta = planner.widened(incumbent.candidate.policy)
         self.run = (own.states[:, : planner.task.model.n], own.inputs)
         self.corrected: Corrected | None = None
-        self.missed = 0.0  # share of its movements that the model is likely to be off by
+        self.missed = 0.0  # likely error of the model's movements, as a share of them
         self.alternatives: tuple[Alternative, ...] = ()
         if options.damps and len(make.now.history) > 1 and not self._kept():
             from grounded.search.mispredictions import believed
@@ -68,20 +69,20 @@ class About:
         already = predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
         began = np.append(own.states[0], self.real.start[own.states.shape[1] :])
-        as_run = replace(self.real, start=began)  # theta's from where its trial began
+        as_run = replace(self.real, start=began)  # theta's run from where its trial began
         self.as_run = predicted(as_run, incumbent.candidate.policy).utility
         self.least = options.tolerance * abs(self.already)
-        self.plain = plan.problem(exact=True)  # no trial in it, hence no noise and no start
+        self.plain = plan.problem(exact=True)  # without a bias: independent of noise and start
         self.plainly = predicted(self.plain, incumbent.candidate.policy).utility
-        self.ruinous: Candidate | None = None  # a step that was foretold to lose, and not taken
+        self.ruinous: Candidate | None = None  # a step rejected because of its predicted loss
 
     @property
     def slopes(self) -> Slopes:
-        """Whose they are."""
+        """Which derivatives the model uses."""
         return "corrected" if self.corrected else ""
 
     def _kept(self) -> bool:
-        """Whether the model's own slopes have foretold what the step to the incumbent brought."""
+        """Return whether the model's own derivatives predicted the incumbent's gain well."""
         made, history = self.incumbent.candidate, self.make.now.history
         base = next((t for t in history if t.candidate.id == made.base), None)
         if base is None or made.slopes or made.model != self.make.fingerprint:
@@ -91,7 +92,7 @@ class About:
         return not lost and abs(off) <= (1 - KEPT) * made.predicted_gain
 
     def _refuted(self) -> int:
-        """How many steps by corrected slopes lost by more than they were likely to be off by."""
+        """Count the steps with corrected derivatives that lost by more than their likely error."""
         best, model = self.incumbent, self.make.fingerprint
         lost = losers_of(self.make.now.history, best.candidate.id, model)
         corrected = {candidate.id for candidate in lost if candidate.slopes}
@@ -102,16 +103,16 @@ class About:
         )
 
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
-        """A candidate with what this model promises of it, and how far that is likely to be off."""
+        """Return a candidate with this model's prediction and its likely error."""
         made = self.make.candidate(policy, self.real, step, self.already, way)
         made = replace(made, slopes=self.slopes, base_as_run=self.as_run)
         return self._steadied(made) if made.predicted_gain > self.least else made
 
     def _steadied(self, made: Candidate) -> Candidate:
-        """The same run with the incumbent's gains, where the new ones may not hold (`feedback`).
+        """Return the same run with the incumbent's gains if the new ones cost more (`feedback`).
 
-        A changed model's own plan keeps its own: the incumbent's were designed in a model that
-        lacked what was found since, a delay say, and that is what made them swing.
+        The own plan of a changed model keeps its gains: the incumbent's were designed in a model
+        that lacked what was found since, such as a delay.
         """
         new, run = made.policy, self.incumbent.candidate.policy
         own = made.way == "own plan" or new.gain is None or run.gain is None
@@ -125,16 +126,16 @@ class About:
         return replace(made, likely_off=self.missed * moved)
 
     def step_from(self, first: Step, promised: list[float]) -> Proposal | None:
-        """The first step worth a trial; one that is not allowed, or None; adds to the promises.
+        """Return the first step worth a trial, else one that is not allowed, else None.
 
-        One that is likely to lose, for what the model misses, is left for when there is no other.
-        One that any of the models that explain the trials foretells to be a disaster is none.
-        One whose run is nearly that of a candidate that lost is none: where the price on leaving
-        the trial's inputs is small beside the others, ten times the damping is the same step.
+        A step whose likely error exceeds its gain is only used if there is no other. Steps for
+        which a model that explains the trials predicts a very large loss are skipped. So are steps
+        whose run is nearly that of a candidate that lost: if the damping penalty is small beside
+        the other weights, ten times the damping gives the same step.
 
         Args:
-            first: the step that is due, whatever the slopes of those that lost.
-            promised: gains that were too small.
+            first: the due step, regardless of the derivatives of those that lost.
+            promised: predicted gains that were too small are appended to it.
         """
         make, options = self.make, self.options
         history, model = make.now.history, make.fingerprint
@@ -179,23 +180,23 @@ class About:
         return doubted or unsafe
 
     def _ruinous(self, made: Candidate) -> bool:
-        """Whether it is foretold to lose more than all that the incumbent costs there."""
+        """Return whether it is predicted to lose more than the incumbent's whole cost."""
         return made.expected_gain < -max(self._disturbed, -self.incumbent.utility)
 
     @cached_property
     def _disturbed(self) -> float:
-        """What the incumbent's policy costs in the alternatives."""
+        """Cost of the incumbent's policy in the alternatives."""
         return sum(a.cost(self.incumbent.candidate.policy) for a in self.alternatives)
 
     def _near(self, made: Candidate, lost: Rollout) -> bool:
-        """Whether a candidate is to do nearly what one that lost would do in this model."""
+        """Return whether a candidate's run is nearly that of one that lost, in this model."""
         run, other = (made.predicted_states, made.predicted_inputs), (lost.states, lost.inputs)
         return apart(self.real, run, other) <= NEAR**2 * apart(self.real, self.run, other)
 
     def _told(self, made: Candidate) -> Candidate:
-        """The same; it is likely to be off by no less than what other models say.
+        """Return the candidate with its likely error raised to what other models imply.
 
-        Those are the alternatives and the plain model, where that foretold the incumbent's trial.
+        These are the alternatives, and the plain model if it predicted the incumbent's trial.
         """
         gains = [made.predicted_gain - made.likely_off]
         if self.alternatives:
@@ -207,23 +208,26 @@ class About:
 
     @property
     def _plain_off(self) -> float:
-        """What the model with no trial in it is off by at the incumbent."""
+        """Error of the plain model, without a bias, at the incumbent's utility."""
         return abs(self.plainly - self.incumbent.utility)
 
     def _plain_gain(self, made: Candidate) -> float | None:
-        """What that model promises over the incumbent; None where it did not foretell that."""
+        """Return the gain predicted by the plain model; None if it mispredicts the incumbent."""
         if not self._plain_off < FORETOLD * -self.incumbent.utility:
             return None
         return predicted(self.plain, made.policy).utility - self.plainly
 
     def own_plan(self, rival: Proposal | None) -> Proposal | None:
-        """A model that was changed since: its own new plan, where more is promised of that.
+        """Return the changed model's own plan if its predicted gain exceeds the rival's.
 
-        The plan of a crude model may sit in another valley than that of the better one: going on
-        from it ends where it began. Both are judged by the grounded prediction, less what it is
-        likely to be off by so far away; and the own plan by the changed model alone as well, where
-        that foretells the incumbent's trial (`_worth`). It needs no promise where that trial was
-        wild, or its feedback swung to and fro: a bias measured there says nothing of other runs.
+        The plan of the crude model may lie near another local optimum than that of the better
+        model, where local steps from it can't go. Both are judged by the grounded prediction less
+        its likely error, and the own plan also by the changed model alone if that predicts the
+        incumbent's trial (`_worth`). No gain is required if that trial failed badly or was a limit
+        cycle: a bias measured there does not apply to other runs.
+
+        Args:
+            rival: the best step along a direction; None if there is none.
         """
         make, base = self.make, self.incumbent.candidate
         tried = losers_of(make.now.history, base.id, make.fingerprint, "own plan")
@@ -238,12 +242,12 @@ class About:
         return proposal if proposal is not None and proposal.candidate is not None else None
 
     def _worth(self, made: Candidate) -> float:
-        """What an own plan is likely to gain: the larger of what two models say.
+        """Return the likely gain of an own plan: the larger of the estimates of two models.
 
-        Trials that swung make every model that replays them doubtful. A changed model that
-        foretells the incumbent without its bias is believed over that doubt, less what it is off
-        by there, where the grounded one promises a gain too (or a drift car flew off), and unless
-        it is little: its own plan always promises something in it.
+        The first is the grounded model's gain less its likely error. The second is the gain in the
+        changed model alone, less its error at the incumbent. It is used only if that model predicts
+        the incumbent without a bias, the grounded model predicts a gain too (else a drift car
+        diverged), and the gain is not small: in its own model a plan always gains something.
         """
         plainly = self._plain_gain(made) if made.predicted_gain > self.least else None
         sure = -np.inf if plainly is None else plainly - self._plain_off
@@ -253,7 +257,7 @@ class About:
 
 @dataclass(frozen=True, eq=False)
 class Maker:
-    """Makes candidates of a policy: what a robot can run of it, and its predicted run."""
+    """Makes candidates: the policy as a robot can run it, and its predicted run."""
 
     planner: Planner
     now: Standing
@@ -269,7 +273,7 @@ class Maker:
         way: Way = "",
         caution: float | None = None,
     ) -> Candidate:
-        """A candidate; its gains are designed as gently as its incumbent's, or by `caution`."""
+        """Return a candidate; its gains are as gentle as the incumbent's, or set by `caution`."""
         base, policy = self.now.incumbent, self.planner.narrowed(policy)
         if caution is None:
             follows = base is not None and base.candidate.base and way != "own plan"
@@ -295,7 +299,7 @@ class Maker:
     def foretold(
         self, made: Candidate, policy: Policy, problem: Problem, already: float
     ) -> Candidate:
-        """A candidate with this policy and what a model predicts of it."""
+        """Return the candidate with another policy and the model's prediction for it."""
         run = predicted(problem, policy)
         return replace(
             made,
@@ -307,12 +311,12 @@ class Maker:
         )
 
     def gentler(self, incumbent: Tried) -> Candidate | None:
-        """The incumbent's plan with gentler gains, where its loop was unstable on the robot.
+        """Return the incumbent's plan with gentler gains if its loop was unstable on the robot.
 
-        High gains and a delay that the model lacks make a limit cycle, which no step along a
-        direction leaves: the grounded model replays it, and has no delay to blame. An input that
-        swings from limit to limit asks for far less gain. Else it may be noise that high gains
-        carry, and half of them are still needed.
+        High gains together with a delay that the model lacks cause a limit cycle. Steps along a
+        direction do not remove it: the grounded model replays it but contains no delay. An input
+        that swings from limit to limit needs much lower gains. Otherwise the cause may be noise
+        amplified by high gains, and the gains are only about halved.
         """
         own = incumbent.candidate
         lost = losers_of(self.now.history, own.id, self.fingerprint, "gentler gains")
@@ -330,7 +334,7 @@ class Maker:
         return self.candidate(own.policy, problem, Step(), real, "gentler gains", caution)
 
     def _gently(self, policy: Policy, problem: Problem, caution: float) -> Policy:
-        """The same run with the gains of a regulator whose inputs cost GENTLER ** caution more."""
+        """Return the same run with the gains of an LQR with GENTLER ** caution the input weight."""
         if policy.gain is None:
             return policy
         run, gentle = predicted(problem, policy), self.planner.dearer(problem, GENTLER**caution)
@@ -343,7 +347,7 @@ class Maker:
         return self.planner.narrowed(made)
 
     def with_margin(self, made: Candidate, problem: Problem) -> Candidate:
-        """The same run with gains that hold under worse conditions, see `margin`."""
+        """Return the same run with gains that hold under worse conditions, see `margin`."""
         own = made.policy
         if own.gain is None or not self.planner.needs_margin:
             return made
@@ -352,7 +356,7 @@ class Maker:
         return made if new is own else self.foretold(made, new, problem, made.expected_of_base)
 
     def checked(self, made: Candidate) -> Proposal:
-        """A candidate that is finite, inside the limits and predicted to stay safe; or none."""
+        """Return a proposal of the candidate, or a refusal if it violates limits or [safety]."""
         task, history = self.planner.task, self.now.history
         if not (found := objections(task, made, spread(task, history, self.fingerprint))):
             return Proposal(self.now, made, is_new=True)
@@ -362,20 +366,20 @@ class Maker:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Proposal(Result):
-    """What to run next, or why nothing is: `candidate` is None when the search has ended."""
+    """What to run next, or why there is nothing: `candidate` is None if the search has ended."""
 
     standing: Standing
     candidate: Candidate | None
-    is_new: bool
+    is_new: bool  # whether the candidate was made by this call
     notes: tuple[str, ...] = ()
-    refused: Candidate | None = None  # what `notes` speak against
+    refused: Candidate | None = None  # a candidate that was refused for the reasons in `notes`
 
     def summary(self) -> str:
-        """The candidate, or the end of the search."""
+        """Return the summary of the candidate, or of the standing if there is none."""
         return self.candidate.summary() if self.candidate else self.standing.summary()
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `grounded propose --json`; `file` is for whoever writes the candidate."""
+        """Return the document of `grounded propose --json`; the command fills in `file`."""
         now, made = self.standing, self.candidate
         known = document(
             candidate=made and made.id,
@@ -393,5 +397,5 @@ class Proposal(Result):
 
 
 def _gain(policy: Policy) -> float:
-    """The mean size of the feedback's gains."""
+    """Return the mean absolute feedback gain."""
     return 0.0 if policy.gain is None else float(np.abs(policy.gain).mean())

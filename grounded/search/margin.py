@@ -1,15 +1,15 @@
-"""Whether a loop holds where a robot acts on what it knows a little late, and not exactly.
+"""Check the stability margin of a loop with sensor noise and old samples, and adapt its gains.
 
-A controller of 100 Hz that takes the latest of 200 samples a second acts on one that is up to 5 ms
-old, and sensors have noise. A predicted run follows its own reference and shows nothing of this; a
-model with a delay, or with memory that no sensor shows, makes gains that rely on fresh samples to
-the last part of a step, for its plan counts on every command under way.
+A 100 Hz controller that uses the latest of 200 samples per second acts on data up to 5 ms old, and
+sensors have noise. A predicted run follows its own reference and shows none of this. With a delay
+or unmeasured memory in the model, the gains rely on fresh samples to a fraction of a step, because
+the plan accounts for every command under way.
 
-So the policy is run in its model under worse conditions: with noise of a part of what the run does
-in a step; on old samples, which to the controller is a robot whose inputs arrive later by as much
-(samples interpolated between two steps would show little: an input that swings from step to step
-moves a robot between its samples alone); and with dry friction that builds up slowly, since as it
-is linearised a joint that sticks needs no gain, and once it slips it has none.
+So the policy is simulated in its model under worse conditions: with noise, a fraction of the motion
+in a step; with old samples, simulated as a later arrival of the inputs (interpolating samples would
+hide the problem, since an input that alternates from step to step moves the robot between its
+samples); and with dry friction that builds up slowly, because in the linearised model a joint that
+sticks needs no gain, and would have none once it slips.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from grounded.frozen import Array
 from grounded.policy import Policy, z_difference
 from grounded.search.planner import predicted
 
-AGES = (0.0, 0.3, 0.6)  # of a step: how old the samples are
-NOISE, SEEDS = 0.1, 3  # of what each state does in a step, rms; and how often it is drawn
-WORSE = 1.5  # times what the run is to cost: worse conditions cost no more where a loop holds
-LITTLE = 1.3  # times what they cost at least, on average: gentler gains bear what no model knows
-CAUTIONS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25)  # of `Maker`: gains that are tried
+AGES = (0.0, 0.3, 0.6)  # age of the samples, as a fraction of a step
+NOISE, SEEDS = 0.1, 3  # noise, as a fraction of each state's rms motion in a step; number of draws
+WORSE = 1.5  # most cost, relative to the predicted run, with which a loop counts as stable
+LITTLE = 1.3  # most mean cost relative to the best gains; gentler ones are more robust
+CAUTIONS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25)  # gains that are tried, see `Maker._gently`
 
 
 def steadied(
@@ -37,13 +37,13 @@ def steadied(
     gently: Callable[[float], Policy],
     loose: Problem | None = None,
 ) -> Policy:
-    """The policy where it holds; else the gentlest gains that cost little more than the best.
+    """Return the policy if its loop is stable, else the gentlest gains of nearly the least cost.
 
     Args:
-        problem: that predicts its run.
-        policy: as a robot runs it.
-        gently: the same run with gains for inputs that are dearer, by a caution.
-        loose: the problem with dry frictions that build up slowly.
+        problem: the problem that predicts its run.
+        policy: the policy as a robot runs it.
+        gently: returns the same run with gains for larger input weights, given a caution.
+        loose: the problem with dry friction that builds up slowly; None if there is none.
     """
     models = [problem] if loose is None else [problem, loose]
     own = worse_costs(models, policy)
@@ -60,11 +60,11 @@ def steadied(
 
 
 def worse_costs(models: Sequence[Problem], policy: Policy) -> Array:
-    """What a policy's runs cost with noise and on samples of some AGES, in each model, (M, A).
+    """Return the cost of a policy with noise and old samples, (M, A) for M models and A ages.
 
     Args:
         models: the first one predicts the run.
-        policy: over their z, or fewer states, as a robot runs it.
+        policy: the policy as a robot runs it, over the models' z or fewer states.
     """
     n = len(policy.state_names)
     run = predicted(models[0], policy)

@@ -1,34 +1,34 @@
-"""What earlier trials say about the SLOPES of the model that replays the incumbent's.
+"""Correct the DERIVATIVES of the grounded model from the mispredictions of earlier trials.
 
-The grounded model is right along the incumbent's trial; its slopes there are the crude model's.
-Every other trial j left that trial by x_j - x and u_j - u, and what the grounded model then
-mispredicts over one step,
+The grounded model is exact along the incumbent's trial, but its derivatives there are the crude
+model's. Another trial j differs from that trial by x_j - x and u_j - u. The error of the grounded
+model's prediction of one of its steps,
 
     y_jt = x_j,t+1 - (f(x_jt, u_jt) + bias_t),        zero for the incumbent itself,
 
-is, to first order, what its slopes lack. One trial gives H such vectors, far more than the one
-number of its utility. Two laws are fitted to them, each the same at all times of the run, the
-second one to what the first leaves:
+is, to first order, the effect of the error of the derivatives. A trial gives H such vectors, far
+more information than its utility alone. Two linear laws are fitted to them, each constant over the
+run, the second one to the residuals of the first:
 
     1. y_t = f_u,t D [dx_t, du_t, du_t-1, v_t-1]   what acts where the inputs act: a lag, a gain, a
                                                    load; v is y in units of the inputs
     2. y_t = E [dx_t, du_t]                        what acts elsewhere
 
-Each is a ridge regression. Its price, and how much less trials count the farther they are from the
-incumbent, are chosen by leaving out parts of the run in turn (Stone, "Cross-validatory choice and
-assessment of statistical predictions", J. R. Stat. Soc. B 36, 1974). (A law of each step's own
-gains the last half per cent on cars and costs twice the trials.)
+Each is a ridge regression. Its penalty, and how fast the weight of trials decreases with their
+distance from the incumbent, are chosen by cross-validation over parts of the run (Stone,
+"Cross-validatory choice and assessment of statistical predictions", J. R. Stat. Soc. B 36, 1974).
+(A separate law for each step gains the last half per cent on cars but costs twice the trials.)
 
-Which slopes are believed, the crude ones or those of the laws, is decided by leaving out the
-nearest trials in turn: each model, fitted to the others, runs the policy of the one left out, and
-`Believed.missed` is the share of what that trial did otherwise than the incumbent's (`apart`, in
-the units of the cost) that it does not foretell. The least wins. As much of a new step is likely to
-be missed, so one that would lose by that is put last (`making.About`). Left out in turn as well are
-steps that corrected slopes have made and that lost, however far they went: laws that such a trial
-refutes foretell those nearby. And where two of them lost from the incumbent by more than they were
-likely to be off by, the crude slopes are believed (`making.REFUTED`).
-A single other trial can't be left out: there, it is at least the share of the mispredictions that
-law 1 leaves in parts of the run that it was not fitted to.
+The choice between the crude and the corrected derivatives is made by leaving out the nearest trials
+in turn. Each model, fitted to the others, runs the policy of the trial left out. `Believed.missed`
+is the share of that trial's difference from the incumbent's (`apart`, in units of the cost) that
+the model does not predict. The model with the lower value is used. The same share of a new step is
+likely to be mispredicted, so a step that might lose because of it is put last (`making.About`).
+Steps that were made with corrected derivatives and lost are also left out in turn, at any distance:
+laws that such a trial refutes still predict trials nearby. After two such losses from the incumbent
+by more than the likely error, the crude derivatives are used (`making.REFUTED`).
+With a single other trial nothing can be left out: the value is then at least the share of the
+mispredictions that law 1 leaves in the held-out parts of the run.
 """
 
 from __future__ import annotations
@@ -49,18 +49,18 @@ from grounded.search.planner import Planner, predicted
 from grounded.solve.bias import input_span
 from grounded.trial import mean_trial
 
-PRICES = (1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)  # of the ridge
-FADING = (0.0, 2.0)  # powers of the distance with which a trial's squares lose weight
-PARTS = 8  # of the run, left out in turn
-NEAREST = 12  # trials that count
-ASKED = 3  # the nearest trials, which are left out in turn
-LATEST = 100  # of which they are chosen
-DEAD = 1e-4  # of the mean square effect of the inputs: less explains nothing
+PRICES = (1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)  # ridge penalties
+FADING = (0.0, 2.0)  # the weight of a trial is its distance to minus this power
+PARTS = 8  # parts of the run for cross-validation
+NEAREST = 12  # nearest trials that are used
+ASKED = 3  # nearest trials that are left out in turn
+LATEST = 100  # latest trials that these are chosen from
+DEAD = 1e-4  # regularisation, relative to the mean square effect of the inputs
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A trial as the grounded model sees it; u is what the actuators received."""
+    """A trial and its mispredictions by the grounded model; u is what the actuators received."""
 
     x: Array  # (H, n)
     u: Array  # (H, m)
@@ -72,7 +72,7 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Believed:
-    """A model that replays the incumbent's trial, and the share of movements that it misses."""
+    """A model that replays the incumbent's trial, and the share of movements it mispredicts."""
 
     problem: Problem
     corrected: Corrected | None = None
@@ -87,14 +87,15 @@ def believed(
     grounded: Problem,
     trusted: bool = True,
 ) -> Believed:
-    """The grounded model, with corrected slopes where those foretell trials better.
+    """Return the grounded model, with corrected derivatives if they predict trials better.
 
     Args:
-        planner: the task, and the task as it is planned.
-        incumbent: whose trial the model replays.
+        planner: the task, and the task used for planning.
+        incumbent: the candidate whose trial the model replays.
         history: all candidates with their trials.
         grounded: the exact model with the incumbent's bias.
-        trusted: whether corrected slopes may be believed; False: they are an alternative alone.
+        trusted: whether corrected derivatives may be chosen; if not, they only serve as an
+            alternative.
     """
     own = seen(planner, incumbent, grounded)
     if own is None:
@@ -141,14 +142,14 @@ def _with(law: Array | None, own: Seen, grounded: Problem) -> Believed:
 
 
 def unforetold(problem: Problem, own: Seen, other: Seen) -> float:
-    """The share of what a trial did otherwise than the incumbent's that a model is off by."""
+    """Return the share of a trial's difference from the incumbent's that a model mispredicts."""
     found = predicted(problem, other.policy)
     run = (found.states, found.inputs)
     return min(1.0, apart(problem, run, other.run) / apart(problem, own.run, other.run))
 
 
 def seen(planner: Planner, tried: Tried, grounded: Problem) -> Seen | None:
-    """The mean trial of a candidate in the grounded model; None where it is not whole."""
+    """Return the mean trial of a candidate with its mispredictions; None if it is incomplete."""
     H, mask = grounded.horizon, planner.task.model.angle_mask
     trial = planner.lift(mean_trial(tried.trials, mask))
     if trial.finite_steps < H:
@@ -169,16 +170,16 @@ def _sent(problem: Problem, u: Array) -> Array:
 
 
 def laws(own: Seen, others: Sequence[Seen], grounded: Problem) -> tuple[Array | None, float]:
-    """What the slopes lack, (H, n, 2 n + 2 m) by [x, u, u before, y before]: laws 1 and 2.
+    """Fit laws 1 and 2, the error of the derivatives with respect to [x, u, u before, y before].
 
     Args:
         own: the incumbent's trial.
-        others: trials that moved away from it.
+        others: other trials.
         grounded: the exact model with the incumbent's bias.
 
     Returns:
-        Their sum, None where no trial moved, and the share of the nearest trial's mispredictions
-        that law 1 leaves in parts of the run that it was not fitted to.
+        The sum of the laws (H, n, 2 n + 2 m), or None if no trial differs from the incumbent's; and
+        the share of the mispredictions that law 1 leaves in held-out parts of the run.
     """
     span = input_span(grounded, own.u)
     reach = np.ptp(own.x, axis=0) + 1e-9
@@ -202,7 +203,7 @@ def laws(own: Seen, others: Sequence[Seen], grounded: Problem) -> tuple[Array | 
 
 
 def _features(own: Seen, other: Seen, grounded: Problem) -> Array:
-    """How a trial moved away from the incumbent's, [x, u, u before, y before] (H, 2 n + 2 m)."""
+    """Return a trial's differences in [x, u, u before, y before], (H, 2 n + 2 m)."""
     y_before = np.vstack([np.zeros_like(other.y[:1]), other.y[:-1]])
     x = wrapped(other.x - own.x, grounded.angles)
     return np.hstack([x, other.u - own.u, other.before - own.before, y_before])
@@ -213,7 +214,7 @@ def _rms(a: Array) -> float:
 
 
 def _matching(own: Seen, y: Array, grounded: Problem, span: Array) -> tuple[Array, Array]:
-    """f_u (H, n, m) along the incumbent, and the inputs (H, m, n) that make up best for y."""
+    """Return f_u (H, n, m) along the incumbent, and its weighted pseudo-inverse (H, m, n)."""
     scale = np.sqrt(np.mean(y**2, axis=(0, 1)))
     scale = np.maximum(scale, 1e-6 * scale.max()) + 1e-300
     _, f_u = grounded.system.linearise(own.x, _sent(grounded, own.u), grounded.p, grounded.dt)
@@ -225,15 +226,16 @@ def _matching(own: Seen, y: Array, grounded: Problem, span: Array) -> tuple[Arra
 
 
 def shared(d: Array, y: Array, far: Array) -> tuple[Array, float]:
-    """The law y_t = C d_t that holds at all times, C (k, q), and the share of y that it leaves.
+    """Fit the law y_t = C d_t, constant over the run, by ridge regression.
 
     Args:
         d: features of trials (j, H, q).
-        y: what they are to explain (j, H, k).
+        y: mispredictions to explain (j, H, k).
         far: (j,) distance of each trial from the incumbent.
 
     Returns:
-        Zeros, and 1, where no law predicts parts of the run that it was not fitted to.
+        C (k, q), and the share of y that it leaves in held-out parts of the run; zeros and 1 if no
+        law predicts those.
     """
     d, y = d / far[:, None, None], y / far[:, None, None]
     scale = np.sqrt(np.mean(d**2, axis=(0, 1))) + 1e-12

@@ -1,4 +1,4 @@
-"""The figure of a search: utility by candidate, what the model promised, and the step sizes."""
+"""Figures of a search: utility and predicted utility by candidate, and the step sizes."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from grounded.result import figure
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.standing import Standing
 
-STEEP = 8.0  # worst over best utility from which on the axis is logarithmic
-MOST = 300  # candidates that are drawn
-TICKS = 8  # candidates that an axis names
-OPEN = {  # verdicts of candidates that are neither better nor worse
+STEEP = 8.0  # ratio of worst to best utility from which on the axis is logarithmic
+MOST = 300  # most candidates that are drawn
+TICKS = 8  # most candidates named on an axis
+OPEN = {  # labels of undecided verdicts
     "waiting": "waiting for its trial",
     "in doubt": "in doubt",
     "no trial": "without a trial",
 }
-NEAR = 4  # candidates from which on the better half has a panel of its own
+NEAR = 4  # with more candidates than this, the better two thirds get a panel of their own
 
 
 def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
-    """Utility per candidate with the model's own prediction, and the step sizes.
+    """Draw the utility of each candidate with the model's prediction, and the step sizes.
 
     Args:
-        now: where the search stands.
-        optimum: of the real system, where it is known.
+        now: the standing of the search.
+        optimum: best possible utility on the real system, if known.
     """
     shown, left = few(now.history, MOST)
     tried = [t for t in shown if t.utilities]
@@ -53,17 +53,17 @@ def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
     if whole.bands:
         key.append(Key("other", "±2 standard errors of the best", "band"))
     caption = (
-        "Each candidate is run on the real system; it becomes the best so far when its utility, a "
-        "sum of rewards, is higher. A dash is what the model, made to replay the trial before, "
-        "promised for it."
-    ) + f" {left} candidates between them are not drawn." * bool(left)
+        "Each candidate is run on the real system; it becomes the best so far if its utility, the "
+        "sum of its rewards, is higher. A dash is the utility predicted by the model, which "
+        "replays the trial before."
+    ) + f" {left} candidates in between are not drawn." * bool(left)
     return Figure("utility", "Utility", caption, panels, tuple(key))
 
 
 def few(history: Sequence[Tried], most: int) -> tuple[list[Tried], int]:
-    """At most so many candidates, and how many are left out.
+    """Select at most `most` candidates; return them and the number left out.
 
-    The first, then improvements, evenly spread where there are too many, then the latest ones.
+    Keeps the first and the last, then improvements (evenly spread if too many), then the latest.
     """
     if len(history) <= most:
         return list(history), 0
@@ -88,7 +88,7 @@ def _utility(
         rules.append(Rule(optimum, "accepted", "optimum"))
         values.append(optimum)
     best = now.incumbent
-    if best is not None and math.isfinite(best.standard_error):  # it was run twice or more
+    if best is not None and math.isfinite(best.standard_error):
         error = 2 * best.standard_error
         note = f"{figure(best.utility)} ± {figure(error, 2)}: two standard errors of the best"
         bands.append(Band(best.utility - error, best.utility + error, "other", note))
@@ -108,13 +108,13 @@ def _utility(
 
 
 def _near(whole: Panel) -> Panel:
-    """The same for the better two thirds of the candidates, on a linear axis."""
+    """Return the panel for the better two thirds of the candidates, on a linear axis."""
     values = sorted(d.y for d in whole.dots if math.isfinite(d.y) and d.shape != "dash")
     low, high = values[len(values) // 3], max(d.y for d in whole.dots if d.y == d.y)
     high = min(high, values[-1] + 0.5 * (values[-1] - low))
     room = 0.08 * (high - low) or 0.05 * abs(high)
     dots = tuple(d for d in whole.dots if low <= d.y <= high)
-    title = "The better two thirds of them, linear"
+    title = "The better two thirds of the candidates, linear"
     bounds = (low - room, high + room)
     return replace(whole, title=title, dots=dots, loss=False, y_range=bounds)
 
@@ -139,7 +139,7 @@ def _dots(tried: Tried, at: int, became: str) -> list[Dot]:
 
 
 def _record(tried: Sequence[Tried], number: dict[str, int]) -> tuple[Curve, ...]:
-    """The best utility so far, as steps."""
+    """Return the curve of the best utility so far, as steps."""
     best, steps = -math.inf, []
     for t in tried:
         if t.accepted and t.utility > best:
@@ -153,20 +153,20 @@ def _record(tried: Sequence[Tried], number: dict[str, int]) -> tuple[Curve, ...]
 
 
 def _named(shown: Sequence[Tried], number: dict[str, int]) -> tuple[tuple[float, str], ...]:
-    """Ids on the axis: all, or every so many."""
+    """Return the candidate ids on the axis, evenly thinned to at most TICKS."""
     kept = shown[:: -(-len(shown) // TICKS)]
     return tuple((float(number[t.candidate.id]), t.candidate.id) for t in kept)
 
 
 def _look(tried: Tried, verdict: str) -> tuple[str, str]:
-    """(shape, role) of a candidate's mark."""
+    """Return (shape, role) of a candidate's mark."""
     if verdict in OPEN:
         return "ring", "predicted"
     return ("disc", "best") if tried.accepted else ("ring", "other")
 
 
 def _undecided(verdicts: Sequence[str]) -> list[Key]:
-    """The entry of the legend for candidates that were not decided on; none without one."""
+    """Return the legend entry for undecided candidates; empty if there are none."""
     names = [words for verdict, words in OPEN.items() if verdict in verdicts]
     return [Key("predicted", " or ".join(names), "ring")] if names else []
 
@@ -180,7 +180,7 @@ def _steps(now: Standing, shown: list[Tried], number: dict[str, int]) -> Panel:
         dots.append(Dot(number[c.id], math.log2(max(c.alpha, 2.0**-30)), role, note, shape))
     low = min(d.y for d in dots)
     return Panel(
-        title="Step size: log₂ α (0: the whole step, −1: half of it)",
+        title="Step size: log₂ α (0: full step, −1: half)",
         x_name="candidate",
         y_name="log₂ α",
         x_ticks=_named(shown, number),
@@ -191,7 +191,7 @@ def _steps(now: Standing, shown: list[Tried], number: dict[str, int]) -> Panel:
 
 
 def candidate_figure(candidate: Candidate) -> Figure:
-    """What the model predicts for a policy: its states and inputs over time."""
+    """Draw the predicted states and inputs of a candidate over time."""
     policy = candidate.policy
     columns = [*zip(policy.state_names, candidate.predicted_states.T, strict=True)]
     columns += zip(policy.input_names, candidate.predicted_inputs.T, strict=True)

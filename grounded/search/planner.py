@@ -1,10 +1,10 @@
-"""Planner: the task as the search plans it, beside the task as the robot's trials judge it.
+"""Planner: the task used for planning, beside the task that judges the robot's trials.
 
 They differ once effects are adopted: a lag, a backlash or a rate limit gives the model memory
-states that no sensor of the robot knows. Trials are LIFTED to the planning model (the memory
-follows from the commands), policies are NARROWED to what the robot measures (their gains are made
-for that, `measured_gains`; the memory's part of the feed-forward stays), and the predicted run is
-the narrowed policy's.
+states, which the robot does not measure. Trials are LIFTED to the planning model (the memory
+follows from the commands). Policies are NARROWED to what the robot measures (their gains are
+designed for that, `measured_gains`; the memory's part of the feed-forward stays). The predicted run
+is that of the narrowed policy.
 """
 
 from __future__ import annotations
@@ -35,53 +35,60 @@ if TYPE_CHECKING:
     from grounded.solve.ddp import Solution
 
 
-DEARER = (1.0, 10.0, 100.0, 1000.0)  # times what inputs cost: gains that are tried
-LOOSE = 64.0  # times the speed a dry friction builds up over: it damps what moves next to nothing
+DEARER = (1.0, 10.0, 100.0, 1000.0)  # factors on the input weights for gains that are tried
+LOOSE = 64.0  # factor on the speed a dry friction builds up over: it then hardly damps
 
 
 @dataclass(frozen=True, eq=False)
 class Planner:
-    """`task` judges; `plan` has the planning model, whose first states are the task's."""
+    """The task that judges trials, and the task used for planning.
+
+    Args:
+        task: judges the trials; its states are those that the robot measures.
+        plan: has the planning model, whose first states are the task's.
+        widths: names of parameters of the planning model that are speeds over which a dry friction
+            builds up.
+    """
 
     task: Task
     plan: Task
-    widths: tuple[str, ...] = ()  # parameters of the plan's model: speeds a friction builds up over
+    widths: tuple[str, ...] = ()
 
     @cached_property
     def fingerprint(self) -> str:
-        """Of the model that plans, see `model_fingerprint`."""
+        """Fingerprint of the planning model, see `model_fingerprint`."""
         return model_fingerprint(self.plan)
 
     @property
     def needs_margin(self) -> bool:
-        """Whether gains may rely on what a robot has not: no delay, all memory shown, no slip."""
+        """Whether gains need a check of their margin: with memory, a delay or dry friction."""
         assert self.plan.latency is not None
         remembers = self.plan.model.n > self.task.model.n
         return remembers or bool(self.plan.latency.any() or self.widths)
 
     def loosened(self, problem: Problem) -> Problem | None:
-        """The plan's problem with dry frictions that build up slowly; None where it has none."""
+        """Return the problem with dry friction that builds up slowly; None if there is none."""
         return dataclasses.replace(problem, p=self.loose.model.values) if self.widths else None
 
     def dearer(self, problem: Problem, factor: float) -> Problem:
-        """The same, if it has any, whose inputs cost `factor` times as much: for gentler gains."""
+        """Return the problem, loosened if it has dry friction, with `factor` the input weights."""
         easier = self.loosened(problem) or problem
         weight = factor * easier.input_weight + (factor - 1) * easier.change_weight
         return dataclasses.replace(easier, input_weight=weight)
 
     @cached_property
     def loose(self) -> Task:
-        """The plan's task with such frictions; its own where it has none."""
+        """The planning task with dry friction that builds up slowly; unchanged if it has none."""
         model = self.plan.model
         slow = {name: LOOSE * model.params[name].value for name in self.widths}
         return self.plan.with_model(model.with_values(slow)) if slow else self.plan
 
     @cached_property
     def aim(self) -> Task:
-        """The plan's task, whose end is asked of true values where the log of a state is late.
+        """The planning task with terminal weights on true values instead of filtered ones.
 
-        What a filter shows is judged, but a plan that ends by it kicks in its last steps: then the
-        filter shows rest, and the robot moves.
+        Trials are judged by the filtered log. But a plan with terminal weights on filtered states
+        makes abrupt inputs in its last steps, so that the filter shows rest while the robot moves.
         """
         n, names = self.task.model.n, self.plan.model.state_names
         if len(names) == n:
@@ -97,7 +104,7 @@ class Planner:
         return dataclasses.replace(self.plan, target=target, reward=goals)
 
     def lift(self, trial: Trial) -> Trial:
-        """A trial with the planning model's memory states beside its own."""
+        """Return a trial with the planning model's memory states added."""
         plan, base = self.plan.model, self.task.model
         if plan.n == base.n:
             return trial
@@ -109,22 +116,26 @@ class Planner:
         return dataclasses.replace(trial, states=states, state_names=plan.state_names)
 
     def widened(self, policy: Policy) -> Policy:
-        """A robot's policy over the planning model's z."""
+        """Return a robot's policy over the planning model's z."""
         model = self.plan.model
         angles = tuple(bool(a) for a in model.angle_mask)
         return policy.laid_out(model.state_names, angles, self.plan.problem().depths)
 
     def narrowed(self, policy: Policy) -> Policy:
-        """A planned policy over what the robot measures and sent."""
+        """Return a planned policy over the states that the robot measures and the inputs sent."""
         model = self.task.model
         angles = tuple(bool(a) for a in model.angle_mask)
         return policy.laid_out(model.state_names, angles, policy.depths)
 
     def first_policy(self, caution: int = 0, tick: Tick | None = None) -> tuple[Policy, Solution]:
-        """The planning model's own policy with gains on what the robot measures alone.
+        """Return the planning model's own policy, with gains on measured states only.
 
-        Of several, whose predicted run costs least: made where kinks are blended; or where dry
-        friction does not count, for inputs that are dearer and dearer.
+        Of several sets of gains the one with the least predicted cost is chosen: those designed
+        with smoothed kinks, and those without dry friction for ever larger input weights.
+
+        Args:
+            caution: how often a first policy has crashed.
+            tick: called with a line of progress.
         """
         from grounded.search.first_policy import cautious, first_policy
         from grounded.solve.ddp import sweep
@@ -143,14 +154,14 @@ class Planner:
         return max(policies, key=lambda one: predicted(exact, one).utility), found
 
     def with_model(self, model: Model) -> Planner:
-        """The same with other parameter values of the planning model."""
+        """Return the planner with other parameter values of the planning model."""
         return dataclasses.replace(self, plan=self.plan.with_model(model))
 
 
 def model_fingerprint(task: Task) -> str:
-    """16 hex digits over the model that plans: its values, latency, smoothing and predictions.
+    """Return a hash of the planning model's values, latency, smoothing and predictions.
 
-    Predictions at fixed points stand for the code of the dynamics, which has no other identity.
+    It has 16 hex digits. Predictions at fixed points stand for the code of the dynamics.
     """
     model, problem = task.model, task.problem(exact=True)
     digest = hashlib.sha256()
@@ -166,7 +177,7 @@ def model_fingerprint(task: Task) -> str:
 
 
 def predicted(problem: Problem, policy: Policy) -> Rollout:
-    """A robot's policy in a model that may have more states than it measures."""
+    """Simulate a robot's policy in a model that may have more states than the robot measures."""
     angles = tuple(map(bool, problem.angles))
     return simulate(problem, policy.laid_out(problem.system.states, angles, problem.depths))
 
@@ -180,18 +191,20 @@ def planner_with(
     library: Library | None = None,
     checked: Callable[[Effect, Given], Given] | None = None,
 ) -> Planner:
-    """The planner of a task whose model got these effects, in the order in which they act.
+    """Return the planner of a task with effects added to its model.
 
-    A pure delay becomes latency of the task, a queue that the robot's runner knows; everything else
-    wraps the model, with memory states where the effect has a memory. Of an input that is bent on
-    its way (a dead zone, a limit of its rate) the latency has whole steps alone: what is left of a
-    step acts behind the bend, since the mean of two commands, bent, is not the mean of both bent.
+    A pure delay becomes latency of the task, a queue of inputs that the robot's runner keeps. Every
+    other effect wraps the model, with memory states if it has memory. If an input also has a
+    nonlinear effect (a dead zone, a rate limit), its latency has whole steps only. The remaining
+    fraction of a step is applied after the nonlinearity, since a nonlinear function of the mean of
+    two commands is not the mean of the function's values.
 
     Args:
-        task: what is to be done, with the model as it was.
-        effects: names, `family:target`, and quantities.
-        library: where the families are; None: the built-in ones.
-        checked: an effect's quantities, all of them and in bounds; None: `Effect.complete`.
+        task: the manoeuvre, with the original model.
+        effects: names, `family:target`, and quantities, in the order in which the effects act.
+        library: the library of effect families; None for the built-in families.
+        checked: function (effect, quantities) -> complete quantities within bounds; None for
+            `Effect.complete`.
 
     Raises:
         GroundedError: for an unknown effect, or a quantity that is missing or unknown.
@@ -231,11 +244,11 @@ def planner_with(
     return dataclasses.replace(planner_for(task, model, latency), widths=widths)
 
 
-WHOLE = 1e-6  # of a step: closer to whole steps is whole
+WHOLE = 1e-6  # tolerance, as a fraction of a step, for whole numbers of steps
 
 
 def _late_by(model: Model, late: Array, dt: float) -> Model:
-    """The model whose inputs arrive parts of a step late, (m,) [s]: constants, not estimated."""
+    """Return the model with inputs delayed by fixed fractions of a step `late` (m,) [s]."""
     from grounded.effects import Library, wrap
     from grounded.effects.family import MemoryFamily
 
@@ -257,7 +270,13 @@ def _input(task: Task, name: str, target: str) -> int:
 
 
 def planner_for(task: Task, model: Model, latency: np.ndarray) -> Planner:
-    """A planner with another model, whose first states are the task's, and another latency (m,)."""
+    """Return a planner with another model and latency.
+
+    Args:
+        task: judges the trials.
+        model: the planning model, whose first states are the task's.
+        latency: transport delay of each input [s] (m,).
+    """
     extra = model.n - task.model.n
     held = Trial(
         states=task.start[None],
@@ -268,7 +287,7 @@ def planner_for(task: Task, model: Model, latency: np.ndarray) -> Planner:
         start_inputs=task.past,
     )
     memory = np.zeros(0)
-    if extra:  # effects take a while to import, and most models have none
+    if extra:  # importing effects is slow, and most models have none
         from grounded.effects import memory_start
 
         memory = memory_start(model, task.model, held)

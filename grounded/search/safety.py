@@ -1,9 +1,9 @@
-"""What must hold before a candidate is handed to a robot.
+"""Checks before a candidate is handed to a robot.
 
-Finite numbers, inputs inside the hard limits, gains within reason, and a PREDICTED run that stays
-inside [safety], widened by the spread that real runs have shown so far. Each objection is a
-sentence that says which limit, where and when. Where the model goes on to after a run, with the
-input that a runner holds then, is no objection: people may stop it; they are told.
+All numbers must be finite, inputs inside the hard limits, gains of reasonable size, and the
+PREDICTED run, widened by the spread of real runs so far, inside [safety]. Each objection is a
+sentence with the limit, the state and the time. If the model leaves [safety] after the run, while
+the runner holds its last input, that is not an objection but a warning: the operator may stop it.
 """
 
 from __future__ import annotations
@@ -20,19 +20,20 @@ from grounded.search.candidate import Candidate, Tried
 from grounded.task import Task
 from grounded.trial import Trial
 
-COASTS = 2.0  # seconds after a run that are looked at
-MAX_GAIN = 1e6  # input units per state unit: beyond it a gain is a numerical accident
-MOST = 0.6  # of the squared scatter of repeated runs: one of three that alone is off makes 2 / 3
+COASTS = 2.0  # [s] time after a run that is checked
+MAX_GAIN = 1e6  # input units per state unit; a larger gain is a numerical error
+MOST = 0.6  # share of the squared scatter that marks one run; a single outlier of three makes 2 / 3
 
 
 @dataclass(frozen=True, eq=False)
 class Strays:
-    """How far real runs strayed from what was expected of them, and which one did most of it.
+    """Deviations of real runs from predictions or repeats, and the trial that causes most of it.
 
     Args:
-        size: in units of the states, (H + 1, n).
-        trial: the id of the trial that makes most of that, (H + 1, n); "" where none does.
-        foretold: whether that trial missed its prediction, (H + 1, n); else the runs beside it.
+        size: deviation in units of the states, (H + 1, n).
+        trial: id of the trial that causes most of it, (H + 1, n); "" if none does.
+        foretold: whether it is a deviation from the trial's prediction, (H + 1, n); else from
+            repeated runs.
     """
 
     size: Array
@@ -40,28 +41,28 @@ class Strays:
     foretold: Array
 
     def clause(self, t: int, i: int) -> str:
-        """Which run the spread of state i at step t comes from, and what to do; "" where none."""
+        """Return which run causes the spread of state i at step t and what to do; "" if none."""
         if not (one := self.trial[t, i]):
             return ""
         what = "its prediction" if self.foretold[t, i] else "the other runs of its candidate"
         return (
-            f"; +- is how far trial {one} was from {what}: if something disturbed that run, "
-            f"`discard {one}` takes it out"
+            f"; +- is the distance of trial {one} from {what}: if that run was disturbed, remove "
+            f"it with `discard {one}`"
         )
 
 
 def spread(task: Task, history: Sequence[Tried], model: str) -> Strays:
-    """How far real runs strayed from what was expected of them; zero before the first.
+    """Return the deviations of real runs so far; zero before the first run.
 
-    Two standard deviations between repeated runs of one candidate, or the error of the latest
-    prediction that this model, grounded on a trial, made of a step, whichever is larger. What
-    another model or a plan of the bare model missed says nothing of the next step.
+    This is the larger of two standard deviations between repeated runs of one candidate, and the
+    error of the latest prediction of a step by this model, grounded on a trial. Errors of other
+    models, or of the model without a bias, do not count: they don't apply to the next step.
     """
     found = np.zeros((task.horizon + 1, task.model.n))
     whose, foretold = np.full(found.shape, "", dtype=object), np.zeros(found.shape, dtype=bool)
     assert task.safety_low is not None and task.safety_high is not None
     if not np.isfinite([task.safety_low, task.safety_high]).any():
-        return Strays(found, whose, foretold)  # nobody asks
+        return Strays(found, whose, foretold)  # no [safety] to check
     for tried in history:
         whole = [t for t in tried.trials if t.finite_steps == task.horizon]
         if len(whole) > 1:
@@ -88,12 +89,12 @@ def spread(task: Task, history: Sequence[Tried], model: str) -> Strays:
 
 
 def objections(task: Task, candidate: Candidate, strays: Strays | None = None) -> list[str]:
-    """Why a candidate must not be run; empty when nothing speaks against it.
+    """Return the reasons why a candidate must not be run; empty if there are none.
 
     Args:
-        task: gives [safety].
-        candidate: with its predicted run.
-        strays: how far real runs strayed so far, see `spread`; None: not at all.
+        task: has the limits of [safety].
+        candidate: the candidate with its predicted run.
+        strays: deviations of real runs so far, see `spread`; None for zero.
     """
     policy = candidate.policy
     parts = {"feed-forward": policy.feedforward, "predicted state": candidate.predicted_states}
@@ -118,7 +119,7 @@ def objections(task: Task, candidate: Candidate, strays: Strays | None = None) -
 
 
 def _outside(task: Task, candidate: Candidate, strays: Strays | None, i: int) -> str:
-    """The sentence for state i leaving [safety] in the predicted run, or ""."""
+    """Return the sentence for state i leaving [safety] in the predicted run, or ""."""
     assert task.safety_low is not None and task.safety_high is not None
     value = candidate.predicted_states[:, i]
     stray = np.zeros(len(value)) if strays is None else strays.size[:, i]
@@ -138,15 +139,15 @@ def _outside(task: Task, candidate: Candidate, strays: Strays | None, i: int) ->
 
 
 def coasting(task: Task, run: Trial, held: Array) -> Array:
-    """Where a robot goes after a run by the model, with the input that its runner sends then.
+    """Simulate the robot after a run, with the input that its runner sends then.
 
     Args:
-        task: of planning, with the model's memory.
-        run: the run, of its states (T + 1, n).
+        task: the planning task, whose model includes memory states.
+        run: the run, with that task's states (T + 1, n).
         held: the input that is sent after it (m,).
 
     Returns:
-        States (S + 1, n) from the end of the run on, as far as they are finite.
+        States (S + 1, n) from the end of the run on, up to the first non-finite one.
     """
     problem = task.problem(exact=True)
     steps = math.ceil(COASTS / task.dt)
@@ -164,12 +165,12 @@ def coasting(task: Task, run: Trial, held: Array) -> Array:
 
 
 def coasts_out(task: Task, plan: Task, run: Trial, held: Array) -> str:
-    """The clause for a robot that leaves [safety] after a run, by the model, or "".
+    """Return a warning if the model predicts that the robot leaves [safety] after a run, or "".
 
     Args:
-        task: gives [safety].
-        plan: see `coasting`, as are `run` and `held`.
-        run: as predicted, inside [safety].
+        task: has the limits of [safety].
+        plan: the planning task, see `coasting`.
+        run: the predicted run, inside [safety].
         held: the input that is sent after it (m,).
     """
     assert task.safety_low is not None and task.safety_high is not None
@@ -188,9 +189,8 @@ def coasts_out(task: Task, plan: Task, run: Trial, held: Array) -> str:
         for (one, of), value in zip(inputs, held, strict=True)
     )
     return (
-        f"its runner holds {sent}, and by the model the robot leaves [safety] {name} = "
-        f"[{task.safety_low[i]:g}, {task.safety_high[i]:g}] {t * task.dt:.2g} s later and goes on "
-        f"to {states[most, i]:.3g} {unit}, {most * task.dt:.2g} s later: be ready to stop it, go "
-        "over to a controller that holds it once the runner is done, or let the target come to "
-        "rest inside"
+        f"its runner holds {sent}, and the model predicts that the robot leaves [safety] {name} = "
+        f"[{task.safety_low[i]:g}, {task.safety_high[i]:g}] {t * task.dt:.2g} s later and reaches "
+        f"{states[most, i]:.3g} {unit}, {most * task.dt:.2g} s later: be ready to stop it, switch "
+        "to a holding controller once the runner is done, or let the target come to rest inside"
     )

@@ -1,22 +1,22 @@
-"""What noise does to utilities: how far those of runs of one policy scatter, and what it costs.
+"""Noise of utilities: the scatter between runs of one policy, and the cost of sensor noise.
 
-Two runs whose utilities happen to agree give a spread near zero, and few candidates are run more
-than twice. So what is known is pooled:
+Two runs may have nearly equal utilities by chance, and few candidates are run more than twice. So
+the variance is estimated from pooled data:
 
-    over candidates   those that were repeated and cost about as much: a wild policy's scatter says
-                      nothing of a tame one's, and the other way round
-    within runs       a utility is the sum of what PIECES parts of the run are worth. That two sums
-                      agree by luck, their parts don't: with B the sum of the parts' variances and A
-                      that of the utilities, (nu A + mu B) / (nu + mu)
+    over candidates   all repeated candidates of about the same cost: the scatter of a poor policy
+                      says nothing about that of a good one
+    within runs       a utility is the sum over PIECES parts of the run. Two sums may agree by
+                      chance, but hardly all of their parts. With A the variance of the utilities
+                      and B the sum of the variances of the parts: (nu A + mu B) / (nu + mu)
 
-nu is the number of repeats. mu is what the parts add: the effective degrees of freedom of B
-(Satterthwaite, "An approximate distribution of estimates of variance components", Biometrics
-Bulletin 2, 1946), less nu, and at most PIECES - 1, so that many repeats outweigh the assumption
-that parts scatter independently of each other. This is a conjugate prior on the variance (Gelman
-et al., *Bayesian Data Analysis*, 2013, section 2.6); Student's t has nu + mu degrees of freedom.
+nu is the number of repeats. mu is the additional information of the parts: the effective degrees of
+freedom of B (Satterthwaite, "An approximate distribution of estimates of variance components",
+Biometrics Bulletin 2, 1946), less nu, and at most PIECES - 1, so that many repeats outweigh the
+assumption that the parts are independent. This is a conjugate prior on the variance (Gelman et al.,
+*Bayesian Data Analysis*, 2013, section 2.6); Student's t has nu + mu degrees of freedom.
 
-Sensors' noise also lowers every utility, since logged states are judged: a model that has seen no
-trial promises a run without it (`noise_cost`).
+Sensor noise also lowers every utility, since logged states are judged. A model that has seen no
+trial predicts a run without it (`noise_cost`).
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from grounded.search.candidate import Tried
 from grounded.task import Task
 from grounded.trial import Trial
 
-PIECES = 4  # of a run
-MEDIAN = 0.6745  # standard deviations that half of all normal numbers lie within
-ORDERS = (2, 3, 4, 5)  # of differences
-FAR = 2.0  # times the cost of a candidate: others scatter otherwise
+PIECES = 4  # parts of a run
+MEDIAN = 0.6745  # median of |x| of a standard normal x
+ORDERS = (2, 3, 4, 5)  # orders of differences
+FAR = 2.0  # largest ratio of costs of candidates whose scatter is pooled
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """Of a single run's utility: its variance, nan where nothing was repeated."""
+    """Variance of a single run's utility; nan if nothing was repeated."""
 
     variance: float = math.nan
     freedom: float = 0.0  # degrees of freedom of that estimate
@@ -52,26 +52,26 @@ class Scatter:
         return self.freedom > 0
 
     def error(self, runs: int) -> float:
-        """Standard error of the mean of so many runs."""
+        """Return the standard error of the mean of `runs` runs."""
         return math.sqrt(self.variance / runs)
 
 
 def by_pieces(task: Task, trials: Sequence[Trial]) -> Array:
-    """What each of PIECES parts of each run is worth (runs, PIECES); rows sum to the utilities."""
+    """Return the utility of each part of each run, (runs, PIECES); rows sum to the utilities."""
     worth = [task.rewards(trial) for trial in trials]
     return np.array([[part.sum() for part in np.array_split(r, PIECES)] for r in worth])
 
 
-CHANCE = 3.0  # standard deviations of a sensor's noise that one row may be off by
-NOTHING = 1e-9  # in a state's unit, or of its value: no difference at all
+CHANCE = 3.0  # standard deviations of sensor noise by which one sample may differ
+NOTHING = 1e-9  # difference treated as zero, in the state's unit or relative to its value
 
 
 def beyond_noise(trials: Sequence[Trial], off: Array, start: Array) -> Array:
-    """Whether the first rows of trials are off s_0 by more than their sensors' noise, (n,) bool.
+    """Return which start states differ from s_0 by more than the sensor noise, (n,) bool.
 
     Args:
-        trials: of one candidate.
-        off: s_0 of each trial less that of the task, (N, n).
+        trials: N trials of one candidate.
+        off: first state of each trial less s_0, (N, n).
         start: s_0 of the task (n,).
     """
     noise = np.sqrt(np.mean([white_noise(t.states) ** 2 for t in trials], axis=0) / len(trials))
@@ -80,10 +80,11 @@ def beyond_noise(trials: Sequence[Trial], off: Array, start: Array) -> Array:
 
 
 def white_noise(states: Array) -> Array:
-    """The white noise of each sensor (n,) by differences of states (H + 1, n); 0 of none.
+    """Estimate the standard deviation of each sensor's white noise (n,) from states (H + 1, n).
 
-    The k-th differences of white noise have (2k)! / k!^2 times its variance; those of a motion that
-    is smooth over k samples vanish, so that the least of several orders has the least motion in it.
+    The k-th differences of white noise have (2k)! / k!^2 times its variance, whereas those of a
+    motion that is smooth over k samples vanish. So the smallest estimate of several orders contains
+    the least motion. It is 0 for a state without samples.
     """
     found = np.full(states.shape[1], np.inf)
     for order in ORDERS:
@@ -95,14 +96,14 @@ def white_noise(states: Array) -> Array:
 
 
 def noise_cost(task: Task, policy: Policy, noise: Array) -> float:
-    """What sensors' noise takes from the utility of a logged run in the mean; >= 0.
+    """Return the mean loss of utility of a logged run due to sensor noise; >= 0.
 
-    The noise itself, where states are weighed, and the inputs that the gains make of it. What those
-    inputs move is left out: the robot is slow beside white noise.
+    It counts the noise of weighted states and the inputs that the gains derive from it. The motion
+    that these inputs cause is neglected: robots are slow compared with white noise.
 
     Args:
-        task: whose reward judges the log.
-        policy: that is run.
+        task: its reward judges the log.
+        policy: the policy that is run.
         noise: standard deviations of the sensors' white noise, (n,), in the states' units.
     """
     reward, steps = task.reward, task.horizon
@@ -115,16 +116,16 @@ def noise_cost(task: Task, policy: Policy, noise: Array) -> float:
 
 
 class Repeats:
-    """The candidates that were repeated, each with its cost and its sums of squares."""
+    """The candidates that were run repeatedly, with their costs and sums of squares."""
 
     def __init__(self, history: Iterable[Tried]) -> None:
         rows = [_sums(tried) for tried in history if _repeated(tried)]
-        if any(row[2:].any() for row in rows):  # runs that agree to the last bit are copies then
+        if any(row[2:].any() for row in rows):  # then identical runs must be copies
             rows = [row for row in rows if row[2:].any()]
         self.rows = np.array(rows).reshape(len(rows), 3 + PIECES)
 
     def near(self, utility: float) -> Scatter:
-        """The scatter of runs that are worth about so much."""
+        """Return the scatter of runs of about this utility."""
         cost, each = abs(utility), np.abs(self.rows[:, 0])
         some = self.rows[(each <= FAR * cost) & (cost <= FAR * each)]
         nu, total = float(some[:, 1].sum()), float(some[:, 2].sum())
@@ -137,7 +138,7 @@ class Repeats:
 
 
 def with_errors(history: Sequence[Tried]) -> tuple[Tried, ...]:
-    """The same, each with the scatter of what was repeated near it."""
+    """Return the candidates, each with the standard deviation of a run of similar utility."""
     near = Repeats(history).near
     return tuple(replace(t, deviation=math.sqrt(near(t.utility).variance)) for t in history)
 
@@ -147,9 +148,9 @@ def _repeated(tried: Tried) -> bool:
 
 
 def _sums(tried: Tried) -> Array:
-    """Utility, degrees of freedom, sum of squares, those of the parts."""
+    """Return the utility, degrees of freedom, sum of squares, and sums of squares of the parts."""
     parts = np.zeros(PIECES)
-    with np.errstate(over="ignore", invalid="ignore"):  # of runs that flew off
+    with np.errstate(over="ignore", invalid="ignore"):  # diverged runs
         if tried.pieces is not None:
             parts = ((tried.pieces - tried.pieces.mean(axis=0)) ** 2).sum(axis=0)
         total = float(np.var(tried.utilities)) * len(tried.utilities)

@@ -1,17 +1,17 @@
-"""Where the search stands: DERIVED from candidates and stored trials, never kept beside them.
+"""The state of the search, DERIVED from candidates and stored trials; it is never stored itself.
 
-The real system is run by people, so the paper's loop can't be a while loop. Candidates in the order
-in which they were proposed, and the trials that came back, say all there is to know:
+The real system is run by people, so the paper's loop can't be a while loop. The candidates, in the
+order of their proposal, and their trials determine:
 
     the incumbent    the best candidate so far, pi_theta^(i); its trials measure the next bias
     outstanding      the candidate that was proposed and has not been run often enough
     tried            the steps from the incumbent that did not improve (step 6)
-    in doubt         a loss that may be luck: the incumbent is run once more before it is believed
+    in doubt         a loss that may be luck: the incumbent is run again before it is accepted
 
-Two trials of one candidate that agree to the last bit say that the system is deterministic, unless
-others of one candidate differ: nothing is run a second time from then on.
+Two trials of a candidate that agree to the last bit show that the system is deterministic, unless
+other repeats differ: from then on nothing is run twice.
 
-Same candidates and trials, same state: nothing depends on the clock or on the process that asks.
+The same candidates and trials give the same state, at any time and in any process.
 """
 
 from __future__ import annotations
@@ -33,38 +33,55 @@ if TYPE_CHECKING:
 
 Phase = Literal["propose", "await-trial", "converged", "stopped"]
 Ending = Literal[
-    "",  # it goes on
-    "nothing promised",  # the grounded model sees nothing more to gain
+    "",  # the search goes on
+    "nothing promised",  # the grounded model predicts no further gain
     "no step improved",  # step 7: real trials lost down to the smallest step
-    "every step loses",  # in the grounded model already
-    "too doubtful",  # all that is promised would be lost many times over by other models
-    "model diverges",  # grounded on the best trial
-    "crashed",  # every first policy
-    "not allowed",  # by [limits] or [safety]
-    "too little gained",  # by the last trials, for what they cost
+    "every step loses",  # already in the grounded model
+    "too doubtful",  # other models that explain the trials predict a large loss
+    "model diverges",  # when grounded on the best trial
+    "crashed",  # every first policy crashed
+    "not allowed",  # the next candidate violates [limits] or [safety]
+    "too little gained",  # by the last candidates
     "trials used up",
 ]
-BOLDER = 3  # factors of 10 below the damping that is due, tried where all from it on lose
-OTHER_WAY = 2  # losses of "recorded inputs", which comes after all others, before it is given up
+BOLDER = 3  # factors of 10 below the due damping, tried if the due step and all after it lose
+OTHER_WAY = 2  # losses of the way that comes second, before it is given up
 PATIENCE = 4  # candidates in a row that may gain less than the tolerance each
-LOST = 2  # steps in a row without improvement that ask for a diagnosis
-WILD = 100.0  # times its promise that a first trial's loss may be before it asks for one
-MAX_CAUTION = 3  # times the first policy is designed again, ever more gently, after a crash
+LOST = 2  # steps in a row without improvement after which a diagnosis is suggested
+WILD = 100.0  # a first trial worse than predicted by this factor suggests a diagnosis
+MAX_CAUTION = 3  # times the first policy is made again, each time more gently, after a crash
 
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """The [search] table of grounded.toml; docs/configuration.md says what each key means."""
+    """Settings of a search; the [search] table of grounded.toml (docs/configuration.md).
+
+    Args:
+        method: algorithm that makes a direction: "ddp" or "policy-gradient".
+        step: "damped" raises the damping before alpha is halved; "full" only halves alpha, as in
+            the paper.
+        refit: fit the model's uncertain parameters to all trials before each proposal.
+        match_inputs: attribute what shifted inputs explain to the inputs, and only the rest to the
+            bias; False for the paper's bias alone.
+        max_halvings: smallest step size is alpha = 2^-max_halvings, 0 to 30.
+        repeats: trials of each candidate, 1 to 100.
+        rerun_incumbent: run the best candidate again if a loss to it may be due to noise.
+        max_trials: the search stops after this many trials.
+        tolerance: the search ends when the model predicts a smaller relative gain, 0 to below 1.
+
+    Raises:
+        GroundedError: if a setting is out of range.
+    """
 
     method: Literal["ddp", "policy-gradient"] = "ddp"
     step: Literal["damped", "full"] = "damped"
     refit: bool = False
-    match_inputs: bool = True  # False: the paper's bias alone, see `bias`
+    match_inputs: bool = True
     max_halvings: int = 6
     repeats: int = 1
-    rerun_incumbent: bool = True  # see `certainty.in_doubt`
+    rerun_incumbent: bool = True
     max_trials: int = 40
-    tolerance: float = 1e-3  # stop when the model predicts less relative gain than this
+    tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
         bounds = {"max_halvings": (0, 30), "repeats": (1, 100), "max_trials": (1, 100_000)}
@@ -82,19 +99,19 @@ class SearchOptions:
 
     @property
     def damps(self) -> bool:
-        """Whether steps are damped as well (see `step_size`), or only halved as in the paper."""
+        """Whether steps are also damped (see `step_size`), not only halved as in the paper."""
         return self.method == "ddp" and self.step == "damped"
 
     def first_step(self) -> Step:
-        """The first step along a new direction when nothing is known of the model's promises."""
+        """Return the first step along a new direction, before any prediction was tested."""
         return Step(damping=1.0 if self.damps else 0.0)
 
     def next_step(self, step: Step) -> Step | None:
-        """The step after one that did not improve; None when the search has failed (step 7)."""
+        """Return the step after one that did not improve; None if no smaller one is left."""
         return after_failure(step, self.max_halvings, damps=self.damps)
 
     def ways(self, incumbent: Candidate) -> tuple[Way, ...]:
-        """The ways to make a direction, first the one that has made the incumbent."""
+        """Return the ways to make a direction, first the one that made the incumbent."""
         if not (self.damps and self.match_inputs):
             return ("",)
         recorded = incumbent.way == "recorded inputs"
@@ -108,10 +125,10 @@ class SearchOptions:
         way: Way,
         slopes: Slopes | None = None,
     ) -> Step | None:
-        """The step that is due from the incumbent in one way; None where it is exhausted.
+        """Return the next step from the incumbent in one way; None if the way is exhausted.
 
-        A direction belongs to one model, and to one kind of its slopes where that is known: what
-        was learnt with another counts for nothing.
+        Only losses of the same model (and of the same kind of derivatives, `slopes`, if given)
+        count: a direction belongs to one model.
         """
         made = incumbent.candidate
         losers = losers_of(history, made.id, model, way)
@@ -128,7 +145,7 @@ class SearchOptions:
         return after_success(Step(made.damping, made.alpha), made.predicted_gain, real)
 
     def steps_from(self, step: Step | None) -> Iterator[Step]:
-        """The step that is due, the more cautious ones after it, then bolder ones than it."""
+        """Yield the due step, then ever more cautious steps, then steps bolder than the first."""
         first = step
         while step is not None:
             yield step
@@ -139,47 +156,47 @@ class SearchOptions:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Standing(Result):
-    """Where the search stands, with the sentence that says it."""
+    """The state of a search, with a sentence that describes it."""
 
     phase: Phase
     iteration: int  # accepted improvements so far
     incumbent: Tried | None
     outstanding: Candidate | None
     missing: int  # trials that the outstanding candidate still needs
-    step: Step | None  # what to try next when a candidate is to be made
+    step: Step | None  # the next step, if a candidate is to be made
     way: Way
     caution: int
     history: tuple[Tried, ...]
     trials: int
     sentence: str
     ending: Ending = ""
-    then: NextCommand | None = None  # what helps now, beside going on
+    then: NextCommand | None = None  # a command that helps now
     doubt: str = ""  # why a diagnosis helps more than the next trial
 
     @property
     def utilities(self) -> list[float]:
-        """Utility of the model's policy, then after each accepted improvement."""
+        """Utility of the first policy, then of each accepted improvement."""
         return [t.utility for t in self.history if t.accepted]
 
     @property
     def outcome(self) -> str:
-        """The phase in words: only a search whose model promises nothing more has converged."""
+        """The phase in words; "converged" only if the model predicts no further gain."""
         if self.ending in ("", "nothing promised"):
             return {"propose": "going on", "await-trial": "waiting"}.get(self.phase, self.phase)
         return self.ending
 
     def verdict(self, tried: Tried) -> str:
-        """What became of a candidate; one that will not get its trials any more has none."""
+        """Return the verdict on a candidate, see `Tried.verdict`."""
         return tried.verdict(tried.candidate is (self.outstanding or self.history[-1].candidate))
 
     def summary(self) -> str:
-        """Its phase and the best candidate."""
+        """Return the phase, the number of trials and the best candidate."""
         best = self.incumbent
         known = f"best {best.candidate.id}, utility {best.utility:.4g}" if best else "none yet"
         return f"{self.outcome}: trials {self.trials}, {known}"
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `grounded status --json`, with the whole history."""
+        """Return the document of `grounded status --json`, with the whole history."""
         best = self.incumbent
         return document(
             phase=self.phase,
@@ -196,7 +213,7 @@ class Standing(Result):
         )
 
     def figures(self) -> Sequence[Figure]:
-        """Utility by candidate, and the step sizes."""
+        """Return the figure of utilities by candidate and step sizes."""
         from grounded.search.pictures import search_figure
 
         found = search_figure(self)
@@ -210,14 +227,14 @@ def standing(
     options: SearchOptions,
     model: str,
 ) -> Standing:
-    """Steps 6 and 7 over stored trials.
+    """Derive the state of the search from stored trials (steps 6 and 7).
 
     Args:
         task: judges the trials.
         candidates: in order of proposal.
-        trials: in order of storage; those of no known candidate are ignored here.
+        trials: in order of storage; those of unknown candidates are ignored.
         options: the [search] table.
-        model: fingerprint of the task's model now; a direction belongs to one model.
+        model: fingerprint of the current planning model; a direction belongs to one model.
     """
     history, incumbent, iteration = judged(task, candidates, trials, options, model)
     total = sum(len(t.trials) for t in history)
@@ -232,7 +249,7 @@ def standing(
         caution=0,
         history=history,
         trials=total,
-        sentence="the model's own policy comes first",
+        sentence="the first candidate is the model's own policy",
     )
     if (awaited := _awaited(now, options, model)) is not None:
         return awaited
@@ -245,8 +262,8 @@ def standing(
         failed = sum(t.accepted is False for t in history)
         if failed > MAX_CAUTION:
             sentence = (
-                f"the first policy crashed {failed} times, designed more gently each time: the "
-                "model is too far off to start from; mend it (fit, diagnose) and propose again"
+                f"the first policy crashed {failed} times, although each was gentler: the model is "
+                "too inaccurate to start from; correct it (fit, diagnose) and propose again"
             )
             return replace(
                 now,
@@ -258,7 +275,7 @@ def standing(
         now = replace(now, step=options.first_step(), caution=failed)
         if failed < LOST or history[-1].candidate.model != model:
             return now
-        why = f"{failed} policies crashed in a row: a diagnosis may say what the model lacks"
+        why = f"{failed} policies crashed in a row: a diagnosis may show what the model lacks"
         return replace(now, sentence=why, then=NextCommand("diagnose"), doubt=why)
     own = incumbent.candidate.id
     step, way = _next_step(history, incumbent, options, model)
@@ -280,10 +297,10 @@ def standing(
 
 
 def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[Ending, str] | None:
-    """The ending where the last candidates of this model gained too little for what they cost.
+    """Return the ending and its reason if the last candidates gained too little, else None.
 
-    Too little is less than the tolerance each, or less in all than the standard error of that gain,
-    where repeats tell it: a search under noise would go from one lucky run to the next.
+    Too little is less than the tolerance each on average, or in total less than the standard error
+    of that gain, if repeats show it. Else a search under noise would follow lucky runs.
     """
     before = [t for t in history[:-PATIENCE] if t.accepted]
     last = history[-PATIENCE:]
@@ -293,49 +310,49 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
     gained = best.utility - old.utility
     if gained == 0.0:
         return "no step improved", f"the last {PATIENCE} candidates did not improve"
-    told = f"the last {PATIENCE} candidates gained {gained:.3g} in all, less than"
+    told = f"the last {PATIENCE} candidates gained {gained:.3g} in total, less than"
     if gained < PATIENCE * tolerance * abs(best.utility):
         return "too little gained", f"{told} {100 * tolerance:g} % each ([search] tolerance)"
     error, known = error_between(old, best, history)
     if known and gained < error:
-        return "too little gained", f"{told} its standard error, {error:.2g} by repeats"
+        return "too little gained", f"{told} its standard error of {error:.2g} from repeats"
     return None
 
 
 def _suspicion(history: tuple[Tried, ...], incumbent: Tried, model: str) -> str:
-    """Why a diagnosis helps more than the next trial, "" where nothing says so."""
+    """Return why a diagnosis would help more than the next trial; "" if there is no reason."""
     if history[-1].candidate.model != model:
-        return ""  # it was changed since: the next trial tells what that was worth
+        return ""  # the model has changed since: the next trial shows the effect
     lost = 0
     for tried in history:
         lost = 0 if tried is incumbent or tried.accepted is None else lost + 1
     if lost >= LOST:
-        return f"{lost} steps in a row did not improve: a diagnosis may say what the model lacks"
+        return f"{lost} steps in a row did not improve: a diagnosis may show what the model lacks"
     if wild(incumbent):
         made = incumbent.candidate
         return (
-            f"its trial gave {incumbent.utility:.4g} where the model promised "
-            f"{made.predicted_utility:.4g}: a diagnosis may say what the model lacks"
+            f"its trial gave {incumbent.utility:.4g}, but the model promised "
+            f"{made.predicted_utility:.4g}: a diagnosis may show what the model lacks"
         )
     return ""
 
 
 def wild(tried: Tried) -> bool:
-    """Whether a model's own policy did so much worse than promised that its bias says little."""
+    """Return whether a first policy did so much worse than predicted that its bias is useless."""
     predicted = tried.promised
     worse = predicted - tried.utility > WILD * max(abs(predicted), 1e-9)
     return bool(tried.utilities) and not tried.candidate.base and worse
 
 
 def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | None:
-    """The same, waiting for a trial; None where every candidate has its trials."""
+    """Return the standing while it waits for a trial; None if every candidate has its trials."""
     waiting = _waiting(now, model)
     doubt = next((t for t in now.history if t.in_doubt), None)
     if doubt is not None and now.incumbent is not None:
         made, missing = now.incumbent.candidate, 1
         sentence = (
-            f"{doubt.candidate.id} lost to {made.id} by less than luck may do: {made.id} is "
-            "waiting for another trial"
+            f"{doubt.candidate.id} lost to {made.id} by no more than noise may explain: {made.id} "
+            "is waiting for another trial"
         )
     elif waiting is not None:
         made, missing = waiting.candidate, options.repeats - len(waiting.trials)
@@ -346,10 +363,10 @@ def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | No
 
 
 def _waiting(now: Standing, model: str) -> Tried | None:
-    """The latest candidate without its trials whose reason still stands.
+    """Return the latest candidate without its trials that is still valid, or None.
 
-    A trial may be set aside after a candidate was made of it: the crash for which a first policy
-    is gentle, or the run that a step starts from.
+    It is invalid if the trial that it was made from was discarded since: the crash for which a
+    first policy was made gentler, or the run that a step starts from.
     """
     undecided = {t.candidate.id for t in now.history if t.accepted is None}
     failed = sum(t.accepted is False for t in now.history)
@@ -365,13 +382,13 @@ def _waiting(now: Standing, model: str) -> Tried | None:
 def losers_of(
     history: Sequence[Tried], base: str, model: str, way: Way | None = None
 ) -> list[Candidate]:
-    """The candidates from another one, planned in this model, that did not improve on it.
+    """Return the candidates derived from `base` in this model that did not improve on it.
 
     Args:
         history: all candidates with their trials.
-        base: the id of the one that they started from.
+        base: id of the candidate that they started from.
         model: fingerprint of the model.
-        way: only those that were made so; None: all.
+        way: only candidates made in this way; None for all.
     """
     tried = [t for t in history if t.candidate.base == base and t.candidate.model == model]
     lost = [t.candidate for t in tried if t.accepted is False]
@@ -381,7 +398,7 @@ def losers_of(
 def _next_step(
     history: tuple[Tried, ...], incumbent: Tried, options: SearchOptions, model: str
 ) -> tuple[Step | None, Way]:
-    """Damping and alpha after what the trials have shown, and the way to make the direction."""
+    """Return the next step after the trials so far, and the way to make its direction."""
     ways = options.ways(incumbent.candidate)
     for way in ways:
         if (step := options.due(history, incumbent, model, way)) is not None:

@@ -1,4 +1,4 @@
-"""The MuJoCo adapter: names, numbers, parameters, rotations, determinism, and what it refuses."""
+"""The MuJoCo adapter: names, numbers, parameters, rotations, determinism, and errors."""
 
 from __future__ import annotations
 
@@ -239,7 +239,7 @@ def test_rotation_vectors_near_zero_and_pi() -> None:
 def test_batches_are_single_samples_bit_for_bit(threads: int) -> None:
     model = adapter.model(ARM.format(**NOMINAL), threads=threads)
     rng = np.random.default_rng(3)
-    many = 2 * adapter.SHARED  # so many are shared among threads
+    many = 2 * adapter.SHARED  # enough samples for several threads
     x, u = rng.normal(size=(many, 5)), rng.normal(size=(many, 2))
     together = step(model, x, u)
     for i in rng.permutation(many):
@@ -330,7 +330,7 @@ def test_a_step_that_is_no_multiple_a_missing_file_and_a_broken_one(tmp_path: Pa
 
 
 def test_a_joint_and_its_velocity_are_known_as_such() -> None:
-    """A semi-implicit simulator adds the new velocity, and can't make a very short step."""
+    """MuJoCo is semi-implicit: positions integrate the new velocity, whatever the step."""
     found = integrals(adapter.model(ARM.format(**NOMINAL)))
     assert [(r.i, r.j) for r in found] == [(0, 2), (1, 3)]
     assert [r.c for r in found] == pytest.approx([1.0, 1.0])

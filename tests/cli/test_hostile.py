@@ -101,7 +101,7 @@ def test_code_that_others_may_change_is_not_executed(place: str, mode: int, fold
     if mode == 0o775 and not suspicion(folder / place):
         pytest.skip("the group is the user's private one")
     done = grounded("-C", folder, "propose")
-    assert done.code == 1 and "writable for" in done.err and "chmod" in done.err
+    assert done.code == 1 and "writable by" in done.err and "chmod" in done.err
     assert not marker.exists()
 
 

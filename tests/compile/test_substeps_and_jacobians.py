@@ -121,8 +121,8 @@ def test_derivatives_of_another_step_are_found_out():
     ("fields", "message"),
     [
         ({"derivative": rate, "substeps": 0}, "substeps must be 1 to 1000, got 0"),
-        ({"step": step_of, "substeps": 2}, "makes its own"),
-        ({"derivative": rate, "jacobian": exact}, "beside step="),
+        ({"step": step_of, "substeps": 2}, "only apply to derivative="),
+        ({"derivative": rate, "jacobian": exact}, "only for step="),
     ],
 )
 def test_what_does_not_go_together_is_said(fields, message):

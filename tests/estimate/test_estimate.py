@@ -1,4 +1,4 @@
-"""The filter against a dense Gaussian, the slopes against differences, claims against truth."""
+"""Compares the filter with a dense Gaussian, slopes with differences, intervals with truth."""
 
 from dataclasses import replace
 from functools import partial
@@ -53,7 +53,7 @@ SPRING_NOISE = NoiseStd(np.array([0.002, 0.02]), np.array([0.01, 0.05]), DT)
 
 
 def simulated(model, rng, noise, *, B=4, T=100, latency=0.0, low=-1.0, high=1.0):
-    """B noisy open-loop runs with random steps of input: true states and trials."""
+    """Return true states and trials of B noisy open-loop runs with random input steps."""
     system, p, dt = model.system, model.values, noise.dt
     u = np.repeat(rng.uniform(low, high, (T // 10 + 1, B, model.m)), 10, axis=0)[:T]
     x = np.zeros((T + 1, B, model.n))
@@ -74,7 +74,7 @@ def batched(model, trials, latency=None):
 
 
 def dense(model, trial, noise):
-    """Mean and covariance of all states given the start sample, and of all later samples."""
+    """Return mean and covariance of all states given the start sample, and of later samples."""
     system, p, n, T = model.system, model.values, model.n, trial.steps
     Q, R = np.diag(noise.process**2), np.diag(noise.measurement**2)
     A = system.linearise(trial.states[:1], trial.inputs[:1], p, DT)[0][0]
@@ -338,7 +338,7 @@ def test_camera_at_30_hz_and_control_at_20_hz_from_two_markers():
     rows = np.isfinite(stored.innovations[:, 0])
     assert np.allclose(np.array(live), stored.states[rows], atol=1e-4)
     error = (np.array(live) - x[::2])[60:]
-    assert np.sqrt(np.mean(error[:, 1] ** 2)) < 0.05  # speed, which no marker shows
+    assert np.sqrt(np.mean(error[:, 1] ** 2)) < 0.05  # speed, which no marker measures
     assert np.sqrt(np.mean(error[:, 2] ** 2)) < sigma
     assert 0.85 < np.mean(nis[1:]) < 1.15
     assert np.isnan(tracker.update(1.0, y[0]))  # older than the estimate: not used

@@ -1,4 +1,4 @@
-"""The closed loop on estimated states: one run of it, and the study on one seed, cut short."""
+"""The closed loop on estimated states: one run, and a shortened study with one seed."""
 
 import json
 from dataclasses import replace
@@ -40,7 +40,7 @@ def test_a_run_comes_back_as_a_smoothed_trial_near_the_truth(filmed, policy):
     assert (smoothed[2:4] < 0.003).all()  # better than a marker
     assert (smoothed[1:5] < live[1:5]).all()
     assert smoothed[1] < 0.05 and smoothed[4] < 0.02
-    assert smoothed[5] < 0.5  # heading rate, which no marker shows: by kinematics, not adrift
+    assert smoothed[5] < 0.5  # heading rate, not measured: known by kinematics
     assert 0.8 < flown.nis < 1.3
     assert task.utility(flown.trial) == pytest.approx(task.utility(flown.truth), rel=0.05)
 

@@ -1,4 +1,4 @@
-"""Known parameters found again, with honest intervals; what can't be known is said."""
+"""Recovers known parameters with correct intervals, and reports unidentified ones."""
 
 import dataclasses
 import os
@@ -142,7 +142,7 @@ def test_a_threshold_is_found_by_scanning():
 
 
 def test_correlated_disturbances_widen_intervals_of_thresholds_too():
-    """A wind that the model knows nothing of: nats of white noise would be far too sure."""
+    """An unmodelled wind: intervals that assume white noise would be far too narrow."""
     calm = NoiseStd(np.array([0.005]), np.array([0.02]), DT)
     widths = {}
     for wind in (0.0, 0.15):
@@ -167,7 +167,7 @@ def test_correlated_disturbances_widen_intervals_of_thresholds_too():
 def test_what_the_data_cannot_tell_is_named():
     noise = NoiseStd(np.array([1e-3, 1e-2]), np.array([5e-3, 2e-2]), DT)
     trials = simulated(pendulum, np.random.default_rng(4), noise, B=4, T=100)
-    found = fit(pendulum, trials, hold_out=0.0)  # torque/(m l^2), b/(m l^2), g/l: three, not four
+    found = fit(pendulum, trials, hold_out=0.0)  # three: torque/(m l^2), b/(m l^2), g/l
     assert not found.params["g"].identified  # the one with the narrowest bounds is held
     assert np.isinf(found.params["g"].std) and found.params["g"].value == 9.81
     assert all(found.params[name].identified for name in "mlb")
@@ -394,7 +394,7 @@ def test_the_real_dart_car_has_a_dead_zone():
 
 
 def test_a_fit_that_predicts_no_better_is_not_recommended():
-    """The table's own columns decide: q 0.00694 -> 0.0111 and w 0.0281 -> 0.0382 is worse."""
+    """Errors in the table decide: q 0.00694 -> 0.0111 and w 0.0281 -> 0.0382 is worse."""
 
     def fitted(*ahead):
         made = [PredictionError(("q", "w"), np.full(2, 0.01), np.array(a), 1.0, 9) for a in ahead]
@@ -415,7 +415,7 @@ def test_a_fit_that_predicts_no_better_is_not_recommended():
 
 
 def test_a_gain_that_ties_with_what_is_at_its_bound_is_identified():
-    """k and d do the same here; where d has ended at its bound 0, the trials tell k."""
+    """k and d are tied here; with d at its bound 0, the trials identify k."""
     unknowns = unknowns_of(SPRING, None, np.zeros(1), "known")
     both = Linear(np.full((2, 2), 1e4), np.zeros(2), np.zeros((3, 2)))
     every, inside, at_bound = np.ones(2, bool), np.array([4.0, 0.5]), np.array([4.0, 0.0])

@@ -1,4 +1,4 @@
-"""Sensors that filter: a fit that knows it finds the model behind them."""
+"""Filtered sensors: a fit that knows the filters recovers the model."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ TRUE = {"k": 4.0, "b": 6.0, "c": 0.5}
 
 
 def filtered(v, tau, dt=DT):
-    """A speed (T + 1,) as a sensor shows it that filters."""
+    """Return a speed (T + 1,) as measured by a sensor with a filter."""
     off, y = 0.0, v.copy()
     for t in range(1, len(v)):
         off = lagging(off, v[t] - v[t - 1], tau, dt)
@@ -48,7 +48,7 @@ def filtered(v, tau, dt=DT):
 
 
 def runs(tau=TAU, count=4, steps=250, seed=0):
-    """Logs of the axis, its position in steps of 0.05 mm, its speed filtered."""
+    """Return logs of the axis with position quantised to 0.05 mm and filtered speed."""
     rng, found = np.random.default_rng(seed), []
     values = AXIS.with_values(TRUE).values
     for _ in range(count):
@@ -66,7 +66,7 @@ def runs(tau=TAU, count=4, steps=250, seed=0):
 
 
 def pushed(task, seed):
-    """A run of a cart under pushes that differ."""
+    """Return a run of a cart under varying pushes."""
     rng = np.random.default_rng(seed)
     force = np.repeat(rng.uniform(-4, 4, (5, 1)), 8, axis=0)
     run = simulate(task.problem(exact=True), task.policy(force, None, None))
@@ -75,7 +75,7 @@ def pushed(task, seed):
 
 
 def test_a_filter_of_speeds_is_not_fitted_as_friction():
-    """A cart's k came out as 1.20 for 1.57, at a filter of 30 ms that `diagnose` had corrected."""
+    """Without the known filter of 30 ms, a cart's k is estimated as 1.20 instead of 1.57."""
     trials = runs(count=3, steps=200)
     looked = sound_trials(AXIS, trials)
     assert looked.filters == {"v": pytest.approx(TAU, rel=0.05)}
@@ -101,7 +101,7 @@ def test_the_model_that_a_search_plans_with_is_refitted_behind_the_filter_too():
 
 
 def test_values_that_predict_worse_are_not_planned_with():
-    """Every fourth trial judges; it was driven with the model as it is, the others were not."""
+    """Every fourth trial is held out; it comes from the nominal model, the others do not."""
     task = cart_task()
     other = task.with_model(task.model.with_values({"mass": 2.0}))
     trials = [pushed(other, 0), pushed(other, 1), pushed(other, 2), pushed(task, 3)]
@@ -115,7 +115,7 @@ def test_without_a_filter_nothing_is_added():
     model, same, measurement = behind_filters(AXIS, records, sensors, {})
     assert model is AXIS and same[0].start.shape == (31, 2)
     assert measurement.names == sensors.names
-    alone = of_states(AXIS, ["x"])  # of a speed that nothing measures a filter says nothing
+    alone = of_states(AXIS, ["x"])  # the filter of an unmeasured speed is ignored
     assert behind_filters(AXIS, records, alone, {"v": TAU})[0].n == 2
 
 
@@ -134,7 +134,7 @@ def test_true_values_begin_ahead_of_the_log_anywhere_in_a_record():
     ]
     assert off[1] < 0.6 * off[0] and off[1] < grown.start_std[2]
     again = behind_filters(model, [grown], sensors, {"v": TAU})[0]
-    assert again.n == 3  # which the model has a lag of already
+    assert again.n == 3  # the model already has a lag for it
 
 
 def test_filters_are_of_sensors_that_measure_states():

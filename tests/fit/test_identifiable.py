@@ -1,4 +1,4 @@
-"""Constants never move; of uncertain parameters only what the trials identify is written."""
+"""Constants never change; only uncertain parameters that the trials identify are written."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def test_a_constant_is_neither_fitted_nor_blamed_nor_calibrated():
 
 @pytest.mark.slow
 def test_of_a_combination_the_surest_parameter_stays():
-    """Only gain / mass and drag / mass are known."""
+    """Only gain / mass and drag / mass are identified."""
     model = motor(
         mass=Param(2.0, "kg", std=0.1), gain=Param(2.5, std=0.5), drag=Param(0.4, std=0.2)
     )

@@ -95,7 +95,7 @@ def test_ctrl_c_in_a_diagnosis_says_the_best_hypothesis_so_far(trials, after):
 
 def test_ctrl_c_in_a_fit_says_the_values_so_far(trials):
     def stop(stage):
-        if stage.startswith("climb"):
+        if stage.startswith("fit"):
             raise KeyboardInterrupt
 
     with pytest.raises(Interrupted, match=r"gain = .* m/s"):

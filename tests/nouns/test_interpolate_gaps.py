@@ -1,4 +1,4 @@
-"""Lost samples: short gaps are bridged, long ones end the trial, inputs are never invented."""
+"""Lost samples: short gaps are interpolated, long ones end the trial, inputs never are."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Model and Param: names, units, angles, and what is refused at the door."""
+"""Model and Param: names, units, angles, and the errors for wrong arguments."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The runner that is copied to a robot: one file, and nothing raised in the control loop."""
+"""The runner for the robot: a single file that raises nothing in the control loop."""
 
 import ast
 import subprocess
@@ -102,7 +102,7 @@ def test_time_runs_forward_or_stays():
 
 
 def test_a_run_that_is_over_stays_over_where_the_time_begins_anew():
-    """Seen: a quadrotor's second flight by the same runner, on the last step's command."""
+    """A quadrotor's second flight with the same runner must not get the last step's command."""
     runner, state = Runner(policy()), [0.0, 0.0]
     dt = policy().dt
     for k in range(H):
@@ -130,10 +130,10 @@ def test_inputs_of_missed_calls_count_as_held():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"dt": 0.0}, "don't fit"),
+        ({"dt": 0.0}, "inconsistent"),
         ({"past": np.array([np.nan])}, "not finite"),
-        ({"low": np.array([2.0])}, "exclude each other"),
-        ({"gain": np.zeros((H, 1, 2))}, "don't fit"),
+        ({"low": np.array([2.0])}, "lower limit above"),
+        ({"gain": np.zeros((H, 1, 2))}, "inconsistent"),
         ({"format": "other"}, "not a candidate"),
     ],
     ids=str,

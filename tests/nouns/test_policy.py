@@ -1,4 +1,4 @@
-"""theta + alpha d, and the runner that a robot runs: numpy alone."""
+"""theta + alpha d, and the runner for a robot, which needs numpy alone."""
 
 import os
 import pickle
@@ -210,7 +210,7 @@ def test_after_the_horizon_the_held_input_is_sent():
 
 @pytest.mark.parametrize("t", [0.949, 0.951, 0.989, 0.991, 1.05, 0.05, 0.15])
 def test_done_agrees_with_action(t):
-    """A loop `while not done(t)` never asks for a step that the policy doesn't have."""
+    """A loop `while not done(t)` never requests a step beyond the policy's last."""
     p = policy(feedback=False)
     run = Runner(p)
     over = np.array_equal(run.action(t, np.zeros(2)), p.past)
@@ -218,7 +218,7 @@ def test_done_agrees_with_action(t):
 
 
 def test_an_action_can_be_kept_and_changed_by_the_caller():
-    """A driver may scale what it got; the policy and what is remembered are not touched."""
+    """A driver may modify the returned array without changing the policy or the past inputs."""
     p = policy()
     a, b = Runner(p), Runner(p)
     s = np.zeros(2)
@@ -352,7 +352,7 @@ def test_cut_and_flipped_files_are_refused_or_whole(tmp_path):
 
 
 def test_the_robot_needs_numpy_alone(tmp_path):
-    """Importing the runner brings in neither the compiler nor scipy nor the log library."""
+    """Importing the runner does not load the compiler, scipy or the log library."""
     path = saved(tmp_path, policy())
     code = (
         "import sys; from grounded.policy import load; import numpy as np\n"

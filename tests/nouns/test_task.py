@@ -1,4 +1,4 @@
-"""Task: checked once, at the door; its hash covers what a utility depends on."""
+"""Task: its checks, and a hash of everything that a utility depends on."""
 
 import time
 from dataclasses import replace
@@ -31,7 +31,7 @@ REWARD = Reward(np.array([10.0, 0.0]), np.zeros(2), np.array([0.01]), np.array([
             r"\[limits\] force: the lower limit 5 must be below the upper limit 5",
         ),
         ({"low": np.array([np.nan])}, r"\[limits\] force"),
-        ({"past": np.array([9.0])}, r"force = 9 N is held before the start, beyond its limits"),
+        ({"past": np.array([9.0])}, r"force = 9 N is held before the start, outside its limits"),
         (
             {"latency": np.array([-0.1])},
             r"latency of force must be 0 to 50 control steps \(2.5 s\)",
@@ -115,7 +115,7 @@ def test_an_open_loop_task_has_policies_without_gains():
 
 
 def test_a_model_of_a_thousand_states_is_refused_at_once():
-    """FACTS 9: on 0.1 `propose` took 70 s and 2.8 GB of it."""
+    """A model this large would take `propose` 70 s and 2.8 GB."""
     names = [f"x{i}" for i in range(1000)]
     states = dict.fromkeys(names, "m")
     began = time.process_time()
@@ -125,7 +125,7 @@ def test_a_model_of_a_thousand_states_is_refused_at_once():
 
 
 def test_nouns_with_arrays_are_shown_in_one_short_line():
-    """`print(task)` was 340 lines of arrays."""
+    """`print(task)` shows one line, not the arrays."""
     found = cart_task()
     policy = found.policy(np.zeros((found.horizon, found.model.m)), None, None)
     run = simulate(found.problem(), policy)

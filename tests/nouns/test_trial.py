@@ -1,4 +1,4 @@
-"""Trial: arrays that fit each other, read-only, and finite up to a known step."""
+"""Trial: arrays of matching shapes, read-only, and finite up to a known step."""
 
 import numpy as np
 import pytest

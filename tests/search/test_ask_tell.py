@@ -1,4 +1,4 @@
-"""The front door: a search that is asked and told, and results that a notebook can show."""
+"""The public Python API: the ask-and-tell search, and results shown in a notebook."""
 
 import json
 import subprocess
@@ -57,7 +57,7 @@ def test_a_search_goes_on_from_its_candidates_and_trials(search):
 
 
 def test_learning_stops_at_a_first_trial_whose_heading_is_in_degrees():
-    """It went on to its end, with plans made of headings 57 times too large."""
+    """Headings logged in degrees stop the search at the first trial."""
     heading = TASK.model.state_names.index(str(TASK.model.roles["heading"]))
 
     def in_degrees(candidate):
@@ -74,7 +74,7 @@ def test_learning_stops_at_a_first_trial_whose_heading_is_in_degrees():
 
 @pytest.mark.slow
 def test_a_search_goes_on_with_effects_that_have_a_memory():
-    """A wrapped delay made states that no target had: "task: target must have shape"."""
+    """An adopted delay becomes latency, a lag a memory state of the planning model."""
     begun = gr.Search(TASK, OPTIONS)
     begun.tell(run(begun.ask()))
     delays = {"delay:speed": {"d": 0.01}, "delay:turn": {"d": 0.04}}  # the plant's, less the task's
@@ -158,14 +158,14 @@ def test_fit_stays_the_function_after_its_room_was_imported():
 
 
 def test_the_front_door_opens_at_once():
-    """`import grounded` loads no numbers; `benchmarks/run.py` says what it takes."""
+    """`import grounded` does not load numpy; `benchmarks/run.py` measures the time."""
     code = "import sys, grounded; print(' '.join(m for m in sys.modules if '.' not in m))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"numpy", "scipy", "llvmlite"} & set(done.stdout.split())
 
 
 def test_a_short_gap_is_bridged_as_in_a_workspace():
-    """One NaN of 151 was a crash."""
+    """A single NaN among 151 samples does not count as a crash."""
     search = gr.Search(TASK, OPTIONS)
     trial = run(search.ask())
     states = np.array(trial.states)
@@ -195,7 +195,7 @@ def test_what_a_user_gets_wrong_in_python_is_said():
             "in this order",
         ),
         (lambda: gr.Search(replace(TASK, model=two)).ask(), r"\(s, a, p\)"),
-        (lambda: gr.learn(TASK, lambda candidate: None), "returns a Trial"),
+        (lambda: gr.learn(TASK, lambda candidate: None), "expected a Trial"),
     ):
         with pytest.raises(gr.GroundedError, match=told):
             mistake()

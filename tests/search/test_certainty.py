@@ -1,4 +1,4 @@
-"""How sure an improvement is, in a sentence; what became of a candidate, in a word."""
+"""The sentence on the certainty of an improvement, and the verdicts on candidates."""
 
 from types import SimpleNamespace
 
@@ -52,7 +52,7 @@ def test_noise_of_a_repeated_candidate_stands_in_for_the_others():
 
 
 def test_the_wild_first_policy_says_nothing_of_the_noise_of_later_ones():
-    """FACTS 7: 0.1 pooled it, so that a gain of many standard errors had probability 0.5."""
+    """Scatter at very different utilities is not pooled: it would hide a clear gain."""
     wild = tried(-9000.0, -200.0, -4000.0, base="")
     found = last_improvement([wild, tried(-5.0, -5.02, -4.98), tried(-4.0, -4.01, -3.99)])
     assert holds(found, "probability 1.00")
@@ -63,7 +63,7 @@ def test_the_wild_first_policy_says_nothing_of_the_noise_of_later_ones():
 
 
 def test_a_gain_within_its_own_standard_error_ends_a_search():
-    """Each of four candidates was a little luckier than the one before it, on and on."""
+    """Under noise, four candidates in a row may each be slightly luckier than the one before."""
     small = (tried(-1.05), tried(-1.3, accepted=False), tried(-1.2, accepted=False))
 
     def ending(best, repeated=(-1.2, -1.0), tolerance=1e-3, base="c0001"):
@@ -72,7 +72,7 @@ def test_a_gain_within_its_own_standard_error_ends_a_search():
         return found and found[0]
 
     assert ending(-1.02) == "too little gained" and ending(-0.5) is None
-    assert ending(-1.02, repeated=(-1.1,)) is None  # nobody knows the noise
+    assert ending(-1.02, repeated=(-1.1,)) is None  # the noise is unknown
     assert ending(-1.02, repeated=(-1.1,), tolerance=0.05) == "too little gained"
     assert ending(-0.9, repeated=(-9.0, -0.2, -4.0), base="") is None  # the wild first policy
 
@@ -85,7 +85,7 @@ def test_failed_runs_are_left_out_and_trials_that_agree_say_so():
 
 
 def test_a_crash_is_called_a_crash():
-    """FACTS 7 and issue 12: a run that ended early was "no better" in table, page and text."""
+    """A run that ended early is "crashed", not "no better", in table, page and text (issue 12)."""
     candidate = SimpleNamespace(base="c0001")
     lost = Tried(candidate, (None, None), (-4.0, -np.inf), False)
     assert lost.verdict() == "crashed"
@@ -112,10 +112,10 @@ def test_a_verdict_is_one_of_a_few_words(accepted, base, doubt, trials, last, wo
 
 
 def test_what_a_start_is_worth_is_no_improvement():
-    """Seen: "an improvement with probability 1.00" of a robot that was set down 7 cm nearer."""
+    """A robot that starts 7 cm nearer to the target has not improved with probability 1.00."""
 
     def ran(name, base, utility, off, as_run=np.nan):
-        """A run from `off` beside s_0; the model gives its base -4 from s_0."""
+        """Return a run from `off` beside s_0; the model gives its base -4 from s_0."""
         states = np.linspace(off, 0.0, 30)[:, None]
         candidate = SimpleNamespace(
             id=name, base=base, expected_of_base=-4.0, base_as_run=as_run, model="m"

@@ -1,4 +1,4 @@
-"""A candidate's gains hold in all models that explain the trials, and its doubts are told."""
+"""Gains are compared in all models that explain the trials; doubtful candidates are reported."""
 
 import importlib
 from dataclasses import replace
@@ -57,7 +57,7 @@ def noisy():
 
 
 def test_gains_that_would_not_hold_are_the_incumbents(noisy):
-    """Corrected slopes took two thirds of a quadrotor's gains: promised -2.07, flown -45."""
+    """Corrected slopes cut a quadrotor's gains to a third: predicted -2.07, flown -45."""
     about, best = noisy.about, noisy.now.incumbent
     assert about.alternatives
     weak = replace(best.candidate.policy, gain=0.1 * best.candidate.policy.gain)
@@ -80,7 +80,7 @@ def test_gains_that_hold_are_kept(noisy):
 
 
 def test_a_step_that_lost_is_not_tried_again_under_another_name(noisy):
-    """Crude steps of an arm with armature at damping 0.03, 0.3 and 3.3 were the same one, lost."""
+    """An arm's steps at damping 0.03, 0.3 and 3.3 are nearly the same; only the first is run."""
     about, now = noisy.about, noisy.now
     about.least = 1e-9
     found = about.step_from(Step(), []).candidate
@@ -105,13 +105,13 @@ def test_what_a_model_is_likely_to_miss_grows_with_the_step(noisy):
 
 
 def test_an_own_plan_must_promise_more_than_it_is_likely_off_by(noisy):
-    """After `adopt` the changed model's own plan went before a step for any promise."""
+    """The changed model's own plan only precedes a step if its predicted gain is larger."""
     about, task = noisy.about, noisy.task
     better = planner_for(task, task.model.with_values({"mass": 1.2}), np.zeros(1))
     fingerprint = model_fingerprint(better.plan)
     about.make = Maker(better, about.make.now, "c0099", fingerprint)
     about.already, about.least, about.missed = -1e3, 1.0, 0.0  # so that it promises 999
-    assert about.own_plan(None) is None  # of which the alternatives see nothing
+    assert about.own_plan(None) is None  # the alternatives predict no gain
     about.alternatives = ()
     assert about.own_plan(None).candidate.way == "own plan"
     about.missed = 1e9
@@ -119,25 +119,25 @@ def test_an_own_plan_must_promise_more_than_it_is_likely_off_by(noisy):
 
 
 def test_a_changed_model_that_foretells_the_incumbent_judges_its_own_plan(noisy):
-    """From -1.307, which it foretold to be -1.275, its plan was worth -0.17 and never tried."""
+    """A model that predicted the incumbent well (-1.275 for -1.307) had a plan of -0.17."""
     about, task, best = noisy.about, noisy.task, noisy.now.incumbent
     better = planner_for(task, task.model.with_values({"mass": 1.2}), np.zeros(1))
     about.make = Maker(better, about.make.now, "c0099", model_fingerprint(better.plan))
     about.plain, about.missed = better.plan.problem(exact=True), 1e9  # the grounded one is doubtful
-    about.already = -1e3  # it promises 999, and the plain one:
+    about.already = -1e3  # the grounded model promises 999, and the plain one:
     about.plainly = predicted(about.plain, best.candidate.policy).utility
-    assert about.own_plan(None) is None  # the best one is about as good: it promises little
+    assert about.own_plan(None) is None  # hardly better than the incumbent: a small gain
     bad = 5 * best.utility
     about.incumbent, about.plainly = replace(best, utilities=(bad,)), 0.9 * bad
     assert about.own_plan(None).candidate.way == "own plan"
-    about.plainly = 2 * bad  # more would be gained, but it did not foretell this one
+    about.plainly = 2 * bad  # a larger gain, but it mispredicts the incumbent
     assert about.own_plan(None) is None
-    about.plainly, about.already = 0.9 * bad, 0.0  # to which the grounded one says: a loss
+    about.plainly, about.already = 0.9 * bad, 0.0  # the grounded model predicts a loss
     assert about.own_plan(None) is None
 
 
 def test_a_step_that_is_foretold_to_be_a_disaster_is_not_proposed(noisy, monkeypatch):
-    """A quadrotor's step promised 0.25, was likely off by 24, and was flown all the same."""
+    """A quadrotor's step with a predicted gain of 0.25 and a likely error of 24 is not flown."""
     about = noisy.about
     step = about.step_from(Step(), []).candidate
     assert step is not None and about.ruinous is None
@@ -155,7 +155,7 @@ def test_the_plain_model_judges_where_it_foretold_the_incumbent(noisy):
     step = about.step_from(Step(), []).candidate
     run, cost = predicted(about.plain, step.policy).utility, -noisy.now.incumbent.utility
     about.alternatives = ()
-    about.plainly = noisy.now.incumbent.utility  # as if it had foretold it exactly
+    about.plainly = noisy.now.incumbent.utility  # as if it had predicted it exactly
     lost = about.plainly - run
     told = about._told(replace(step, predicted_gain=0.0, likely_off=0.0))
     assert told.likely_off == pytest.approx(max(lost, 0.0))
@@ -173,7 +173,7 @@ def test_a_candidate_says_that_it_may_well_lose():
 
 @pytest.mark.slow
 def test_a_plan_with_dry_friction_is_followed_from_a_wider_kink(monkeypatch):
-    """What sticks has no slope: the cart's plan stopped half a per cent short of the best."""
+    """A cart that sticks has no slope: its plan stopped half a per cent short of the best."""
     monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2]))
     task = importlib.import_module("benchmarks.foreign.mechanisms").cart_task("gentle")
     friction = {"name": "joint_friction:force<-x_vel", "c": 0.8, "b": 0.0, "width": 0.005}
@@ -185,7 +185,7 @@ def test_a_plan_with_dry_friction_is_followed_from_a_wider_kink(monkeypatch):
 
 
 def test_what_the_incumbent_lost_by_its_start_is_known(noisy):
-    """Seen: "the rest was luck or its start", where the model had it which of the two."""
+    """The model also predicts the incumbent's run from its real start."""
     about = noisy.about
     run = about.candidate(about.theta, Step(), "")
     trial = noisy.now.incumbent.trials
@@ -210,8 +210,8 @@ def test_what_the_incumbent_lost_by_its_start_is_known(noisy):
         ),
         (-8.0, 0.6, ("within the scatter",), ("start",)),
         (-8.0, 0.1, ("more than its runs scatter",), ("start",)),
-        (-8.0, np.nan, (), ("scatter", "start")),  # one run: nobody knows
-        (np.nan, 0.1, (), ("scatter", "start")),  # of an older version
+        (-8.0, np.nan, (), ("scatter", "start")),  # one run: the scatter is unknown
+        (np.nan, 0.1, (), ("scatter", "start")),  # from an older version
     ],
 )
 def test_of_what_the_model_gives_otherwise_only_known_reasons_are_told(as_run, error, parts, never):
@@ -235,7 +235,7 @@ def test_of_what_the_model_gives_otherwise_only_known_reasons_are_told(as_run, e
 
 
 def promise(base, of_base, gain, as_run):
-    """A candidate by what its model gives its base, what it promises, and its base's run."""
+    """Return a candidate with the model's utility of its base, the gain, and the base as run."""
     return Candidate(
         *("c0002", None, 1, 1.0, base, "m", None, None, of_base + gain),
         predicted_gain=gain,
@@ -244,7 +244,7 @@ def promise(base, of_base, gain, as_run):
 
 
 def begun(task, off=0.0, noise=0.0, seed=0):
-    """A run that follows the target, from `off` beside the start, with a noisy position sensor."""
+    """Return a run that follows the target, started at `off`, with a noisy position sensor."""
     states = np.nan_to_num(task.target)
     states[:, 0] += off + noise * np.random.default_rng(seed).standard_normal(len(states))
     names = (task.model.state_names, task.model.input_names)
@@ -252,7 +252,7 @@ def begun(task, off=0.0, noise=0.0, seed=0):
 
 
 def test_the_noise_of_a_first_row_is_no_start_elsewhere():
-    """Seen: "2.3 less because its runs began elsewhere", of a cart at rest with noisy sensors."""
+    """The sensor noise of a cart at rest is not reported as a different start state."""
     from grounded_cli.propose import _so_far
 
     task = cart_task()
@@ -263,7 +263,7 @@ def test_the_noise_of_a_first_row_is_no_start_elsewhere():
     assert began_elsewhere(task, [begun(task, off=0.1, noise=0.02)]) == ("x",)
     assert began_elsewhere(task, rows) == ()
     shifted = [begun(task, off=0.02, noise=0.02, seed=seed) for seed in range(40)]
-    assert began_elsewhere(task, shifted) == ("x",)  # the mean of many is known better
+    assert began_elsewhere(task, shifted) == ("x",)  # the mean of many is more precise
     made = promise("c0001", -8.0, 0.5, -10.0)
     best = SimpleNamespace(
         candidate=SimpleNamespace(id="c0001"), utility=-10.0, standard_error=0.1, noise_cost=0.0

@@ -1,4 +1,4 @@
-"""Where DDP starts: a closed-loop run near the target, for every manoeuvre."""
+"""The start of DDP: a closed-loop run near the target, for every manoeuvre."""
 
 from dataclasses import replace
 
@@ -79,7 +79,7 @@ def test_a_target_that_no_input_reaches_still_gives_a_guess():
 
 
 def test_caution_does_not_hang_on_the_unit_of_an_input():
-    """After a crash, the least weight on changes was a thousandth per square percent."""
+    """After a crash, the smallest weight on changes depends on the input's unit (percent here)."""
     task = car_task(NAMES[0], car.model)
     plain = replace(task.reward, input_change=np.zeros(task.model.m))
     task = replace(task, reward=plain)
@@ -91,7 +91,7 @@ def test_caution_does_not_hang_on_the_unit_of_an_input():
 
 
 def no_plan(**function):
-    """What is raised where a model has no number at the start, in place of a plan."""
+    """Return the error for a model that is not finite at the start."""
     nothing = {"states": {"x": "m", "v": "m/s"}, "inputs": {"a": "m/s^2"}}
     task = gr.Task(
         model=gr.Model(**nothing, **function),

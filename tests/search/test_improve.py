@@ -1,4 +1,4 @@
-"""The loop: its figures on the paper's car, and that it is a function of its trials alone."""
+"""The loop: its results on the paper's car, and that it depends on the trials alone."""
 
 import hashlib
 import os
@@ -81,7 +81,7 @@ print(digest(*story({name!r})))
 
 
 def story(name):
-    """Two trials of a task, and what is proposed then."""
+    """Run two trials of a task and return the next proposal."""
     task, plant = {
         "car": (car_task("circle", car.model), real_plant(noisy=True)),
         "rover": (rover_task(), Plant(other(rover_task().model))),
@@ -108,7 +108,7 @@ def digest(task, candidates, trials):
     ("name", "processes"), [("rover", [("1", "cache"), ("2", "cache")]), ("car", [("3", "")])]
 )
 def test_the_same_trials_give_the_same_candidate_bit_for_bit(name, processes, tmp_path):
-    """Here twice; in fresh processes with a cold cache, a warm one, none, and other hash seeds."""
+    """Twice here; in new processes with a cold, a warm or no cache, and other hash seeds."""
     told = story(name)
     here = digest(*told)
     assert digest(*told) == here
@@ -146,7 +146,7 @@ def test_the_first_policy_is_locally_optimal_in_the_model():
 
 
 def test_predictions_are_made_in_the_exact_model():
-    """The planning model is smoothed, what is promised is not."""
+    """The planning model is smoothed, the prediction is not."""
     task = rover_task(smoothing=0.3)
     first = propose(task, [], [], SearchOptions()).candidate
     assert first.predicted_utility == simulate(task.problem(exact=True), first.policy).utility
@@ -198,7 +198,7 @@ def test_damping_is_a_price_on_leaving_the_trials_inputs():
 
 
 def test_the_bias_goes_to_the_original_model_not_to_the_last_biased_one():
-    """After two trials only the incumbent's own bias counts: errors do not pile up."""
+    """After two trials only the incumbent's own bias counts: errors do not accumulate."""
     task, candidates, trials = story("rover")
     made = propose(task, candidates, trials, SearchOptions()).candidate
     worse = replace(trials[0], states=trials[0].states + 5.0)
@@ -274,7 +274,7 @@ def test_the_fingerprint_follows_the_model_and_nothing_else():
 
 
 def test_refit_plans_with_parameters_from_all_trials():
-    """[search] refit: the model that `refit` gives is the one that the bias is added to."""
+    """[search] refit: the bias is added to the model that `refit` returns."""
     task, candidates, trials = story("rover")
     asked = []
 
@@ -291,7 +291,7 @@ def test_refit_plans_with_parameters_from_all_trials():
 
 @pytest.mark.parametrize("name", ["car", "far"])
 def test_the_fingerprint_is_the_same_without_a_compiler(name, monkeypatch):
-    """Another machine rounds its last bits otherwise: the model is the same model."""
+    """Rounding differences between machines do not change a model's fingerprint."""
     from grounded.compile.run import jit
 
     make = {

@@ -1,4 +1,4 @@
-"""Where a sensor shows a speed late, a run is to end at rest itself, not its log."""
+"""With a delayed speed sensor, the robot is at rest at the end of a plan, not just its log."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ STEPS = 60
 
 
 def cart(terminal: float, lag: float = 0.04) -> Planner:
-    """A cart that goes 0.4 m in 1.2 s; its speed is shown through a filter."""
+    """A cart that moves 0.4 m in 1.2 s; its speed sensor has a filter."""
     model = Model(
         states={"x": "m", "v": "m/s"},
         inputs={"force": "N"},
@@ -41,7 +41,7 @@ def cart(terminal: float, lag: float = 0.04) -> Planner:
 
 @pytest.mark.parametrize("terminal", [1.0, 10.0])
 def test_the_end_is_asked_of_the_true_speed(terminal):
-    """A student's cart was kicked in its last steps: its filter read 0.02, and it moved at 0.3."""
+    """A cart was pushed in its last steps: its filter read 0.02 m/s at a speed of 0.3."""
     planner = cart(terminal)
     policy, _ = planner.first_policy()
     run = predicted(planner.plan.problem(exact=True), policy)

@@ -1,4 +1,4 @@
-"""A plan through a limit that is small in its own unit is as good as the limit allows."""
+"""A plan with a limit that is small in its unit makes full use of the limit."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ DT, STEPS = 0.05, 80
 
 
 def rover() -> Model:
-    """A robot that is commanded speeds, in NumPy."""
+    """A robot driven by speed commands, in NumPy."""
     return Model(
         states={"x": "m", "y": "m", "psi": "rad", "v": "m/s", "w": "rad/s"},
         inputs={"linear": "m/s", "angular": "rad/s"},
@@ -31,7 +31,7 @@ def rover() -> Model:
 
 
 def task(model: Model) -> Task:
-    """Half a metre per second squared up to 1 m/s, in a gentle turn."""
+    """Acceleration at 0.5 m/s^2 up to 1 m/s, in a gentle turn."""
     t = DT * np.arange(STEPS + 1)
     v, w = np.minimum(0.5 * t, 1.0), 0.4 * np.sin(0.8 * t)
     psi = np.cumsum(w) * DT
@@ -51,7 +51,7 @@ def task(model: Model) -> Task:
 
 
 def test_a_limit_below_the_width_of_smoothing_is_planned_through():
-    """A warehouse robot's first plan had -85.6 where -0.004 was to be had: 0.035 of 0.05."""
+    """A warehouse robot's first plan used 0.035 of a limit of 0.05: -85.6 in place of -0.004."""
     effects = [("rate_limit:linear", {"r": 0.7}), ("rate_limit:angular", {"r": 3.0})]
     effects.append(("delay:linear+angular", {"d": 0.128}))
     found = []

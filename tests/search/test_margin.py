@@ -1,4 +1,4 @@
-"""Gains of a model with adopted memory hold on samples that are a part of a control step old."""
+"""Gains for a model with adopted memory are stable with samples a fraction of a step old."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ LATE = [
 
 
 def joint(effects: list[tuple[str, dict[str, float]]], change: float) -> Planner:
-    """A joint that is moved by 1 rad in half a second and held; `change` weighs its torque's."""
+    """A joint moved by 1 rad in half a second and held; `change` weights its torque's changes."""
     model = Model(
         states={"q": "rad", "w": "rad/s"},
         inputs={"tau": "N m"},
@@ -67,7 +67,7 @@ def test_noise_and_fresh_samples_alone_cost_what_a_run_with_noise_costs(planner)
 
 
 def test_what_holds_stays_as_it_is():
-    """Little noise, no sticking, no memory: nothing costs more than it does on fresh samples."""
+    """With little noise and without friction or memory, old samples do not raise the cost."""
     planner = joint([("delay:tau", {"d": 0.005})], change=1.0)
     own = planner.narrowed(planner.first_policy()[0])
     assert planner.needs_margin and planner.loosened(planner.plan.problem(exact=True)) is None
@@ -75,7 +75,7 @@ def test_what_holds_stays_as_it_is():
 
 
 def test_gains_that_rely_on_fresh_samples_are_made_gentler():
-    """An arm's first run was predicted at -0.014, swung from step to step, and gave -61."""
+    """An arm's first run was predicted at -0.014, oscillated from step to step, and gave -61."""
     planner = joint([("delay:tau", {"d": 0.0148})], change=1e-7)
     problem = planner.plan.problem(exact=True)
     own, made = planner.narrowed(planner.first_policy()[0]), made_by(planner)
@@ -86,7 +86,7 @@ def test_gains_that_rely_on_fresh_samples_are_made_gentler():
 
 
 def test_gains_do_not_count_on_a_joint_that_sticks():
-    """An arm's gains vanished where it was to stand still, and it whirled once it slipped."""
+    """Without gains at standstill, an arm with dry friction spins once it slips."""
     effects = [
         ("delay:tau", {"d": 0.0148}),
         ("joint_friction:tau<-w", {"c": 0.3, "b": 0.02, "width": 0.005}),
@@ -102,7 +102,7 @@ def test_gains_do_not_count_on_a_joint_that_sticks():
 
 
 def test_a_policy_of_the_task_s_own_model_is_as_it_was():
-    """Nothing was adopted: no run is simulated, and the same trials give the same candidate."""
+    """Without adopted effects the check is skipped, and the same trials give the same candidate."""
     plain = planner_with(task(rover()), [])
     own, _ = plain.first_policy()
     made = propose(plain.task, [], [], SearchOptions(), planner=plain).candidate
@@ -110,7 +110,7 @@ def test_a_policy_of_the_task_s_own_model_is_as_it_was():
 
 
 def test_a_command_at_its_limit_tells_nothing_of_what_no_sensor_shows():
-    """A gain on it, of rounding by rounding, reached 1e27, and the plan was refused for it."""
+    """A gain on it, a quotient of rounding errors, could reach 1e27, and the plan was refused."""
     plain = task(rover())
     reward = replace(plain.reward, input_change=np.array([0.01, 0.003]))
     slow = replace(plain, low=np.array([-0.3, -0.3]), high=np.array([1.5, 0.3]), reward=reward)

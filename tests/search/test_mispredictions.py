@@ -1,4 +1,4 @@
-"""Slopes of the grounded model, corrected by what earlier trials were mispredicted by."""
+"""Derivatives of the grounded model, corrected by the mispredictions of earlier trials."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -20,7 +20,7 @@ from small_tasks import cart_task, drive, other, rover_task
 
 
 def searched(task, plant, trials):
-    """A search after some trials: its incumbent, and the crude model grounded on it."""
+    """Return a search after some trials, its incumbent, and the crude model grounded on it."""
     search = Search(task)
     for _ in range(trials):
         search.tell(drive(task, plant, search.ask()))
@@ -54,7 +54,7 @@ def test_the_trial_is_still_replayed_and_others_are_foretold(found):
 
 
 def test_a_new_trial_is_foretold_too():
-    """What was learnt from two trials holds for a third, in a direction that neither took."""
+    """A correction learnt from two trials holds for a third one in another direction."""
     task = cart_task()
     plant = Plant(task.model.with_values({"mass": 1.6, "drag": 0.6}))
     found = searched(task, plant, 2)
@@ -131,7 +131,7 @@ def test_runs_are_apart_by_the_cost_of_their_difference(found):
 
 
 def test_slopes_that_kept_their_promise_are_not_corrected():
-    """Worse before: the aircraft's flight went on with laws that do not hold (-1840 for -1826)."""
+    """Crude slopes that predicted the last gain are kept (else the aircraft lost 14 of -1826)."""
     task = cart_task()
     plant = Plant(task.model.with_values({"mass": 1.3}))
     found = searched(task, plant, 2)
@@ -144,7 +144,7 @@ def test_slopes_that_kept_their_promise_are_not_corrected():
 
 
 def lost(found, utility=-100.0, **changes):
-    """A step from the best candidate by corrected slopes that lost."""
+    """Return a step from the best candidate with corrected slopes that lost."""
     first, best = found.search.standing.history[0], found.best
     fields = {"base": best.candidate.id, "slopes": "corrected", "model": best.candidate.model}
     made = replace(first.candidate, predicted_gain=1.0, **fields)
@@ -153,7 +153,7 @@ def lost(found, utility=-100.0, **changes):
 
 @pytest.mark.parametrize(("slopes", "believes"), [("", True), ("corrected", False)])
 def test_a_step_by_corrected_slopes_that_lost_far_away_refutes_them(slopes, believes):
-    """Seen: the laws foretold the near trials, and lost 6 and 10 with each step they made."""
+    """Laws may predict the near trials and still lose with each step made from them."""
     task = cart_task()
     found = searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 2)
     first = found.search.standing.history[0]
@@ -161,7 +161,7 @@ def test_a_step_by_corrected_slopes_that_lost_far_away_refutes_them(slopes, beli
     policy = found.best.candidate.policy
     bump = 2.0 * np.sin(np.linspace(0, 9, task.horizon))[:, None]
     policy = replace(policy, feedforward=policy.feedforward + bump)
-    run = predicted(found.problem, policy)  # as the model's own slopes say
+    run = predicted(found.problem, policy)  # by the model's own slopes
     trial = replace(found.own, states=run.states, inputs=run.inputs)
     made = replace(first.candidate, id="far", policy=policy, slopes=slopes)
     far = replace(first, candidate=made, trials=(trial,), accepted=False)
@@ -187,13 +187,13 @@ def test_after_two_lost_more_than_foretold_steps_are_by_the_models_own_slopes(ut
     doubted = [
         replace(t, candidate=replace(t.candidate, likely_off=1000.0)) if k > 1 else t
         for k, t in enumerate(named)
-    ]  # it was said that they may well lose so much
+    ]  # losses within the likely error
     maker = replace(maker, now=replace(now, history=tuple(doubted)))
     assert About(maker, found.best, SearchOptions(), "").slopes == "corrected"
 
 
 def test_old_samples_are_asked_of_corrected_slopes_too(found):
-    """A law is one of its step: of all runs at once it ended in a traceback."""
+    """A law belongs to its step, also if several runs are simulated at once."""
     planner, now = Planner(found.task, found.task), found.search.standing
     maker = Maker(planner, now, "c0099", found.best.candidate.model)
     about = About(maker, found.best, SearchOptions(), "")

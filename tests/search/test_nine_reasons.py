@@ -1,6 +1,6 @@
-"""What the search of 0.1 did wrong on simulators that others wrote, and what has come of it since.
+"""Regression tests for nine failures of the search of version 0.1 on third-party simulators.
 
-Nine reasons were read in its source. Three have their tests elsewhere: 1 (`learn` never ended on a
+Three of the nine are tested elsewhere: 1 (`learn` never ended on a
 deterministic system) in tests/workspace/test_deterministic_system.py, 6 (a joint's friction is a
 torque) in tests/effects/test_effects_joint.py, 8 (float32) in
 tests/compile/test_substeps_and_jacobians.py. The crude models are those of benchmarks/foreign.
@@ -38,7 +38,7 @@ def mechanisms(monkeypatch):
 
 @pytest.fixture
 def late_arm(mechanisms):
-    """The arm whose commands arrive 30 ms late: high gains make a limit cycle."""
+    """An arm with a command delay of 30 ms: high gains cause a limit cycle."""
     task = mechanisms.arm_task()
     plant = Plant(task.model, latency=dict.fromkeys(task.model.input_names, 0.03), substeps=10)
     return SimpleNamespace(task=task, run=lambda candidate: drive(task, plant, candidate))
@@ -50,13 +50,13 @@ def test_the_first_plan_is_finished_and_the_best_of_many_starts(mechanisms):
     task = mechanisms.cart_task("smooth")
     _, plan = first_policy(task)
     assert plan.status == "converged"
-    assert plan.cost < 84.0  # no start leads there but a plan to be upright early; others to 91.9
+    assert plan.cost < 84.0  # only found by a plan to be upright early; others give 91.9
     held = ddp.solve(task.problem(), np.tile(task.past, (task.horizon, 1)))
-    assert plan.cost < 0.9 * held.cost  # a valley that the held input does not lead to
+    assert plan.cost < 0.9 * held.cost  # an optimum that the held input does not lead to
 
 
 def test_early_plans_are_among_the_starts(mechanisms, monkeypatch):
-    """Every other further start pays for all states from some step on what it pays for the last."""
+    """Every other further start has the final weights from some step on."""
     task, weights, solve = mechanisms.cart_task("smooth"), [], starts.finished
 
     def finished(problem, *start, **options):
@@ -105,7 +105,7 @@ def test_a_better_models_own_plan_is_a_rival(late_arm, trials):
 
 @pytest.mark.parametrize("seed", (20, 32, 40))
 def test_what_no_model_predicts_is_in_no_other_unit(late_arm, seed):
-    """An arm that spun was taken for degrees: a dead zone was claimed in the place of its delay."""
+    """An arm that spins is not taken for one logged in degrees, with a dead zone for its delay."""
     task, rng = late_arm.task, np.random.default_rng(seed)
     search = Search(task)
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""After `adopt` the changed model's own plan is run, with its own gains, where it is due.
+"""After `adopt` the changed model's own plan is run with its own gains, when it is due.
 
 A hydraulic boom's first policy swung in a limit cycle: its valve is late and slow. The plan of the
 model that knew both kept the swinging gains: ten more trials ended at -1.3, where the same model
@@ -31,7 +31,7 @@ def boom(s, a, p):
 
 
 def valve_and_oil(s, a, p):
-    """A spool that lags and is slow, a dead zone, and the spring of the oil."""
+    """A hydraulic valve with delay and lag, a dead zone, and the compressibility of the oil."""
     flow = p.K * np.sign(s.spool) * np.maximum(np.abs(s.spool) - 0.08, 0.0) - 0.01 * np.cos(s.th)
     return {
         "th": s.w,
@@ -79,7 +79,7 @@ def late_boom():
 
 
 def step(run, planner):
-    """One more trial: what it ran, and its utility."""
+    """Run one more trial; return the candidate and the utility."""
     made = propose(run.task, run.candidates, run.trials, OPTIONS, planner=planner)
     run.candidates += [made.candidate] * made.is_new
     run.trials.append(drive(run.task, run.plant, made.candidate, len(run.trials)))
@@ -87,7 +87,7 @@ def step(run, planner):
 
 
 def test_the_changed_models_plan_is_run_with_its_own_gains(late_boom):
-    """It kept the incumbent's, which were designed for a valve that is neither late nor slow."""
+    """The incumbent's gains were designed for a valve without delay and lag, and are not kept."""
     best = max(map(late_boom.task.utility, late_boom.trials))
     made, utility = step(late_boom, late_boom.better)
     afresh = SimpleNamespace(**vars(late_boom) | {"candidates": [], "trials": []})
@@ -100,7 +100,7 @@ def test_the_changed_models_plan_is_run_with_its_own_gains(late_boom):
 
 
 def test_a_limit_cycle_needs_no_promise(late_boom, monkeypatch):
-    """A model that replays a limit cycle says nothing of runs that don't swing."""
+    """A model that replays a limit cycle does not predict runs without one."""
     monkeypatch.setattr(making, "wild", lambda tried: False)
     monkeypatch.setattr(making.About, "_worth", lambda self, made: -np.inf)
     first = SimpleNamespace(**vars(late_boom))
@@ -112,7 +112,7 @@ def test_a_limit_cycle_needs_no_promise(late_boom, monkeypatch):
 
 
 def test_noise_that_gains_carry_leaves_half_of_them_and_a_limit_cycle_far_less(monkeypatch):
-    """A first user's quadrotor flew with 8 % of its gains: three times worse than with all."""
+    """A quadrotor with 8 % of its gains flew three times worse than with all of them."""
     model = Model(
         states={"x": "m", "v": "m/s"},
         inputs={"u": "m/s^2"},
@@ -151,7 +151,7 @@ def test_an_input_that_is_at_both_limits_for_long_swings_between_them():
 
 
 def test_noise_about_an_input_that_is_off_lastingly_is_no_limit_cycle():
-    """A first user's arm sagged under a load: gentler gains were asked for, and it sagged more."""
+    """An arm that sags under a load does not get gentler gains: it would sag more."""
     task = SimpleNamespace(low=np.array([-20.0]), high=np.array([20.0]))
     plan = np.linspace(0.0, 0.5, 80)[:, None]
     made = SimpleNamespace(predicted_inputs=plan)

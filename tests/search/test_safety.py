@@ -1,4 +1,4 @@
-"""What must hold before a candidate is handed to a robot."""
+"""Checks before a candidate is handed to a robot."""
 
 from dataclasses import replace
 
@@ -67,7 +67,7 @@ def test_a_bound_that_is_just_kept_is_no_objection(made):
 
 
 def test_only_steps_that_this_model_has_foretold_say_how_far_runs_stray(made):
-    """Seen at a robot: a miss of 1.2 m, by other gains, closed [safety] to all steps."""
+    """A miss of 1.2 m with other gains does not make [safety] refuse all further steps."""
     task = cart_task(safety_low=np.full(2, -9.0), safety_high=np.full(2, 9.0))
     names = task.model.state_names, task.model.input_names
     ran = Trial(
@@ -84,7 +84,7 @@ def test_only_steps_that_this_model_has_foretold_say_how_far_runs_stray(made):
 
 
 def test_the_run_that_most_of_the_spread_comes_from_is_named(made):
-    """A balancer was kicked once: every step was refused for +- 0.6 rad, and nothing said why."""
+    """If a disturbed run widens the spread, the refusal names that trial."""
     task = cart_task(safety_low=np.full(2, -1.4), safety_high=np.full(2, 1.4))
     names = task.model.state_names, task.model.input_names
 
@@ -109,21 +109,21 @@ def test_the_run_that_most_of_the_spread_comes_from_is_named(made):
 
 
 def test_who_coasts_out_of_safety_after_a_run_is_told_when_and_how_far(made):
-    """A car's plan ended at 2.2 m/s in front of a wall: nothing was said, and it hit it."""
+    """A plan that ends at 2.2 m/s in front of a wall gives a warning."""
     task, run = cart_task(latency=np.array([0.1])), made.predicted_run
     states = np.array(run.states)
     states[-1] = 1.0, 2.0
     run = replace(run, states=states)
     moved = coasting(task, run, np.zeros(1))
     assert (moved[0] == states[-1]).all()
-    assert np.all(np.diff(moved[:, 0]) > 0)  # it rolls on
+    assert np.all(np.diff(moved[:, 0]) > 0)  # it keeps rolling
     pushed = coasting(cart_task(), run, np.zeros(1))
-    assert run.inputs[-1] != 0 and moved[2, 1] != pushed[2, 1]  # what was sent arrives still
+    assert run.inputs[-1] != 0 and moved[2, 1] != pushed[2, 1]  # commands under way still arrive
     bound = np.array([moved[10, 0], np.inf])
     tight = cart_task(safety_low=-np.full(2, np.inf), safety_high=bound)
     clause = coasts_out(tight, task, run, np.zeros(1))
     assert holds(clause, "x", "[safety]", f"{11 * task.dt:.2g} s later", f"{moved[-1, 0]:.3g}")
-    assert holds(clause, f"{(len(moved) - 1) * task.dt:.2g} s later")  # and when it is so far
+    assert holds(clause, f"{(len(moved) - 1) * task.dt:.2g} s later")  # and the time of it
     wide = cart_task(safety_low=-np.full(2, np.inf), safety_high=np.array([99.0, np.inf]))
     assert coasts_out(wide, task, run, np.zeros(1)) == ""
     assert coasts_out(cart_task(), task, run, np.zeros(1)) == ""

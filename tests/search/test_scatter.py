@@ -1,4 +1,4 @@
-"""How far runs scatter: two that agree by luck are no proof that they don't."""
+"""The scatter between runs: two that agree by chance do not prove that there is none."""
 
 from types import SimpleNamespace
 
@@ -16,14 +16,14 @@ from small_tasks import cart_task, drive, other
 
 
 def runs(pieces, cost=10.0):
-    """A candidate whose runs are worth so much in each piece, beside a common cost."""
+    """Return a candidate whose runs have these utilities in each part, plus a common cost."""
     utilities = tuple(float(u) for u in pieces.sum(axis=1) - cost)
     candidate = SimpleNamespace(base="c0001", model="m", id="c0002")
     return Tried(candidate, (None,) * len(pieces), utilities, True, pieces=pieces)
 
 
 def test_intervals_from_two_repeats_hold_as_often_as_they_say():
-    """Seen: 0.453 +- 0.038 from two pairs that agreed; seven repeats said 0.09 for a single run."""
+    """Two pairs that agree by chance gave +- 0.038; seven repeats give 0.09 for a single run."""
     rng = np.random.default_rng(0)
     inside, least, width = [], [], []
     for _ in range(2000):
@@ -81,7 +81,7 @@ def test_pieces_sum_to_the_utility():
 
 
 def test_what_noise_in_a_log_costs_is_no_doubt_in_the_model():
-    """Seen: -0.14 promised and -12.5 in the log, most of it noise of what the reward weighs."""
+    """A run predicted at -0.14 gave -12.5 in the log, mostly from noise of weighted states."""
     task = cart_task()
     proposal = propose(task, [], [], SearchOptions())
     policy, noise = proposal.candidate.policy, np.array([0.1, 0.1])

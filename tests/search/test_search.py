@@ -1,4 +1,4 @@
-"""Where the search stands: a pure function of candidates and stored trials."""
+"""The state of the search is a pure function of candidates and stored trials."""
 
 from dataclasses import replace
 
@@ -24,14 +24,14 @@ PLANT = Plant(other(TASK.model, 1.6), latency={"force": 0.02})
 
 
 def bad(trial, value=30.0):
-    """The same run with a state that is far off: a trial that improves nothing."""
+    """Return the run with a state far off the target: a trial without improvement."""
     states = np.array(trial.states)
     states[1:, 0] += value
     return replace(trial, states=states)
 
 
 class Story:
-    """A search whose trials are made to order."""
+    """A search with prescribed trials."""
 
     def __init__(self, task=TASK, plant=PLANT, **options):
         self.task, self.plant = task, plant
@@ -182,7 +182,7 @@ def test_a_candidate_run_more_often_is_averaged_too():
 
 
 def worse(by):
-    """A trial whose utility is lower by about so much: the cart stands a little further off."""
+    """Return a function that lowers a trial's utility by about so much by shifting the cart."""
     return lambda trial: bad(trial, by)
 
 
@@ -192,15 +192,15 @@ def test_a_loss_sends_the_incumbent_out_again_before_it_is_believed():
     assert now.phase == "await-trial" and now.outstanding.id == "c0001" and now.missing == 1
     assert now.history[-1].accepted is None and now.history[-1].in_doubt
     assert holds(now.sentence, "c0002", "c0001")
-    story.add()  # the same again: it was no luck
+    story.add()  # the same result again, so it was not luck
     now = story.now
     assert now.history[-1].accepted is False and now.phase == "propose"
-    story.add(worse(0.05))  # scatter is known to be none now: the next loss is believed at once
+    story.add(worse(0.05))  # no scatter is known now: the next loss counts at once
     assert story.now.history[-1].accepted is False and len(story.trials) == 4
 
 
 def test_a_lucky_winner_loses_its_luck():
-    """c0001's only trial flattered it; c0002, truly better, wins once c0001 was run again."""
+    """c0001's only trial was lucky; c0002 is truly better and wins once c0001 was run again."""
     story = Story(rerun_incumbent=True).add().add()
     honest = [story.task.utility(t) for t in story.trials]
     assert honest[1] > honest[0]
@@ -217,7 +217,7 @@ def test_a_lucky_winner_loses_its_luck():
 
 
 def test_losses_are_not_checked_for_ever():
-    """At most one trial more for each loss, however much trials scatter."""
+    """At most one additional trial is run for each loss, however much trials scatter."""
     noisy = Plant(PLANT.model, noise=Noise(process={"v": 0.2}))
     story = Story(plant=noisy, rerun_incumbent=True, max_trials=60)
     while story.propose().candidate is not None:
@@ -281,7 +281,7 @@ def test_a_crash_of_the_first_policy_makes_a_gentler_one(how):
         assert made.caution == k and made.base == "" and made.iteration == 0
         efforts.append(float(np.abs(np.diff(made.predicted_inputs, axis=0)).sum()))
         asked = story.now.then is not None and story.now.then.verb == "diagnose"
-        assert asked == (k > 0)  # nothing did before the search was at its end
+        assert asked == (k > 0)  # not after the first crash
     assert efforts == sorted(efforts, reverse=True) and efforts[1] < 0.7 * efforts[0]
     last = story.propose()
     assert last.candidate is None and last.standing.phase == "stopped"
@@ -342,7 +342,7 @@ def test_a_trial_longer_than_the_horizon_counts_up_to_it():
 
 @pytest.mark.parametrize(("off", "repeats", "least"), [(0.02, 3, -0.9), (0.3, 1, -1.35)])
 def test_a_start_away_from_s0_does_not_stop_the_search(off, repeats, least):
-    """The robot is put down a little (or far) off. Without: from -1.349 to -0.881."""
+    """The robot starts slightly (or far) off s_0. With the exact start: from -1.349 to -0.881."""
     rng = np.random.default_rng(0)
 
     def run(candidate):
@@ -353,7 +353,7 @@ def test_a_start_away_from_s0_does_not_stop_the_search(off, repeats, least):
     now, candidates, trials = found.standing, found.candidates, found.trials
     assert now.iteration >= 1 and len(candidates) >= 3
     assert TASK.utility(drive(TASK, PLANT, now.incumbent.candidate)) > least
-    if repeats == 3:  # scatter is no gain to look for: the search ends before trials run out
+    if repeats == 3:  # scatter is not a gain: the search ends before max_trials
         assert now.phase == "converged" and len(trials) <= 30
 
 
@@ -457,7 +457,7 @@ def test_the_mean_of_one_trial_is_itself_and_held_inputs_are_averaged():
 
 
 def test_headings_that_wrap_between_repeats_do_not_spoil_the_mean():
-    """One log unwrapped, the other a full turn off: their mean is the run, not half a turn off."""
+    """Logs may differ by a full turn: their mean is not half a turn off."""
     task = rover_task()
     policy = task.policy(np.full((60, 2), 0.5), None, None)
     one = Plant(task.model).run(policy, {}, np.random.default_rng(0))
@@ -491,7 +491,7 @@ EVENTS = {
 )
 @settings(max_examples=40, deadline=None)
 def test_whatever_happens_the_search_goes_on_or_says_why(events, repeats, step):
-    """Any story of crashes, noise, mended models, repeated runs: no exception, no worse policy."""
+    """Crashes, noise, changed models, repeats: no exception, no worse policy."""
     story = Story(repeats=repeats, step=step, max_halvings=2, max_trials=8)
     for event in events:
         proposal = story.propose()
@@ -569,13 +569,13 @@ def test_odd_tasks_are_searched_or_ended_with_a_sentence(name, options):
 
 
 def test_a_loss_by_several_times_the_best_utility_is_no_luck():
-    """Seen at a robot: -6.4 after -1.1, and the best one was sent out again to make sure."""
+    """After a loss of -6.4 against -1.1 the best candidate is not run again."""
     story = Story(rerun_incumbent=True).add().add(bad)
     assert story.now.history[-1].accepted is False and story.now.phase == "propose"
 
 
 def test_what_another_model_gained_ends_no_search():
-    """Seen after `adopt`: "the last 4 candidates gained 0.0044", and nothing was tried."""
+    """After `adopt`, small gains with the old model do not end the search."""
     story = Story().add().add()
     for _ in range(4):
         story.add(bad)
@@ -587,7 +587,7 @@ def test_what_another_model_gained_ends_no_search():
 
 @pytest.mark.parametrize(("times", "made"), [(12, "gentler gains"), (2, "")])
 def test_gains_are_cut_only_where_the_loop_swung_to_and_fro(times, made):
-    """Seen at a robot: a thousand times worse than promised, with a loop that was stable."""
+    """A run may be a thousand times worse than predicted although its loop is stable."""
     story = Story(TASK, PLANT)
     plan = story.propose().candidate.predicted_inputs
     wave = np.ptp(plan) * np.sign(np.sin(np.pi * times * (np.arange(len(plan)) + 0.5) / len(plan)))
@@ -597,7 +597,7 @@ def test_gains_are_cut_only_where_the_loop_swung_to_and_fro(times, made):
     if made:
         first = story.candidates[0].policy.gain
         assert np.abs(second.policy.gain).mean() < 0.5 * np.abs(first).mean()
-        story.add(lambda trial: bad(trial, 60.0)).propose()  # it lost: not again
+        story.add(lambda trial: bad(trial, 60.0)).propose()  # it lost and is not tried again
         assert [c.way for c in story.candidates].count("gentler gains") == 1
 
 

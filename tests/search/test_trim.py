@@ -1,4 +1,4 @@
-"""Trim: inputs and free states for which the model moves as it is told."""
+"""Trim: inputs and free states for which the model follows the prescribed motion."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_limits_are_kept():
 
 
 def test_a_dead_zone_does_not_hold_it_back():
-    """At zero input there is no slope to follow: it starts from other inputs too."""
+    """At zero input the slope is zero, so the trim also starts from other inputs."""
     task = rover_task(past=np.zeros(2))
     x, u = trim(task, task.target, np.array([True, True, True]))
     assert np.abs(u[:, 0] - 1.0).max() < 0.05 and np.abs(u[:, 1] - 3.0).max() < 0.05

@@ -1,4 +1,4 @@
-"""The step rule of the search: a promise kept widens the step, a promise broken narrows it."""
+"""The step rule: an accurate prediction enlarges the step, an inaccurate one reduces it."""
 
 import pytest
 
@@ -35,6 +35,6 @@ def test_failures_damp_first_and_halve_then():
 
 
 def test_a_damping_is_written_as_in_the_table_of_status():
-    """`propose` and the page said "damping 1e+02", `status` 100."""
+    """`propose`, the page and `status` show the same number, 100 rather than 1e+02."""
     texts = [str(Step(damping)) for damping in (1.0, 33.3, 100.0, 1000.0)]
     assert [text.partition("damping ")[2] for text in texts] == ["1.0", "33", "100", "1,000"]

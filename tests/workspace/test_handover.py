@@ -88,7 +88,7 @@ def test_a_step_that_may_well_lose_is_handed_over_with_a_word(ran):
     wild = replace(made, id="c0004", predicted_gain=0.07, likely_off=1.44e8)
     ran.save_candidate(wild)  # two crashed runs had said so, of a base that cost 1,200
     (note,) = checked_candidate(ran, "c0004").notes
-    assert "e+08" not in note and f"more than all that {made.base} costs" in note
+    assert "e+08" not in note and f"more than the whole cost of {made.base}" in note
 
 
 def test_what_was_just_proposed_is_handed_over_without_a_word(w, tmp_path):
