@@ -313,7 +313,7 @@ def test_another_robots_candidate_is_refused_even_anyway(w, tmp_path):
 
 def test_other_units_and_another_dt_are_refused(w, tmp_path):
     configure(w, model=MODEL.replace('"N"', '"kN"'))
-    refused(w, tmp_path, "it has force in N, the model of today in kN")
+    refused(w, tmp_path, "it has force in N, but the current model has it in kN")
     configure(w, CONFIG.replace("dt = 0.05", "dt = 0.1"), model=MODEL)
     rows = [f"{0.1 * i:.1f},0.5" for i in range(41)]
     (w.folder / "target.csv").write_text("t,x\n" + "\n".join(rows) + "\n")
