@@ -152,6 +152,6 @@ def _earlier(one: Ingested) -> str:
     if not one.crashed or one.trial in one.crashed:
         return ""
     return (
-        f": this run was complete, but {listed(one.crashed)} was not, and one incomplete run fails "
+        f": this run completed, but {listed(one.crashed)} did not, and one incomplete run fails "
         "the candidate (`discard` removes a run that somebody stopped)"
     )
