@@ -213,7 +213,10 @@ RUNS = {
         lambda s, u: (s + np.array([0.5, 0.0]), u),
         ["started with x = 0.5", "start is 0"],
     ),
-    "beyond limits": (lambda s, u: (s, u * 0 + 9.0), ["force in the log is up to 4 outside its [limits]"]),
+    "beyond limits": (
+        lambda s, u: (s, u * 0 + 9.0),
+        ["force in the log is up to 4 outside its [limits]"],
+    ),
     "late": (lambda s, u: (s, np.vstack([u[:1], u[:-1]])), ["logged 1 step late"]),
     "longer": (
         lambda s, u: (np.vstack([s, s[-3:]]), np.vstack([u, u[-3:]])),

@@ -266,8 +266,8 @@ def _corrections(found: Diagnosis, names: list[str]) -> list[str]:
         return names
     if not found.correction.adoptable:
         raise GroundedError(
-            f"'{asked[0]}' is not adoptable: it does not improve the prediction of trials that it "
-            "was not fitted to; run more trials and diagnose again"
+            f"'{asked[0]}' is not adoptable: it does not predict trials better that it was not "
+            "fitted to; run more trials and diagnose again"
         )
     missing = [name for name in found.effects if name not in names]
     if missing:
