@@ -1,6 +1,6 @@
-"""The commands of `grounded`: options, one call of `grounded_trials.Workspace`, a printout.
+"""The commands of `grounded`: each parses its options, calls `grounded_trials.Workspace`, prints.
 
-Read `main.py` first: the list of commands with the file of each, and how errors become exit codes.
-`options.py` has what commands share, `terminal.py` how words, tables and progress are shown,
-`completion.py` the TAB key. `studies/` has the commands that need no robot.
+Read `main.py` first: it lists the commands with their files and turns errors into exit codes.
+`options.py` has the options that commands share, `terminal.py` the output of text, tables and
+progress, `completion.py` shell completion. `studies/` has the commands that need no robot.
 """

@@ -1,4 +1,4 @@
-"""grounded adopt: diagnosed effects join the model."""
+"""grounded adopt: add diagnosed effects to the model, or undo it."""
 
 from __future__ import annotations
 
@@ -15,49 +15,47 @@ if TYPE_CHECKING:
     from grounded_trials import Workspace
 
 UNCLAIMED = (
-    "was not claimed by the last diagnosis: its values were fitted by themselves, in place of what "
-    "was claimed; the model's own parameters stay as they are"
+    "was not claimed by the last diagnosis: its values were fitted on their own, instead of what "
+    "was claimed; the model's own parameters are unchanged"
 )
 BESIDE = (
-    "was adopted from the same diagnosis, and stays in the model: its values were fitted in place "
-    "of these, not beside them. Take it out of [model] effects in grounded.toml, or diagnose again"
+    "was adopted from the same diagnosis and stays in the model, but its values were fitted "
+    "instead of these, not together with them. Remove it from [model] effects in grounded.toml, or "
+    "diagnose again"
 )
 
 BIASED = (
-    "the robot is steered by what the sensor of {state} reads, {by}: where [task] start or the "
-    "target was not measured by it, they are off by that. Add it there, or take it out of what is "
-    "read, [log.state.{state}] offset = {off:.3g}, and in the robot's program"
+    "the robot is steered by its sensor of {state}, which reads {by}: [task] start and the target "
+    "are off by that unless this sensor measured them. Add it there, or correct the readings: "
+    "[log.state.{state}] offset = {off:.3g}, and the same in the robot's program"
 )
 SCALED = (
-    "the target and [task] start, and how far off the target {state} is said to be, are of {state} "
-    "as its sensor reads it, {by:.3g} % {more} than it is: for the true one scale what is read, "
-    "[log.state.{state}] scale, and in the robot's program"
+    "the target, [task] start and the reported distance of {state} from the target are in readings "
+    "of its sensor, which shows {by:.3g} % {more} than the true value: for true values correct "
+    "[log.state.{state}] scale, and the scale in the robot's program"
 )
-DRAW = (
-    "draw the manoeuvre first (`grounded target --help`), or propose all the same to have that "
-    "drive repeated"
-)
-REMEASURE = "nothing has measured the model as it is now yet: `grounded diagnose` does"
+DRAW = "draw the manoeuvre first (`grounded target --help`), or propose anyway to repeat that drive"
+REMEASURE = "the changed model was not compared with the trials yet: `grounded diagnose` does that"
 
 
 @click.command("adopt")
 @click.argument("effects", nargs=-1, metavar="EFFECT...", shell_complete=complete.effects)
 @click.option("--effect-only", is_flag=True, help="Leave the model's own parameters alone.")
-@click.option("--undo", is_flag=True, help="Take the last adoption back.")
+@click.option("--undo", is_flag=True, help="Undo the last adoption.")
 @in_workspace
 @as_json
 def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool) -> None:
     """Add effects of the last diagnosis (`family:target`) to [model] in grounded.toml.
 
-    Effects that were claimed together were estimated together: adopt them together. Parameters of
-    the model that were calibrated beside them come along, in [model] params. An effect that was
-    not claimed can be adopted by itself: its values come without parameters.
+    Effects that were claimed together were estimated together: adopt them together. The model
+    parameters calibrated with them are written to [model] params. An effect that was not claimed
+    can be adopted alone: its values come without parameters.
 
-    The search goes on from the best policy, planned with the better model. --undo gives [model]
-    the effects and parameters that it had before the last adoption; again, before the one before.
+    The search goes on from the best policy and plans with the better model. --undo restores the
+    effects and parameters that [model] had before the last adoption; repeat it to go further back.
     """
     if undo == bool(effects) or (undo and effect_only):
-        raise click.UsageError("name what to adopt, EFFECT..., or else --undo alone")
+        raise click.UsageError("name the effects to adopt, EFFECT..., or give --undo alone")
     workspace = open_workspace()
     if undo:
         _undo(workspace, json_)
@@ -90,19 +88,19 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
         show(field(name, text, "  "))
     for one in done.left.values():
         kept, beside = (with_unit(number(value), one.unit) for value in (one.kept, one.value))
-        text = f"{one.called} stays at {kept}: these trials do not tell it"
-        remark("note", f"{text}. The effects were fitted beside {beside}")
+        text = f"{one.called} stays at {kept}: these trials do not determine it"
+        remark("note", f"{text}. The effects were fitted with it at {beside}")
     if done.stopped:
         remark("note", done.stopped)
     if done.left:
         remark("note", REMEASURE)
     if done.logged:
-        remark("note", f"target.csv is still {done.logged}, the drive that was logged: {DRAW}")
+        remark("note", f"target.csv is still the logged drive, {done.logged}: {DRAW}")
     show(f"\n{next_line(done.then)}")
 
 
 def _undo(workspace: Workspace, json_: bool) -> None:
-    """Takes the last adoption back, and prints what the model has again."""
+    """Undo the last adoption and print the restored effects and parameters."""
     before = workspace.base_model.params
     done = workspace.undo_adoption()
     if json_:

@@ -1,7 +1,7 @@
-"""grounded completion: names for the TAB key, from file names alone, so that it answers at once.
+"""grounded completion: shell completion of commands, candidates, trials, effects and examples.
 
-`candidates`, `trials` and `effects` are for `shell_complete=` of arguments and options; they read
-folders, and never a trial or a model.
+`candidates`, `trials` and `effects` are for `shell_complete=` of arguments and options. To answer
+fast they read file names (and the last diagnosis), never a trial or a model.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ def command(shell: str) -> None:
     maker = get_completion_class(shell)
     assert maker is not None
     script = maker(root, {}, "grounded", "_GROUNDED_COMPLETE").source()
-    if shell == "bash":  # or `dead_zone:throttle` counts as two words
+    if shell == "bash":  # otherwise bash splits `dead_zone:throttle` into two words
         script += '\nCOMP_WORDBREAKS="${COMP_WORDBREAKS//:/}"\n'
     show(script)
 
 
 def candidates(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """c0001 and so on, and `best`."""
+    """Complete candidate names (c0001) and `best`."""
     files = (_folder(ctx) / "candidates").glob("c[0-9]*.mcap")
     return _items(["best", *sorted(path.stem for path in files)], incomplete)
 
 
 def trials(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """t0001 and so on."""
+    """Complete trial names (t0001)."""
     files = (_folder(ctx) / "trials").glob("t[0-9]*-*.mcap")
     return _items(sorted(path.name.split("-")[0] for path in files), incomplete)
 
 
 def effects(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """The effects that the last diagnosis weighed, best first."""
+    """Complete the effects that the last diagnosis ranked, best first."""
     from grounded.errors import GroundedError
     from grounded_trials.workspace.diagnosing import read_diagnosis
 
@@ -62,7 +62,7 @@ def effects(ctx: click.Context, param: click.Parameter, incomplete: str) -> list
 
 
 def examples(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """The names of the examples."""
+    """Complete the names of the examples."""
     from grounded_trials.starting.examples import EXAMPLES
 
     return [
@@ -73,7 +73,7 @@ def examples(ctx: click.Context, param: click.Parameter, incomplete: str) -> lis
 
 
 def commands(table: dict[str, tuple[str, str]], incomplete: str) -> list[CompletionItem]:
-    """The commands of a lazy group, none of them imported."""
+    """Complete the commands of a lazy group without importing them."""
     return [
         CompletionItem(name, help=text)
         for name, (_, text) in table.items()
@@ -86,5 +86,5 @@ def _items(names: Iterable[str], incomplete: str) -> list[CompletionItem]:
 
 
 def _folder(ctx: click.Context) -> Path:
-    """The workspace that -C names, at the command or before it."""
+    """Return the workspace that -C names, at the command or before it."""
     return Path(given(ctx) or ".")

@@ -1,4 +1,4 @@
-"""grounded discard, restore: trials that should not count, and take it back."""
+"""grounded discard, restore: leave trials out of everything, or use them again."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _trials = click.argument(
 
 @click.command("discard")
 @_trials
-@click.option("--why", default="", metavar="TEXT", help="Kept with it; `status` shows it.")
+@click.option("--why", default="", metavar="TEXT", help="The reason; `status` shows it.")
 @in_workspace
 @as_json
 def command(trials: tuple[str, ...], why: str, json_: bool) -> None:
     """Set trials aside: search, fit, diagnosis and report leave them out.
 
-    Nothing is deleted: `grounded restore` takes it back. The search goes on as if they had not
+    Nothing is deleted: `grounded restore` undoes it. The search goes on as if the trials had not
     been run.
     """
     _tell(open_workspace().discard(*trials, why=why), json_)
@@ -38,7 +38,7 @@ def command(trials: tuple[str, ...], why: str, json_: bool) -> None:
 @in_workspace
 @as_json
 def restore(trials: tuple[str, ...], json_: bool) -> None:
-    """Count trials again that were discarded."""
+    """Use discarded trials again."""
     _tell(open_workspace().restore(*trials), json_)
 
 

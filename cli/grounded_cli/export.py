@@ -1,4 +1,4 @@
-"""grounded export: a candidate as a file that the robot's own program reads."""
+"""grounded export: write a candidate as a file that the robot's own program reads."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from grounded_cli import completion as complete
 from grounded_cli.options import anyway, as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import remark, show, show_json
 
-# the formats, and how a program begins with each
+# each format and how to use it
 USES = {
-    "csv": "a row a control step; the control law is in its head",
+    "csv": "one row per control step; the control law is in its head",
     "npz": "on the robot: grounded.policy.load; --runner adds a file for numpy alone",
     "bag": "a ROS 2 bag of the run: `ros2 bag play`, RViz, Foxglove, PlotJuggler",
     "json": "the control law, names and units are in it (docs/robot.md)",
@@ -26,18 +26,18 @@ USES = {
     "--format",
     "form",
     type=click.Choice(list(USES)),
-    help="Default: as FILE is named, else json. npz is what `grounded.policy.load` reads.",
+    help="Default: the extension of FILE, else json. `grounded.policy.load` reads npz.",
 )
 @click.option(
     "-o",
     "--output",
     metavar="FILE",
-    help="Default: ID.FORMAT in the current folder, with -C DIR too; `next` writes into DIR.",
+    help="Default: ID.FORMAT in the current folder, even with -C DIR; `next` writes into DIR.",
 )
 @click.option(
     "--runner",
     is_flag=True,
-    help="Write npz, and beside it grounded_runner.py, which runs it with numpy alone.",
+    help="Write npz, and beside it grounded_runner.py, which runs it and needs only numpy.",
 )
 @anyway
 @in_workspace
@@ -52,20 +52,20 @@ def command(
 ) -> None:
     """Write a candidate as csv, npz or json, with units and the time base in the file.
 
-    --format bag writes the run that it predicts as a ROS 2 bag of standard messages; a trial
-    (t0007) is written as a bag, csv or npz.
+    --format bag writes the predicted run as a ROS 2 bag of standard messages. A trial (t0007) can
+    be written as a bag, csv or npz.
 
-    `best` names the best candidate so far. One that must not be run any more (see `grounded run`)
-    is refused; one that was run in an earlier task is not, if it keeps today's [limits] and
-    [safety].
+    `best` names the best candidate so far. A candidate that must not be run any more (see
+    `grounded run`) is refused. One that was run in an earlier task is allowed if it keeps to the
+    current [limits] and [safety].
     """
     named = Path(output or "").suffix.lstrip(".").lower()
     run = candidate.startswith("t") or form == "bag"
     if form is not None and named in USES and named != form:
-        raise click.UsageError(f"-o {output} is named as {named}, --format says {form}")
+        raise click.UsageError(f"-o {output} has the extension {named}, but --format is {form}")
     done = open_workspace().export(candidate, output, form=form, runner=runner, anyway=anyway)
     for reason in done.overridden:
-        remark("warning", f"{done.candidate} is exported all the same: {reason}")
+        remark("warning", f"{done.candidate} is exported anyway: {reason}")
     for note in done.notes:
         remark("note", note)
     if json_:
@@ -73,7 +73,7 @@ def command(
     else:
         show(f"{done.candidate} is written to {done.file}")
         if run and done.format != "bag":
-            show("  a column a state and input, a row a control step, t in seconds")
+            show("  one column per state and input, one row per control step, t in seconds")
         elif done.runner is None:
             show(f"  {USES[done.format]}")
         else:

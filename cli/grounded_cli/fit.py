@@ -1,4 +1,4 @@
-"""grounded fit: the model's parameters from all trials, with intervals."""
+"""grounded fit: estimate the model's parameters from all trials, with intervals."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from grounded.model import Model
 
 STANDS_IN = (
-    "numbers fitted alone also stand in for what the equations lack (a mass for a friction): "
-    "`grounded diagnose` tells the two apart, on the same trials"
+    "fitted parameters can also compensate for effects that the equations lack (a mass for a "
+    "friction): `grounded diagnose` separates the two, on the same trials"
 )
 
 
@@ -31,9 +31,9 @@ STANDS_IN = (
 def command(params: str | None, latency: bool, apply_: bool, engine: Engine, json_: bool) -> None:
     """Estimate parameters by maximum likelihood of the trials, noise included.
 
-    What the sensors show (a delay, a filter of speeds, degrees) is corrected first, as `diagnose`
-    does. Prediction errors are measured on a quarter of the time that the fit has not seen; values
-    that predict it worse are never written.
+    Sensor faults (a delay, filtered speeds, degrees) are corrected first, as in `diagnose`.
+    Prediction errors are measured on a held-out quarter of the time; values that predict it worse
+    are never written.
     """
     workspace = open_workspace()
     from grounded.diagnosis.tables import instrument_lines
@@ -42,7 +42,7 @@ def command(params: str | None, latency: bool, apply_: bool, engine: Engine, jso
     names = names_in(params) or None
     if params is not None and names is None:
         raise GroundedError(
-            "--params names no parameter: expected some, like a1,L; leave it out to fit all"
+            "--params names no parameter: expected names such as a1,L; omit it to fit all"
         )
     with stages() as tell:
         done = workspace.fit(names, latency=latency, apply=apply_, engine=engine, progress=tell)
@@ -63,7 +63,7 @@ def command(params: str | None, latency: bool, apply_: bool, engine: Engine, jso
         remark("note", STANDS_IN)
         show("\nto write the values to grounded.toml, add --apply")
     else:
-        show("\nnothing was written: these values don't lower the held-out errors by 1 %")
+        show("\nnothing was written: these values don't reduce the held-out errors by 1 %")
     show(next_line(done.then))
 
 

@@ -1,4 +1,4 @@
-"""grounded ingest, next: take in what came back from the real system, and go on."""
+"""grounded ingest, next: store logs of the real system, and go on from them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 CLOCKS = {"header": "header stamps", "log": "log times", "publish": "publish times"}
 AGAIN = "run again"  # a verdict
-# what a verdict means for the search
+# verdict -> what it means for the search
 VERDICTS = {
     "first": ": what the search improves on",
     "better": ": the best so far",
@@ -29,7 +29,7 @@ VERDICTS = {
     "crashed": ": it did not run to the end",
     "waiting": ": more trials of it are needed ([search] repeats)",
     "in doubt": ": it may be bad luck, the best so far is run once more",
-    "probe": ", for the diagnosis: the search leaves it out",
+    "probe": ", for the diagnosis: the search ignores it",
     "set aside": ": it does not count",
     AGAIN: ": the candidate counts with the mean of its runs",
 }
@@ -46,9 +46,9 @@ VERDICTS = {
 def command(files: tuple[str, ...], candidate: str | None, data: bool, json_: bool) -> None:
     """Check, resample and store trials: MCAP files or bag folders.
 
-    A file that was stored before is a success that says which trial it is. Trials that grounded
-    wrote are taken as they are; other logs are mapped by the [log] table (`grounded inspect LOG`
-    prints one).
+    Ingesting a file again succeeds and names the trial it is stored as. Trials written by grounded
+    are stored unchanged; other logs are mapped by the [log] table (`grounded inspect LOG` prints
+    one).
     """
     workspace = open_workspace()
     done = []
@@ -71,10 +71,10 @@ def command(files: tuple[str, ...], candidate: str | None, data: bool, json_: bo
 @in_workspace
 @as_json
 def following(log: str, candidate: str | None, json_: bool) -> None:
-    """Ingest what came back, say the verdict, propose, and export for the robot.
+    """Ingest a log, show the verdict, propose, and export for the robot.
 
-    The same as `ingest LOG`, `propose` and `export ID --runner` one after the other; the candidate
-    is written into the workspace's folder.
+    Does the same as `ingest LOG`, `propose` and `export ID --runner`; the candidate is written into
+    the workspace's folder.
     """
     from grounded_cli.propose import tell_proposed
 
@@ -97,7 +97,7 @@ def following(log: str, candidate: str | None, json_: bool) -> None:
 
 
 def _best(workspace: Workspace, one: Ingested) -> Tried | None:
-    """Who is best with a log that may have changed it without being better itself."""
+    """Return the best candidate after a repeated run, which may have changed it; else None."""
     if one.verdict != AGAIN:
         return None
     from grounded_trials.workspace.proposing import standing_in
@@ -143,15 +143,15 @@ def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
             for clock in dict.fromkeys(s.clock for s in one.signals)
         }
         clocks = listed(CLOCKS[clock] + names * (len(own) > 1) for clock, names in own.items())
-        skewed = "; skew: stamp minus log time, below 0 where it was recorded after its stamp"
+        skewed = "; skew: stamp minus log time, negative if recorded after its stamp"
         sentence(f"  Hz, jitter, gap: by {clocks}{skewed * any(s.skew_s for s in one.signals)}")
 
 
 def _earlier(one: Ingested) -> str:
-    """That other runs than this one crashed; "" where this one did, or none."""
+    """Return a text if other runs of the candidate crashed but this one did not; else ""."""
     if not one.crashed or one.trial in one.crashed:
         return ""
     return (
-        f": this run came to its end, but {listed(one.crashed)} did not, and one such run fails "
-        "the candidate (`discard` takes out a run that somebody stopped)"
+        f": this run completed, but {listed(one.crashed)} did not, and one incomplete run fails "
+        "the candidate (`discard` removes a run that somebody stopped)"
     )

@@ -1,4 +1,4 @@
-"""grounded init: a workspace from a log of your robot, from a model alone, or from an example."""
+"""grounded init: make a workspace from a log of your robot, from a model, or from an example."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from grounded_trials.logs.inspect_guess import Guess
     from grounded_trials.starting.begin import Begun
 
-FEW = 8  # numbers of a log that are named for one that is missing
+FEW = 8  # alternative signals listed for an unsure state or input
 
 
 @click.command("init")
@@ -40,7 +40,7 @@ FEW = 8  # numbers of a log that are named for one that is missing
 @click.option("--blank", is_flag=True, help="No log yet: a workspace of --model, to fill in.")
 @click.option(
     "--kind",
-    help="Of the model skeleton: car, rover, differential, balance, drone, arm, pendulum, crane, "
+    help="Kind of model skeleton: car, rover, differential, balance, drone, arm, pendulum, crane, "
     "generic.",
 )
 @click.option("--inputs", metavar="A,B,...", help="Columns that are inputs (kind generic).")
@@ -50,7 +50,7 @@ FEW = 8  # numbers of a log that are named for one that is missing
     metavar="SECONDS",
     help="Control interval (the log's; 0.05 with --blank).",
 )
-@click.option("--yes", is_flag=True, help="Ask nothing: take the best guesses, marked as such.")
+@click.option("--yes", is_flag=True, help="Ask nothing: use the best guesses, marked as such.")
 @click.option(
     "--example",
     "name",
@@ -75,24 +75,24 @@ def command(
 ) -> None:
     """Make a workspace in DIR: grounded.toml, model.py, target.csv, trials/, candidates/.
 
-    --from LOG finds the model's states and inputs in a log and says why; without --model it writes
-    a model skeleton of the kind of robot that the log shows. --blank --model FILE needs no log and
-    writes drive.py, the robot's program. --example NAME takes an example, whose real.py stands in
-    for your robot.
+    --from LOG finds the model's states and inputs in a log and says why it chose them; without
+    --model it also writes a model skeleton for the kind of robot in the log. --blank --model FILE
+    needs no log and writes drive.py, the robot's program. --example NAME copies an example, whose
+    real.py simulates the robot.
     """
     sorts = (("--kind", kind), ("--inputs", inputs), ("--yes", yes))
     if list_:
         _list(json_)
     elif folder is None or [log is not None, name is not None, blank].count(True) != 1:
         raise click.UsageError(
-            "give a folder and a log, grounded init DIR --from run1.mcap, or an example, grounded "
-            "init DIR --example car-turn (`grounded init --list` names them), or a model alone, "
-            "grounded init DIR --blank --model model.py"
+            "expected a folder and one source: a log, grounded init DIR --from run1.mcap; an "
+            "example, grounded init DIR --example car-turn (`grounded init --list` names them); or "
+            "a model alone, grounded init DIR --blank --model model.py"
         )
     elif foreign := [key for key, given in sorts if given and not log]:
-        raise click.UsageError(f"{foreign[0]} belongs to --from LOG")
+        raise click.UsageError(f"{foreign[0]} only works with --from LOG")
     elif name is not None and (model or dt):
-        raise click.UsageError("an example brings its own model and dt: edit its files afterwards")
+        raise click.UsageError("an example has its own model and dt: edit its files afterwards")
     elif blank:
         _blank(folder, model, dt, json_)
     elif log is not None:
@@ -110,7 +110,7 @@ def command(
 
 
 def _ask(guess: Guess) -> str:
-    """Asks which signal a state or input is."""
+    """Ask the user which signal of the log is a state or input; return its path, "" for none."""
     paths = [p for p in (guess.path, *guess.others) if p]
     show(f"\n{guess.name} {'is unsure' if guess.path else 'was not found'}")
     for reason in guess.reasons:
@@ -174,11 +174,11 @@ def _blank(folder: str, model: str | None, dt: float | None, json_: bool) -> Non
         return
     show(f"{folder} is a workspace for the model of {model}. Yours to fill in:")
     show("  grounded.toml  dt, start, the input held before it, weights, limits")
-    show("  target.csv     what the states are to do")
+    show("  target.csv     the desired states over time")
     show("  drive.py       measure() and send() of your robot")
     if held := made.config.task.start:
         told = ", ".join(f"{name} = {value:.6g}" for name, value in held.items())
-        sentence(f"{told} holds the model at zero: [task] start has it as held before the run")
+        sentence(f"{told} holds the model at zero: [task] start sets it as the input before a run")
     where = f"cd {shlex.quote(folder)} && " * (folder != ".")
     show(f"\nnext: edit these, then {where}grounded propose")
 

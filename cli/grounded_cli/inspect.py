@@ -1,4 +1,4 @@
-"""grounded inspect: what is in a log, what it is, and a [log] table for it."""
+"""grounded inspect: show the contents of a log, and a [log] table for it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from grounded_trials.logs.inspect_log import FieldReport, TopicReport
     from grounded_trials.workspace.inspecting import Inspected
 
-MANY = 9  # constants of one array, as of an IMU's smallest covariance: they are one line
+MANY = 9  # constant fields of one array (an IMU's covariance has 9) that are folded into one line
 
 
 @click.command("inspect")
@@ -26,8 +26,8 @@ MANY = 9  # constants of one array, as of an IMU's smallest covariance: they are
 def command(log: str, json_: bool) -> None:
     """Show topics, types, rates and fields of a log, and a ready-made [log] table.
 
-    The table is guessed for the states and inputs of the workspace; `unsure` marks what to look at.
-    It is left out for files of grounded's own, for damaged ones, and outside a workspace.
+    The table is guessed for the states and inputs of the workspace; `unsure` marks lines to check.
+    There is no table for files written by grounded, for damaged files, and outside a workspace.
     """
     from grounded_trials.workspace.folder import Folder
     from grounded_trials.workspace.inspecting import inspect_in
@@ -74,7 +74,7 @@ def _tell(topic: TopicReport) -> None:
 
 
 def _rows(fields: Sequence[FieldReport]) -> list[tuple[str, str, str]]:
-    """A line a field; the many constants of one array, a covariance's say, are one line."""
+    """Return a row per field; the constants of one array (a covariance, say) share one row."""
     arrays: dict[str, list[FieldReport]] = {}
     for one in fields:
         array = one.path.rpartition("[")[0]
@@ -94,7 +94,7 @@ def _rows(fields: Sequence[FieldReport]) -> list[tuple[str, str, str]]:
 
 
 def _what(found: Inspected) -> str:
-    """What a file is, where it says so itself."""
+    """Describe what a file is, if it says so itself; else ""."""
     from grounded_trials.store.own_files import CANDIDATE, TRIAL
 
     damaged = ["DAMAGED"] * bool(found.report.damage)
@@ -107,7 +107,7 @@ def _what(found: Inspected) -> str:
 
 
 def _next(found: Inspected) -> str:
-    """What to do with the file."""
+    """Return the lines that say what to do with the file."""
     from grounded_trials.store.own_files import TRIAL
 
     if found.log_table:

@@ -1,4 +1,4 @@
-"""grounded run, learn: a candidate on the [system], once or until the search ends."""
+"""grounded run, learn: run candidates on the [system], once or until the search ends."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 def run(candidate: str | None, anyway: bool, json_: bool) -> None:
     """Run the candidate on [system] and write a trial file for `grounded ingest`.
 
-    CANDIDATE is the outstanding one by default; any candidate, `best` too, may be run again (its
-    utilities are averaged). It is refused if its file was rewritten, or if [limits], [safety], the
+    CANDIDATE defaults to the outstanding one. Any candidate may be run again, also `best`; its
+    utilities are averaged. It is refused if its file was rewritten, or if [limits], [safety], the
     task or the model changed so that it must not be run any more.
     """
     workspace = open_workspace()
@@ -51,7 +51,7 @@ def run(candidate: str | None, anyway: bool, json_: bool) -> None:
 @in_workspace
 @as_json
 def command(trials: int | None, json_: bool) -> None:
-    """Propose, run and ingest until the search ends; stopped at any moment, it can go on."""
+    """Propose, run and ingest until the search ends; it can be interrupted and resumed."""
     status = narrated(open_workspace(), trials)
     if json_:
         show_json(status.to_json())
@@ -61,7 +61,7 @@ def command(trials: int | None, json_: bool) -> None:
 
 
 def narrated(workspace: Workspace, trials: int | None = None) -> Status:
-    """Learns, with a line for each trial."""
+    """Run the learning loop and print a line for each trial."""
     with stages() as tell:
 
         def each(candidate: Candidate, found: Ingested) -> None:

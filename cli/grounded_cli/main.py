@@ -1,9 +1,9 @@
-"""grounded: the command. Commands are imported when they are called; errors become exit codes.
+"""The `grounded` command: imports each command when it is called, turns errors into exit codes.
 
     0 done      1 failed, with one clear message      2 usage      3 done with loss, saying what
 
-A GroundedError is the user's to mend and is printed as a sentence; any other exception is a mistake
-of ours and keeps its traceback.
+A GroundedError is something the user can fix and is printed as one message. Any other exception is
+a bug in grounded and keeps its traceback.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from contextlib import suppress
 from io import StringIO, TextIOWrapper
 from typing import TYPE_CHECKING, Any, NoReturn
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads only cost start-up
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads only slow start-up
 
 import click
 
@@ -33,37 +33,37 @@ COMMANDS = {
     "target": ("target", "Draw the manoeuvre: line, circle, figure-8, step, swing-up, a run."),
     "propose": ("propose", "Say what to run next and write its candidate file."),
     "run": ("learn", "Run the candidate on the system of grounded.toml."),
-    "ingest": ("ingest", "Take in what came back: check, resample, store."),
+    "ingest": ("ingest", "Check, resample and store the log of a run."),
     "next": ("ingest", "Ingest a log, propose, and export for the robot, in one go."),
     "discard": ("discard", "Set a trial aside; nothing is deleted."),
-    "restore": ("discard", "Take back what discard did."),
+    "restore": ("discard", "Use a discarded trial again."),
     "learn": ("learn", "Propose, run and ingest until the search ends."),
     "status": ("status", "Show where the search stands."),
-    "report": ("report", "Show what all trials say: text, page, pictures, recording."),
+    "report": ("report", "Summarise all trials: text, page, pictures, recording."),
     "view": ("report", "Open the recording in Rerun."),
     "fit": ("fit", "Estimate the model's parameters from all trials."),
-    "diagnose": ("diagnose", "Find where the model is wrong, and which effect makes it so."),
+    "diagnose": ("diagnose", "Find where the model is wrong, and which effect explains it."),
     "adopt": ("adopt", "Add a diagnosed effect to the model."),
     "inspect": ("inspect", "Show what is in a log and guess its [log] table."),
-    "recover": ("recover", "Save what can be saved of a damaged log."),
+    "recover": ("recover", "Recover what is readable in a damaged log."),
     "export": ("export", "Write a candidate for the robot: csv, npz or json."),
     "verify": ("status", "Check every stored file against its hash."),
     "demo": ("studies.demo", "Run a whole example in a new folder: learn, diagnose, report."),
-    "experiment": ("studies.experiment", "Run the paper's studies again."),
+    "experiment": ("studies.experiment", "Reproduce the paper's studies."),
     "challenge": ("studies.challenge", "Make, diagnose and score blind cases for the diagnosis."),
     "completion": ("completion", "Print the shell's completion script."),
 }
 
 
 class LazyGroup(click.Group):
-    """Imports a command's module when it is called, so that `--help` and start-up stay quick."""
+    """A group that imports a command's module when it is called, so that start-up stays fast."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Names, in the order of use."""
+        """Return the command names, in the order of use."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
-        """The command of a name, imported now."""
+        """Import and return the command with this name."""
         if name not in COMMANDS:
             return None
         module = importlib.import_module(f"grounded_cli.{COMMANDS[name][0]}")
@@ -73,7 +73,7 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Adds the nearest name to an unknown command's message."""
+        """Suggest the nearest name for an unknown command."""
         name = args[0]
         if name in COMMANDS or name.startswith("-"):
             return super().resolve_command(ctx, args)
@@ -82,7 +82,7 @@ class LazyGroup(click.Group):
         ctx.fail(f"no command '{name}': {nearest(name, COMMANDS)}")
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Runs a command; an error's text ends with the command that mends it, as typed here."""
+        """Run a command; append the command to type next to the message of a GroundedError."""
         try:
             return super().invoke(ctx)
         except Exception as error:
@@ -96,14 +96,14 @@ class LazyGroup(click.Group):
             raise GroundedError(f"{placed(str(error))}{then}") from None
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Names for the TAB key without importing any command."""
+        """Complete command names without importing any command."""
         from grounded_cli.completion import commands
 
         options = click.Command.shell_complete(self, ctx, incomplete)
         return [*commands(COMMANDS, incomplete), *options]
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The list of commands without importing any."""
+        """List the commands without importing any."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
 
@@ -120,10 +120,10 @@ def cli() -> None:
 
 
 def main() -> NoReturn:
-    """Runs the command line and exits with its code."""
-    atexit.register(gc.freeze)  # a process that is over needs no search for cycles, 30 ms long
+    """Run the command line and exit with its code."""
+    atexit.register(gc.freeze)  # saves the 30 ms garbage collection at exit
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # a terminal that lacks a character shows "?"
+        if isinstance(stream, TextIOWrapper):  # show "?" for characters the encoding lacks
             stream.reconfigure(errors="replace")
     try:
         code, words = _run()
@@ -133,19 +133,19 @@ def main() -> NoReturn:
             say(words)
         if sys.stdout is not None:
             sys.stdout.flush()
-    except BrokenPipeError:  # nobody reads any more, as after `| head`
+    except BrokenPipeError:  # the reader has gone, as after `| head`
         code = 0
         _silence()
     except OSError as error:
         code = 1
         with suppress(OSError):
-            sys.stderr.write(f"error: the output can't be written: {error.strerror}\n")
+            sys.stderr.write(f"error: cannot write the output: {error.strerror}\n")
         _silence()
     sys.exit(code)
 
 
 def _run() -> tuple[int, str]:
-    """The exit code of the command, and what to say at its end."""
+    """Run the command; return its exit code and a final message."""
     stdout = sys.stdout
     try:
         code = cli.main(standalone_mode=False, prog_name="grounded")
@@ -157,9 +157,9 @@ def _run() -> tuple[int, str]:
         return error.exit_code, text.getvalue().rstrip()
     except (click.Abort, KeyboardInterrupt) as error:
         found = str(error.__cause__ or "") and f"{error.__cause__}\n"
-        return 130, f"{found}interrupted; what was stored is safe, run the same command again"
+        return 130, f"{found}interrupted; stored data is safe, run the same command again"
     except SystemExit:
-        if sys.stdout is not stdout:  # click has seen a closed pipe, and would end with 1
+        if sys.stdout is not stdout:  # click found a closed pipe, and would exit with 1
             raise BrokenPipeError from None
         raise
     except Exception as error:
@@ -176,10 +176,10 @@ def _run() -> tuple[int, str]:
 
 
 def _silence() -> None:
-    """What is still to be written goes nowhere: Python would complain of it at its end."""
+    """Discard output still buffered, or Python would report an error at exit."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError, AttributeError):  # closed, or none of the system's
+        with suppress(OSError, ValueError, AttributeError):  # closed, or without a descriptor
             os.dup2(nowhere, stream.fileno())
 
 

@@ -1,4 +1,4 @@
-"""Options that commands share, the workspace that they name, and the command to type next."""
+"""Options that commands share, opening the workspace of -C, and formatting the next command."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from grounded_trials import Workspace
 
 F = TypeVar("F", bound=Callable[..., Any])
-# the commands that are about no workspace: they are printed without -C
+# commands that use no workspace: they are printed without -C
 ELSEWHERE = frozenset({"init", "recover", "demo", "experiment", "challenge", "completion"})
 _KEY = "grounded_cli.folder"
 _NAMED = re.compile(r"`grounded ([a-z][^`]*)`")
 
 
 def in_workspace(function: F) -> F:
-    """Adds -C DIR, at the group or at a command; `given` says what it named."""
+    """Add the option -C DIR to the group or a command; `given` returns its value."""
     return click.option(
         "-C",
         metavar="DIR",
@@ -40,28 +40,28 @@ def _remembered(ctx: click.Context, option: click.Parameter, folder: str | None)
 
 
 def given(ctx: click.Context | None = None) -> str | None:
-    """The folder as -C named it, None where it was not given.
+    """Return the folder of -C, or None if it was not given.
 
     Args:
-        ctx: the command's; None: the one that runs.
+        ctx: the command's context; None: that of the running command.
     """
     ctx = ctx or click.get_current_context(silent=True)
     return None if ctx is None else ctx.meta.get(_KEY)
 
 
 def as_json(function: F) -> F:
-    """Adds --json; passed as `json_`."""
+    """Add the option --json, passed as `json_`."""
     return click.option("--json", "json_", is_flag=True, help="Print one JSON document.")(function)
 
 
 def anyway(function: F) -> F:
-    """Adds --anyway, for commands that hand a candidate over."""
-    text = "Hand the candidate over though [limits], [safety], task or model changed since."
+    """Add the option --anyway, for commands that hand a candidate over."""
+    text = "Hand the candidate over even if [limits], [safety], task or model changed since."
     return click.option("--anyway", is_flag=True, help=text)(function)
 
 
 def parallel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds the options of a command with independent pieces; passed as `engine`."""
+    """Add the options of a command that can run in parallel, passed as `engine`."""
 
     @functools.wraps(function)
     def call(*args: Any, jobs: int, engine: str, address: str | None, **others: Any) -> Any:
@@ -90,10 +90,10 @@ def parallel(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def open_workspace() -> Workspace:
-    """The workspace that -C names, at the command or before it.
+    """Open the workspace that -C names, at the command or before it.
 
     Raises:
-        GroundedError: if its grounded.toml is missing or wrong.
+        GroundedError: if its grounded.toml is missing or invalid.
     """
     from grounded_trials import Workspace
 
@@ -101,11 +101,11 @@ def open_workspace() -> Workspace:
 
 
 def typed(then: NextCommand, folder: str | None = None) -> str:
-    """A command as it works from where the user is.
+    """Format a command so that it works from the user's current folder.
 
     Args:
         then: the command.
-        folder: a workspace to name; None: the one that -C named.
+        folder: the workspace for its -C; None: that of the -C given to this command.
     """
     if folder is None and then.verb not in ELSEWHERE:
         folder = given()
@@ -113,12 +113,12 @@ def typed(then: NextCommand, folder: str | None = None) -> str:
 
 
 def placed(text: str) -> str:
-    """A sentence whose commands, `grounded VERB ...`, are as they work from where the user is."""
+    """Add -C DIR to the commands in a text (`grounded VERB ...`) if it was given to this one."""
 
     def as_typed(found: re.Match[str]) -> str:
         try:
             verb, *arguments = shlex.split(found[1])
-        except ValueError:  # an odd quote, in what a stranger's file says
+        except ValueError:  # an unbalanced quote, in text from an untrusted file
             return found[0]
         return f"`{typed(NextCommand(verb, tuple(arguments)))}`"
 
@@ -126,5 +126,5 @@ def placed(text: str) -> str:
 
 
 def next_line(then: NextCommand, folder: str | None = None) -> str:
-    """The last line of an output: the command to type next, see `typed`."""
+    """Return the last line of an output, `next: ...`, with the command to type next."""
     return folded(typed(then, folder))

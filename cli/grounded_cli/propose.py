@@ -1,4 +1,4 @@
-"""grounded propose: what to run next, what it will do, and whether to trust it."""
+"""grounded propose: show what to run next, what it will do, and whether to trust it."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.proposing import Proposed
 
 
-MOST = 3  # target states whose range is told
-ENDS = 8  # states whose values at the end are told: a table of more says nothing
-LAST = 3  # predictions whose misses are told
-LUCKY = 2.0  # standard errors
-NOISY = 0.1  # of a promised cost: how much of noise in its log is told
-MUCH = 0.2  # of what the best one costs: sensors' noise that is told
-MISSED = 0.5  # of a run's cost: a model off by more doesn't know what is left to gain
-ASTRAY = 3.0  # times what a run cost: a model that gives it so much does not replay it
+MOST = 3  # target states whose range is shown at most
+ENDS = 8  # final values are shown for models with at most this many states
+LAST = 3  # number of recent predictions whose errors are shown
+LUCKY = 2.0  # standard errors within which a difference counts as scatter
+NOISY = 0.1  # share of the predicted cost above which the cost of sensor noise is shown
+MUCH = 0.2  # share of the best cost above which its part due to sensor noise is shown
+MISSED = 0.5  # share of a run's cost: a model off by more cannot say what is left to gain
+ASTRAY = 3.0  # a model that predicts more than this times a run's cost does not replay it
 
 
 @click.command("propose")
 @in_workspace
 @as_json
 def command(json_: bool) -> None:
-    """Say what to run next and write its candidate file.
+    """Show what to run next and write its candidate file.
 
-    The outstanding candidate is named again while its trial is missing. Nothing is proposed once
+    The outstanding candidate is shown again while its trial is missing. Nothing is proposed once
     the search has ended.
     """
     workspace = open_workspace()
@@ -54,7 +54,13 @@ def command(json_: bool) -> None:
 
 
 def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True) -> None:
-    """Says what to run next; `last`: and the command after that."""
+    """Print what to run next.
+
+    Args:
+        workspace: the workspace.
+        proposed: the result of `Workspace.propose`.
+        last: whether to end with the next command.
+    """
     standing, candidate = proposed.standing, proposed.candidate
     for note in proposed.proposal.notes:
         remark("note", note)
@@ -80,26 +86,29 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
 
 
 def _predicted(proposed: Proposed) -> str:
-    """The promise, and what a log of it is likely to show where sensors' noise costs much."""
+    """Return the predicted utility, and that expected in its log if sensor noise costs much."""
     assert proposed.candidate is not None
     promised, cost = proposed.candidate.predicted_utility, proposed.noise_cost
     text = f"utility {number(promised)}"
     if not cost > NOISY * abs(promised):
         return text
-    return f"{text}; about {number(promised - cost)} in its log, where sensors' noise counts, too"
+    return f"{text}; about {number(promised - cost)} in its log, including sensor noise"
 
 
 def _otherwise(candidate: Candidate, best: Tried) -> bool:
-    """Whether the model gives the best one, on which this one is based, clearly something else."""
+    """Return whether the model's utility of the base, the best one, clearly differs from its runs'.
+
+    False for a candidate that is not based on the best one.
+    """
     return candidate.base == best.candidate.id and candidate.unlike(best.utility)
 
 
 def _so_far(candidate: Candidate, best: Tried, task: Task) -> str:
-    """The best one's utility; beside it what the model gives it, and why, as far as that is known.
+    """Return the best one's utility and, if it differs clearly, what the model gives it and why.
 
-    The model's own run of it starts at s_0: what that is worth is known where its runs began
-    elsewhere by more than their sensors' noise, and so is the scatter of its runs once something
-    near it was repeated. What is left, the model does not replay. What is told adds up.
+    The difference is split into two parts: the start (the model's own run starts at s_0, the real
+    ones elsewhere, if by more than sensor noise), and the rest, which is compared with the scatter
+    of its runs if that is known. The parts shown add up to the difference.
     """
     from grounded_trials.workspace.off_target import began_elsewhere
 
@@ -108,31 +117,31 @@ def _so_far(candidate: Candidate, best: Tried, task: Task) -> str:
         return text
     same, told = candidate.expected_of_base, UNLIKE * abs(candidate.predicted_gain)
     if same < ASTRAY * best.utility:
-        return f"{text}, which the same model does not replay: it gives {number(same)}"
-    text = f"{text}, to which the same model gives {number(same)}"
+        return f"{text}, which the same model does not reproduce: it predicts {number(same)}"
+    text = f"{text}, for which the same model predicts {number(same)}"
     if not math.isfinite(candidate.base_as_run):
         return text
     elsewhere, why = began_elsewhere(task, best.trials), []
     start = same - candidate.base_as_run if elsewhere else 0.0
     if abs(start) > told:
-        where = f"elsewhere than [task] start in {listed(elsewhere)}"
-        why.append(f"{_dearer(start)} because its runs began {where}")
+        where = f"away from [task] start in {listed(elsewhere)}"
+        why.append(f"{_dearer(start)} because the real runs began {where}")
     else:
         start = 0.0
     rest, known = same - start - best.utility, math.isfinite(best.standard_error)
     if abs(rest) > told and (known or why):
         within = abs(rest) <= LUCKY * best.standard_error
-        lucky = "within the scatter of its runs" if within else "more than its runs scatter"
-        unknown = "and how far its runs scatter is not known"
-        why.append(f"{_dearer(rest)} that it does not explain, {lucky if known else unknown}")
+        lucky = "within the scatter of the runs" if within else "more than the runs scatter"
+        unknown = "and how far the runs scatter is not known"
+        why.append(f"{_dearer(rest)} without explanation, {lucky if known else unknown}")
     return f"{text}: the model's run costs {', and '.join(why)}" if why else text
 
 
 def noise_share(best: Tried) -> str:
-    """How much of what the best one costs no policy takes away, where it is much; else ""."""
+    """Return how much of the best one's cost is sensor noise, if it is much; else ""."""
     if not best.noise_cost > MUCH * -best.utility:
         return ""
-    return f", about {number(min(best.noise_cost, -best.utility))} of it noise of the sensors"
+    return f", about {number(min(best.noise_cost, -best.utility))} of it sensor noise"
 
 
 def _dearer(gain: float) -> str:
@@ -140,35 +149,35 @@ def _dearer(gain: float) -> str:
 
 
 def _what(candidate: Candidate, standing: Standing, task: Task) -> str:
-    """Where a candidate comes from."""
+    """Describe how a candidate was made."""
     seconds = f"{task.horizon * task.dt:g} s"
     if candidate.way == "own plan":
-        return f"the changed model's own plan, in place of a step from {candidate.base}, {seconds}"
+        return f"the changed model's own plan, instead of a step from {candidate.base}, {seconds}"
     if candidate.way == "gentler gains":
         share = _gain(candidate) / next(
             _gain(t.candidate) for t in standing.history if t.candidate.id == candidate.base
         )
         return (
-            f"{candidate.base} with gains of {percent(share)}: its feedback swung the inputs to "
-            f"and fro, {seconds}"
+            f"{candidate.base} with its gains reduced to {percent(share)}: its feedback made the "
+            f"inputs oscillate, {seconds}"
         )
     if candidate.base:
         step = Step(candidate.damping, candidate.alpha)
-        by = ", by slopes that the trials corrected" * bool(candidate.slopes)
+        by = ", with derivatives corrected by the trials" * bool(candidate.slopes)
         return f"iteration {candidate.iteration}: {step} from {candidate.base}{by}, {seconds}"
-    crashes = round(candidate.caution)  # of a first policy
-    gently = f", designed more gently after {count(crashes, 'crash', 'crashes')}" * bool(crashes)
+    crashes = round(candidate.caution)  # crashes of earlier first policies
+    gently = f", made gentler after {count(crashes, 'crash', 'crashes')}" * bool(crashes)
     return f"the model's own policy{gently}, {seconds}"
 
 
 def _gain(candidate: Candidate) -> float:
-    """The mean size of the feedback's gains."""
+    """Return the mean absolute feedback gain."""
     gain = candidate.policy.gain
     return 0.0 if gain is None else float(abs(gain).mean())
 
 
 def show_extent(candidate: Candidate, task: Task) -> None:
-    """Shows where a candidate's predicted run goes."""
+    """Print where a candidate's predicted run goes."""
     rows = _extent(candidate, task)
     width = max(LABEL, *(len(name) for name, _ in rows))
     for name, text in rows:
@@ -176,7 +185,7 @@ def show_extent(candidate: Candidate, task: Task) -> None:
 
 
 def _extent(candidate: Candidate, task: Task) -> list[tuple[str, str]]:
-    """Where the predicted run goes, and how much of the inputs it uses."""
+    """Return (label, text) rows: ranges of the main states, ranges of inputs, the end."""
     model, rows = task.model, []
     for name in _told(task):
         values = candidate.predicted_states[:, model.state_names.index(name)]
@@ -193,7 +202,7 @@ def _extent(candidate: Candidate, task: Task) -> list[tuple[str, str]]:
 
 
 def _end(candidate: Candidate, task: Task) -> str:
-    """Where the predicted run ends, of a task that is to get somewhere; "" of others."""
+    """Return where the predicted run ends if the task has an aim at its end; else ""."""
     from grounded_trials.workspace.off_target import reaches
 
     model, last, aim = task.model, candidate.predicted_states[-1], task.target[-1]
@@ -207,7 +216,7 @@ def _end(candidate: Candidate, task: Task) -> str:
 
 
 def _told(task: Task) -> list[str]:
-    """The states that say where a run goes: the position; else those of [safety] and a target."""
+    """Return the states whose range is shown: the position; else those in [safety] or a target."""
     model, position = task.model, task.model.roles.get("position", ())
     where = [position] if isinstance(position, str) else list(position)
     if found := [name for name in where if name in model.states]:
@@ -221,7 +230,7 @@ def _told(task: Task) -> list[str]:
 
 
 def _span(low: float, high: float) -> str:
-    """From the lowest to the highest value, to a hundredth, or a millionth where all are small."""
+    """Format a range with two decimals, or up to six where all values are small."""
     size = max(abs(low), abs(high))
     if size < 0.5e-6:
         return "0"
@@ -230,9 +239,9 @@ def _span(low: float, high: float) -> str:
 
 
 def _trust(candidate: Candidate, standing: Standing, workspace: Workspace) -> str:
-    """How predictions came true, and whether this one's gain is more than they missed by.
+    """Return how far recent predictions were off, and whether the promised gain exceeds that.
 
-    Before a run has tested the model that plans now: what it was compared with.
+    If no run has tested the current model yet, return what it was compared with instead.
     """
     ran = [tried for tried in standing.history if tried.utilities]
     same = [tried for tried in ran if tried.candidate.model == workspace.planner.fingerprint]
@@ -242,24 +251,24 @@ def _trust(candidate: Candidate, standing: Standing, workspace: Workspace) -> st
     if ran:
         since = "the model was changed since the last run"
         if not measured:
-            return f"unknown: {since}, none has tested it as it is now"
+            return f"unknown: {since}, and no run has tested it since"
         return f"{since}: {measured}; no run has tested its plans yet"
     logs = len(workspace.trials()) - sum(len(tried.trials) for tried in standing.history)
     if measured:
-        return f"{measured}, by its diagnosis; it was never tried on this manoeuvre"
+        return f"{measured}, by its diagnosis; it was never tested on this manoeuvre"
     if not logs:
         return "unknown: the crude model was never compared with the real system"
     config = workspace.config.model
     done = " and ".join(["fitted"] * bool(config.params) + ["given effects"] * bool(config.effects))
-    by = f"was {done} with" if done else "can be judged by"
+    by = f"was {done} with" if done else "can be checked against"
     return (
-        f"the model {by} {count(logs, 'log')} of data (`grounded diagnose` says how far it "
-        "predicts), but it was never tried on this manoeuvre"
+        f"the model {by} {count(logs, 'log')} of data (`grounded diagnose` shows how well it "
+        "predicts), but it was never tested on this manoeuvre"
     )
 
 
 def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) -> str:
-    """By how much the last predictions missed, beside the gain that this one promises."""
+    """Return by how much the last predictions missed, and the gain that this one promises."""
     last = sorted(same, key=lambda tried: max(trial.id for trial in tried.trials))[-LAST:]
     promises = [one.promised for one in last]
     missed = [abs(promise - one.utility) for promise, one in zip(promises, last, strict=True)]
@@ -268,7 +277,7 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     if len(missed) == 1:
         promised, real = number(promises[-1]), number(last[-1].utility)
         said = number(last[-1].candidate.predicted_utility)
-        noise = f" ({said} without its sensors' noise)" * (said != promised)
+        noise = f" ({said} without sensor noise)" * (said != promised)
         text = f"the last prediction was {promised}{noise}, the real run gave {real}"
         if failed:
             text = f"the last run failed, where {promised}{noise} was predicted"
@@ -277,7 +286,7 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     elif not whole:
         text = f"the last {failed} runs failed"
     else:
-        text = f"of the last {len(missed)} runs {failed} failed; where they did not, predictions "
+        text = f"of the last {len(missed)} runs {failed} failed; for the others, predictions "
         text += f"missed by {listed(whole)}"
     best, tried = standing.incumbent, {one.candidate.id for one in standing.history}
     if best is None or candidate.id in tried or not math.isfinite(missed[-1]):
@@ -288,17 +297,17 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     promise = f"{text}; this one promises a gain of {number(gain)}"
     if not gain < max(missed[-1], candidate.likely_off):
         return promise
-    doubt = f"{promise}, which is no more than such a miss"
+    doubt = f"{promise}, which is no more than such an error"
     blind = missed[-1] > MISSED * abs(last[-1].utility)
-    if blind or candidate.doubtful or not gain < LITTLE * abs(best.utility):  # a note may say so
+    if blind or candidate.doubtful or not gain < LITTLE * abs(best.utility):  # a note may say it
         return doubt
     return f"{doubt}: you may stop here, with {best.candidate.id}, the best so far"
 
 
 def _measured(workspace: Workspace) -> str:
-    """How far the model that plans now predicts, by the last diagnosis; "" where none says it."""
+    """Return how well the current model predicts, by the last diagnosis; "" if there is none."""
     if not (workspace.reports / "diagnosis.json").is_file():
-        return ""  # and nothing that reads one is imported
+        return ""  # avoids the imports below
     from grounded_trials.report.settled import measured_now
 
     text = measured_now(workspace)

@@ -1,4 +1,4 @@
-"""grounded recover: what can be saved of a damaged log."""
+"""grounded recover: save the readable part of a damaged log."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @click.option("-o", "--output", metavar="FILE", help="Default: LOG with -recovered in its name.")
 @as_json
 def command(log: str, output: str | None, json_: bool) -> None:
-    """Save what can be saved of a damaged MCAP file; exit 3 when something was lost.
+    """Recover what is readable in a damaged MCAP file; exit with 3 if something was lost.
 
     The damaged file is not changed.
     """
@@ -83,27 +83,27 @@ def _is_trial(found: Recovery) -> bool:
 
 
 def _steps(found: Recovery) -> str:
-    """How much of a trial of ours is there."""
+    """Describe how much of a trial written by grounded is left."""
     ran = f"of {found.candidate}" if found.candidate else "that ran no candidate"
     planned = f" of {found.planned}" if found.planned is not None else ""
     return f"{found.steps}{planned} steps of a trial {ran}{', with a hole' * found.hole}"
 
 
 def _next(found: Recovery) -> str:
-    """What to do with the file."""
+    """Return the lines that say what to do with the file."""
     from grounded.errors import NextCommand
     from grounded_trials.store.own_files import CANDIDATE
 
     target = str(found.target)
     if found.format == CANDIDATE:
         return (
-            f"a candidate is not for repair: remove {found.source}\n"
-            f"next: {typed(NextCommand('propose'))}   writes the one that is waiting again"
+            f"a damaged candidate can't be used: remove {found.source}\n"
+            f"next: {typed(NextCommand('propose'))}   writes the outstanding candidate again"
         )
     if not _is_trial(found):
         return f"next: {typed(NextCommand('inspect', (target,)))}"
     if found.hole:
-        why = "a trial with a hole can't be used: it has to be run again"
+        why = "a trial with a hole can't be used: run it again"
         again = NextCommand("run", (found.candidate,))
         return f"{why}\nnext: {typed(again)}" if found.candidate else why
     short = found.planned is None or found.steps < found.planned
@@ -111,5 +111,5 @@ def _next(found: Recovery) -> str:
         return f"next: {typed(NextCommand('ingest', (target,)))}"
     return (
         f"next: {typed(NextCommand('ingest', ('--data', target)))}   for fit and diagnose only;\n"
-        "without --data it counts as a run that failed, as one that ended early does"
+        "without --data it counts as a failed run that ended early"
     )

@@ -1,4 +1,4 @@
-"""grounded report, view: the trials as text, page, pictures, and a recording in its viewer."""
+"""grounded report, view: the trials as text, page, pictures or recording, and its viewer."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def command(html: bool, png: bool, rrd: bool, watch: bool, json_: bool) -> None:
 
 
 def _watch(workspace: Workspace) -> None:
-    """Says each time that the page was written, or why it could not be; Ctrl-C ends it."""
+    """Report each time that the page was written, or why it could not be, until Ctrl-C."""
 
     def trouble(error: GroundedError) -> None:
         remark("waiting", str(error))
@@ -69,7 +69,7 @@ def _watch(workspace: Workspace) -> None:
             trials = count(len(findings.runs) + findings.left_runs, "trial")
             show(f"{path}: {trials}{known}")
     except KeyboardInterrupt:
-        say("the page is as it was written last")
+        say("stopped; the page stays as last written")
 
 
 @click.command("view")
@@ -77,8 +77,8 @@ def _watch(workspace: Workspace) -> None:
 def view() -> None:
     """Open the recording in the Rerun viewer: paths, states, inputs, bias, trial by trial.
 
-    The file reports/recording.rrd is written first. Without a screen, copy it to a computer that
-    has one (extra `view`) and open it there: rerun recording.rrd
+    The file reports/recording.rrd is written first. If this machine has no screen, copy the file to
+    one that has (with the extra `view`) and open it there: rerun recording.rrd
     """
     workspace = open_workspace()
     from grounded_trials.report.reporting import save_recording
@@ -89,10 +89,10 @@ def view() -> None:
 
 
 def _open(path: Path) -> None:
-    """Starts the viewer and leaves it running.
+    """Start the viewer and leave it running.
 
     Raises:
-        GroundedError: if there is none, or it ends at once.
+        GroundedError: if the viewer is not installed, there is no screen, or it exits at once.
     """
     import shutil
     import subprocess
@@ -104,16 +104,16 @@ def _open(path: Path) -> None:
     program = str(beside) if beside.exists() else shutil.which("rerun")
     if program is None:
         raise GroundedError(
-            "the viewer is missing: pip install '.[view]' in grounded's own folder, then: "
-            f"rerun {path}"
+            "the viewer is not installed: run pip install '.[view]' in grounded's own folder, "
+            f"then: rerun {path}"
         )
-    # A viewer of its own that no other machine can reach: it would listen on every address.
+    # A new viewer, bound to this machine only: by default it listens on every address.
     words = [program, "--new", "--bind", "127.0.0.1", str(path)]
     viewer = subprocess.Popen(words, stdout=2, start_new_session=True)
     try:
         code = viewer.wait(timeout=2.0)
     except subprocess.TimeoutExpired:
-        viewer.returncode = 0  # it goes on without us
+        viewer.returncode = 0  # it keeps running: Popen must not warn about it
         say(f"{path} is open in the viewer")
         return
     if code != 0:

@@ -1,4 +1,4 @@
-"""grounded status, verify: where the search stands, and whether what is kept is what it was."""
+"""grounded status, verify: show where the search stands; check the stored files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LEGEND = "damp: penalty on leaving the last trial's inputs; +-: standard error"
 @in_workspace
 @as_json
 def command(json_: bool) -> None:
-    """Show where the search stands: derived from the stored trials, nothing is written."""
+    """Show where the search stands, from the stored trials; nothing is written."""
     workspace = open_workspace()
     from grounded_trials.report.settled import settled_in
     from grounded_trials.workspace.next_step import Since
@@ -51,7 +51,7 @@ def command(json_: bool) -> None:
 @in_workspace
 @as_json
 def verify(json_: bool) -> None:
-    """Check everything that is kept: changed, damaged, deleted, or put in its place."""
+    """Find stored files that were changed, damaged, deleted or replaced."""
     workspace = open_workspace()
     with progress("checking"):
         found = workspace.verify()
@@ -66,7 +66,7 @@ def verify(json_: bool) -> None:
 
 
 def summary(status: Status) -> str:
-    """The history as a table, with a line of bars and how sure the last improvement is."""
+    """Return the history as a table, the utilities as bars, and the certainty of the last gain."""
     from grounded.search.certainty import last_improvement
 
     standing, lines = status.standing, []
@@ -91,7 +91,7 @@ def summary(status: Status) -> str:
 
 
 def _gained(standing: Standing) -> str:
-    """By how much the best candidate beats the model's own policy, as the end of a sentence."""
+    """Return by how much the best candidate beats the model's own policy, as a sentence's end."""
     from grounded.search.certainty import owed_to_start
 
     best, own = standing.incumbent, standing.history[0]
@@ -104,7 +104,7 @@ def _gained(standing: Standing) -> str:
     percent = 100 / abs(own.utility)
     gain = f", {percent * (best.utility - own.utility):.1f} % better than the model's own policy"
     if start := owed_to_start(own, best, standing.history):
-        return f"{gain}; {percent * start:.1f} % by where the runs began, as the model sees it"
+        return f"{gain}; {percent * start:.1f} % is due to different start states, by the model"
     return gain
 
 

@@ -18,20 +18,24 @@ if TYPE_CHECKING:
     from grounded.model import Model
     from grounded_trials import Workspace
 
-SECONDS = 5.0  # of a step or a swing-up
-TURNS = 2.0  # of an angle: more is asked about, since it may be meant in degrees
+SECONDS = 5.0  # default duration of a step or a swing-up
+TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
 
 
 @click.command("target")
 @click.argument("shape", metavar="SHAPE|FILE")
 @click.option("--size", type=float, default=2.0, help="Length, or radius [m] (2).")
-@click.option("--speed", type=float, help="At most [m/s] (1).")
-@click.option("--accel", type=float, help="Along the path, at most [m/s^2] (1).")
-@click.option("--lateral", type=float, default=4.0, help="Across it, at most [m/s^2] (4).")
-@click.option("--laps", type=float, default=1.0, help="Of a circle or figure-8 (1).")
-@click.option("--hold", type=float, default=0.0, help="At rest at a path's end [s] (0).")
+@click.option("--speed", type=float, help="Maximum speed [m/s] (1).")
+@click.option("--accel", type=float, help="Maximum acceleration along the path [m/s^2] (1).")
+@click.option(
+    "--lateral", type=float, default=4.0, help="Maximum lateral acceleration [m/s^2] (4)."
+)
+@click.option("--laps", type=float, default=1.0, help="Laps of a circle or figure-8 (1).")
+@click.option("--hold", type=float, default=0.0, help="Time at rest at a path's end [s] (0).")
 @click.option("--to", multiple=True, metavar="STATE=VALUE", help="Where a line or step ends.")
-@click.option("--seconds", type=float, help="Of a step or swing-up (5), of a line to a STATE.")
+@click.option(
+    "--seconds", type=float, help="Duration of a step or swing-up (5), or of a line to a STATE."
+)
 @in_workspace
 @as_json
 def command(
@@ -49,15 +53,14 @@ def command(
     """Write target.csv: a line, circle, figure-8, step or swing-up, or a recorded run.
 
     FILE is a log, read through [log], or a CSV with columns `t` and states. Paths start from rest
-    and keep to the speeds and accelerations given. A line with --to, and that of a robot with one
-    axis, goes from [task] start to rest, in the states' own units, in --seconds if they are given,
-    with --speed or --accel where one of them is; a step begins at [task] start.
-    With --hold a path ends at rest and stays there.
+    and keep to the given speeds and accelerations. A line with --to, or of a robot with one axis,
+    goes from [task] start to rest, in the states' own units; --seconds, --speed and --accel set
+    its pace. A step begins at [task] start. With --hold a path ends at rest and stays there.
 
-    The target there was is kept as target.csv.bak, and [task] horizon follows; so do the weights in
-    [reward] state, unless you chose them, and with them input_change of inputs that have [limits],
-    where it is what `init` wrote. Earlier trials stay, for fit and diagnose; the search
-    begins anew.
+    The previous target is kept as target.csv.bak. [task] horizon is updated, and so are the weights
+    in [reward] state unless you chose them, and input_change of inputs with [limits] if it is
+    still what `init` wrote. Earlier trials stay available to fit and diagnose; the search starts
+    again.
     """
     from grounded_trials.starting.shapes import (
         PATHS,
@@ -79,7 +82,7 @@ def command(
     if shape == "line" and (ends or not has_plane(model)):
         if seconds is not None and len(paces) > 1:
             raise click.UsageError(
-                "of --seconds, --speed and --accel a line has two: leave one away"
+                "a line takes only two of --seconds, --speed and --accel: omit one"
             )
         columns = line_target(ends, start, drive, model, dt, seconds, next(iter(paces), ""))
     elif shape == "step":
@@ -88,8 +91,8 @@ def command(
         columns = swing_up(model, dt, long)
     elif seconds is not None:
         raise click.UsageError(
-            "--seconds is of a step, a swing-up or a line --to STATE=VALUE; how fast a path is "
-            "driven --speed and --accel say"
+            "--seconds is for a step, a swing-up or a line --to STATE=VALUE; use --speed and "
+            "--accel to set how fast a path is driven"
         )
     elif shape in PATHS:
         columns = path_target(shape, drive, model, dt)
@@ -109,8 +112,8 @@ def command(
         if model.states.get(name) == "rad" and abs(value) > TURNS * 2 * math.pi:
             remark(
                 "warning",
-                f"{name} = {value:g} rad is {abs(value) / (2 * math.pi):.2g} turns: if degrees "
-                f"are meant, `--to {name}={math.radians(value):.4g}`",
+                f"{name} = {value:g} rad is {abs(value) / (2 * math.pi):.2g} turns: if you meant "
+                f"degrees, use `--to {name}={math.radians(value):.4g}`",
             )
     show(f"{path}: {shape}, {(rows - 1) * dt:g} s, {rows - 1} steps")
     for name, (low, high) in ranges.items():
@@ -138,34 +141,37 @@ def command(
         remark(
             "note",
             f"{listed(still)} {stay if len(at) == 1 else 'stay as they are'} in the target, "
-            "which says nothing of what is a small error there: choose the weight in "
+            "so it does not show what a small error is there: choose the weight in "
             "[reward] state",
         )
     show(f"\n{next_line(NextCommand('propose'))}")
 
 
 def _rest_of(model: Model, free: list[str]) -> str:
-    """The free state whose column has its rate come along, else the first one."""
+    """Return the first free state that has a rate among the states, else the first free state."""
     from grounded_trials.logs.inspect_pairs import velocities
 
     return next((name for name in free if name in velocities(model)), free[0])
 
 
 def _free(names: list[str], reward: dict[str, dict[str, float]], rest: str) -> str:
-    """What it means for states that the target has no column for them.
+    """Explain what it means that the target has no column for some states.
 
-    `rest`: the one to bring to rest; "" where the shape has no way to say so.
+    Args:
+        names: the states.
+        reward: the tables of [reward].
+        rest: the state to suggest bringing to rest with --to, "" for no suggestion.
     """
     weighed = [n for n in names if any(reward.get(k, {}).get(n) for k in ("state", "terminal"))]
     it = "them" if len(names) > 1 else "it"
-    text = f"{listed(names)}: no column in the target, so nothing asks where a run takes {it}"
+    text = f"{listed(names)}: no column in the target, so a run may take {it} anywhere"
     if weighed:
         text += (
             f". [reward] weighs {listed(weighed)}, and `propose` refuses weights without a column: "
-            f"give it one (`--to {weighed[0]}=VALUE`), or take the weight out"
+            f"add a column (`--to {weighed[0]}=VALUE`), or remove the weight"
         )
     if rest:
-        text += f". `--to {rest}=0`, beside the others, asks for rest there"
+        text += f". Add `--to {rest}=0` to ask for rest there"
     return text
 
 
@@ -188,7 +194,7 @@ def _values(pairs: tuple[str, ...]) -> dict[str, float]:
 
 
 def _recorded(workspace: Workspace, file: str) -> dict[str, Array]:
-    """A run of a log, or the columns of a CSV of states."""
+    """Read a run of a log, or the columns of a CSV of states."""
     from grounded_trials.starting.shapes import SHAPES, recorded_run
 
     return recorded_run(workspace, file, SHAPES)

@@ -1,4 +1,4 @@
-"""Words on a terminal: colour only where it is wanted, progress on stderr, JSON without NaN."""
+"""Terminal output: optional colour, wrapped text, tables, progress on stderr, JSON without NaN."""
 
 from __future__ import annotations
 
@@ -19,42 +19,42 @@ from grounded_trials.wording import MARKS, columns, figure, glued, wrapped
 
 number = figure
 BARS = "▁▂▃▄▅▆▇█"
-LABEL = 10  # columns of what stands before a text
-EVERY = 30.0  # seconds between words on a long command's stage where there is no terminal
+LABEL = 10  # width of the label column
+EVERY = 30.0  # seconds between progress lines when stderr is not a terminal
 
 
-# Our own marks in a text, which are no characters: what strangers' files say can't be anything else
+# Styles are marked with non-characters, so text from untrusted files cannot inject escape codes
 _MARKS = dict(zip(MARKS, (f"\033[{code}m" for code in ("1", "1;31", "0", "32", "33")), strict=True))
 BOLD, ALARM, _END, GOOD, DOUBT = _MARKS
 MEANING = {
     **dict.fromkeys(("better", "first", "effect", "several", "none", "converged"), GOOD),
     **dict.fromkeys(("crashed", "failed", "DAMAGED", "damaged", "lost"), ALARM),
     **dict.fromkeys(("in doubt", "waiting", "unknown", "UNSURE", "warning", "left out"), DOUBT),
-}  # words that are shown in a colour where there is one
+}  # words shown in colour on a terminal
 
 
 def style(text: str, mark: str = BOLD) -> str:
-    """Text in bold, or in another of the styles here, where it is shown in colour."""
+    """Mark text as bold, or with another of the styles above, for output in colour."""
     return f"{mark}{text}{_END}"
 
 
 def tinted(word: str) -> str:
-    """A word in the colour of what it means: good, doubtful or bad; others as they are."""
+    """Colour a word by its meaning (good, doubtful or bad); return other words unchanged."""
     return style(word, MEANING[word]) if word in MEANING else word
 
 
 def say(text: str) -> None:
-    """Narration, on stderr."""
+    """Write narration to stderr."""
     _write(text, sys.stderr)
 
 
 def show(text: str = "") -> None:
-    """Data, on stdout."""
+    """Write data to stdout."""
     _write(text, sys.stdout)
 
 
 def _write(text: str, stream: TextIO | None, end: str = "\n") -> None:
-    """The one place that writes to a terminal; a stream that the caller closed gets nothing."""
+    """Write text to a stream, without control characters; do nothing if there is no stream."""
     if stream is not None:
         stream.write(harmless(text, coloured=is_live(stream) and not os.environ.get("NO_COLOR")))
         stream.write(end)
@@ -62,55 +62,62 @@ def _write(text: str, stream: TextIO | None, end: str = "\n") -> None:
 
 
 def is_live(stream: TextIO | None) -> bool:
-    """Whether a stream is a terminal."""
+    """Return whether a stream is a terminal."""
     return stream is not None and stream.isatty()
 
 
 def harmless(text: str, *, coloured: bool = False) -> str:
-    """Text without control characters, since names come from strangers' files; "?" for each."""
+    """Replace control characters by "?", since names may come from untrusted files."""
     marks = _MARKS if coloured else dict.fromkeys(_MARKS, "")
     return "".join(c if c.isprintable() or c in "\n\t" else marks.get(c, "?") for c in text)
 
 
 def show_json(document: dict[str, Any]) -> None:
-    """One JSON document on stdout; a number that JSON doesn't have becomes null."""
+    """Write one JSON document to stdout, with null for NaN and infinities."""
     text = json.dumps(plain(document), indent=1, ensure_ascii=False, allow_nan=False)
     _write(re.sub(r"[^\n -~]", _escaped, text), sys.stdout)
 
 
 def _escaped(found: re.Match[str]) -> str:
-    """A character as it is, or as JSON escapes it where a terminal might obey it."""
+    """Return a character, JSON-escaped if a terminal might interpret it."""
     return found[0] if found[0].isprintable() else json.dumps(found[0])[1:-1]
 
 
 def lines(text: str, first: str, rest: str) -> list[str]:
-    """A sentence as lines of the terminal's width, begun as said; its commands as typed here."""
+    """Wrap a text to the terminal's width, with `-C DIR` added to its commands where needed.
+
+    Args:
+        text: the text.
+        first: the prefix of the first line.
+        rest: the prefix of the other lines.
+    """
     return wrapped(placed(text), first, rest)
 
 
 def field(label: str, text: str, indent: str = "", width: int = LABEL) -> str:
-    """A label and its text, wrapped to the terminal under itself; a number keeps its %."""
+    """Format a label and its text, wrapped to the terminal with a hanging indent."""
     head = f"{indent}{label:<{width}} "
     first, *rest = lines(text, head, " " * len(head)) or [head.rstrip()]
     return "\n".join([first.replace(label, tinted(label), 1) if label else first, *rest])
 
 
 def remark(kind: str, text: str) -> None:
-    """Narration with a word ahead, `note: ...`, wrapped to the terminal."""
+    """Write narration with a prefix, `note: ...`, to stderr, wrapped to the terminal."""
     first, *rest = lines(text, f"{kind}: ", "  ")
     say("\n".join([first.replace(kind, tinted(kind), 1), *rest]))
 
 
 def names_in(text: str | None) -> list[str]:
-    """The names of a list like `a,b`, each once."""
+    """Split a list like `a,b` into its names, without duplicates."""
     return [name for name in dict.fromkeys(n.strip() for n in (text or "").split(",")) if name]
 
 
 @contextmanager
 def stages() -> Iterator[Callable[[str], None]]:
-    """A function that shows which stage a long command is in, "" for none.
+    """Yield a function that shows the current stage of a long command ("" clears it).
 
-    On a terminal at once, in place; elsewhere, in a log say, a line now and then.
+    On a terminal the line is updated in place; elsewhere (in a log file, for example) a line is
+    written every `EVERY` seconds at most.
     """
     live, told = is_live(sys.stderr), time.monotonic()
 
@@ -131,7 +138,7 @@ def stages() -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def progress(text: str) -> Iterator[None]:
-    """Says what is going on while something takes more than a moment; only on a terminal."""
+    """Show a text while something takes a while; see `stages`."""
     with stages() as tell:
         tell(text)
         yield
@@ -139,7 +146,7 @@ def progress(text: str) -> Iterator[None]:
 
 @contextmanager
 def bar(text: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar on stderr for things that can be counted; only on a terminal."""
+    """Yield a function (done, total) that shows a progress bar on stderr; see `stages`."""
     width = 30
     with stages() as tell:
 
@@ -151,15 +158,15 @@ def bar(text: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def sentence(text: str) -> None:
-    """A sentence on stdout, wrapped to the terminal."""
+    """Write a sentence to stdout, wrapped to the terminal."""
     show("\n".join(lines(text, "", "  ")))
 
 
 def table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:
-    """Aligned columns: the first and those of words to the left, numbers to the right.
+    """Format aligned columns: the first column and text left-aligned, numbers right-aligned.
 
-    Where it is wider than a terminal, names of columns are broken at their blanks, then cells at
-    theirs; what is wider still goes on in a second table under the same first column.
+    A table wider than the terminal wraps its headers at blanks, then its cells. Columns that still
+    do not fit go into a second table with the same first column.
     """
     body = [[cell.replace("\n", "?") for cell in row] for row in rows]
     for gap in (2, 1):
@@ -181,7 +188,7 @@ def table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:
         for j in range(tall):
             text = ""
             for i, lines in enumerate(cells):
-                at = j - (tall - len(lines)) if k == 0 else j  # names stand on the line below them
+                at = j - (tall - len(lines)) if k == 0 else j  # headers are aligned at the bottom
                 cell = lines[at] if 0 <= at < len(lines) else ""
                 pad = " " * (widths[i] - len(cell))
                 text += " " * gap * (i > 0) + (
@@ -192,10 +199,10 @@ def table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:
 
 
 def _fit(lines: list[list[str]], gap: int) -> list[int]:
-    """The widths of columns within a terminal, as far as words allow: first of names, then all."""
+    """Return column widths that fit the terminal if possible; headers are broken before cells."""
     across = list(zip(*lines, strict=True))
     widths = [max(map(len, column)) for column in across]
-    for whole in (True, False):  # cells
+    for whole in (True, False):  # whether cells stay on one line
         least = [
             max([_longest(name), *(len(c) if whole else _longest(c) for c in cells)])
             for name, *cells in across
@@ -207,7 +214,7 @@ def _fit(lines: list[list[str]], gap: int) -> list[int]:
 
 
 def _longest(cell: str) -> int:
-    """The widest part of a cell that is not broken."""
+    """Return the length of the longest unbreakable part of a cell."""
     return max(map(len, glued(cell).split(" ")))
 
 
@@ -216,14 +223,14 @@ def _total(widths: Sequence[int], gap: int) -> int:
 
 
 def _reach(widths: Sequence[int], gap: int) -> int:
-    """How many columns a terminal shows beside each other, two at least."""
+    """Return how many columns fit side by side on the terminal, at least two."""
     whole = range(len(widths), 2, -1)
     fitting = (k for k in whole if _total(widths[:k], gap) <= columns())
     return next(fitting, min(len(widths), 2))
 
 
 def _words(cells: Sequence[str]) -> bool:
-    """Whether a column holds words rather than numbers."""
+    """Return whether a column holds words rather than numbers."""
     known = [cell for cell in cells if cell]
     return all(cell[0].isalpha() for cell in known) or 2 * sum(
         len(c.split()) > 3 for c in known
@@ -231,7 +238,7 @@ def _words(cells: Sequence[str]) -> bool:
 
 
 def _broken(cell: str, width: int) -> list[str]:
-    """A cell's lines."""
+    """Wrap a cell into lines."""
     if len(cell) <= width:
         return [cell]
     lines = textwrap.wrap(glued(cell), width, break_long_words=False, break_on_hyphens=False)
@@ -239,10 +246,9 @@ def _broken(cell: str, width: int) -> list[str]:
 
 
 def sparkline(values: Sequence[float]) -> str:
-    """Utilities as little bars, worst to best; a failed run is a cross.
+    """Draw utilities as small bars, with their scale behind them; a failed run is an x.
 
-    By the logarithm of the distance from 0 where the worst would flatten all others; the scale is
-    said beside it.
+    If the worst utility would flatten all others, bars use the logarithm of the distance from 0.
     """
     shown = list(values)[-columns() // 2 :]
     known = [v for v in shown if math.isfinite(v)]

@@ -213,11 +213,14 @@ RUNS = {
         lambda s, u: (s + np.array([0.5, 0.0]), u),
         ["started with x = 0.5", "start is 0"],
     ),
-    "beyond limits": (lambda s, u: (s, u * 0 + 9.0), ["force up to 4 outside its [limits]"]),
+    "beyond limits": (
+        lambda s, u: (s, u * 0 + 9.0),
+        ["force in the log is up to 4 outside its [limits]"],
+    ),
     "late": (lambda s, u: (s, np.vstack([u[:1], u[:-1]])), ["logged 1 step late"]),
     "longer": (
         lambda s, u: (np.vstack([s, s[-3:]]), np.vstack([u, u[-3:]])),
-        ["goes on for 3 steps after the horizon of 40"],
+        ["continues for 3 steps after the horizon of 40"],
     ),
 }
 
@@ -327,7 +330,7 @@ TARGETS = {
     "nan": ("t,x\n0,nan\n", ["line 2: nan in column 'x'"]),
     "ragged": ("t,x\n0,0\n0.05\n", ["line 3: 1 values for 2 columns"]),
     "short": ("t,x\n0,0\n0.05,0\n", ["has 2 rows", "needs 41", "horizon = 1"]),
-    "twice": ("t,x,x\n" + "".join(f"{0.05 * i},0,1\n" for i in range(41)), ["'x'", "twice"]),
+    "twice": ("t,x,x\n" + "".join(f"{0.05 * i},0,1\n" for i in range(41)), ["'x'", "two columns"]),
     "only t": ("t\n" + "".join(f"{0.05 * i}\n" for i in range(41)), ["weighs state 'x'"]),
     "grid": ("t,x\n" + "".join(f"{0.04 * i},0\n" for i in range(41)), ["line 3: t = 0.04 s"]),
     "semicolons": ("t;x\n0;0\n", ["found 't;x'"]),

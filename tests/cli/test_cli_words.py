@@ -159,7 +159,7 @@ def test_repeats_say_what_is_waited_for(tmp_path):
         (["diagnose", "--trials", "t9,"], "there is no trial to learn from"),
         (["diagnose", "--without", "delay,delai"], "did you mean 'delay'"),
         (["diagnose", "--trials", ""], "--trials names no trial: expected some, like t0001"),
-        (["fit", "--params", ","], "--params names no parameter: expected some, like a1,L"),
+        (["fit", "--params", ","], "--params names no parameter: expected names such as a1,L"),
         (["diagnose", "--trials", " , "], "omit it to use all"),
         (["recover", "trials"], "is a folder"),
         (["recover", "model.py"], "look for another copy of the recording"),

@@ -183,7 +183,7 @@ def test_what_holds_the_start_is_held_before_it_or_asked_for(tmp_path):
     def notes(start, limits="[limits]"):
         file.write_text(whole.replace(given, f"start = {start}").replace("[limits]", limits))
         w.forget()
-        return [n for n in w.propose().proposal.notes if "counts as held" in n]
+        return [n for n in w.propose().proposal.notes if "the plan assumes" in n]
 
     (note,) = notes("{ }")
     assert "v changes" in note and "left = 0.8578, right = 0.8578" in note
@@ -213,7 +213,7 @@ def test_a_start_that_another_state_would_hold_is_told_with_it(tmp_path):
     file.write_text(file.read_text().replace("[limits]", limits))
     proposed = Workspace(w.folder).propose()
     assert proposed.standing.ending == "not allowed" and proposed.then.verb == "propose"
-    (note,) = (n for n in proposed.proposal.notes if "counts as held" in n)
+    (note,) = (n for n in proposed.proposal.notes if "the plan assumes" in n)
     assert "fan = 2700, pwm = 48.21" in note and "v changes" in note
     assert not any("widen" in n for n in proposed.proposal.notes)
     text = re.sub(
@@ -224,7 +224,7 @@ def test_a_start_that_another_state_would_hold_is_told_with_it(tmp_path):
     heavier = 'effects = [{name = "offset:v", c = -0.981}]\n[task]'  # a tenth more to carry
     given = "start = { h = 0.2 }"
     file.write_text(re.sub(r"(?m)^start = .*$", given, text.replace("[task]", heavier)))
-    (note,) = (n for n in Workspace(w.folder).propose().proposal.notes if "counts as held" in n)
+    (note,) = (n for n in Workspace(w.folder).propose().proposal.notes if "the plan assumes" in n)
     assert "fan = 2970, pwm = 53.04" in note
 
 
@@ -323,9 +323,9 @@ def test_a_plan_whose_inputs_cost_nearly_all_says_so_and_a_target_tells_its_weig
     file = blank.folder / "grounded.toml"
     text = file.read_text()
     assert "input = { }" in text
-    assert not [n for n in blank.propose().proposal.notes if "of what the plan costs" in n]
+    assert not [n for n in blank.propose().proposal.notes if "of the plan's cost" in n]
     s = np.linspace(0, 1, 201)
     blank.target({"x": 10 * s**3 * (10 - 15 * s + 6 * s**2)})
     text = file.read_text().replace("state = {x = 0.01}", "state = {x = 1000.0}")
     file.write_text(text.replace("input = { }", "input = { force = 0.1 }"))
-    assert [n for n in blank.propose().proposal.notes if "of what the plan costs" in n]
+    assert [n for n in blank.propose().proposal.notes if "of the plan's cost" in n]

@@ -365,9 +365,9 @@ def test_any_text_is_valid_or_one_sentence(tmp_path_factory, text):
     [
         ('name = "delay:force"', "needs a value for 'd'"),
         ('name = "delay:force", d = 0.02, dd = 3.0', "has no quantity 'dd': did you mean 'd'"),
-        ('name = "delay:force", d = -0.02', "d = -0.02 can't be: expected at least 0"),
+        ('name = "delay:force", d = -0.02', "d = -0.02 is out of bounds: expected at least 0"),
         ('name = "delay:force", d = nan', "d must be a number"),
-        ('name = "dead_zone:force", c = -5.0', "c = -5 can't be: expected at least 0"),
+        ('name = "dead_zone:force", c = -5.0', "c = -5 is out of bounds: expected at least 0"),
         ('name = "input_gain:force", g = 9.0', "expected at least -3 and at most 5"),
         ('name = "viscous_friction:v"', "needs a value for 'k'"),
     ],

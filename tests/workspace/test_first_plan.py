@@ -34,7 +34,7 @@ def test_what_holds_the_start_is_told_of_an_adopted_model_with_all_that_is_given
     def told(effects: str, start: str) -> str:
         changed = re.sub(r"(?m)^start = .*$", f"start = {{ {start} }}", text)
         file.write_text(changed.replace("[task]", f"effects = [{effects}]\n[task]", 1))
-        notes = [n for n in Workspace(w.folder).propose().proposal.notes if "counts as held" in n]
+        notes = [n for n in Workspace(w.folder).propose().proposal.notes if "the plan assumes" in n]
         return " ".join(notes).partition("start = ")[2]
 
     fading = '{name = "input_fade:thrust", k = 0.001}'
@@ -70,7 +70,7 @@ def test_a_start_that_a_target_gives_is_told_for_each_target_where_its_sensor_ha
     file.write_text(text)
 
     def told() -> str:
-        notes = [n for n in Workspace(w.folder).propose().proposal.notes if "counts as held" in n]
+        notes = [n for n in Workspace(w.folder).propose().proposal.notes if "the plan assumes" in n]
         return " ".join(notes).partition("start = ")[2]
 
     for far in (0.1, 0.2):
@@ -92,7 +92,7 @@ def test_a_plan_that_begins_from_no_input_is_not_handed_out_before_it_was_said(t
     text = re.sub(r"(?ms)^\[system\].*?(?=^\[|\Z)", "", text)
     file.write_text(re.sub(r"(?m)^start = .*$", "start = { h = 1 }", text))
     first = Workspace(w.folder).propose()
-    assert "counts as held" in " ".join(first.proposal.notes) and first.then.verb == "propose"
+    assert "the plan assumes" in " ".join(first.proposal.notes) and first.then.verb == "propose"
     again = Workspace(w.folder).propose()  # it is right as it is
     assert again.candidate.id == first.candidate.id and again.then.verb == "export"
 
@@ -161,7 +161,7 @@ def test_what_holds_a_joint_is_told_though_it_sticks(tmp_path):
     for effects in ("", friction):
         file.write_text(text.replace("[task]", f"effects = [{effects}]\n[task]", 1))
         notes = Workspace(w.folder).propose().proposal.notes
-        (note,) = [note for note in notes if "counts as held" in note]
+        (note,) = [note for note in notes if "the plan assumes" in note]
         assert f"tau = {5 * np.cos(0.3):.4g}" in note.partition("start = ")[2]
 
 
@@ -236,10 +236,10 @@ def test_weights_that_were_made_of_the_limits_seen_follow_those_that_are_given(t
         notes = Workspace(folder).propose().proposal.notes
         return [note for note in notes if "input_change" in note and "[limits]" in note]
 
-    (note,) = [n for n in Workspace(folder).propose().proposal.notes if "happened" in n]
+    (note,) = [n for n in Workspace(folder).propose().proposal.notes if "range used" in n]
     assert holds(note, "r.csv", "[limits]", "`target`")
     assert weight() == pytest.approx(0.01, rel=1e-3) and not limited(-1, 1)
-    assert not any("happened" in n for n in Workspace(folder).propose().proposal.notes)
+    assert not any("range used" in n for n in Workspace(folder).propose().proposal.notes)
     (note,) = limited(-20, 20)
     assert "force = 2.5e-05" in note
     assert grounded(*step, "x=1").code == 0
@@ -342,6 +342,6 @@ def test_a_plan_that_throws_an_input_from_end_to_end_says_so_and_what_calms_it(t
         assert calm in changed
         file.write_text(re.sub(r"(?m)^input = .*$", "input = {}", changed))
         notes = Workspace(w.folder).propose().proposal.notes
-        return [note for note in notes if "throws turn" in note]
+        return [note for note in notes if "turn jumps over" in note]
 
     assert len(told(1e-9)) == 1 and not told(1.0)

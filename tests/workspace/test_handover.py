@@ -107,7 +107,7 @@ def test_limits_that_were_narrowed_make_it_void(w, tmp_path):
     made = w.propose()
     assert made.candidate.id == "c0002" and made.proposal.is_new
     note, held = made.proposal.notes
-    assert note == f"c0001 was not run and is void: {why}; run c0002 in its place"
+    assert note == f"c0001 was not run and is void: {why}; run c0002 instead"
     assert holds(held, "force", "[limits]")  # half a newton does not reach the target
     assert w.run().candidate == "c0002"
     assert w.propose().proposal.notes == ()  # said once
@@ -313,11 +313,11 @@ def test_another_robots_candidate_is_refused_even_anyway(w, tmp_path):
 
 def test_other_units_and_another_dt_are_refused(w, tmp_path):
     configure(w, model=MODEL.replace('"N"', '"kN"'))
-    refused(w, tmp_path, "it has force in N, the model of today in kN")
+    refused(w, tmp_path, "it has force in N, but the current model has it in kN")
     configure(w, CONFIG.replace("dt = 0.05", "dt = 0.1"), model=MODEL)
     rows = [f"{0.1 * i:.1f},0.5" for i in range(41)]
     (w.folder / "target.csv").write_text("t,x\n" + "\n".join(rows) + "\n")
-    refused(w, tmp_path, "it runs every 0.05 s, [task] dt is 0.1 s")
+    refused(w, tmp_path, "it runs every 0.05 s, but [task] dt is 0.1 s")
 
 
 def test_anyway_says_what_it_overrides_before_the_robot_moves(w, tmp_path):
@@ -367,8 +367,8 @@ def test_an_open_loop_policy_must_send_and_hold_what_is_allowed(w):
 
 def test_runs_of_another_task_are_told_once_as_data(ran):
     """`status` and the page counted 6 trials beside a diagnosis of 9, and said nothing of three."""
-    assert not [note for note in ran.status().notes if "data alone" in note]
+    assert not [note for note in ran.status().notes if "only as data" in note]
     names = [trial.id for trial in ran.task_trials()]
     configure(ran, CONFIG.replace(LIMITS, NARROW))
-    (note,) = [note for note in ran.status().notes if "data alone" in note]
+    (note,) = [note for note in ran.status().notes if "only as data" in note]
     assert names[0] in note and names[-1] in note

@@ -235,7 +235,7 @@ def test_a_delay_that_log_takes_out_by_now_does_not_act_twice(cart, tmp_path, no
     assert done.code == (1 if counted else 0)
     if counted:
         assert toml.read_text() == before
-        assert holds(" ".join(done.err.split()), "[log.state.v] delay_s = 0.05", "one of both")
+        assert holds(" ".join(done.err.split()), "[log.state.v] delay_s = 0.05", "Either remove")
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""grounded challenge: blind cases for the diagnosis, with sealed labels."""
+"""grounded challenge: make, run and score blind cases for the diagnosis, with sealed labels."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ if TYPE_CHECKING:
 def command() -> None:
     """Make, diagnose and score blind cases for the diagnosis.
 
-    Run `grounded challenge run DIR` where the labels are not on the disk.
+    Run `grounded challenge run DIR` on a machine without the labels.
     """
 
 
-@command.command("make", short_help="Write cases, and their labels, sealed, elsewhere.")
+@command.command("make", short_help="Write cases, and their sealed labels elsewhere.")
 @click.argument("folder", metavar="DIR")
 @click.option(
     "--kind",
     type=click.Choice(["single", "double", "none", "withheld"]),
     required=True,
-    help="One effect, two, none, or one that the library lacks.",
+    help="One effect, two, none, or one that is not in the library.",
 )
 @click.option("--cases", type=click.IntRange(1), required=True, metavar="N", help="How many.")
 @click.option(
-    "--seed", type=click.IntRange(0), required=True, metavar="S", help="Of all that is drawn."
+    "--seed", type=click.IntRange(0), required=True, metavar="S", help="Seed of all random draws."
 )
 @click.option(
     "--systems",
     default="own",
     metavar="G1,G2",
-    help="Of own, kinked, mujoco (default: own, which is half of the cases where there are more).",
+    help="Groups: own, kinked, mujoco (default: own; of several, own makes half of the cases).",
 )
 @click.option("--labels", metavar="DIR", help="Where the labels go (default: DIR-labels).")
 @click.option(
@@ -60,7 +60,7 @@ def make_cases(
     param_error: float | None,
     json_: bool,
 ) -> None:
-    """Write N workspaces of trials into DIR, and their labels, sealed by hash, elsewhere."""
+    """Write N workspaces with trials into DIR, and their labels, sealed by hash, elsewhere."""
     from grounded.challenge import make
     from grounded_trials.challenge import write_cases
 
@@ -73,12 +73,12 @@ def make_cases(
         show_json({"workspace": folder, "labels": str(sealed), "cases": names})
         return
     made = count(len(names), "case")
-    show(f"{made} in {folder}, the labels in {sealed} (keep them away from it)")
+    show(f"{made} in {folder}, the labels in {sealed} (keep them apart)")
     show(f"\nnext: {typed(NextCommand('challenge', ('run', folder)))}")
 
 
 def _at_hand(groups: list[str]) -> list[str]:
-    """The groups without MuJoCo's where it is missing and there are others; stderr says so."""
+    """Drop the group `mujoco` if it is not installed and others are named; warn on stderr."""
     from grounded.challenge import simulator
 
     try:
@@ -94,8 +94,8 @@ def _at_hand(groups: list[str]) -> list[str]:
 
 @command.command("run", short_help="Diagnose the cases that have no diagnosis yet.")
 @click.argument("folder", metavar="DIR")
-@click.option("--without", multiple=True, metavar="F1,F2,...", help="Families not to blame.")
-@click.option("--again", is_flag=True, help="Diagnose the others once more, too.")
+@click.option("--without", multiple=True, metavar="F1,F2,...", help="Effect families to leave out.")
+@click.option("--again", is_flag=True, help="Also repeat the diagnoses that exist.")
 @parallel
 @as_json
 def run_cases(
@@ -105,7 +105,7 @@ def run_cases(
     engine: Engine,
     json_: bool,
 ) -> None:
-    """Diagnose the cases of DIR that have no diagnosis yet; a run that was cut off goes on."""
+    """Diagnose the cases of DIR that have no diagnosis yet; an interrupted run resumes."""
     from grounded_trials.challenge import diagnose_cases, undiagnosed
 
     families = [name for text in without for name in names_in(text)]
@@ -122,17 +122,20 @@ def run_cases(
         are = "case is" if len(waiting) == 1 else "cases are"
         show(f"{len(waiting)} {are} diagnosed now; {mean:.1f} s of CPU a case")
     else:
-        show("nothing to do: every case is diagnosed already (--again does them once more)")
+        show("nothing to do: every case is diagnosed already (--again repeats them)")
     show(f"\n{_scored(folder)}")
 
 
-@command.command("score", short_help="Open the labels, mark the diagnoses.")
+@command.command("score", short_help="Open the labels, score the diagnoses.")
 @click.argument("folder", metavar="DIR")
 @click.option("--labels", metavar="DIR", help="Where the labels are (default: DIR-labels).")
 @parallel
 @as_json
 def score(folder: str, labels: str | None, engine: Engine, json_: bool) -> None:
-    """Open the labels and mark the diagnoses of DIR, beside an oracle that knows the effects."""
+    """Open the labels, score the diagnoses of DIR and compare with an oracle.
+
+    The oracle knows the effects of each case.
+    """
     from grounded.challenge import summary
     from grounded_trials.challenge import score_cases
 
@@ -157,10 +160,10 @@ def _few(names: list[str]) -> str:
 
 
 def _labels(folder: str, labels: str | None) -> Path:
-    """Where the labels are.
+    """Return the folder of the labels.
 
     Raises:
-        GroundedError: if they were not named, and are not where they are by default.
+        GroundedError: if none is named and the default one does not exist.
     """
     usual = Path(f"{folder}-labels")
     if labels is None and Path(folder).is_dir() and not usual.is_dir():
@@ -172,7 +175,7 @@ def _labels(folder: str, labels: str | None) -> Path:
 
 
 def _scored(folder: str) -> str:
-    """How the cases are scored; it says what is to be filled in where the labels are elsewhere."""
+    """Return the `next:` line for scoring, with --labels if they are not in the default folder."""
     if Path(f"{folder}-labels").is_dir():
         return f"next: {typed(NextCommand('challenge', ('score', folder)))}"
     line = f"next: {typed(NextCommand('challenge', ('score', folder, '--labels', 'DIR')))}"
@@ -188,7 +191,7 @@ def _words(value: Any) -> str:
 
 
 def _share(count: int, of: int, share: float | None, interval: list[float] | None) -> str:
-    """`17 of 18 (94 %; 74 to 99 %)`, the interval behind the semicolon."""
+    """Format a share with its interval, `17 of 18 (94 %; 74 to 99 %)`."""
     if share is None or interval is None:
         return "none of that kind"
     low, high = (100 * end for end in interval)

@@ -1,4 +1,4 @@
-"""grounded demo: a whole example in an empty folder."""
+"""grounded demo: run a whole example in an empty folder."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.proposing import Status
 
 
-STEPS = 1600  # of all trials that are diagnosed: a demo is to end within a minute or two
+STEPS = 1600  # total steps of the diagnosed trials, so that a demo ends within a minute or two
 
 
 @click.command("demo")
@@ -77,15 +77,15 @@ def command(name: str, folder: str | None, json_: bool) -> None:
 
 
 def _few(workspace: Workspace, status: Status) -> list[str]:
-    """The trials to diagnose: first, last and best, then the earliest; [] for all.
+    """Choose the trials to diagnose: first, last and best, then the earliest; [] means all.
 
-    The later ones hardly differ from the best, and the demo's user waits.
+    The later ones hardly differ from the best, and leaving them out saves time.
     """
     standing, most = status.standing, max(STEPS // workspace.task.horizon, 2)
     best = standing.incumbent
     tried = [trial for one in standing.history for trial in one.trials[:1]]
     last = sorted((t for one in standing.history for t in one.trials), key=lambda t: t.id)[-1:]
-    repeats = [*best.trials] if best else []  # they tell how far runs scatter
+    repeats = [*best.trials] if best else []  # they show how far runs scatter
     chosen = list(dict.fromkeys(one.id for one in (*tried[:1], *last, *repeats, *tried)))
     return chosen[:most] if standing.trials > most else []
 

@@ -1,4 +1,4 @@
-"""grounded experiment: the paper's studies, by seed, on one machine or on a cluster."""
+"""grounded experiment: run the paper's studies, on one machine or on a cluster."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from grounded_cli.terminal import bar, show, show_json, table
 if TYPE_CHECKING:
     from grounded.engine import Engine
 
-# name -> (module, function, what --seeds is: "seeds", "count" of runs, or none, one line)
+# name -> (module, function, meaning of --seeds, see `_seeds`, or "" if it takes none, summary)
 STUDIES = {
     "flight": ("flight", "run", "count", "Table 1 and Figure 1: the aircraft's figure-8"),
     "car": ("car", "run", "seeds", "the car's three tasks, Figures 4 and 5"),
@@ -30,9 +30,11 @@ STUDIES = {
 
 @click.command("experiment")
 @click.argument("name", type=click.Choice(list(STUDIES)), metavar="[NAME]", required=False)
-@click.option("--seeds", metavar="N|A-B|A,B,...", help="How many seeds, or which.")
+@click.option("--seeds", metavar="N|A-B|A,B,...", help="How many seeds, or which ones.")
 @parallel
-@click.option("--keep", metavar="DIR", help="Finished jobs (default: .grounded-studies/NAME).")
+@click.option(
+    "--keep", metavar="DIR", help="Where finished jobs are kept (default: .grounded-studies/NAME)."
+)
 @click.option("--png", metavar="FILE", help="Draw the study's picture.")
 @as_json
 def command(
@@ -45,7 +47,7 @@ def command(
 ) -> None:
     """Run one of the paper's studies; the same seeds give the same results on any machine.
 
-    Without NAME the studies are listed. Finished jobs are kept: a study that was cut off goes on.
+    Without NAME the studies are listed. Finished jobs are kept, so an interrupted study resumes.
     """
     if name is None and json_:
         show_json({"studies": {key: text for key, (_, _, _, text) in STUDIES.items()}})
@@ -81,11 +83,11 @@ def command(
 
 
 def _seeds(text: str | None, kind: str, name: str) -> dict[str, Any]:
-    """The study's own argument for what --seeds says."""
+    """Translate --seeds into the arguments of a study."""
     if text is None:
         return {"seeds": range(20)} if name == "fit-car" else {}
     if not kind:
-        raise click.UsageError(f"'{name}' draws nothing at random: it takes no --seeds")
+        raise click.UsageError(f"'{name}' is deterministic: it takes no --seeds")
     try:
         if "-" in text:
             first, last = (int(part) for part in text.split("-"))
@@ -97,11 +99,11 @@ def _seeds(text: str | None, kind: str, name: str) -> dict[str, Any]:
     except ValueError:
         raise click.UsageError(f"--seeds must be like 8, 0-7 or 1,4,9, found '{text}'") from None
     if not chosen:
-        raise click.UsageError(f"--seeds {text} names no seed")
+        raise click.UsageError(f"--seeds {text} selects no seed")
     if kind == "seeds":
         return {"seeds": chosen}
     if chosen != list(range(chosen[0], chosen[-1] + 1)):
-        raise click.UsageError(f"'{name}' takes a number or a range of seeds")
+        raise click.UsageError(f"--seeds of '{name}' must be a number or a range, like 8 or 0-7")
     if kind == "runs":
         return {"runs": len(chosen), "seed": chosen[0]}
     return {"count": len(chosen), "first_seed": chosen[0]}

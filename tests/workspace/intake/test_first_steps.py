@@ -68,7 +68,7 @@ def test_a_run_whose_first_steps_were_not_sent_begins_before_its_first_command(w
     """A car's driver skipped step 0: all of it was booked a step late, its utility was halved."""
     policy = w.candidate("c0002")[0].policy
     found = w.ingest(unsent(w, tmp_path / "a.csv", policy, missed))
-    told = [one for one in found.warnings if "first command is that of step" in one]
+    told = [one for one in found.warnings if "first command in the log is that of step" in one]
     assert found.candidate == "c0002" and len(told) == bool(missed)
     assert all(f"step {missed} of c0002" in one for one in told)
     assert not any("bridged" in one or "seem to be" in one for one in found.warnings)

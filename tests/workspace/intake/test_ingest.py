@@ -127,14 +127,14 @@ def test_a_start_is_no_warning_where_earlier_ones_scatter_as_far(w, tmp_path):
         warnings = ingest_log(w, tmp_path / "t.mcap", "c0001").warnings
         told.append([one for one in warnings if "the run started with" in one])
     assert [len(one) for one in told] == [1, 1, 0, 0, 1]
-    assert "no need to run it again" in told[0][0] and "`discard t0005`" in told[-1][0]
+    assert "no need to repeat it" in told[0][0] and "`discard t0005`" in told[-1][0]
 
 
 @pytest.mark.parametrize("data", [False, True])
 def test_units_that_a_trial_states_must_be_the_models(w, tmp_path, data):
     """A trial in cm was stored as if it were in m."""
     write_trial(tmp_path / "t.mcap", plain(), {}, state_units={"x": "cm", "v": "m / s"})
-    with pytest.raises(GroundedError, match="x is in cm, the model has m") as refused:
+    with pytest.raises(GroundedError, match="x is in cm, but the model has it in m") as refused:
         ingest_log(w, tmp_path / "t.mcap", data=data)
     assert " v is" not in str(refused.value) and not w.store.list()
     write_trial(tmp_path / "u.mcap", plain(), {}, state_units={"x": "m", "v": "m / s"})
@@ -339,7 +339,7 @@ def test_a_state_without_a_sensor_gets_the_lines_that_estimate_it(w, tmp_path):
     (kept,) = found.trials()
     assert kept.meta["estimated"] == "v"
     file.write_text(f"{bare}\n{lines.replace('x = ', 'v = 0.1, x = ')}\n")
-    with pytest.raises(GroundedError, match=holding("'v'", "measured", "take it out")):
+    with pytest.raises(GroundedError, match=holding("'v'", "measured", "remove it")):
         ingest_log(Folder(w.folder), log, data=True)
     unheard = f"{bare}\n{lines}\n".replace('force = { path = "/csv.force" }', "")
     file.write_text(unheard)

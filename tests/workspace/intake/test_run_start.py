@@ -40,7 +40,7 @@ def test_a_run_with_feedback_is_found_to_the_log_s_sample(w, tmp_path, before, f
         candidate="c0002" if forced else None,
     )
     assert found.candidate == "c0002" and not found.warnings[:-1] and found.notes
-    assert not any("taken from" in note for note in exact.notes)
+    assert not any("left out" in note for note in exact.notes)
     stored = w.trials()[-1].trial
     table = np.loadtxt(tmp_path / "b.csv", delimiter=",", skiprows=1)
     k = round(before * RATE) + 5 * np.arange(policy.horizon)
@@ -370,7 +370,7 @@ def test_a_strange_log_has_no_start_and_is_taken_with_a_warning_where_it_is_name
     driven = 3 * np.sin(np.arange(policy.horizon) / 3)[:, None]
     strange = replace(policy, feedforward=driven, gain=0 * policy.gain)
     path = record(w, tmp_path / "a.csv", strange, 1.0)
-    with pytest.raises(GroundedError, match=holding("c0002", "--candidate c0002 all the same")):
+    with pytest.raises(GroundedError, match=holding("c0002", "--candidate c0002 anyway")):
         w.ingest(path)
     assert len(w.trials()) == 1
     found = w.ingest(path, candidate="c0002")
@@ -474,10 +474,10 @@ def test_stamps_of_a_recording_played_at_another_rate_are_told(w, tmp_path, pace
     np.savetxt(path, rows, "%.5f", ",", header="t,x,v,force", comments="")
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
-    assert holds(str(refused.value), "c0002", "stamps", f"times {pace:g}")
+    assert holds(str(refused.value), "c0002", "stamps", f"by {pace:g}")
     assert len(w.trials()) == 1
     named = w.ingest(path, candidate="c0002")
-    assert holds(named.warnings[0], "stamps", f"times {pace:g}")
+    assert holds(named.warnings[0], "stamps", f"by {pace:g}")
 
 
 def test_one_log_is_one_trial(w, tmp_path):
@@ -511,7 +511,7 @@ def test_data_that_begin_in_motion_begin_where_it_is_known_what_was_sent(w, tmp_
     """Held at rest before the first row, a delay made of the first step a limit that nobody has."""
     rows = recorded_in_motion(tmp_path / "a.csv")
     found = w.ingest(tmp_path / "a.csv", data=True)
-    assert any("before its first command" in note for note in found.notes)
+    assert any("before the first command" in note for note in found.notes)
     (kept,) = (t for t in w.trials() if t.stored.id == found.trial)
     first = round((0.17 + 0.25) / 0.01)  # nothing has changed for 0.25 s
     np.testing.assert_allclose(kept.trial.states[0], rows[first, 1:3], atol=1e-3)
@@ -625,7 +625,7 @@ def test_a_delay_that_puts_states_off_is_named_where_a_run_seems_to_begin_too_ea
     written = toml.read_text()
     toml.write_text(written.replace('path = "/csv.x"\n', 'path = "/csv.x"\ndelay_s = -0.24\n'))
     assert toml.read_text() != written
-    with pytest.raises(GroundedError, match=r"\[log\.state\.x\] delay_s = -0\.24 .*take that out"):
+    with pytest.raises(GroundedError, match=r"\[log\.state\.x\] delay_s = -0\.24 .*remove that"):
         Workspace(w.folder).ingest(log, candidate="c0002")
     toml.write_text(written)
     assert Workspace(w.folder).ingest(log, candidate="c0002").candidate == "c0002"

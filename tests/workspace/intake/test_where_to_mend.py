@@ -68,7 +68,7 @@ def test_a_late_sensor_of_a_foreign_log_is_mended_in_its_table(tmp_path):
     one = found_in(w)
     assert one.log.startswith("delay_s = 0.1")
     # before any candidate ran, a first run swung
-    assert holds(one.advice, "the robot's program", "late", "sensor_delay:v", "in place of delay_s")
+    assert holds(one.advice, "the robot's program", "late", "sensor_delay:v", "instead of delay_s")
     toml = w.folder / "grounded.toml"
     toml.write_text(toml.read_text().replace("[task]\n", "[task]\nfeedback = false\n"))
     assert not found_in(w).advice

@@ -1,14 +1,11 @@
-"""Effects that grounded.toml says were adopted, as part of the model that plans.
-
-`better_model` has those that were diagnosed in it before anybody adopts them, for reports to draw
-beside the crude one; once effects are adopted and nothing newer was diagnosed, it is the model that
-plans.
+"""Adopted effects, as listed in grounded.toml, as part of the model that plans.
 
     [model]
     effects = [ { name = "dead_zone:throttle", c = 0.146 } ]
 
-Families come with grounded and with other packages (`installed_effects`); how they
-join the model: `grounded.search.planner.planner_with`.
+Families come with grounded and with other packages (`installed_effects`);
+`grounded.search.planner.planner_with` adds them to the model. `better_model` is for reports: the
+model with diagnosed effects that are not adopted yet, or else with the adopted ones.
 """
 
 from __future__ import annotations
@@ -38,12 +35,12 @@ if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
     from grounded_trials.workspace.folder import Folder
 
-LINEAR = ("c", "k", "A", "B", "a", "b")  # the numbers of an added rate that it grows with
-STEEP = 3.0  # times its width: what a dry friction takes off a speed in a step, at most
+LINEAR = ("c", "k", "A", "B", "a", "b")  # parameters that an added rate is proportional to
+STEEP = 3.0  # largest change of speed by dry friction in one step, in units of its width
 
 
 def installed_effects() -> Library:
-    """The effects that may be blamed: built in, and those of other packages.
+    """Return the library of effects: built-in families, and those of other packages.
 
     A package adds families by the entry point group `grounded.effects`: a family, or a sequence of
     families.
@@ -59,7 +56,7 @@ def installed_effects() -> Library:
             loaded = point.load()
         except Exception as error:
             raise GroundedError(
-                f"the effects of package '{point.value}' can't be loaded: {error}; mend or "
+                f"the effects of package '{point.value}' can't be loaded: {error}; fix or "
                 "uninstall it"
             ) from None
         families = [loaded] if isinstance(loaded, Family) else list(loaded)
@@ -72,14 +69,14 @@ def installed_effects() -> Library:
 def in_order(
     old: Sequence[Mapping[str, Any]], new: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Effects that a model has and those that were diagnosed on it, in the order in which they act.
+    """Merge a model's effects with newly diagnosed ones, in the order in which they act.
 
-    A gain of a rate was found on the rate that the model had by then, adopted effects and all; here
-    it acts on the model's own, so that those grow with it.
+    A rate gain was diagnosed on the rate including the adopted effects, but acts on the model's own
+    rate. So the adopted effects on that rate are scaled by the gain.
 
     Args:
-        old: of the model, as [model] effects has them.
-        new: in the order of the diagnosis (`Diagnosis.joining`).
+        old: the effects of the model, as in [model] effects.
+        new: the new effects, in the order of the diagnosis (`Diagnosis.joining`).
     """
     library = installed_effects()
     both = ([_grown(library, effect, new) for effect in old], new)
@@ -90,7 +87,7 @@ def in_order(
 def _grown(
     library: Library, effect: Mapping[str, Any], new: Sequence[Mapping[str, Any]]
 ) -> Mapping[str, Any]:
-    """An adopted effect on a rate, as much larger as a gain of that rate that joins the model."""
+    """Scale an adopted effect on a rate by the newly diagnosed gain of that rate, if any."""
     name, _, target = str(effect["name"]).partition(":")
     family, driven = library.family(name), target.partition("<-")[0]
     gains = [1 + e["g"] for e in new if e["name"] == f"rate_gain:{driven}"]
@@ -101,7 +98,7 @@ def _grown(
 
 
 def planner_of(task: Task, effects: Sequence[Mapping[str, Any]]) -> Planner:
-    """The planner of a task whose model got these effects, in the order in which they act.
+    """Return the planner of a task with these effects in its model, in the order in which they act.
 
     Raises:
         GroundedError: for an unknown effect, or a quantity that is missing or unknown.
@@ -112,10 +109,11 @@ def planner_of(task: Task, effects: Sequence[Mapping[str, Any]]) -> Planner:
 
 
 def _followed(effect: Effect, values: Mapping[str, Any], dt: float) -> Mapping[str, float]:
-    """The quantities with a dry friction as steep as a step can follow.
+    """Check an effect's parameters and widen a dry friction too steep for the time step.
 
-    Where c dt is many times the width over which it builds up, a step throws a slow motion back
-    farther than it was: no plan gets through, a ball in a tube went to 4 m instead of 0.6.
+    If c dt is many times the width over which the friction builds up, one step reverses a slow
+    motion and makes it faster, so that no plan converges (a ball in a tube went to 4 m instead of
+    0.6 m).
     """
     whole = _checked(effect, values)
     if effect.family.name != "coulomb_friction":
@@ -124,10 +122,10 @@ def _followed(effect: Effect, values: Mapping[str, Any], dt: float) -> Mapping[s
 
 
 def but_late_sensors(effects: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Effects but delays and lags of sensors: those of the model that estimates states.
+    """Drop delays and lags of sensors from effects, for the model that estimates states.
 
-    What a log has of a late state is its late value; states that nothing measures are estimated as
-    late as what they are estimated from, or they contradict each other.
+    A log holds late values of a late state. Estimated states must be as late as the measured ones
+    they are estimated from, or the two contradict each other.
     """
     library = installed_effects() if effects else Library()
     family = {str(e["name"]): library.family(str(e["name"]).partition(":")[0]) for e in effects}
@@ -136,7 +134,7 @@ def but_late_sensors(effects: Sequence[Mapping[str, Any]]) -> list[Mapping[str, 
 
 
 def _checked(effect: Effect, values: Mapping[str, Any]) -> Mapping[str, float]:
-    """The quantities of an effect as grounded.toml has them: numbers, all there, in bounds."""
+    """Check the parameters of an effect in grounded.toml: complete, numbers, within bounds."""
     where = f"grounded.toml: [model] effects: {effect.name}"
     for key, value in values.items():
         number = isinstance(value, int | float) and not isinstance(value, bool)
@@ -152,16 +150,16 @@ def _checked(effect: Effect, values: Mapping[str, Any]) -> Mapping[str, float]:
             at_most = f" and at most {high:g}" * math.isfinite(high)
             at_least = f"at least {low:g}" if math.isfinite(low) else "a number"
             raise GroundedError(
-                f"{where}: {name} = {whole[name]:g} can't be: expected {at_least}{at_most}; "
-                "correct it, or take the effect out"
+                f"{where}: {name} = {whole[name]:g} is out of bounds: expected {at_least}{at_most};"
+                " correct it, or remove the effect"
             )
     return whole
 
 
 def _bounds(effect: Effect) -> dict[str, tuple[float, float]]:
-    """Bounds that are a quantity's own; those that a scan chose by the data's scale are left out.
+    """Return the bounds of parameters, without those that depend on the scale of the data.
 
-    They are told apart by building the effect for data of another size.
+    To separate the two, the effect is built for data of two different scales.
     """
     model, targets = effect.site.model, effect.site.targets
     names = (*model.state_names, *model.input_names)
@@ -188,10 +186,10 @@ class Better:
 
 
 def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | None:
-    """The diagnosed model, or else the one with adopted effects; None where there is neither.
+    """Return the diagnosed model, else the one with adopted effects, or None if there is neither.
 
     Raises:
-        GroundedError: if the diagnosis names an effect or a quantity that is not known.
+        GroundedError: if the diagnosis names an unknown effect or parameter.
     """
     own, effects = _as_diagnosed(workspace, diagnosis) if diagnosis is not None else ({}, [])
     if not (own or effects):
@@ -205,7 +203,7 @@ def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | Non
 def _as_diagnosed(
     workspace: Folder, diagnosis: Diagnosis
 ) -> tuple[dict[str, float], list[dict[str, Any]]]:
-    """The parameters and effects with what is claimed and not adopted; empty for nothing new."""
+    """Return parameters and effects including claims not adopted yet; empty if there are none."""
     from grounded_trials.workspace.adopting import joined, nominal_values
 
     table = workspace.config.model

@@ -1,8 +1,7 @@
-"""adopt in a workspace: diagnosed effects join the model of grounded.toml, with their values.
+"""Adopt in a workspace: add diagnosed effects to the model of grounded.toml, with their values.
 
-A diagnosis estimates the model's parameters beside the effects, so both belong to what it claims
-and are adopted together. reports/adoptions.json keeps what [model] was before each, so that the
-last can be undone.
+A diagnosis estimates the model's parameters together with the effects, so both are adopted
+together. reports/adoptions.json records [model] before each adoption, so that it can be undone.
 """
 
 from __future__ import annotations
@@ -25,38 +24,38 @@ from grounded_trials.workspace.intake.where_to_mend import in_time_now
 Effect = dict[str, Any]  # {"name": "dead_zone:throttle", "c": 0.146}
 AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")
 KEPT = "adoptions.json"  # in reports/
-SLIGHT = 1e-3  # of a parameter: no move at all
+SLIGHT = 1e-3  # relative change of a parameter that counts as none
 
 
 @dataclass(frozen=True)
 class Left:
-    """A number that moved beside the effects and is not adopted with them."""
+    """A parameter that changed in the fit of the effects and is not adopted with them."""
 
     called: str  # `m`, or `k of coupling:w<-th`
-    kept: float  # what it stays at
-    value: float  # beside what the effects were fitted
+    kept: float  # its value in the model
+    value: float  # its value in the fit of the effects
     unit: str
 
 
 @dataclass(frozen=True, repr=False)
 class Adopted(Result):
-    """What the model has now."""
+    """The model's effects and parameters after an adoption."""
 
-    effects: tuple[Mapping[str, Any], ...]  # all that are adopted
-    params: Mapping[str, float]  # of the model, written with them
-    claimed: bool  # the diagnosis claims the new ones; else one was taken by itself
+    effects: tuple[Mapping[str, Any], ...]  # all adopted effects
+    params: Mapping[str, float]  # model parameters written with the new effects
+    claimed: bool  # whether the diagnosis claims the new effects; else one was adopted alone
     then: NextCommand = PROPOSE
-    beside: tuple[str, ...] = ()  # adopted before from the same diagnosis, fitted in their place
-    left: Mapping[str, Left] = field(default_factory=dict)  # by name
-    logged: str = ""  # the trial whose drive target.csv still is, where it ran no candidate
-    stopped: str = ""  # what to do about parameters that went as far as they may
+    beside: tuple[str, ...] = ()  # adopted from the same diagnosis, but fitted instead of these
+    left: Mapping[str, Left] = field(default_factory=dict)  # by parameter name
+    logged: str = ""  # the trial that target.csv still repeats, if it ran no candidate
+    stopped: str = ""  # what to do about parameters that reached their bounds
 
     def summary(self) -> str:
-        """The effects that the model has now."""
+        """Return the effects that the model has now."""
         return ", ".join(str(effect["name"]) for effect in self.effects)
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `adopt --json`."""
+        """Return the document of `adopt --json`."""
         effects = [dict(effect) for effect in self.effects]
         return {
             "effects": effects,
@@ -69,36 +68,36 @@ class Adopted(Result):
 
 @dataclass(frozen=True, repr=False)
 class Undone(Result):
-    """What the model has again."""
+    """The model's effects and parameters after an adoption was undone."""
 
-    undone: tuple[str, ...]  # the effects that the last adoption had brought
-    effects: tuple[Mapping[str, Any], ...]  # all that are adopted now
-    params: Mapping[str, float]  # of [model] now
+    undone: tuple[str, ...]  # the effects of the adoption that was undone
+    effects: tuple[Mapping[str, Any], ...]  # all adopted effects
+    params: Mapping[str, float]  # [model] params
     then: NextCommand = PROPOSE
 
     def summary(self) -> str:
-        """The effects that the model lost again."""
+        """Return the effects that were removed from the model."""
         return ", ".join(self.undone)
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `adopt --undo --json`."""
+        """Return the document of `adopt --undo --json`."""
         effects = [dict(effect) for effect in self.effects]
         return {"undone": list(self.undone), "effects": effects, "params": dict(self.params)}
 
 
 def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool = True) -> Adopted:
-    """Adds diagnosed effects to [model] effects, see `Workspace.adopt`; or else writes nothing.
+    """Add diagnosed effects to [model] effects, see `Workspace.adopt`; write nothing on an error.
 
-    Where the diagnosis calibrated the model's own parameters beside the effects that it claims,
-    they are adopted with those: the effects' values hold beside them. An effect that it does not
-    claim was fitted in place of those, without them.
+    If the diagnosis calibrated the model's own parameters together with the effects that it claims,
+    these parameters are adopted too, since the effects' values are only valid with them. An effect
+    that it does not claim was fitted instead of those, without parameters.
     """
     from grounded_trials.workspace.adopted import in_order
     from grounded_trials.workspace.next_step import logged_target, to_plan
 
     found = read_diagnosis(workspace.reports)
     if found is None:
-        raise GroundedError("nothing was diagnosed yet: diagnose first", then=AGAIN)
+        raise GroundedError("nothing was diagnosed yet: run a diagnosis first", then=AGAIN)
     names = _corrections(found, list(dict.fromkeys(names)))
     before = {} if found.made is None else found.made.effects
     _check(names, found, workspace, before)
@@ -110,7 +109,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     own, both = joined(found, names, old, nominal, calibrated)
     adopted = in_order(both[: len(old)], both[len(old) :])
     whole = dict(workspace.config.model.params) | own
-    earlier, _ = _kept(workspace)  # or nothing is written
+    earlier, _ = _kept(workspace)  # raises before anything is written
     set_in_model(workspace.config.file, params=whole if own else None, effects=adopted or None)
     model = workspace.config.model
     after = {"effects": adopted or model.effects, "params": whole if own else model.params}
@@ -132,9 +131,10 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
 
 
 def left_behind(found: Diagnosis) -> dict[str, Left]:
-    """The numbers, of parameters and adopted effects, that moved and are not adopted.
+    """Return the parameters, also of adopted effects, that changed in the fit but are not adopted.
 
-    The trials do not tell them apart from others; what the diagnosis measured had them all.
+    The trials do not identify them, but the prediction errors of the diagnosis include their
+    changes.
     """
     from grounded.effects import param_name
 
@@ -153,7 +153,7 @@ def left_behind(found: Diagnosis) -> dict[str, Left]:
 
 
 def undo_adoption(workspace: Folder) -> Undone:
-    """Gives [model] back what it had before an adoption, see `Workspace.undo_adoption`.
+    """Restore [model] as it was before the last adoption, see `Workspace.undo_adoption`.
 
     Raises:
         GroundedError: if nothing is left to undo, or [model] was changed since.
@@ -165,8 +165,8 @@ def undo_adoption(workspace: Folder) -> Undone:
     if not kept:
         has = ", ".join(str(effect["name"]) for effect in model.effects) or "none"
         raise GroundedError(
-            f"no adoption is left to undo; [model] effects in {file}: {has}. One that was written "
-            "there by hand is taken out by hand"
+            f"no adoption is left to undo; [model] effects in {file}: {has}. Remove effects that "
+            "were written by hand there"
         )
     *earlier, last = kept
     names, before = [str(name) for name in last["names"]], last["before"]
@@ -175,8 +175,8 @@ def undo_adoption(workspace: Folder) -> Undone:
         had = listed(f"{name} = {value.as_string()}" for name, value in was.items())
         raise GroundedError(
             f"[model] in {file} was changed after {', '.join(names)} was adopted, by `fit --apply` "
-            f"or by hand, which would be lost. Before, it had {had}: write there what "
-            "should stay"
+            f"or by hand, and undoing would lose that. Edit [model] by hand instead; before the "
+            f"adoption it had {had}"
         )
     set_in_model(file, params=before["params"], effects=before["effects"])
     write_document(workspace.reports / KEPT, {"adoptions": earlier, "undone": [*undone, *names]})
@@ -185,12 +185,12 @@ def undo_adoption(workspace: Folder) -> Undone:
 
 
 def declined(workspace: Folder) -> tuple[str, ...]:
-    """What the last diagnosis claims, and was adopted and undone since."""
+    """Return the effects of the last diagnosis that were adopted and undone since."""
     return tuple(str(name) for name in _kept(workspace)[1])
 
 
 def _kept(workspace: Folder) -> tuple[list[dict[str, Any]], list[str]]:
-    """The adoptions that can be undone, oldest first, and what was undone since a diagnosis."""
+    """Read the adoptions that can be undone, oldest first, and those undone since a diagnosis."""
     path = workspace.reports / KEPT
     try:
         document = read_document(path)
@@ -199,19 +199,19 @@ def _kept(workspace: Folder) -> tuple[list[dict[str, Any]], list[str]]:
         return [], []
     except (ValueError, KeyError, TypeError, RecursionError, GroundedError) as error:
         raise GroundedError(
-            f"{path} can't be read ({error}): without it, adoptions can't be undone; delete it"
+            f"{path} can't be read ({error}): delete it; earlier adoptions can't be undone then"
         ) from None
 
 
 def diagnosed_again(workspace: Folder) -> None:
-    """Forgets what was undone: a newer diagnosis may claim it again."""
+    """Forget which effects were undone: a newer diagnosis may claim them again."""
     kept, undone = _kept(workspace)
     if undone:
         write_document(workspace.reports / KEPT, {"adoptions": kept, "undone": []})
 
 
 def _written(model: ModelTable) -> dict[str, Any]:
-    """What an adoption may change, as JSON has it."""
+    """Return the parts of [model] that an adoption may change, for JSON."""
     return {"effects": [dict(e) for e in model.effects], "params": dict(model.params)}
 
 
@@ -222,14 +222,14 @@ def joined(
     nominal: Mapping[str, float],
     calibrated: Mapping[str, Estimate],
 ) -> tuple[dict[str, float], list[Effect]]:
-    """The parameters that are set and all effects, once diagnosed ones have joined a model.
+    """Return the parameters to set and all effects, after adding diagnosed effects to a model.
 
     Args:
         found: the diagnosis.
-        names: of its effects, in any order: they join in that in which they were fitted.
-        effects: that the model has already; they stay in front.
-        nominal: the value from which each parameter that is adopted by name counts.
-        calibrated: the parameters that come along.
+        names: its effects to add, in any order: they are added in the order of the fit.
+        effects: the effects that the model has already; they stay in front.
+        nominal: the value to which the change of each parameter among `names` is added.
+        calibrated: the parameters that are adopted with the effects.
     """
     before = {} if found.made is None else found.made.effects
     adopted, new = [dict(effect) for effect in effects], list[Effect]()
@@ -240,7 +240,7 @@ def joined(
         family, _, target = name.partition(":")
         if family == "parameter":
             params[target] = _rounded(nominal[target] + values["d"])
-        elif name in before:  # a delay more
+        elif name in before:  # a further delay adds to the adopted one
             values["d"] = _rounded(float(before[name]["d"]) + values["d"])
             adopted = [e | values if e["name"] == name else e for e in adopted]
         else:
@@ -253,7 +253,11 @@ def _curves(found: Diagnosis) -> list[str]:
 
 
 def _corrections(found: Diagnosis, names: list[str]) -> list[str]:
-    """The names with `correction:v` replaced by its curves, which must have passed their test."""
+    """Replace `correction:v` by its curves.
+
+    Raises:
+        GroundedError: if the correction is not adoptable, or claimed effects are not adopted too.
+    """
     curves, asked = _curves(found), [n for n in names if n.startswith("correction:")]
     if found.correction is None or asked not in (
         [f"correction:{found.correction.channel}"],
@@ -262,31 +266,31 @@ def _corrections(found: Diagnosis, names: list[str]) -> list[str]:
         return names
     if not found.correction.adoptable:
         raise GroundedError(
-            f"'{asked[0]}' does not predict trials better that it was not fitted to: expected a "
-            "correction that is adoptable; run more trials and diagnose again"
+            f"'{asked[0]}' is not adoptable: it does not predict trials better that it was not "
+            "fitted to; run more trials and diagnose again"
         )
     missing = [name for name in found.effects if name not in names]
     if missing:
         raise GroundedError(
-            f"'{asked[0]}' was fitted beside {', '.join(missing)}: adopt them together",
+            f"'{asked[0]}' was fitted together with {', '.join(missing)}: adopt them together",
             then=NextCommand("adopt", (*missing, asked[0])),
         )
     return [name for name in names if name not in asked] + curves
 
 
 def nominal_values(found: Diagnosis, workspace: Folder, names: Iterable[str]) -> dict[str, float]:
-    """The values, when a diagnosis was made, of the parameters among its effects.
+    """Return the values that parameters among the effects had when the diagnosis was made.
 
     Raises:
-        GroundedError: if neither an older document nor the model has one.
+        GroundedError: if neither the diagnosis nor the model has a value.
     """
     made, base = found.made or Made(), workspace.base_model.params
     nominal = {}
     for name in (n.removeprefix("parameter:") for n in names if n.startswith("parameter:")):
         if name not in made.nominal and name not in base:
             raise GroundedError(
-                f"the last diagnosis does not say from which value of '{name}' it counts: diagnose "
-                "again",
+                f"the last diagnosis does not state the value of '{name}' that it started from: "
+                "diagnose again",
                 then=AGAIN,
             )
         nominal[name] = made.nominal[name] if name in made.nominal else float(base[name].value)
@@ -296,7 +300,7 @@ def nominal_values(found: Diagnosis, workspace: Folder, names: Iterable[str]) ->
 def settled(
     params: Mapping[str, float], effects: Sequence[Mapping[str, Any]]
 ) -> tuple[dict[str, float], list[Effect]]:
-    """The model's own parameters, and the effects with the values of theirs."""
+    """Split parameters into the model's own, and those of effects, which are set in the effects."""
     from grounded.effects import param_name
 
     own, changed = dict(params), []
@@ -311,7 +315,11 @@ def settled(
 def _check(
     names: Sequence[str], found: Diagnosis, workspace: Folder, before: Mapping[str, Any]
 ) -> None:
-    """Each must have been weighed, and not be adopted since."""
+    """Check that each effect is in the diagnosis and was not adopted since.
+
+    Raises:
+        GroundedError: if not, or if [log] already corrects the delay that it describes.
+    """
     known = [row.effect for row in found.ranking] + _curves(found) + [*found.late_sensors]
     adopted = [e["name"] for e in workspace.config.model.effects if e["name"] not in before]
     in_log = in_time_now(workspace, found.preflight)
@@ -324,11 +332,11 @@ def _check(
         if name in in_log:
             _, _, state = name.partition(":")
             raise GroundedError(
-                f"'{name}': [log.state.{state}] delay_s = {in_log[name]:g} takes that delay out of "
-                "every log that is read now, and the model would have it as well. Expected one of "
-                "both: take delay_s out again, as it was for the trials that were diagnosed, and "
-                "the plan knows what the robot's program gets; or keep delay_s, and let that "
-                "program predict it ahead by as much"
+                f"'{name}': [log.state.{state}] delay_s = {in_log[name]:g} already removes that "
+                "delay from every log that is read, so the model must not have it as well. Either "
+                "remove delay_s again, as it was for the diagnosed trials, so that plans allow for "
+                "the delay that the robot's program sees; or keep delay_s and let that program "
+                "predict the state ahead by as much"
             )
         if name in adopted:
             raise GroundedError(
@@ -337,7 +345,7 @@ def _check(
 
 
 def _check_alike(name: str, found: Diagnosis) -> None:
-    """Refuses what the diagnosis lists as alike a claimed effect, and has no values for."""
+    """Refuse an effect that the diagnosis only lists as alike a claimed one, without values."""
     alike = next((one for one in found.lookalikes if one.like == name), None)
     if alike is None:
         return
@@ -347,15 +355,20 @@ def _check_alike(name: str, found: Diagnosis) -> None:
     if family == name.partition(":")[0]:
         then, what = NextCommand("adopt", found.effects), "adopt that one"
     raise GroundedError(
-        f"'{name}' was not fitted in its own right, so that it has no values: the last diagnosis "
-        f"lists it because it makes {percent(alike.share)} of the signal of {alike.effect}, which "
-        f"was fitted; {what} instead",
+        f"'{name}' was not fitted in its own right and has no values: the last diagnosis lists it "
+        f"because it reproduces {percent(alike.share)} of the signal of {alike.effect}, which was "
+        f"fitted; {what} instead",
         then=then,
     )
 
 
 def _claimed(found: Diagnosis, names: Sequence[str]) -> bool:
-    """Whether the verdict claims them all; several that it doesn't were fitted as rivals."""
+    """Return whether the verdict claims all the effects.
+
+    Raises:
+        GroundedError: if nothing can be adopted, or several effects are named and some of them were
+            fitted as alternatives to others.
+    """
     if found.no_cause:
         raise GroundedError(
             f"too little is known to adopt anything ({found.sentence}): run another trial, ingest "
@@ -366,7 +379,7 @@ def _claimed(found: Diagnosis, names: Sequence[str]) -> bool:
         own = f"those that it claims ({', '.join(found.effects)}), or " * bool(found.effects)
         raise GroundedError(
             f"the last diagnosis does not claim {', '.join(rivals)}: these effects were fitted one "
-            f"instead of another, not together; expected {own}one alone",
+            f"instead of another, not together; adopt {own}one alone",
             then=NextCommand("adopt", found.effects or (rivals[0],)),
         )
     return not rivals

@@ -1,8 +1,8 @@
 """grounded.toml: the task, the search, how to reach the real system, how to read its logs.
 
-Only shapes and names are checked here that need no model; names of states and inputs are checked
-in `workspace`, once the model is loaded. docs/configuration.md lists every key.
-Changes (tomlkit) leave the user's comments and layout alone.
+Only checks that need no model are made here; names of states and inputs are checked in `folder`,
+once the model is loaded. docs/configuration.md lists every key. Changes are made with tomlkit,
+which keeps the user's comments and layout.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from grounded_trials.toml_table import Table, read_toml
 
 MADE = re.compile(r"(?m)^# input_change = \{.*\}$")
 FILE = "grounded.toml"
-OFFERED = 10  # times the weight of a state: what a comment of `init` offers for the run's end
+OFFERED = 10  # terminal weights in the comment that `init` writes, as multiples of `state`
 
 
 @dataclass(frozen=True)
 class ModelTable:
-    """[model]: where the crude model is, and what is changed in it."""
+    """[model]: where the crude model is, and changes to its parameters and effects."""
 
     file: str = ""
     module: str = ""
@@ -45,13 +45,13 @@ class TaskTable:
     start: Mapping[str, float]
     latency: Mapping[str, float]
     horizon: int = 1
-    target: str = ""  # none: logs are fitted and diagnosed, nothing can be proposed
+    target: str = ""  # none: logs can be fitted and diagnosed, but nothing can be proposed
     feedback: bool = True
 
 
 @dataclass(frozen=True)
 class SystemTable:
-    """[system]: a command of the user's, or a simulated system."""
+    """[system]: the user's command, or a simulated system."""
 
     command: str = ""
     model: str = ""
@@ -60,13 +60,13 @@ class SystemTable:
 
     @property
     def reachable(self) -> bool:
-        """Whether `run` can reach the system; else candidates are run by hand."""
+        """Whether `run` can reach the system; otherwise the user runs candidates by hand."""
         return bool(self.command or self.model)
 
 
 @dataclass(frozen=True)
 class Config:
-    """A checked grounded.toml; tables that need the model's names stay tables."""
+    """A checked grounded.toml; tables with names of states or inputs stay unchecked tables."""
 
     file: Path
     model: ModelTable
@@ -81,10 +81,10 @@ class Config:
 
 
 def read_config(folder: Path) -> Config:
-    """Reads and checks the workspace's grounded.toml.
+    """Read and check the workspace's grounded.toml.
 
     Raises:
-        GroundedError: naming the key, what was found and what would be right.
+        GroundedError: naming the key, what was found and what was expected.
     """
     table = read_toml(folder / FILE)
     table.expect(*(field.name for field in fields(Config) if field.name != "file"))
@@ -103,10 +103,10 @@ def read_config(folder: Path) -> Config:
 
 
 def _values(table: Table, kind: type, *others: str) -> dict[str, Any]:
-    """The keys of a table that are there, each checked to be what its field holds.
+    """Read the keys that a table has, checked against the types of a dataclass.
 
     Args:
-        table: what the user wrote; a key that is no field is complained about.
+        table: what the user wrote; unknown keys are errors.
         kind: a dataclass whose fields are numbers, texts, choices, or tables of numbers.
         others: fields that are read elsewhere.
     """
@@ -184,15 +184,15 @@ def _system(table: Table) -> SystemTable:
 
 
 def _log(table: Table) -> Table:
-    """[log] as it stands; an entry without a path reads nothing, so that its keys would be lost."""
+    """Check that each entry of [log] has a path; its other keys would have no effect without."""
     for kind in ("state", "input"):
         group = table.sub(kind)
         for name in group.names():
             if not (one := group.sub(name)).has("path"):
                 raise one.error(
                     "path",
-                    f"is missing: [log] says where a foreign log has {name}, and what is done to "
-                    "it there; a trial that grounded's own TrialWriter wrote is taken as it is",
+                    f"is missing: [log] states where {name} is in a foreign log and how to convert "
+                    "it; trials written by grounded's own TrialWriter need no entry",
                 )
     return table
 
@@ -202,7 +202,7 @@ def set_in_model(
     params: Mapping[str, float] | None = None,
     effects: Sequence[Mapping[str, Any]] | None = None,
 ) -> None:
-    """Replaces [model] params and/or effects; the rest of the file stays as it is.
+    """Replace [model] params and/or effects; the rest of the file is unchanged.
 
     Raises:
         GroundedError: if the file can't be written.
@@ -213,7 +213,7 @@ def set_in_model(
 def as_toml(
     params: Mapping[str, float] | None, effects: Sequence[Mapping[str, Any]] | None
 ) -> dict[str, Any]:
-    """`params` and `effects` as the values that [model] has in grounded.toml, without None."""
+    """Return `params` and `effects` as values of [model] in grounded.toml; None is left out."""
     import tomlkit
 
     found: dict[str, Any] = {}
@@ -228,7 +228,7 @@ def as_toml(
 
 
 def set_latency(file: Path, latency: Mapping[str, float]) -> None:
-    """Replaces [task] latency."""
+    """Replace [task] latency."""
     _change(file, "task", {"latency": _inline(latency)})
 
 
@@ -240,11 +240,19 @@ def set_target(
     before: Mapping[str, float],
     changes: Mapping[str, tuple[float, float]],
 ) -> None:
-    """Replaces [task] target and horizon, and the weights of [reward] that nobody chose.
+    """Replace [task] target and horizon, and the weights of [reward] not chosen by the user.
 
-    Of states those are none, `before`, which belonged to the last target, or 1 each, of `init
-    --blank`. Where they are, so is what `init` wrote for the `changes` of inputs, by name the
-    weight without [limits] and by them: the former, of `--blank`, or `made_changes`.
+    [reward] state counts as not chosen if it is empty, equals `before`, or is 1 for each state (as
+    `init --blank` writes it). In that case [reward] input_change is replaced too, for the inputs
+    whose weight is still what `init` wrote.
+
+    Args:
+        file: grounded.toml.
+        name: the file of the target.
+        steps: the horizon.
+        weights: the new weights of states.
+        before: the weights that the previous target gave.
+        changes: by input, its weight on changes without [limits], and with them.
     """
     import tomlkit
 
@@ -277,10 +285,10 @@ def set_target(
 
 
 def made_changes(text: str) -> dict[str, float]:
-    """The weights on changes of inputs that `init --from` or `target` made, as a comment has them.
+    """Return the `input_change` weights that `init --from` or `target` wrote, from their comment.
 
     Args:
-        text: of grounded.toml.
+        text: the text of grounded.toml.
     """
     found = MADE.search(text)
     with suppress(tomllib.TOMLDecodeError):
@@ -290,7 +298,7 @@ def made_changes(text: str) -> dict[str, float]:
 
 
 def _offered(found: re.Match[str], before: Mapping[str, float], now: Mapping[str, float]) -> str:
-    """What `init` offers for the end, OFFERED times the weights of states; else what was there."""
+    """Return the comment with terminal weights, renewed if it is still what `init` wrote."""
     with suppress(tomllib.TOMLDecodeError, TypeError, AttributeError):
         told = tomllib.loads(found[0].removeprefix("# "))["terminal"]
         if told.keys() == before.keys() and all(
@@ -315,7 +323,7 @@ def _put(document: Any, where: str, changes: Mapping[str, Any]) -> None:
     table: Any = document.setdefault(where, tomlkit.table())
     table.update({name: value for name, value in changes.items() if value})
     for name in [name for name, value in changes.items() if not value]:
-        table.pop(name, None)  # empty is what it is without
+        table.pop(name, None)  # an empty value is equivalent to a missing key
 
 
 def _inline(values: Mapping[str, Any]) -> Any:

@@ -1,8 +1,8 @@
-"""diagnose in a workspace: which trials, which model, where the result is kept and read again.
+"""Run a diagnosis in a workspace: choose trials and model, store the result and read it again.
 
-A diagnosis uses the stored trials up to the first missing input or runaway number; gaps in single
-states stay gaps. reports/diagnosis.json keeps the result; it may come from another version, or from
-a stranger, so no text in it is trusted.
+A diagnosis uses the stored trials up to the first missing input or unbounded number; gaps in single
+states stay gaps. reports/diagnosis.json holds the result. It may come from another version or an
+untrusted source, so no text in it is trusted.
 """
 
 from __future__ import annotations
@@ -54,11 +54,12 @@ def diagnose_in(
     engine: Engine | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
-    """Diagnoses the gap between the model and the stored trials; keeps reports/diagnosis.json.
+    """Diagnose the gap between the model and the stored trials; write reports/diagnosis.json.
 
-    The model is diagnosed with the effects that were adopted. Where two effects tie, it writes the
-    candidate that would tell them apart, `.probe`; asked to, else the one that teaches most.
-    `.next_trial` says what to expect of it. Arguments as `Workspace.diagnose`.
+    The model is diagnosed with the effects that were adopted. If two effects are tied, the
+    candidate that would separate them is written too (`.probe`); with `probe`, the most informative
+    one is written even if nothing is tied. `.next_trial` says what to expect of it. For the
+    arguments see `Workspace.diagnose`.
     """
     from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
     from grounded.effects import Library
@@ -79,7 +80,7 @@ def diagnose_in(
         library=library,
         max_effects=max_effects,
         hidden=tuple(memory),
-        but={*names} - {*delays},  # whose d is no parameter
+        but={*names} - {*delays},  # the d of a delay is not a model parameter
         delays=delays,
         origin=workspace.origin if effects or workspace.config.model.params else None,
     )
@@ -104,8 +105,8 @@ def diagnose_in(
     diagnosed_again(workspace)
     try:
         identity, words = _probe(workspace, found, lifted + second, library, write=probe)
-    except Exception as error:  # it must not cost the diagnosis, which is told whatever it is
-        if not isinstance(error, GroundedError):  # a mistake of ours: its traceback is told as well
+    except Exception as error:  # a failed probe must not lose the diagnosis
+        if not isinstance(error, GroundedError):  # a bug in grounded: log its traceback too
             logging.getLogger(__name__).error("the probe failed, please report it", exc_info=error)
         why = str(error) or type(error).__name__
         identity, words = "", f"{found.next_trial.rstrip('.')}; no probe could be computed ({why})"
@@ -117,13 +118,14 @@ def diagnose_in(
     if undo:
         found = replace(found, next_trial=f"{undo} {found.next_trial}")
     ran = tuple(trial.id for trial in used + others if trial.candidate)
-    wrong = ran if any(one.log for one in in_the_log(measured)) else ()  # in every trial
+    wrong = ran if any(one.log for one in in_the_log(measured)) else ()  # it affects every trial
     if wrong:
         first = (
-            "Mend what writes the trials first, and take those out that the search learned from."
+            "First fix the program that writes the trials, and discard those the search learned "
+            "from."
         )
         found = replace(found, next_trial=f"{first} {found.next_trial}")
-    _keep(workspace, found)  # with what is said of the next trial
+    _keep(workspace, found)  # again, now with `next_trial`
     then = REPORT if undo else after_diagnosis(workspace, found)
     then = NextCommand("discard", wrong) if wrong else then
     if then == EXPORT and found.kind != "none":
@@ -133,7 +135,7 @@ def diagnose_in(
 
 
 def _as_known(workspace: Folder, ranking: Sequence[Ranked], made: Made) -> tuple[Ranked, ...]:
-    """The ranking with delays no surer than tables say when a command was sent, see `Gridded`."""
+    """Widen delays in the ranking by the row interval of tables, see `Gridded`."""
     logs = [one for one in workspace.whole_trials() if one.stored.id in made.trials]
     row = max((float(one.meta.get(ROWS, 0.0)) for one in logs), default=0.0)
 
@@ -152,9 +154,9 @@ def _as_known(workspace: Folder, ranking: Sequence[Ranked], made: Made) -> tuple
 
 
 def _in_vain(workspace: Folder, found: Diagnosis) -> str:
-    """How to undo an adoption after which candidates lost in a row, and no cause is known.
+    """Suggest undoing an adoption if later candidates lost in a row for no known cause; else "".
 
-    Where predictions are better with it than they were before it, the losses have another cause.
+    If predictions are better with the adopted effects than before, the losses have another cause.
     """
     from grounded.search.standing import LOST
     from grounded_trials.workspace.proposing import standing_in
@@ -171,13 +173,13 @@ def _in_vain(workspace: Folder, found: Diagnosis) -> str:
     if lost < LOST:
         return ""
     return (
-        f"The last {lost} candidates planned with the adopted {', '.join(names)} lost: "
-        "`grounded adopt --undo` takes the last adoption back; then diagnose again."
+        f"The last {lost} candidates planned with the adopted {', '.join(names)} lost: undo the "
+        "last adoption with `grounded adopt --undo`, then diagnose again."
     )
 
 
 def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
-    """What the stored trials say of the instruments, before any physics."""
+    """Check the instruments (sensors, clocks, units) in the stored trials, without the physics."""
     from grounded.instruments.sound_trials import sound_trials
 
     planner = workspace.planner
@@ -188,7 +190,7 @@ def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Findi
 
 
 def unheld_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[str, ...]:
-    """The logged states that the stored trials have no other sensor for, see `unheld`."""
+    """Return the logged states that no other sensor in the trials can check, see `unheld`."""
     from grounded.instruments.rows import unheld
 
     return unheld(workspace.planner.task.model, _chosen(workspace, trials))
@@ -200,10 +202,10 @@ def _keep(workspace: Folder, found: Diagnosis) -> None:
 
 
 def read_diagnosis(folder: Path) -> Diagnosis | None:
-    """The diagnosis in a reports folder; None when there is none.
+    """Read the diagnosis in a reports folder; return None if there is none.
 
     Raises:
-        GroundedError: if the file can't be read, or holds something else.
+        GroundedError: if the file can't be read, or does not hold a diagnosis.
     """
     path = folder / FILE
     try:
@@ -217,11 +219,11 @@ def read_diagnosis(folder: Path) -> Diagnosis | None:
 
 
 def _chosen(workspace: Folder, names: Sequence[str]) -> list[Trial]:
-    """The trials to diagnose: gaps in a state stay, what a smoother made of them is no evidence."""
+    """Return the trials to diagnose; states filled in by a smoother are no evidence: NaN again."""
     used = diagnosable(workspace)
     if not used:
         raise GroundedError(
-            "there is no trial to learn from: ingest some, runs of candidates or logs with --data"
+            "there is no trial to learn from: ingest runs of candidates, or other logs with --data"
         )
     known = [trial.id for trial in used]
     for name in names:
@@ -236,7 +238,7 @@ def _chosen(workspace: Folder, names: Sequence[str]) -> list[Trial]:
 
 
 def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:
-    """A trial without the states that it did not measure."""
+    """Set the states that a trial did not measure to NaN."""
     states = trial.states.copy()
     states[:, [trial.state_names.index(name) for name in guessed]] = math.nan
     return replace(trial, states=states)
@@ -245,14 +247,15 @@ def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:
 def _probe(
     workspace: Folder, found: Diagnosis, trials: Sequence[Trial], library: Library, *, write: bool
 ) -> tuple[str, str]:
-    """Writes the candidate that would tell two tied effects apart, or if asked: (id, sentence).
+    """Write the candidate that would separate two tied effects; return (id, sentence).
 
-    It is one that `run` and `export` hand over: inside today's [limits], and inside [safety] by as
-    much as runs have strayed.
+    The candidate is one that `run` and `export` accept: inside the current [limits], and inside
+    [safety] with a margin as large as runs have strayed. With `write` one is written even if
+    nothing is tied. The id is "" if none is written.
     """
     none = f"{found.next_trial.rstrip('.')}. No probe is written"
     if found.no_cause:
-        return "", f"{none}: nothing can be named from these trials." * write
+        return "", f"{none}: these trials can't identify any cause." * write
     from grounded.diagnosis.excitation import NOTHING, probe
     from grounded.diagnosis.verdict import sentence
     from grounded.search.safety import objections, spread
@@ -262,7 +265,7 @@ def _probe(
     now = standing_in(workspace)
     best = now.incumbent
     if best is None:
-        return "", f"{none}: it varies the best candidate, and none has run to its end." * write
+        return "", f"{none}: a probe varies the best candidate, and no run was complete." * write
     planner = workspace.planner
     task, strays = planner.task, spread(planner.task, now.history, best.candidate.model)
     own = best.candidate.policy
@@ -270,7 +273,7 @@ def _probe(
     base = planner.widened(replace(own, low=low, high=high))
     ties = {*found.indistinguishable} - {*found.equivalent}
     offer = write or bool(ties)
-    why = "none of those tried stays inside [safety], or near where trials have been"
+    why = "none of those tried stays inside [safety] and near the stored trials"
     plan = _near(planner, trials)
     for room in (0 * strays.size, strays.size):
         inside = _narrower(plan, room.max(axis=0))
@@ -278,7 +281,7 @@ def _probe(
         if made is None:
             break
         worth = not made.little or (write and (not ties or made.expected >= NOTHING))
-        if not worth:  # asked for, the best of them is written nevertheless
+        if not worth:
             said = made.sentence if ties else f"{found.next_trial} {sentence([made.sentence])}"
             return "", f"{said.rstrip('.')}. No probe is written." if write else said
         if not offer:
@@ -287,7 +290,7 @@ def _probe(
         reasons = (*outside_limits(task, candidate.policy), *objections(task, candidate, strays))
         if not reasons:
             while (saved := workspace.save_candidate(candidate, kind="probe")) is None:
-                workspace.forget_trials()  # somebody took the name
+                workspace.forget_trials()  # another process took the name
                 candidate = replace(candidate, id=workspace.next_id())
             return saved.id, made.sentence
         why = "; ".join(reasons).replace(candidate.id, "the best")
@@ -295,7 +298,7 @@ def _probe(
 
 
 def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:
-    """A probe as the model predicts it, not stored yet."""
+    """Return a probe as a candidate with the model's prediction; it is not stored yet."""
     from grounded.rollout import simulate
     from grounded.search.candidate import Candidate
 
@@ -316,10 +319,10 @@ def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:
 
 
 def _near(planner: Planner, trials: Sequence[Trial]) -> Task:
-    """A task whose states without [safety] stay near where trials have been: half as far again.
+    """Bound the states without [safety] to the range of the trials, extended by half on each side.
 
-    Doublets that sharpen a number have flown a quadrotor 100 m below the ground. A state that
-    nothing measures may go anywhere, and so may what effects remember.
+    Without it, a probe may go anywhere (doublets took a quadrotor 100 m below the ground). States
+    that nothing measures, angles, and the memory states of effects remain unbounded.
     """
     task = planner.plan
     been = np.vstack([trial.states for trial in trials])
@@ -341,9 +344,11 @@ def _near(planner: Planner, trials: Sequence[Trial]) -> Task:
 
 
 def _narrower(task: Task, strays: Array) -> Task | None:
-    """A task whose [safety] is narrower by how far runs have strayed, (n,); None: nothing is left.
+    """Narrow [safety] by how far runs have strayed; return None if nothing is left.
 
-    Its further states, the memory of effects, have none.
+    Args:
+        task: the task; states beyond `strays` (the memory of effects) keep their bounds.
+        strays: the margin, in the states' units, (n,).
     """
     room = np.append(strays, np.zeros(task.model.n - len(strays)))
     assert task.safety_low is not None and task.safety_high is not None
@@ -352,10 +357,10 @@ def _narrower(task: Task, strays: Array) -> Task | None:
 
 
 def diagnosable(workspace: Folder) -> list[Trial]:
-    """In order of arrival, up to the first missing input or number beyond all bounds.
+    """Return the trials in order of arrival, each up to the first missing or unbounded number.
 
-    A fit needs whole states; a diagnosis only needs some, so a sensor that dropped out for a while
-    costs its samples, not the rest of the trial.
+    A fit needs complete states. A diagnosis does not, so a sensor dropout only costs its own
+    samples, not the rest of the trial.
 
     Raises:
         GroundedError: if a stored file is damaged.

@@ -1,6 +1,6 @@
-"""export: a candidate for other languages, as csv, json or npz, with units and time base inside.
+"""export: write a candidate for other programs, as csv, json or npz, with units and time base.
 
-All three say the same. With z = [state, past inputs] (names in `z_names`),
+All three have the same contents. With z = [state, past inputs] (names in `z_names`),
 
     u_t = clip(feedforward_t + gain_t (z - reference_t), low, high)
 
@@ -34,22 +34,22 @@ LAW = "u_t = clip(feedforward_t + gain_t (z - reference_t), low, high); z = [sta
 
 @dataclass(frozen=True, repr=False)
 class Exported(Result):
-    """A candidate's file for other languages."""
+    """An exported candidate and its file."""
 
     candidate: str
     file: Path
     format: str
-    runner: Path | None = None  # the program that runs it, where one was asked for
-    notes: tuple[str, ...] = ()  # what to know about the candidate
-    overridden: tuple[str, ...] = ()  # what spoke against it, with `anyway`
-    named: tuple[str, ...] = ()  # how its log is taken in, where another candidate is waited for
+    runner: Path | None = None  # the program that runs it, if requested
+    notes: tuple[str, ...] = ()  # remarks on the candidate
+    overridden: tuple[str, ...] = ()  # reasons against it, overridden by `anyway`
+    named: tuple[str, ...] = ()  # options of `ingest` for its log if another one is outstanding
 
     def summary(self) -> str:
-        """The candidate and its file."""
+        """Return the candidate and its file."""
         return f"{self.candidate}: {self.file}"
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `export --json`."""
+        """Return the document of `export --json`."""
         document = {"file": str(self.file), "candidate": self.candidate, "format": self.format}
         return document | ({"runner": str(self.runner)} if self.runner else {})
 
@@ -63,7 +63,10 @@ def export_candidate(
     runner: bool = False,
     anyway: bool = False,
 ) -> Exported:
-    """Writes a candidate; without `form` as `path` is named, else as json: `Workspace.export`."""
+    """Write a candidate to a file, see `Workspace.export`.
+
+    Without `form` the extension of `path` decides the format; else npz with `runner`, else json.
+    """
     encoders = _encoders()
     named = path.suffix.lstrip(".").lower() if path else ""
     form = form or (named if named in encoders else "npz" if runner else "json")
@@ -71,7 +74,7 @@ def export_candidate(
     if form not in encoders:
         raise GroundedError(f"there is no format '{form}': {nearest(form, encoders)}")
     if runner and form != "npz":
-        raise GroundedError(f"the runner reads npz, not {form}: leave the format out, or name npz")
+        raise GroundedError(f"the runner reads npz, not {form}: omit the format, or choose npz")
     now = standing_in(workspace) if identity == "best" else None
     identity = candidate_named(workspace, identity, now)
     handed = checked_candidate(workspace, identity, anyway=anyway, other_task=True, now=now)
@@ -86,13 +89,14 @@ def export_candidate(
 
 
 def void_exports(workspace: Folder, but: str = "") -> tuple[Path, ...]:
-    """Files in the workspace's folder that hold a candidate which must not be run any more.
+    """Return exported files in the workspace's folder whose candidate must not be run any more.
 
-    Only those that are byte for byte what `export` or `next` wrote, of one that no trial ran.
+    Only files that are byte for byte what `export` or `next` wrote count, of candidates that no
+    trial ran.
 
     Args:
-        workspace: in whose folder `next` writes.
-        but: the candidate that was just handed over.
+        workspace: the workspace, in whose folder `next` writes.
+        but: the candidate that was just handed over, which is skipped.
     """
     ran = {stored.trial.candidate for stored in workspace.whole_trials()}
     names = [name for name in workspace.candidate_ids() if name not in {but, *ran}]
@@ -106,7 +110,7 @@ def void_exports(workspace: Folder, but: str = "") -> tuple[Path, ...]:
 
 
 def is_export(workspace: Folder, identity: str, path: Path) -> bool:
-    """Whether a file is a candidate as it is exported, or as it was proposed, byte for byte."""
+    """Return whether a file is byte for byte the candidate as exported, or as proposed (mcap)."""
     form = path.suffix.lstrip(".").lower()
     try:
         if form == "mcap":
@@ -169,7 +173,7 @@ def _limits(values: np.ndarray) -> list[float | None]:
 
 
 def _csv(policy: Policy, units: dict[str, str], about: dict[str, str]) -> bytes:
-    """A row a control step; lines that start with # say what a reader must know."""
+    """Format one row per control step; lines that start with # have the law, units and limits."""
     stream = io.StringIO()
     stream.write("# format: grounded-policy-1\n")
     for key, value in {**about, "law": LAW, "dt [s]": repr(policy.dt)}.items():

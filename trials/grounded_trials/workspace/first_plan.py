@@ -1,8 +1,8 @@
-"""What the first plan of a task should tell whoever runs it: what is left open, or out.
+"""Notes on the first plan of a task: what its configuration lacks or asks too much of.
 
 A task may name no limits, ask for more than they allow, weigh inputs so much that errors hardly
-count or so little that the sensors' noise shakes them, or begin from an input under which the robot
-does not stay where it starts.
+count or so little that sensor noise shakes them, or begin with an input under which the robot does
+not stay where it starts.
 """
 
 from __future__ import annotations
@@ -33,30 +33,30 @@ if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
     from grounded.search.making import Proposal
 
-MOSTLY = 0.9  # of a plan's cost
-HELD = 0.8  # of a plan's steps: an input is at a limit nearly all the time
-SHORT = 0.25  # of the way to where a target ends: the plan does not get there
-MISSED = 0.1  # of the way that a target asks for: the plan falls short
-SHAKEN = 0.05  # of what [limits] allow an input, else of what a plan uses of it
-PIECES = 10  # of a plan, in each of which that is asked
-OFTEN = 4  # jumps over half its range: a quick manoeuvre has two or three
-SOMEWHERE = 1.5  # times what noise does over the whole plan: a piece that stands out
-FARTHEST = 1e4  # in its unit: how far a state that nobody gave may be from where it starts
-UNGIVEN = 3  # states, whose values at the start are asked for: of more nobody has thought
-STILL = 1e-3  # of the rates under the held input: under another one the robot stands
-OTHER = 1.5  # times the weight that [limits] would give: it was made by others
-NOTHING = 1e-6  # of an input's [limits], else of 1 in its unit: 0
-MOVED = 0.01  # of the same: a given input that no longer holds the start
-BEGUN = (0.0, 1.0, -1.0)  # beside the held input: a thrust by its square has no slope at 0
+MOSTLY = 0.9  # share of the cost due to inputs above which a note says so
+HELD = 0.8  # share of the steps at a limit above which an input counts as limited
+SHORT = 0.25  # share of the target's extent by which a plan may end away from the target's end
+MISSED = 0.1  # share of the target's extent above which an error is reported
+SHAKEN = 0.05  # share of an input's [limits] (else of its range in the plan) moved by noise
+PIECES = 10  # pieces of the plan in which the effect of noise is computed
+OFTEN = 4  # jumps over half the range of an input; a quick manoeuvre has two or three
+SOMEWHERE = 1.5  # ratio of the noise in one piece to the whole above which its time is reported
+FARTHEST = 1e4  # largest distance, in its unit, of a free state from where it starts
+UNGIVEN = 3  # largest number of states without a start value that are solved for
+STILL = 1e-3  # the robot is at rest if it moves less than this share of the motion as configured
+OTHER = 1.5  # ratio of weights above which a weight was made for other [limits]
+NOTHING = 1e-6  # fraction of an input's range (of 1 unit without limits) treated as zero
+MOVED = 0.01  # fraction of the same by which a given input must differ to be reported
+BEGUN = (0.0, 1.0, -1.0)  # offsets tried: a thrust that is squared has zero slope at 0
 
 
 def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> list[str]:
-    """What a task leaves open, or out, that whoever runs its first plan should know.
+    """Return notes on the configuration that the operator should know before the first run.
 
     Args:
-        workspace: where nothing was run yet.
-        proposal: with its plan, or why there is none.
-        held: what `held_before` says.
+        workspace: a workspace in which nothing was run yet.
+        proposal: the first plan, or why there is none.
+        held: the result of `held_before`.
     """
     task, first, found = workspace.task, proposal.candidate, list[str]()
     free = [
@@ -66,16 +66,14 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
     ]
     if np.allclose(task.target, task.start):
         found.append(
-            "the target is to stay where the run starts, in every state: `target` draws another"
+            "the target stays where the run starts, in every state: draw another with `target`"
         )
     if free:
-        found.append(
-            f"[limits] has none for {', '.join(free)}: what a plan asks for is sent, however much"
-        )
+        found.append(f"[limits] has none for {', '.join(free)}: plans may send values of any size")
     if log := seen_in(workspace.config):
         found.append(
-            f"[limits] are those that {log} happened to use, and a target that `init` wrote is "
-            "what that log did: put in what the robot may get, and draw the manoeuvre (`target`)"
+            f"[limits] are only the range used in {log}, and a target written by `init` is the run "
+            "in that log: enter the robot's real limits, and draw the manoeuvre (`target`)"
         )
     if first is not None and first.predicted_utility < 0:
         none = np.zeros(task.model.n)
@@ -85,7 +83,7 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
         share = step_rewards(reward, error, sent, aim, task.past).sum() / first.predicted_utility
         if share > MOSTLY:
             found.append(
-                f"{percent(share)} of what the plan costs is [reward] input and input_change: with "
+                f"{percent(share)} of the plan's cost is [reward] input and input_change: with "
                 "less weight there, errors would count for more"
             )
     found += _of_other_limits(workspace)
@@ -98,20 +96,20 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
     if proposal.standing.ending == "not allowed" and not held and not loose:
         found.append(
             "nothing was run yet: draw a target whose run stays inside [safety] (`target`) and "
-            "propose again; widen [safety] only where the robot may really go there"
+            "propose again; widen [safety] only if the robot may really go there"
         )
     name = str(workspace.config.task.target)
     rows = len(workspace.read_target(workspace.folder / name)[1])
     if rows > task.horizon + 1:
         found.append(
-            f"{name} has {rows} rows, of which [task] horizon = {task.horizon} uses the first "
+            f"{name} has {rows} rows, but [task] horizon = {task.horizon} uses only the first "
             f"{task.horizon + 1}: the plan ends after {task.horizon * task.dt:g} s"
         )
     return found
 
 
 def _of_other_limits(workspace: Folder) -> list[str]:
-    """Where weights on changes of inputs are still those that were made by other [limits]."""
+    """Return a note if weights on input changes were made for other [limits] than the current."""
     config, model = workspace.config, workspace.base_model
     made = made_changes(config.file.read_text(encoding="utf-8"))
     weights = dict(zip(model.input_names, workspace.task.reward.input_change, strict=True))
@@ -126,14 +124,14 @@ def _of_other_limits(workspace: Folder) -> list[str]:
     was = ", ".join(f"{name} = {weights[name]:.4g}" for name in off)
     new = ", ".join(f"{name} = {now.get(name, w):.4g}" for name, w in weights.items() if w)
     return [
-        f"[reward] input_change has {was}, made for another range than [limits] have now. "
-        f"By [limits] as they are now it would be input_change = {{ {new} }}: write that, or draw "
-        "the target again (`target` does so where no weight in [reward] was changed)"
+        f"[reward] input_change has {was}, made for a different range from that in [limits]. For "
+        f"the current [limits] write input_change = {{ {new} }}, or draw the target again "
+        "(`target` updates it if no weight in [reward] was changed)"
     ]
 
 
 def _not_held(workspace: Folder, refused: Candidate) -> list[str]:
-    """Which states leave [safety] that nothing keeps on a target, and what gives them one."""
+    """Return notes on states that leave [safety] and have no target, or no weight on it."""
     task = workspace.task
     assert task.safety_low is not None and task.safety_high is not None
     states, weight = refused.predicted_states, task.reward.state + task.reward.terminal
@@ -146,26 +144,26 @@ def _not_held(workspace: Folder, refused: Candidate) -> list[str]:
         start = {name: float(task.start[names.index(name)]) for name in bare}
         more = " ".join(f"--to {name}={value:g}" for name, value in start.items())
         drawn = _drawn(task)
-        how = "with a column for each as well"
+        how = "with a column for each of them"
         if drawn is not None:
             again = NextCommand(drawn.verb, (*drawn.arguments, *more.split()))
             command = rendered(again, workspace.address)
-            how = f"with {more} as well, so that it stays: `{command}`, and what else you gave"
+            how = f"and add {more}: `{command}`, with your other options"
         found.append(
             f"{listed(bare)} {'leave' if len(bare) > 1 else 'leaves'} [safety] and "
-            f"{'have' if len(bare) > 1 else 'has'} no column in the target: nothing in [reward] "
-            f"asks to stay inside. Draw the target again {how}"
+            f"{'have' if len(bare) > 1 else 'has'} no column in the target, so nothing in [reward] "
+            f"keeps the run inside. Draw the target again {how}"
         )
     if free:
         found.append(
             f"{listed(free)} {'leave' if len(free) > 1 else 'leaves'} [safety], and [reward] state "
-            "gives no weight to keeping the target there: give it one"
+            "has no weight for the target there: add one"
         )
     return found
 
 
 def _drawn(task: Task) -> NextCommand | None:
-    """The line or step that a target seems to be, to states' values; None for another one."""
+    """Return the `target` command for the line or step that a target appears to be; else None."""
     from grounded_trials.logs.inspect_pairs import velocities
 
     names, rates = task.model.state_names, set(velocities(task.model).values())
@@ -185,7 +183,7 @@ def _drawn(task: Task) -> NextCommand | None:
 
 
 def _held_back(task: Task, first: Candidate) -> list[str]:
-    """Where [limits] keep a plan from its target: an input is at one nearly all the time."""
+    """Return a note if [limits] keep a plan off its target: an input is nearly always at one."""
     names, sent, aim = task.model.input_names, first.predicted_inputs, task.input_target
     assert aim is not None
     held = []
@@ -199,13 +197,13 @@ def _held_back(task: Task, first: Candidate) -> list[str]:
     if not held or not (missed := _most_missed(task, plan)):
         return []
     return [
-        f"{' and '.join(held)}, and still {missed}: the target seems to ask for more "
-        "than [limits] allow. Widen them if the robot may get more, or draw a slower target"
+        f"{' and '.join(held)}, and still {missed}: the target seems to require more "
+        "than [limits] allow. Widen them if the robot can take more, or draw a slower target"
     ]
 
 
 def _falls_short(task: Task, first: Candidate) -> list[str]:
-    """Where a plan ends far from where its target ends, though no input is at its limit."""
+    """Return a note if a plan ends far from the target's end although no input is at its limit."""
     if not (groups := weighed_groups(task)):
         return []
     names, what = groups[0]
@@ -217,28 +215,28 @@ def _falls_short(task: Task, first: Candidate) -> list[str]:
         return []
     short, way_told = measured_alike([off, far], unit)
     return [
-        f"the plan ends {short} from where the target does, which takes {what} "
-        f"over {way_told}: by [reward] it is not worth more, or the model does not get "
-        "there in that time. Weigh inputs and their changes less, draw a slower target, or look at "
+        f"the plan ends {short} from the end of the target, which moves {what} "
+        f"over {way_told}: either [reward] makes getting closer too costly, or the model cannot "
+        "get there in time. Weigh inputs and their changes less, draw a slower target, or check "
         "model.py"
     ]
 
 
 def _thrown(task: Task, first: Candidate) -> list[str]:
-    """Inputs that a plan throws from one end of their [limits] towards the other, often."""
+    """Return notes on inputs that often jump over more than half their [limits] in one step."""
     from grounded.search.limit_cycle import jumps
 
     times = jumps(first.predicted_inputs, task.high - task.low)
     return [
-        f"the plan throws {name} over half its [limits] from one step to the next, "
-        f"{times[j]} times: for a calmer {name} give [reward] input_change of {name} more weight"
+        f"in the plan {name} jumps over half its [limits] from one step to the next, "
+        f"{times[j]} times: for a smoother {name} increase [reward] input_change of {name}"
         for j, name in enumerate(task.model.input_names)
         if times[j] >= OFTEN
     ]
 
 
 def _shaken(workspace: Folder, first: Candidate) -> list[str]:
-    """Inputs that the sensors' noise moves much through the gains, before anything was run."""
+    """Return notes on inputs that sensor noise moves much through the feedback gains."""
     task, gain, found = workspace.task, first.policy.gain, []
     if gain is None:
         return []
@@ -259,21 +257,21 @@ def _shaken(workspace: Folder, first: Candidate) -> list[str]:
         when = sum(len(piece) for piece in pieces[:at]) * task.dt
         where = f" from {when:.3g} s on" * bool(rms[j] > SOMEWHERE * overall[j])
         found.append(
-            f"the sensors' noise moves {name} by {measured(rms[j], unit)} rms{where} through the "
-            f"gains, most of it that of {state} ({measured(noise[k], its)}): for a calmer {name} "
-            f"give [reward] input_change of {name} more weight"
+            f"sensor noise moves {name} by {measured(rms[j], unit)} rms{where} through the gains, "
+            f"mostly the noise of {state} ({measured(noise[k], its)}): for a smoother {name} "
+            f"increase [reward] input_change of {name}"
         )
     return found
 
 
 def sensor_noise(workspace: Folder) -> Array:
-    """The white noise of each state (n,) in the latest log; 0 without one."""
+    """Return the white noise (std) of each state, (n,), in the latest log; 0 without a log."""
     trials = workspace.task_trials(measured=True)
     return white_noise(trials[-1].states) if trials else np.zeros(workspace.base_model.n)
 
 
 def _most_missed(task: Task, plan: Trial) -> str:
-    """What a plan misses by most, beside the way that its target asks for; "" for nothing much."""
+    """Return the largest error of a plan relative to the target's extent; "" if it is small."""
     error, way, found = tracking_error(task, plan), np.vstack([task.start, task.target]), []
     for names, what in weighed_groups(task):
         states = [task.model.state_names.index(name) for name in names]
@@ -289,24 +287,26 @@ def _most_missed(task: Task, plan: Trial) -> str:
 
 
 def held_before(workspace: Folder, again: bool = False) -> list[str]:
-    """That the robot does not stand at its start, but would under another input held before.
+    """Return a note if the robot is not at rest at its start, but would be under another input.
 
-    Or with other values of states that nobody gave, a fan's speed say. Nothing is said of an input
-    whose value somebody gave, nor where it makes no difference: without a price on changes and
-    without latency the first command is as if nothing had been held.
+    Values of states that the user did not give (a fan's speed, say) may be changed too. There is no
+    note if the user gave the inputs, or if they make no difference: without weights on changes and
+    without latency the first command does not depend on the input held before.
 
     Args:
-        workspace: whose first plan it is.
-        again: another model was planned with before: what somebody gave may have held that one.
+        workspace: the workspace of the first plan.
+        again: whether another model was used for an earlier plan: inputs that the user gave are
+            checked too, since they may have held that one.
     """
     base, planner, config = workspace.task, workspace.planner, workspace.config.task
     task, loose = planner.plan, planner.loose
     assert base.latency is not None
     names, states, n = task.model.input_names, task.model.state_names, base.model.n
-    memory = np.arange(task.model.n) >= n  # of adopted effects: it settles
+    memory = np.arange(task.model.n) >= n  # the memory states of adopted effects: they settle
     free = memory.copy()
     biased = {str(e["name"]).removeprefix("sensor_bias:") for e in workspace.config.model.effects}
-    begun = dict(zip(states, base.target[0], strict=False))  # by no sensor: off by its bias
+    # a start taken from the target is off by the bias of a sensor: such a state is free too
+    begun = dict(zip(states, base.target[0], strict=False))
     free[:n] = [s not in config.start and (np.isnan(x) or s in biased) for s, x in begun.items()]
     chosen = any(name in config.start for name in names)
     priced = bool(base.reward.input_change.any() or base.latency.any())
@@ -336,25 +336,27 @@ def held_before(workspace: Folder, again: bool = False) -> list[str]:
     whole |= {name: f"{to:.4g}" for name, to in other.items()}
     told = ", ".join(f"{name} = {whole[name]}" for name in units if name in whole)
     return [
-        f"at the start {held} counts as held, under which {states[k]} changes at once, by "
-        f"{with_unit(f'{rate[k]:.3g}', units[states[k]])} a second; the plan begins from there, "
-        "and after its end the runner holds that input again. If the robot stands until then, give "
-        f"{FILE}'s [task] what holds it, and propose again (if not, propose again as it is): "
-        f"start = {{ {told} }}"
+        f"the plan assumes {held} before the start, under which {states[k]} changes at once, by "
+        f"{with_unit(f'{rate[k]:.3g}', units[states[k]])} per second; after its end the runner "
+        "holds that input again. If the robot is at rest before the run, put what holds it into "
+        f"[task] of {FILE} and propose again (if not, just propose again): start = {{ {told} }}"
     ]
 
 
 def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> Array | None:
-    """States and inputs (n + m,) inside the limits that stay as they are, from where a run starts.
+    """Find states and inputs inside the limits under which the robot rests at its start.
 
-    None where it stands under the input held before, or nothing holds it: the start is in motion.
-    The clock of an effect that grows with time goes on: what holds the start, holds it then.
+    The clock states of effects that grow with time are ignored: they always move.
 
     Args:
-        task: whose start it is.
-        free: (n,), states that may be others than those of the start.
-        loose: the task with dry frictions that build up slowly: what sticks tells of no input
-            whether it holds.
+        task: the task with the start.
+        free: (n,), states that may differ from the start.
+        loose: the task with softened dry friction, used for the search: with sticking friction the
+            robot would rest under almost any input.
+
+    Returns:
+        States and inputs (n + m,); None if the robot rests under the input held before already, or
+        if no input holds it because the start is in motion.
     """
     from grounded.search.first_guess import trim
 
@@ -378,7 +380,7 @@ def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> A
 
 
 def _out_of_reach(task: Task, free: NDArray[np.bool_], clocks: NDArray[np.bool_]) -> bool:
-    """Whether nothing inside the limits stops the start, as of what flies: asked in one step."""
+    """Return whether no input inside the limits can stop the motion at the start, linearised."""
     if not np.isfinite(task.high - task.low).all():
         return False
     problem = task.problem(exact=True)
@@ -391,7 +393,7 @@ def _out_of_reach(task: Task, free: NDArray[np.bool_], clocks: NDArray[np.bool_]
 
 
 def moved_at_start(task: Task, inputs: Array) -> Array:
-    """By how much the start moves in the first step under an input, (n,)."""
+    """Return by how much the state changes in the first step under an input, (n,)."""
     problem = task.problem(exact=True)
     with np.errstate(all="ignore"):
         after = problem.system.step(task.start[None], inputs[None], problem.p, problem.dt)[0]

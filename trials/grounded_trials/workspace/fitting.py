@@ -1,8 +1,8 @@
-"""fit in a workspace: which trials are used, and how the result goes into grounded.toml.
+"""Fit in a workspace: choose the trials and write the result to grounded.toml.
 
-The trials are those that a diagnosis would judge the same model on: the instruments' findings are
-corrected first (`sound_trials`). reports/fit.json keeps of the last fit of everything what it was
-made from and whether it predicts better, so that nobody is sent to make it again in vain.
+As for a diagnosis, findings about the instruments are corrected first (`sound_trials`).
+reports/fit.json records the trials and the model of the last fit of all parameters, and whether it
+predicts better, so that a fit without effect is not suggested again.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ class Fitted(Result):
 
     fit: Fit
     applied: bool
-    preflight: tuple[Finding, ...]  # of the instruments, before any physics
-    then: NextCommand  # write what predicts better; go on with what was written
+    preflight: tuple[Finding, ...]  # findings about the instruments
+    then: NextCommand  # the command to type next
 
     def summary(self) -> str:
-        """The values."""
+        """Return the fitted values."""
         return ", ".join(f"{name} = {e.value:.4g}" for name, e in self.fit.params.items())
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `fit --json`: values, intervals, held-out prediction errors."""
+        """Return the document of `fit --json`: values, intervals, held-out prediction errors."""
         return self.fit.to_json() | {
             "applied": self.applied,
             "preflight": [one.to_json() for one in self.preflight],
@@ -60,10 +60,10 @@ def fit_in(
     engine: Engine | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Fitted:
-    """Fits the workspace's model to its trials, see `Workspace.fit`.
+    """Fit the workspace's model to its trials, see `Workspace.fit`.
 
     Raises:
-        GroundedError: where it should be applied and predicts held-out time worse than before:
+        GroundedError: if `apply` is set but the fit predicts held-out time worse than before;
             nothing is written then.
     """
     from grounded_trials.workspace.next_step import after_fit, to_plan
@@ -84,12 +84,12 @@ def fit_in(
 
 
 def _worse(found: Fit) -> str:
-    """What a fit predicts worse, in the state that loses most."""
+    """Return a sentence on how much worse a fit predicts, with the most affected state."""
     before, after = found.before, found.after
     assert before is not None and after is not None
     far = before.windows > 0
     was, now = (before.ahead, after.ahead) if far else (before.one_step, after.one_step)
-    text = "the fitted values predict held-out time worse than those that the model has"
+    text = "the fitted values predict held-out time worse than the model's current values"
     known = np.isfinite(was) & np.isfinite(now) & (was > 0)
     if not known.any():
         return text
@@ -98,8 +98,8 @@ def _worse(found: Fit) -> str:
     unit = found.model.states.get(name, "")
     off, then = measured_alike([now[i], was[i]], unit)
     return (
-        f"{text} ({name} {when}: off by {off} instead of {then}); values that must differ that "
-        "much stand in for something else"
+        f"{text} ({name} {when}: off by {off} instead of {then}); they compensate for something "
+        "else that the model lacks"
     )
 
 
@@ -109,31 +109,31 @@ def _keep(workspace: Folder, found: Fit) -> None:
 
 
 def _made_from(workspace: Folder) -> dict[str, Any]:
-    """The trials and the model of a fit."""
+    """Return the trials and the model that a fit would use now."""
     trials = [trial.id for trial in usable_trials(workspace)]
     return {"trials": trials, "model": workspace.planner.fingerprint}
 
 
 def fitted_in_vain(workspace: Folder) -> bool:
-    """Whether these trials were fitted with this model, and it predicted no better than before."""
+    """Return whether the current model was already fitted to the same trials without a gain."""
     try:
         kept = read_document(workspace.reports / KEPT)
-    except (OSError, ValueError, RecursionError, GroundedError):  # it only spares a fit
+    except (OSError, ValueError, RecursionError, GroundedError):  # then fit again
         return False
     return kept.get("helps") is False and _made_from(workspace).items() <= kept.items()
 
 
 def usable_trials(workspace: Folder) -> list[Trial]:
-    """Every stored trial of this model up to its first sample that is not a finite number.
+    """Return the stored trials of this model, each up to its first non-finite sample.
 
     Raises:
-        GroundedError: if there is none of at least 3 steps.
+        GroundedError: if none has at least 3 steps.
     """
     trials = ((trial, trial.finite_steps) for trial in workspace.task_trials())
     found = [trial.until(T) for trial, T in trials if T >= 3]
     if not found:
         raise GroundedError(
-            "there is no trial to learn from: ingest some, runs of candidates or logs with --data"
+            "there is no trial to learn from: ingest runs of candidates, or other logs with --data"
         )
     return found
 
@@ -146,11 +146,13 @@ def fit_trials(
     engine: Engine | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[Fit, tuple[Finding, ...]]:
-    """Parameters of the workspace's model, adopted effects in it, from its trials; and its sensors.
+    """Fit the parameters of the workspace's model, including adopted effects, to its trials.
 
-    What the instruments show is corrected first, as `diagnose` does. The memory of an effect (a
-    lag's output) is measured by nothing: the filter follows it from what the commands say of its
-    start.
+    Findings about the instruments are corrected first, as in `diagnose`. The memory of an effect (a
+    lag's output) is not measured: the filter estimates it, with an initial value from the commands.
+
+    Returns:
+        The fit, and the findings about the instruments.
     """
     from grounded.estimate import of_states, record_of
     from grounded.fit import fit
@@ -191,10 +193,10 @@ def fit_trials(
 
 
 def apply_fit(workspace: Folder, found: Fit) -> None:
-    """Writes the fitted values (and a fitted latency) that the data identify to grounded.toml.
+    """Write the fitted values (and a fitted latency) that the data identify to grounded.toml.
 
-    What they don't identify was held where it was while the others were fitted. A fitted latency
-    is the whole one: it takes the place of adopted delays.
+    Parameters that are not identified keep their values. A fitted latency is the total one: it
+    replaces adopted delays.
     """
     base, table = workspace.base_model, workspace.config.model
     values = {

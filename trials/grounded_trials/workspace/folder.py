@@ -1,10 +1,10 @@
-"""A workspace as it lies on the disk: its task, its trials and its candidates.
+"""A workspace on disk: its task, its trials and its candidates.
 
     grounded.toml  model.py  target.csv  trials/  candidates/  reports/
 
-All state is derived from these files. Trials are the store's (content-addressed, never rewritten).
-Candidates are files c0001.mcap ...; one that got lost is taken from the trial that ran it, which
-carries it as an attachment. A trial that was set aside is left out everywhere (see `identity`).
+All state is derived from these files. Trials are in a store (content-addressed, never rewritten).
+Candidates are files c0001.mcap ...; a missing one is restored from a trial that ran it, which has
+it as an attachment. Trials that were set aside are left out everywhere (see `identity`).
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ if TYPE_CHECKING:
     from grounded.search.planner import Planner
     from grounded_trials.store.index import Index
 
-MANY = 200  # trials: fewer are all read, more are indexed
+MANY = 200  # from this number of trials on, an index is used
 _ID = re.compile(r"c\d{4,}")
 
 
 @dataclass(frozen=True)
 class Lost:
-    """A file that should be there, or be readable, and why it is not."""
+    """A file that is missing or damaged, with the reason."""
 
     file: str
     reason: str
@@ -60,18 +60,18 @@ class Lost:
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """What a workspace holds, and what was lost of it."""
+    """The trials and candidates of a workspace, and its lost files."""
 
     trials: tuple[StoredTrial, ...]  # in order of arrival
-    candidates: tuple[Candidate, ...]  # the search's for the present task, in order of proposal
+    candidates: tuple[Candidate, ...]  # those of the search for this task, in order of proposal
     lost: tuple[Lost, ...]
 
 
 class Folder:
-    """The files of a workspace; nothing is read before it is asked for, nothing cached on disk.
+    """The files of a workspace, read lazily.
 
     Args:
-        folder: the workspace; `read_config` complains when it is none.
+        folder: the workspace; `read_config` raises if it is none.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -83,7 +83,7 @@ class Folder:
 
     @property
     def address(self) -> str | None:
-        """The folder as commands name it; None where it is the current one."""
+        """The folder as an argument of commands; None if it is the current one."""
         return None if self.folder == Path() else str(self.folder)
 
     @cached_property
@@ -105,17 +105,17 @@ class Folder:
 
     @cached_property
     def task(self) -> Task:
-        """The task with the crude model: it judges trials."""
+        """The task with the crude model, in which trials are judged."""
         return build_task(self.config, self.base_model, self.folder, self.read_target)
 
     @property
     def origin(self) -> Task:
-        """The task with the model of model.py as it is: nothing fitted, nothing adopted."""
+        """The task with the unchanged model of model.py: nothing fitted, nothing adopted."""
         return build_task(self.config, self._written, self.folder, self.read_target)
 
     @cached_property
     def planner(self) -> Planner:
-        """The task as the search plans it, with all effects that were adopted."""
+        """The task in which the search plans, with all adopted effects."""
         from grounded.search.planner import Planner
 
         if not self.config.model.effects:
@@ -130,30 +130,30 @@ class Folder:
 
     @cached_property
     def noted(self) -> Noted:
-        """What the notes say."""
+        """The notes of the workspace."""
         return self._read_notes(None)
 
     def forget(self) -> None:
-        """Everything is read again when it is asked for next."""
+        """Forget everything that was read, so that it is read again when needed."""
         self.read_target.cache_clear()
         for name in [n for n, kept in vars(Folder).items() if isinstance(kept, cached_property)]:
             vars(self).pop(name, None)
 
     def forget_trials(self) -> None:
-        """Trials are read again when they are asked for next."""
+        """Forget the trials that were read, so that they are read again when needed."""
         for name in ("_trials", "noted"):
             vars(self).pop(name, None)
 
     def read(self, *, strict: bool = True) -> Contents:
-        """The trials, and the search's candidates for the present task.
+        """Read the trials, and the search's candidates for the current task.
 
         Probes and candidates of an earlier task (other target, reward, limits) are left out.
 
         Args:
-            strict: complain about a file that is damaged; else it is left out and named in `lost`.
+            strict: raise for damaged files; else they are left out and named in `lost`.
 
         Raises:
-            GroundedError: if the task can't be built; if strict, also for what is damaged.
+            GroundedError: if the task can't be built; if strict, also for damaged files.
         """
         lost: list[Lost] | None = None if strict else []
         trials = self._trials if lost is None else self._read_trials(lost)
@@ -161,7 +161,7 @@ class Folder:
         return Contents(trials, candidates, tuple(lost or ()))
 
     def trials(self) -> tuple[StoredTrial, ...]:
-        """Every stored trial, in order of arrival.
+        """Return every stored trial that is not set aside, in order of arrival.
 
         Raises:
             GroundedError: if one is damaged, naming it.
@@ -169,45 +169,45 @@ class Folder:
         return self._trials
 
     def whole_trials(self) -> tuple[StoredTrial, ...]:
-        """Those of the stored trials that are not damaged."""
+        """Return the stored trials that are not damaged."""
         try:
             return self._trials
         except GroundedError:
             return self._read_trials([])
 
     def discarded(self) -> dict[str, str]:
-        """Trials that are set aside, t0004 -> why."""
+        """Return the trials that are set aside, t0004 -> why."""
         entries = self.store.list() if self.noted.aside else ()
         found = {one.id: self.noted.why_aside(one) for one in entries}
         return {name: why for name, why in found.items() if why is not None}
 
     def fits(self, trial: Trial) -> bool:
-        """Whether a trial's states and inputs are this model's, and its dt is this task's."""
+        """Return whether a trial has this model's states and inputs, and this task's dt."""
         names = (self.base_model.state_names, self.base_model.input_names)
         same = (trial.state_names, trial.input_names) == names
         return same and abs(trial.dt - self.config.task.dt) < 1e-9
 
     def task_trials(self, *, measured: bool = False) -> list[Trial]:
-        """The trials that fit this task.
+        """Return the trials that fit this task.
 
         Args:
-            measured: as they were logged; else short gaps are bridged.
+            measured: return them as logged; else short gaps are bridged.
         """
         return [t.measured if measured else t.trial for t in self.trials() if self.fits(t.trial)]
 
     def candidate_path(self, identity: str) -> Path:
-        """candidates/c0001.mcap and so on."""
+        """Return the path of a candidate's file, candidates/c0001.mcap for example."""
         return self.folder / "candidates" / f"{identity}.mcap"
 
     def candidate_ids(self) -> list[str]:
-        """Every candidate that was ever proposed, whether its file is there or only its trial."""
+        """Return all candidates that have a file or were run by a trial, in order of number."""
         return self._ids(self.trials())
 
     def next_id(self, *, handed: bool = False) -> str:
-        """The name of the next candidate.
+        """Return the name of the next candidate.
 
         Args:
-            handed: beyond the names that were handed out, though their files are gone.
+            handed: skip names that were handed out even if their files are gone.
         """
         ids = self.candidate_ids()
         if handed:
@@ -215,18 +215,18 @@ class Folder:
         return f"c{(int(ids[-1][1:]) if ids else 0) + 1:04d}"
 
     def candidate(self, identity: str) -> tuple[Candidate, dict[str, str]]:
-        """A candidate and its metadata, from its file or from a trial that ran it.
+        """Read a candidate and its metadata, from its file or from a trial that ran it.
 
         Raises:
-            GroundedError: if neither is there, or the file is damaged.
+            GroundedError: if neither exists, or the file is damaged.
         """
         return candidate_of(self.candidate_bytes(identity), identity)
 
     def candidate_bytes(self, identity: str) -> bytes:
-        """The candidate's file.
+        """Return the contents of a candidate's file, or the copy in a trial that ran it.
 
         Raises:
-            GroundedError: if there is none of that name.
+            GroundedError: if there is no candidate of that name.
         """
         for _, read in self._sources(identity):
             return read()
@@ -235,7 +235,7 @@ class Folder:
         )
 
     def names(self) -> frozenset[str]:
-        """The names of all trials and candidates."""
+        """Return the file names of all trials and candidates."""
         found: set[str] = set()
         for place, first in (("trials", "t"), ("candidates", "c")):
             with suppress(FileNotFoundError):
@@ -244,7 +244,7 @@ class Folder:
         return frozenset(found)
 
     def bring_back(self, identity: str) -> Path:
-        """A candidate's file, taken from a trial that ran it where it got lost."""
+        """Return the path of a candidate's file; restore it from a trial if it is missing."""
         path = self.candidate_path(identity)
         if not path.is_file():
             write_atomically(path, self.candidate_bytes(identity))
@@ -253,16 +253,16 @@ class Folder:
     def save_candidate(
         self, candidate: Candidate, seen: frozenset[str] | None = None, kind: str = "search"
     ) -> Candidate | None:
-        """Writes candidates/cNNNN.mcap, complete or not at all; no file is ever replaced.
+        """Write candidates/cNNNN.mcap atomically; existing files are never replaced.
 
         Args:
-            candidate: a new one.
-            seen: the `names` there were when it was planned; None: whatever there was.
-            kind: search or probe.
+            candidate: a new candidate.
+            seen: the `names` that existed when it was planned; None: do not compare them.
+            kind: "search" or "probe".
 
         Returns:
-            The candidate, under a later name where its own was handed out for another policy;
-            None if trials or candidates came meanwhile: it must be planned again.
+            The candidate, under a later name if its own was handed out for another policy. None if
+            trials or candidates were added meanwhile: it must be planned again.
         """
         data = encoded(candidate, self.task, kind)
         if sha256(data) not in self.noted.handed.get(candidate.id, {sha256(data)}):
@@ -277,7 +277,7 @@ class Folder:
         return candidate
 
     def _read_trials(self, lost: list[Lost] | None) -> tuple[StoredTrial, ...]:
-        """The stored trials; those that are damaged or gone are put into `lost` if it is there."""
+        """Read the stored trials; add damaged and missing ones to `lost`; raise if it is None."""
         broken: list[Damaged] = []
         known, found = self.noted if lost is None else self._read_notes(broken), []
         entries = [e for e in self.store.list() if known.why_aside(e) is None]
@@ -302,7 +302,7 @@ class Folder:
         return noted(self.notes.read(broken, self._index[0].known if self._many else None))
 
     def _read_one(self, stored: Stored) -> tuple[Trial, dict[str, str], bytes | None]:
-        """A trial as it was logged, its metadata and the policy that it carries."""
+        """Read a trial as logged, its metadata, and the candidate file attached to it."""
         trial, meta, policy = read_trial(self.store.read(stored), stored.path.name)
         return replace(trial, id=stored.id), meta, policy
 
@@ -313,7 +313,7 @@ class Folder:
 
     @cached_property
     def _index(self) -> tuple[Index, dict[str, StoredTrial]]:
-        """The index, and the trials that were made of it."""
+        """The index, and the trials that were created from it."""
         from grounded_trials.store.index import Index
 
         return Index(self.store.folder, self._read_one), {}
@@ -332,17 +332,17 @@ class Folder:
         return found
 
     def save_index(self) -> None:
-        """Keeps what was learnt of many trials for the next command."""
+        """Save the index of the trials for the next command, if it is used."""
         if "_index" in vars(self):
             self._index[0].save()
 
     def _read_candidates(
         self, trials: tuple[StoredTrial, ...], lost: list[Lost] | None
     ) -> Iterator[Candidate]:
-        """The search's candidates; unless strict, a trial's copy stands in for a damaged file."""
+        """Yield the search's candidates; unless strict, a trial's copy replaces a damaged file."""
         ran = {t.trial.candidate: (t.stored.id, t.ran) for t in trials if t.ran}
         for identity in self._ids(trials):
-            why = GroundedError("its file is gone and no trial carries it")
+            why = GroundedError("its file is missing and no trial contains it")
             for place, read in self._sources(identity, trials):
                 try:
                     found = self._proven(identity, place, read)
@@ -369,7 +369,7 @@ class Folder:
     def _proven(
         self, identity: str, place: Path | None, read: Callable[[], bytes]
     ) -> StoredCandidate:
-        """A candidate from one of its copies; a file that the index knows is not read again."""
+        """Read a candidate from one of its copies; files known to the index are not read again."""
         if place is None or "_index" not in vars(self):
             return stored_candidate(read(), identity)
         learn = lambda: stored_candidate(read(), identity).about()  # noqa: E731
@@ -385,7 +385,7 @@ class Folder:
     def _sources(
         self, identity: str, trials: tuple[StoredTrial, ...] | None = None
     ) -> Iterator[tuple[Path | None, Callable[[], bytes]]]:
-        """The copies of a candidate, to be read: its file, then those in the trials that ran it."""
+        """Yield the copies of a candidate: its file, then those in the trials that ran it."""
 
         def own() -> bytes:
             with open_file(path, follow=False) as stream:

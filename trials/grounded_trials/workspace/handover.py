@@ -1,14 +1,14 @@
-"""What a candidate must be at the moment it is handed over, whenever it was made.
+"""Checks on a candidate at the moment it is handed over, whenever it was made.
 
-`propose`, `run` and `export` come through here. The configuration, the model and the file may have
-changed since a candidate was proposed, so nothing of that day is believed:
+`propose`, `run` and `export` use these checks. The configuration, the model and the file may have
+changed since a candidate was proposed, so everything is checked again:
 
-    the file      it holds the candidate it is named after, as it was proposed (never overridden)
+    the file      holds the candidate it is named after, as it was proposed (never overridden)
     the robot     state and input names (never overridden), units, dt
-    the task      the task hash; another task's candidate is only exported, and if a trial ran it
-    [limits]      the policy's own limits, what it sends and holds, inside today's
+    the task      the task hash; another task's candidate is only exported, if a trial ran it
+    [limits]      the policy's own limits, and what it sends and holds, are inside the current ones
     the model     a candidate that no trial ran is void once the model was changed
-    [safety]      the predicted run, predicted again where the model was changed
+    [safety]      the predicted run, predicted again if the model was changed
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ from grounded_trials.workspace.identity import StoredTrial, candidate_of, sha256
 if TYPE_CHECKING:
     from grounded.search.standing import Standing
 
-NEAREST = 2  # bounds of [safety] that are told: those nearest beside how far the run goes
-NEAR = 0.25  # of how far a state goes: what else is no nearer than a run may be off
-NEARER = 0.01  # of how far a state goes: a run that comes nearer to a bound than where it starts
-AGREES = 1e-6  # of an input's size: how well a policy repeats its own predicted inputs
+NEAREST = 2  # number of [safety] bounds reported: the nearest, relative to the state's range
+NEAR = 0.25  # fraction of a state's range in the run: bounds farther away are not reported
+NEARER = 0.01  # fraction of that range by which a run must approach a bound from its start
+AGREES = 1e-6  # tolerance, relative to an input's size, for a policy to repeat its prediction
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,21 +51,21 @@ class Handed:
     meta: dict[str, str]
     data: bytes
     check: Check
-    overridden: tuple[str, ...] = ()  # why it would have been refused
+    overridden: tuple[str, ...] = ()  # reasons to refuse it, overridden by `anyway`
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What to know about it."""
+        """Remarks on the candidate that do not prevent its use."""
         return tuple(self.check.notes())
 
 
 class Void(GroundedError):
-    """A candidate that must not be handed over; `reasons` says why, a sentence each."""
+    """Raised for a candidate that must not be handed over; `reasons` has a sentence for each."""
 
     def __init__(self, identity: str, reasons: Sequence[str]) -> None:
         super().__init__(
-            f"{identity} is not handed over: {'; '.join(reasons)}. Propose another, or hand it "
-            "over all the same with --anyway",
+            f"{identity} is not handed over: {'; '.join(reasons)}. Propose another, or use "
+            "--anyway to hand it over regardless",
             NextCommand("propose"),
         )
         self.reasons = tuple(reasons)
@@ -79,18 +79,18 @@ def checked_candidate(
     other_task: bool = False,
     now: Standing | None = None,
 ) -> Handed:
-    """A candidate, checked against the workspace as it is now.
+    """Read a candidate, check it against the current workspace, and note that it was handed over.
 
     Args:
-        workspace: whose model, task, [limits] and [safety] must hold.
-        identity: c0003.
-        anyway: hand it over all the same; what speaks against it is in `overridden`.
-        other_task: a candidate of another task that was run there will do, such as its best.
-        now: where the search stands, where that is known.
+        workspace: the workspace whose model, task, [limits] and [safety] apply.
+        identity: the candidate's name, such as c0003.
+        anyway: hand it over despite reasons against it, which are then in `overridden`.
+        other_task: accept a candidate of another task if a trial ran it.
+        now: the standing of the search, if known.
 
     Raises:
         Void: if it must not be handed over, unless `anyway`.
-        GroundedError: if its file is damaged, rewritten, renamed, or for another robot, always.
+        GroundedError: if its file is damaged, rewritten, renamed, or for another robot.
     """
     data = workspace.candidate_bytes(identity)
     candidate, meta = intact(data, identity)
@@ -104,9 +104,9 @@ def checked_candidate(
 
 
 def _note(workspace: Folder, identity: str, data: bytes) -> None:
-    """Keeps that a candidate was handed out, as these bytes, after the trials there are.
+    """Record that a candidate was handed out: its hash, and the last trial stored by then.
 
-    Nothing is kept in a folder that can only be read.
+    Nothing is recorded in a read-only folder.
     """
     stored = workspace.store.list()
     after = stored[-1].path.stem if stored else ""
@@ -120,13 +120,16 @@ def _note(workspace: Folder, identity: str, data: bytes) -> None:
 
 
 def intact(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
-    """A candidate whose file is whole, and whose policy sends what its prediction says.
+    """Read a candidate and check that its policy sends the inputs that it predicts.
 
-    The second finds what was rewritten where there is no checksum, or a new one.
+    That check finds rewritten files that have no checksum, or a recomputed one.
 
     Args:
-        data: the file.
-        identity: what it is named.
+        data: the contents of the file.
+        identity: the name of the file, such as c0003.
+
+    Returns:
+        The candidate and the metadata of its file.
 
     Raises:
         GroundedError: if it is damaged, rewritten or renamed.
@@ -142,8 +145,8 @@ def intact(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
         raise GroundedError(
             f"candidates/{identity}.mcap is not the candidate that was proposed: at t = "
             f"{t * policy.dt:g} s its policy sends {policy.input_names[j]} = {sent[0, t, j]:g}, "
-            f"its own prediction says {predicted[t, j]:g}. It was rewritten: delete the file and "
-            "propose again",
+            f"but its own prediction has {predicted[t, j]:g}. It was rewritten: delete the file "
+            "and propose again",
             NextCommand("propose"),
         )
     return candidate, meta
@@ -151,7 +154,7 @@ def intact(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
 
 @dataclass(frozen=True)
 class Check:
-    """A candidate against the workspace of today; damaged files don't keep it from being used."""
+    """A candidate checked against the current workspace; damaged trial files are ignored."""
 
     workspace: Folder
     candidate: Candidate
@@ -161,12 +164,12 @@ class Check:
 
     @cached_property
     def trials(self) -> tuple[StoredTrial, ...]:
-        """Those that are whole."""
+        """The trials whose files are intact."""
         return self.workspace.whole_trials()
 
     @cached_property
     def standing(self) -> Standing:
-        """Where the search stands."""
+        """The standing of the search."""
         from grounded.search.standing import standing
 
         if self.now is not None:
@@ -182,14 +185,17 @@ class Check:
 
     @property
     def same_task(self) -> bool:
-        """Whether the candidate was made for the task of today."""
+        """Whether the candidate was made for the current task."""
         return self.meta.get("task") == self.workspace.task.hash
 
     def refuse_foreign(self, found: str) -> None:
-        """Refuses a candidate for another robot, and one that was handed out or run otherwise.
+        """Refuse a candidate for another robot, or one not equal to what was handed out or run.
 
         Args:
             found: SHA-256 of its file.
+
+        Raises:
+            GroundedError: if it is such a candidate.
         """
         made, model = self.candidate, self.workspace.base_model
         for what, names, own in (
@@ -198,8 +204,8 @@ class Check:
         ):
             if names != own:
                 raise GroundedError(
-                    f"{made.id} is for the {what} {', '.join(names)}; this workspace's model has "
-                    f"{', '.join(own)}: it is a candidate of another robot",
+                    f"{made.id} is for the {what} {', '.join(names)}, but this workspace's model "
+                    f"has {', '.join(own)}: it is a candidate of another robot",
                     NextCommand("propose"),
                 )
         if found not in self.workspace.noted.handed.get(made.id, {found}):
@@ -217,27 +223,27 @@ class Check:
                 )
 
     def reasons(self) -> Iterator[str]:
-        """Why it must not be handed over, a sentence each."""
+        """Yield the reasons why it must not be handed over, a sentence each."""
         made, config = self.candidate, self.workspace.config
         if abs(made.policy.dt - config.task.dt) > 1e-9:
-            yield f"it runs every {made.policy.dt:g} s, [task] dt is {config.task.dt:g} s"
+            yield f"it runs every {made.policy.dt:g} s, but [task] dt is {config.task.dt:g} s"
         model = self.workspace.base_model
         for kind, own in (("states", model.states), ("inputs", model.inputs)):
             for name, unit in json.loads(self.meta[kind]).items():
                 if unit != own[name]:
-                    yield f"it has {name} in {unit}, the model of today in {own[name]}"
+                    yield f"it has {name} in {unit}, but the current model has it in {own[name]}"
         yield from outside_limits(self.workspace.task, made.policy)
         if not self.same_task and not (self.other_task and self._ever_ran):
             yield (
                 "it was made for another task (other target, reward, limits, start, feedback or "
-                f"horizon){', and was not run in that one' * self.other_task}"
+                f"horizon){', and was not run there' * self.other_task}"
             )
         elif self.void:
             yield "it was not run and is void: the model was changed since it was made"
         yield from self._unsafe()
 
     def notes(self) -> Iterator[str]:
-        """What a person should know of it, though nothing speaks against it."""
+        """Yield remarks that the user should know although they do not prevent its use."""
         made, name = self.candidate, self.candidate.id
         if made.doubtful and not self._trials(name):
             yield made.doubt(self.standing.incumbent)
@@ -245,9 +251,9 @@ class Check:
         if "sha256" not in self.meta:
             yield f"{name} was written by an older version: its file has no checksum of its own"
         if not self.same_task:
-            yield f"{name} was made for another task than that of grounded.toml"
+            yield f"{name} was made for a different task from that in grounded.toml"
         elif self._changed:
-            again = "predicted again" if self._predictable else "its prediction is the old one"
+            again = "it was predicted again" if self._predictable else "its prediction is outdated"
             yield f"the model was changed since {name} was made; {again}"
         if self.same_task and not self.standing.trials:
             yield from self._untried()
@@ -255,7 +261,7 @@ class Check:
             yield coasts
 
     def _became(self) -> Iterator[str]:
-        """That it lost, or that its trials were set aside, for a hand that types its name."""
+        """Yield that it lost, or that its trials were set aside."""
         name, best = self.candidate.id, self.standing.incumbent
         tried = next((t for t in self.standing.history if t.candidate.id == name), None)
         if tried is not None and tried.accepted is False and best is not None:
@@ -273,9 +279,9 @@ class Check:
         return ""
 
     def _untried(self) -> Iterator[str]:
-        """How near the first run comes to [safety], which nothing but the bare model says.
+        """Yield a warning if the first run is predicted to come near bounds of [safety].
 
-        A bound that it comes no nearer to than where it starts is left out.
+        Bounds that the run does not approach from where it starts are left out.
         """
         task, made = self.workspace.task, self.candidate
         assert task.safety_low is not None and task.safety_high is not None
@@ -296,12 +302,12 @@ class Check:
         if near:
             told = " and ".join(text for _, text in sorted(near)[:NEAREST])
             yield (
-                f"[safety] holds of the prediction, which no run has tested: {made.id} is to come "
-                f"{told}. The robot may go further: be ready to stop it"
+                f"[safety] was only checked on the prediction, which no run has tested: {made.id} "
+                f"is predicted to come {told}. The robot may go further: be ready to stop it"
             )
 
     def _coasting(self) -> str:
-        """Where the robot goes on to after the run, with the input that its runner holds then."""
+        """Return where the robot leaves [safety] after the run, with the input held then; or ""."""
         from grounded.search.safety import coasts_out
 
         made, planner = self.candidate, self.workspace.planner
@@ -312,7 +318,7 @@ class Check:
 
     @property
     def void(self) -> bool:
-        """Whether it is a step of the search in another model that no trial ran."""
+        """Whether it is a step of the search, planned with another model, that no trial ran."""
         searched = self.meta.get("kind") == "search" and self.same_task
         return searched and not self._trials(self.candidate.id) and self._changed
 
@@ -322,7 +328,7 @@ class Check:
 
     @property
     def _predictable(self) -> bool:
-        """Whether the run can be predicted in the task of today: it has the same time grid."""
+        """Whether the run can be predicted in the current task: it has the same time grid."""
         policy, task = self.candidate.policy, self.workspace.task
         return policy.horizon == task.horizon and abs(policy.dt - task.dt) <= 1e-9
 
@@ -335,7 +341,7 @@ class Check:
         return [t for t in found if self.workspace.fits(t)]
 
     def _unsafe(self) -> list[str]:
-        """What [safety] says; a step that no trial ran may stray as earlier ones did."""
+        """Return objections of [safety]; a step not run yet gets a margin for how runs strayed."""
         from grounded.search.safety import objections, spread
 
         workspace, made = self.workspace, self.candidate
@@ -347,7 +353,7 @@ class Check:
         return objections(workspace.task, made, strays)
 
     def _predicted(self) -> Candidate:
-        """The candidate as the model of today predicts it, grounded on its trials or its base's."""
+        """Predict the candidate with the current model, grounded on its trials or its base's."""
         from grounded.rollout import simulate
         from grounded.solve.bias import ground
         from grounded.trial import mean_trial
@@ -370,10 +376,10 @@ class Check:
 
 
 def outside_limits(task: Task, policy: Policy) -> Iterator[str]:
-    """Where a policy may leave the hard limits of a task: a sentence for each input.
+    """Yield a sentence for each input for which a policy may exceed the task's hard limits.
 
-    A feed-forward with feedback may lie outside, since its sum with the feedback is clipped to the
-    policy's own limits; the sum is what must be inside, and is when these are.
+    A feed-forward with feedback may lie outside the limits: its sum with the feedback is clipped to
+    the policy's own limits, so only those need to be inside.
     """
     for j, (name, unit) in enumerate(task.model.inputs.items()):
         low, high = task.low[j], task.high[j]

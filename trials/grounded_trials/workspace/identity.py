@@ -1,9 +1,9 @@
-"""What a name stands for: candidates as files, and what the notes of a folder say of them.
+"""Names of candidates and trials: candidate files, and the notes stored beside the trials.
 
-A policy is known by the bytes of its file. The notes beside the trials say which bytes were handed
-out under a name, so that a file that was written again is found whatever its checksum; and which
-trials were set aside. Where two folders were joined and two policies are called c0002, the trials
-of the second are data, called c0002~3f9a0c2d after the hash of what they ran.
+A policy is identified by the bytes of its file. Notes record the hashes of the files that were
+handed out under each name, so that rewritten files are found even with a valid checksum; they also
+record which trials were set aside. If two folders were merged and two policies are named c0002, the
+trials of the second count as data and get a name with the hash of what they ran: c0002~3f9a0c2d.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ if TYPE_CHECKING:
 
     from grounded_trials.workspace.folder import Folder
 
-ROWS = "rows_s"  # of a log's metadata: the time between a table's rows that repeat a command
-ESTIMATED_WITH = "estimated_with"  # likewise: adopted effects of the model that found its speeds
-LASTED = "source_seconds"  # likewise: how long the log is
-READ_BY = "read_by"  # likewise: the keys of [log] that changed its signals
+# keys of a log's metadata
+ROWS = "rows_s"  # time between rows of a table that repeats commands
+ESTIMATED_WITH = "estimated_with"  # adopted effects of the model that estimated its speeds
+LASTED = "source_seconds"  # duration of the log
+READ_BY = "read_by"  # keys of [log] that changed its signals
 # a candidate's metadata, in the order of the file
 _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "id": str,
@@ -62,24 +63,24 @@ _ABSENT = {
 
 @dataclass(frozen=True, eq=False)
 class StoredTrial:
-    """A trial of the store with what its file says of it."""
+    """A trial of the store, with its metadata and the candidate it ran."""
 
     stored: Stored
     trial: Trial  # .id is its short name (t0007); short gaps are bridged
     meta: dict[str, str]
-    measured: Trial  # as it was logged, gaps and all
-    ran: str  # SHA-256 of the candidate's file that it carries, "" for none
+    measured: Trial  # as logged, with its gaps
+    ran: str  # SHA-256 of the candidate file that it contains, "" for none
     policy_of: Callable[[], bytes | None]
 
     @property
     def policy(self) -> bytes | None:
-        """The file of the candidate that it ran."""
+        """The contents of the candidate file that it ran."""
         return self.policy_of() if self.ran else None
 
 
 @dataclass(frozen=True, eq=False)
 class StoredCandidate:
-    """A candidate with what its file says of it."""
+    """A candidate with the kind, the task and the hash of its file."""
 
     candidate: Candidate
     kind: str  # search or probe
@@ -87,13 +88,13 @@ class StoredCandidate:
     sha256: str  # of its file
 
     def about(self) -> dict[str, Any]:
-        """All but the numbers, for an index."""
+        """Return everything but the arrays, for an index."""
         fields = {key: getattr(self.candidate, key) for key in _FIELDS if key != "task"}
         return {"kind": self.kind, "task": self.task, "sha256": self.sha256, "candidate": fields}
 
     @classmethod
     def known(cls, about: dict[str, Any], load: Callable[[], Candidate]) -> StoredCandidate:
-        """The same from what `about` said; `load` reads the numbers when they are asked for."""
+        """Restore a candidate from `about`; `load` reads the arrays when they are needed."""
         from grounded_trials.store.known import KnownCandidate
 
         fields = KnownCandidate.of(load, about["candidate"])
@@ -102,19 +103,19 @@ class StoredCandidate:
 
 @dataclass(frozen=True, eq=False)
 class Noted:
-    """What the notes of a folder say; trials are named by their hashes, copies by their files."""
+    """The contents of a folder's notes; trials are named by hash, or by file if copies exist."""
 
-    aside: dict[str, str] = field(default_factory=dict)  # discarded and not restored -> why
+    aside: dict[str, str] = field(default_factory=dict)  # discarded trial -> reason
     handed: dict[str, set[str]] = field(default_factory=dict)  # candidate -> SHA-256 of its files
-    ran: dict[str, str] = field(default_factory=dict)  # trials without a policy -> its SHA-256
-    last: set[str] = field(default_factory=set)  # the last file of a trial at each hand-out, or ""
+    ran: dict[str, str] = field(default_factory=dict)  # trial without a policy -> SHA-256 of it
+    last: set[str] = field(default_factory=set)  # the last trial file at each hand-out, or ""
 
     def why_aside(self, stored: Stored) -> str | None:
-        """Why a trial is set aside; None where it isn't."""
+        """Return why a trial is set aside, or None if it is not."""
         return self.aside.get(stored.path.stem, self.aside.get(stored.digest))
 
     def gone(self, store: Store) -> Iterator[Damaged]:
-        """Trials that were stored, and are not there any more."""
+        """Yield the trials that were stored but are missing now."""
         entries = store.list()
         numbers = {stored.number for stored in entries}
         gaps = set(range(1, max(numbers, default=0))) - numbers
@@ -122,12 +123,12 @@ class Noted:
         names = {name.split("-")[0] for name in lost}
         names |= {f"{store.prefix}{number:04d}" for number in gaps}
         for name in sorted(names):
-            reason = f"trials/ has no file of the number {name}: it was removed"
+            reason = f"trials/ has no file with the number {name}: it was removed"
             yield Damaged(store.folder / name, reason)
 
 
 def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
-    """What notes say, taken together: the later one holds."""
+    """Combine notes; later ones override earlier ones."""
     found = Noted()
     for note in notes:
         kind = note["note"]
@@ -145,22 +146,22 @@ def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
 
 @dataclass(frozen=True, repr=False)
 class SetAside(Result):
-    """What `discard` and `restore` answer: the trials that were named, and all that are aside."""
+    """The result of `discard` and `restore`: the named trials, and all that are set aside."""
 
     trials: tuple[str, ...]
     discarded: dict[str, str]  # t0004 -> why
 
     def summary(self) -> str:
-        """All that are set aside."""
+        """Return all trials that are set aside."""
         return f"set aside: {', '.join(self.discarded) or 'none'}"
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `discard --json` and of `restore --json`."""
+        """Return the document of `discard --json` and `restore --json`."""
         return {"trials": list(self.trials), "discarded": self.discarded}
 
 
 def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> SetAside:
-    """Notes that trials were discarded, or restored: see `Workspace.discard`."""
+    """Record that trials were discarded or restored, see `Workspace.discard`."""
     found = [workspace.store.find(name.lower()) for name in trials]
     digests = [stored.digest for stored in workspace.store.list()]
     for one in found:
@@ -174,21 +175,25 @@ def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> 
 
 @lru_cache(maxsize=4)
 def sha256(data: bytes) -> str:
-    """The hash that names a candidate's file."""
+    """Return the hash that identifies a candidate's file."""
     return hashlib.sha256(data).hexdigest()
 
 
 def named_apart(
     trials: Sequence[StoredTrial], known: Noted, path_of: Callable[[str], Path]
 ) -> tuple[StoredTrial, ...]:
-    """Trials of another policy of the same name get a name of their own.
+    """Rename the candidate of trials that ran another policy of the same name.
 
-    The policy of a name is that of its file if that was run or handed out, else the first that ran.
+    A name belongs to the policy in its file if that was run or handed out, else to the first policy
+    that was run under it.
 
     Args:
-        trials: as their files name them.
-        known: what the notes say.
-        path_of: the file of a candidate's name.
+        trials: the trials, with the candidates' names in their files.
+        known: the notes.
+        path_of: returns the file of a candidate's name.
+
+    Returns:
+        The trials, in the same order.
     """
     prints = [one.ran or known.ran.get(one.stored.digest, "") for one in trials]
     policies: dict[str, list[str]] = {}
@@ -212,7 +217,7 @@ def named_apart(
 
 
 def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
-    """A candidate's file, kind search or probe."""
+    """Encode a candidate as the bytes of its file; `kind` is "search" or "probe"."""
     values = vars(candidate) | {"task": task.hash}
     meta = {"kind": kind} | {
         name: repr(values[name]) if of is float else str(values[name])
@@ -229,11 +234,11 @@ def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
 
 
 def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
-    """A candidate and its metadata from the bytes of its file.
+    """Decode a candidate and its metadata from the bytes of its file.
 
     Args:
-        data: the file.
-        identity: what the file is named, c0001; the candidate must have this id.
+        data: the contents of the file.
+        identity: the name of the file, c0001; the candidate must have this id.
 
     Raises:
         GroundedError: if the file is damaged, rewritten, or another candidate's.
@@ -244,24 +249,25 @@ def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]
 
 @lru_cache(maxsize=4)
 def _proven(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
-    """The same, kept: one command meets the bytes of a candidate up to three times."""
+    """Decode a candidate, cached: one command decodes the same bytes up to three times."""
     name = f"candidates/{identity}.mcap"
     policy, states, inputs, meta = read_candidate(data, name)
     try:
         about = {key: of((_ABSENT | meta)[key]) for key, of in _FIELDS.items() if key != "task"}
     except (KeyError, ValueError) as error:
         raise GroundedError(
-            f"{name}: its metadata lacks or garbles {error}; it was not written by `propose`"
+            f"{name}: its metadata has a missing or invalid field, {error}; it was not written by "
+            "`propose`"
         ) from None
     if about["id"] != identity:
         raise GroundedError(
-            f"{name} holds the candidate '{about['id'][:40]}': a file has the name of its "
-            "candidate. Give it its own name again, or delete it if that one is there"
+            f"{name} holds the candidate '{about['id'][:40]}', but a file must have the name of "
+            "its candidate. Rename it, or delete it if the candidate's own file exists"
         )
     return Candidate(policy=policy, predicted_states=states, predicted_inputs=inputs, **about), meta
 
 
 def stored_candidate(data: bytes, identity: str) -> StoredCandidate:
-    """As `candidate_of`, with the kind, the task and the hash of the file."""
+    """Decode a candidate as `candidate_of`, with its kind, its task and the hash of the file."""
     candidate, meta = candidate_of(data, identity)
     return StoredCandidate(candidate, meta.get("kind", ""), meta.get("task", ""), sha256(data))

@@ -1,4 +1,4 @@
-"""inspect: what a log holds, and a [log] table for the workspace's model."""
+"""inspect: show the contents of a log and guess a [log] table for the workspace's model."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ class Inspected(Result):
 
     log: str
     report: LogReport
-    log_table: str  # TOML; "" where none is guessed
+    log_table: str  # TOML; "" if none is guessed
     why_none: str = ""  # why no table is guessed for a log that needs one
-    outside: bool = False  # of any workspace
+    outside: bool = False  # inspected outside any workspace
     ran_nothing: bool = False  # no candidate was proposed yet that it could have run
-    odd: tuple[str, ...] = ()  # what the workspace's [log] reads as what it is not
+    odd: tuple[str, ...] = ()  # suspicious entries of the workspace's [log]
 
     @property
     def format(self) -> str:
-        """What a file of grounded's own says that it is; "" for a foreign log."""
+        """The format that a file written by grounded states; "" for a foreign log."""
         return self.report.meta.get("format", "")
 
     @property
@@ -38,7 +38,7 @@ class Inspected(Result):
 
     @property
     def then(self) -> NextCommand:
-        """What to do with the file."""
+        """The command to type next for this file."""
         if self.report.damage:
             return NextCommand("recover", (self.log if len(self.report.files) == 1 else "FILE",))
         if self.format == CANDIDATE:
@@ -52,11 +52,11 @@ class Inspected(Result):
         return NextCommand("ingest", (*["--data"] * self.ran_nothing, self.log))
 
     def summary(self) -> str:
-        """The log and its size."""
+        """Return the log and its number of messages."""
         return f"{self.log}: {self.report.messages} messages"
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `inspect --json`."""
+        """Return the document of `inspect --json`."""
         report = self.report
         return {
             "files": [str(f) for f in report.files],
@@ -72,11 +72,12 @@ class Inspected(Result):
 
 
 def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
-    """Looks into a log; a table is guessed for foreign ones that are whole.
+    """Inspect a log; guess a [log] table if it is a foreign one and undamaged.
 
     Args:
-        workspace: whose model names the states and inputs; without one no table is guessed.
-        log: a log of any format or a bag's folder.
+        workspace: the workspace whose model names the states and inputs; without a model no table
+            is guessed.
+        log: a log of any format, or a bag's folder.
 
     Raises:
         GroundedError: if the log can't be read at all.

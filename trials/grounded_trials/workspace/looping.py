@@ -1,4 +1,4 @@
-"""The loop in one call: with a system that can be reached (`learn`), and at the track (`next`)."""
+"""The learning loop in one call: `learn` for a reachable system, `next` for a robot run by hand."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from grounded_trials.workspace.proposing import (
 )
 
 STOPS = (
-    "learn stops here, since the next plan would be made of such a log: mend it first, or run "
-    "`learn` again where the warning is mistaken"
+    "learn stops here, since the next plan would be based on this log: fix it first, or run "
+    "`learn` again if the warning is wrong"
 )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NextRun(Result):
-    """What a log gave, what to run next, and the file for the robot (None: the search ended)."""
+    """The result of `next`: the ingested log, what to run next, and the file for the robot."""
 
     taken: Ingested
     proposed: Proposed
-    exported: Exported | None
-    removed: tuple[Path, ...] = ()  # files of candidates that are void now, as `next` wrote them
+    exported: Exported | None  # None if the search has ended
+    removed: tuple[Path, ...] = ()  # deleted exports of candidates that are void now
 
     def summary(self) -> str:
-        """What was taken in, and what comes next."""
+        """Return what was stored, and what comes next."""
         name = None if self.proposed.candidate is None else self.proposed.candidate.id
-        return f"{self.taken.trial} is in; next {name or 'nothing: the search has ended'}"
+        return f"{self.taken.trial} is stored; next: {name or 'nothing, the search has ended'}"
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `next --json`: those of ingest, propose and export."""
+        """Return the document of `next --json`: those of ingest, propose and export."""
         return {
             "trials": [self.taken.to_json()],
             "propose": self.proposed.to_json(),
@@ -58,7 +58,7 @@ def learn_in(
     progress: Callable[[str], None] | None,
     each: Callable[[Candidate, Ingested], None] | None,
 ) -> Status:
-    """Proposes, runs and ingests until the search ends, see `Workspace.learn`."""
+    """Propose, run and ingest until the search ends, see `Workspace.learn`."""
     from grounded_trials.workspace.running import run_candidate
 
     tell, done, odd = progress or (lambda stage: None), 0, _odd_before(workspace)
@@ -75,7 +75,7 @@ def learn_in(
         done += 1
         if each is not None:
             each(made, found)
-        if found.faults and not odd:  # the next plan would be made of it: a person decides
+        if found.faults and not odd:  # the next plan would be based on it: the user decides
             status = status_of(workspace, standing_in(workspace), (STOPS,))
             return replace(status, then=found.then)
     status = status_of(workspace, standing_in(workspace))
@@ -84,7 +84,7 @@ def learn_in(
 
 
 def _odd_before(workspace: Folder) -> bool:
-    """Whether the last run's columns were odd, too, and somebody went on all the same."""
+    """Return whether the last run's log had faults too, so that the user has chosen to go on."""
     from grounded_trials.workspace.intake.log_faults import log_faults
 
     runs = [trial for trial in workspace.task_trials() if trial.candidate]
@@ -92,7 +92,7 @@ def _odd_before(workspace: Folder) -> bool:
 
 
 def next_in(workspace: Folder, log: Path, candidate: str | None, *, runner: bool) -> NextRun:
-    """Takes a log in, proposes, and exports for the robot, see `Workspace.next`."""
+    """Ingest a log, propose, and export for the robot, see `Workspace.next`."""
     taken = ingest_log(workspace, log, candidate)
     workspace.forget()
     proposed, exported = propose_in(workspace), None

@@ -1,6 +1,6 @@
-"""The user's model.py: the one thing in a workspace that is executed, because it is their own code.
+"""Load the user's model.py, the only code in a workspace that is imported.
 
-An exception inside it is a mistake of theirs and becomes a sentence with file and line.
+An exception in it is the user's to fix and becomes a message with file and line.
 """
 
 from __future__ import annotations
@@ -27,10 +27,16 @@ if TYPE_CHECKING:
 def load_module(
     folder: Path, file: str = "", module: str = "", key: str = "[model] file"
 ) -> ModuleType:
-    """The module of a model, from a file in the workspace or by its import name.
+    """Load the module of a model, from a file in the workspace or by its import name.
+
+    Args:
+        folder: the workspace.
+        file: the file of the model, relative to the workspace.
+        module: its import name, or a name among the entry points, instead of a file.
+        key: the key of grounded.toml that named the file, for messages.
 
     Raises:
-        GroundedError: if it isn't there, lies outside the workspace, or fails while it runs.
+        GroundedError: if it does not exist, lies outside the workspace, or fails while it runs.
     """
     if module:
         check_own(folder, [folder / FILE])
@@ -48,11 +54,11 @@ def load_module(
     assert spec is not None and spec.loader is not None
     found = importlib.util.module_from_spec(spec)
     before, writes = set(sys.modules), sys.dont_write_bytecode
-    sys.dont_write_bytecode = True  # bytecode is dated to the second: an edit may be quicker
+    sys.dont_write_bytecode = True  # its times have 1 s resolution: a quick edit would be missed
     sys.path.insert(0, str(folder))
     sys.modules[spec.name] = found  # dataclasses look their module up there
     try:
-        # what a model prints is no data of ours; what it reads lies beside it
+        # a model's prints must not mix with our output; files it reads are relative to its folder
         with contextlib.redirect_stdout(sys.stderr), beside(path.parent):
             spec.loader.exec_module(found)
     except GroundedError as error:
@@ -68,10 +74,10 @@ def load_module(
 
 
 def _installed(name: str) -> ModuleType:
-    """A module by its import name, or a model by its name among the entry points."""
+    """Import a module by its name, or a model by its name among the entry points."""
     registered: dict[str, EntryPoint] = {}
     try:
-        if not _importable(name):  # reading what is installed takes longer than a plan
+        if not _importable(name):  # listing the entry points is slow
             from importlib.metadata import entry_points
 
             registered = {point.name: point for point in entry_points(group="grounded.models")}
@@ -92,12 +98,12 @@ def _installed(name: str) -> ModuleType:
 def _importable(name: str) -> bool:
     try:
         return importlib.util.find_spec(name) is not None
-    except ModuleNotFoundError:  # the package that it should be in
+    except ModuleNotFoundError:  # its parent package is missing
         return False
 
 
 def _forget_neighbours(folder: Path, before: set[str]) -> None:
-    """Modules that the file imported from its own folder: another workspace has its own `model`."""
+    """Unload modules imported from the model's folder: other workspaces have their own."""
     for name in set(sys.modules) - before:
         origin = getattr(sys.modules[name], "__file__", None)
         if origin and Path(origin).resolve().is_relative_to(folder.resolve()):
@@ -105,10 +111,10 @@ def _forget_neighbours(folder: Path, before: set[str]) -> None:
 
 
 def model_in(module: ModuleType) -> Model:
-    """The `model` that a module holds.
+    """Return the `model` of a module.
 
     Raises:
-        GroundedError: if there is none, or it is something else.
+        GroundedError: if there is none, or it is not a Model.
     """
     found: Any = getattr(module, "model", None)
     if isinstance(found, Model):
@@ -122,7 +128,7 @@ def model_in(module: ModuleType) -> Model:
 
 
 def _where(error: BaseException, name: str) -> str:
-    """The user's own line that failed, and why."""
+    """Describe an error with the user's own line that failed."""
     if isinstance(error, SyntaxError):
         line = f" line {error.lineno}" if error.lineno else ""
         return f"{error.filename or name}{line}: {error.msg}"
@@ -132,7 +138,7 @@ def _where(error: BaseException, name: str) -> str:
 
 
 def check_names(names: dict[str, Any] | Any, valid: list[str], what: str) -> None:
-    """Complains about the first name that is not valid."""
+    """Raise a GroundedError for the first name that is not valid."""
     for name in names:
         if name not in valid:
             raise GroundedError(f"{what} '{name}' is not in the model: {nearest(name, valid)}")

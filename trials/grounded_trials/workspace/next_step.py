@@ -1,7 +1,7 @@
-"""What a person does next: one answer for every command, the page and the text.
+"""Choose the command to type next, for every command, the page and the text report.
 
-And what happened since a diagnosis: newer trials, adopted effects, other parameters. A verdict is
-about the model and the trials of its day; what was adopted since is no longer missing.
+`Since` describes what changed after a diagnosis: newer trials, adopted effects, other parameters. A
+verdict refers to the model and the trials of its time; effects adopted since are no longer missing.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ DIAGNOSE = NextCommand("diagnose")
 EXPORT = NextCommand("export", ("best", "--runner"))
 REPORT = NextCommand("report", ("--html",))
 TARGET = NextCommand("target", ("SHAPE",))
-WRITTEN = 1e-3  # of what a target asks for: its digits in a file
-SHORT = 0.1  # of a control step: a filter or delay that makes no difference
-LEFT = 2  # states that are told of what is left
-SAME = 1e-6  # of a value: what writing it in eight digits may take
+WRITTEN = 1e-3  # tolerance for target.csv, relative to its range, due to the digits in the file
+SHORT = 0.1  # fraction of a control step: shorter filters and delays make no difference
+LEFT = 2  # number of states reported of the unexplained rest
+SAME = 1e-6  # relative tolerance for values that were written with eight digits
 
 
 def next_command(
     workspace: Folder, now: Standing, diagnosis: Diagnosis | None, usable: Sequence[str]
 ) -> NextCommand:
-    """What a person does next, given where the search stands and what was diagnosed.
+    """Return the command to type next, given the standing of the search and the last diagnosis.
 
-    Where that is the first plan and nobody has drawn a manoeuvre, that comes before it.
+    If that is the first plan and no manoeuvre was drawn yet, `target` comes first.
 
     Args:
-        workspace: whose model may have changed since the diagnosis.
-        now: where its search stands.
-        diagnosis: the last one.
+        workspace: the workspace, whose model may have changed since the diagnosis.
+        now: the standing of its search.
+        diagnosis: the last diagnosis, or None.
         usable: the trials that a diagnosis can use now, in order of arrival.
     """
     then = _follows(workspace, now, diagnosis, usable)
@@ -52,16 +52,17 @@ def next_command(
 
 
 def to_plan(workspace: Folder) -> NextCommand:
-    """A plan; before the first one, to draw the manoeuvre where target.csv has none yet."""
-    with suppress(GroundedError):  # a target that can't be read `propose` tells of
+    """Return `propose`, or `target` if no candidate was made and no manoeuvre was drawn yet."""
+    with suppress(GroundedError):  # `propose` reports an unreadable target
         return TARGET if undrawn(workspace) else PROPOSE
     return PROPOSE
 
 
 def undrawn(workspace: Folder) -> bool:
-    """Whether no candidate was made and target.csv is what `init --from` wrote in place of one.
+    """Return whether no candidate was made and target.csv is still what `init --from` wrote.
 
-    Zeros of the first state alone where the log could not be sampled yet, from a start at zero.
+    That is the run in the log, or, if the log could not be sampled, zeros for the first state only,
+    with a start at zero.
     """
     task = workspace.config.task
     if not task.target or workspace.candidate_ids():
@@ -75,17 +76,17 @@ def undrawn(workspace: Folder) -> bool:
 def _follows(
     workspace: Folder, now: Standing, diagnosis: Diagnosis | None, usable: Sequence[str]
 ) -> NextCommand:
-    """See `next_command`, whatever target.csv is."""
+    """Return the command to type next regardless of target.csv, see `next_command`."""
     since = since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since()
     follow = to_adopt(workspace, diagnosis) if diagnosis and not since.changed else None
     if follow and (not since.newer or _none_stood(now)):
-        return follow  # wherever the search stands: a better model plans better
+        return follow  # at any point of the search: a better model plans better
     if now.phase == "await-trial":
         return another_trial(workspace, now)
     if now.ending == "not allowed" and not now.trials:
-        return TARGET  # what was asked of the model leaves [safety]; to propose it again helps none
+        return TARGET  # the plan for this target leaves [safety]: proposing again would not help
     if diagnosis is None:
-        logs = usable and not now.history  # what they show comes before the first candidate
+        logs = usable and not now.history  # diagnose logs before the first candidate
         teach = usable and (logs or now.phase != "propose")
         then = None if now.doubt and not doubted(now, None, usable) else now.then
         return then or (DIAGNOSE if teach else PROPOSE)
@@ -98,18 +99,18 @@ def _follows(
 
 
 def doubted(now: Standing, since: Since | None, usable: Sequence[str]) -> bool:
-    """Whether the search doubts its model, and a diagnosis of what came since may say why.
+    """Return whether the search doubts its model and enough new trials exist to diagnose it.
 
     Args:
-        now: where the search stands.
-        since: what the last diagnosis does not know; None without one.
-        usable: what a diagnosis can use now. One run alone confirms nothing.
+        now: the standing of the search.
+        since: what changed since the last diagnosis; None without one.
+        usable: the trials that a diagnosis can use now. A single run would confirm nothing.
     """
     return bool(now.doubt) and (len(usable) if since is None else since.newer) >= LOST
 
 
 def another_trial(workspace: Folder, now: Standing) -> NextCommand:
-    """How to get one more trial: of what waits, of what comes next, or of the best again."""
+    """Return the command for one more trial: of the outstanding, the next or the best candidate."""
     waiting = now.phase == "await-trial"
     if not waiting and (now.phase == "propose" or now.incumbent is None):
         return PROPOSE
@@ -120,12 +121,12 @@ def another_trial(workspace: Folder, now: Standing) -> NextCommand:
 
 
 def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextCommand:
-    """What follows a log: the next candidate; a diagnosis of data, or of a probe's run.
+    """Return the command after ingesting a log: usually `propose`, `diagnose` for data or a probe.
 
     Args:
-        workspace: that has stored it.
+        workspace: the workspace that has stored the log.
         verdict: `Ingested.verdict`.
-        now: where its search stands with it, which says what follows an end; None for data.
+        now: the standing of the search including the log; None for data.
     """
     if now is None or verdict == "probe":
         return DIAGNOSE
@@ -136,9 +137,9 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
 
 
 def logged_target(workspace: Folder) -> str:
-    """The log whose drive target.csv still is, as `init --from` wrote it; "" where it is another.
+    """Return the trial whose states target.csv still repeats, as `init --from` wrote it; or "".
 
-    It is one that ran no candidate, and the target is what its states did, row by row.
+    Only trials that ran no candidate count; the target must equal their states row by row.
     """
     if not workspace.config.task.target:
         return ""
@@ -156,18 +157,18 @@ def logged_target(workspace: Folder) -> str:
 
 
 def _none_stood(now: Standing) -> bool:
-    """Whether every policy that was run crashed: a gentler one is the last resort."""
+    """Return whether every policy that was run crashed."""
     return bool(now.history) and now.incumbent is None
 
 
 def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
-    """What follows a diagnosis: adopt what was claimed, run another trial, or see the whole."""
+    """Return the command after a diagnosis: adopt claims, run another trial, or read the report."""
     if not found.no_cause:
         if (follow := to_adopt(workspace, found)) is not None:
             return follow
         if found.probe:
             return to_run(workspace, found.probe, found.probe)
-        settled = found.kind in ("none", "unknown") or found.contested  # nothing to decide on
+        settled = found.kind in ("none", "unknown") or found.contested  # nothing to adopt
         if not settled or not workspace.config.task.target:
             return REPORT
     now = _standing_ahead(workspace)
@@ -178,22 +179,22 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
 
 
 def nothing_to_do(found: Diagnosis, best: str) -> str:
-    """That a search is over though something is left: what that is, and what would tell more.
+    """Return a text for a search that has ended although part of the gap is unexplained.
 
     Args:
-        found: of the model and the trials that there are; nothing that it claims helps.
+        found: the diagnosis of the current model and trials, without claims left to adopt.
         best: the candidate that the search ended with.
     """
     left = ", ".join(one.sentence() for one in found.leftover[:LEFT])
     return (
-        f"None is needed to have the manoeuvre: the search has ended, with {best}. "
-        + f"No known effect explains what is left: {left}. " * bool(left)
+        f"None is needed for the manoeuvre: the search has ended, with {best}. "
+        + f"No known effect explains the rest: {left}. " * bool(left)
         + f"To learn more: {found.next_trial}"
     )
 
 
 def _standing_ahead(workspace: Folder) -> Standing:
-    """Where the search stands, one proposal ahead where that can be planned with this model."""
+    """Return the standing, one proposal ahead if that can be planned with the current model."""
     try:
         return standing_in(workspace, ahead=True)
     except GroundedError:
@@ -201,9 +202,9 @@ def _standing_ahead(workspace: Folder) -> Standing:
 
 
 def after_fit(workspace: Folder) -> NextCommand:
-    """What follows a fit that predicts no better: what else the last diagnosis leaves to do.
+    """Return the command after a fit that does not predict better.
 
-    Where there is none of today's model and trials: to make one.
+    It is what else the last diagnosis suggests, or a new diagnosis if model or trials changed.
     """
     try:
         found = read_diagnosis(workspace.reports)
@@ -219,15 +220,15 @@ def after_fit(workspace: Folder) -> NextCommand:
 
 
 def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
-    """What to do about what a diagnosis found, None where there is nothing to do.
+    """Return the command that acts on the claims of a diagnosis, or None if there is none.
 
-    Filters and delays of sensors come along where states are fed back: the physics was judged
-    without them, and gains that were made without them swing a robot that has them.
+    Filters and delays of sensors are adopted too if states are fed back: feedback gains designed
+    without them make the robot oscillate.
     """
     from grounded_trials.workspace.adopting import declined
 
     new = diagnosis.open(workspace.config.model.effects, workspace.config.model.params)
-    undone = {*declined(workspace)}  # whoever did that is not asked to do it again
+    undone = {*declined(workspace)}  # effects the user has undone are not suggested again
     late = tuple(name for name in late_open(workspace, diagnosis) if name not in undone)
     claimed = diagnosis.kind in ("effect", "several") and not diagnosis.contested
     if not claimed or {*new} <= undone or _like_a_load(workspace, new):
@@ -237,19 +238,19 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     params = workspace.base_model.params
     known = {n: e.value for n, e in diagnosis.parameters.items() if n in params}
     if all_at_bounds(params, {n: known[n] for n in diagnosis.verdict.parameters if n in known}):
-        return DIAGNOSE  # once their bounds are wider, as it says: they ask for more than can be
+        return DIAGNOSE  # after widening their bounds, as the diagnosis says
     own = {f"parameter:{name}" for name in params}
     if own.issuperset(new):
         if not fitted_in_vain(workspace):
-            return NextCommand("fit")  # the model's form is right: all of its numbers at once
+            return NextCommand("fit")  # only parameters are off: fit all of them together
         if gain(diagnosis.prediction_error, "crude", "with_effects") <= 0:
             return NextCommand("adopt", late) if late else None
     return NextCommand("adopt", (*new, *late))
 
 
 def _like_a_load(workspace: Folder, effects: Sequence[str]) -> bool:
-    """Whether they stand in the place of a load, for which the model wants a parameter."""
-    if len(effects) < 2:  # and nothing is imported
+    """Return whether the effects stand in for a load, for which the model lacks a parameter."""
+    if len(effects) < 2:  # avoids the import
         return False
     from grounded.effects.joint import like_a_load
 
@@ -257,7 +258,7 @@ def _like_a_load(workspace: Folder, effects: Sequence[str]) -> bool:
 
 
 def late_open(workspace: Folder, diagnosis: Diagnosis) -> tuple[str, ...]:
-    """The filters and delays of sensors that a diagnosis found and the model that plans has not."""
+    """Return the filters and delays of sensors that a diagnosis found and the model lacks."""
     task = workspace.config.task
     if not (task.target and task.feedback):
         return ()
@@ -269,7 +270,7 @@ def late_open(workspace: Folder, diagnosis: Diagnosis) -> tuple[str, ...]:
 
 
 def _with_more(effects: int, made: Made) -> NextCommand:
-    """The same diagnosis, of the same trials, with more effects at once."""
+    """Return the command for the same diagnosis of the same trials with more effects allowed."""
     asked: tuple[str, ...] = ()
     if made.compared:
         asked = ("--compare", ",".join(made.named), ",".join(made.compared))
@@ -282,18 +283,18 @@ def _with_more(effects: int, made: Made) -> NextCommand:
 
 @dataclass(frozen=True)
 class Since:
-    """The days between a diagnosis and now."""
+    """What changed since a diagnosis was made."""
 
-    used: int = 0  # of the trials that can be used, those it was made from
-    usable: int = 0
-    newer: int = 0  # that can be used and came after it
+    used: int = 0  # usable trials that the diagnosis was made from
+    usable: int = 0  # trials that a diagnosis can use now
+    newer: int = 0  # usable trials that arrived after the diagnosis
     adopted: tuple[str, ...] = ()  # claimed effects that are part of the model now
-    missing: tuple[str, ...] = ()  # claimed effects that are not, where some are
-    changed: bool = False  # it was made with another model
+    missing: tuple[str, ...] = ()  # claimed effects that are not, if others are
+    changed: bool = False  # the diagnosis was made with another model
 
     @property
     def sentence(self) -> str:
-        """Why it is no longer the last word; "" where it is. What to run, `next_command` says."""
+        """Why the diagnosis is outdated; "" if it is not."""
         parts = []
         if self.newer:
             parts.append(f"diagnosed with {self.used} of {self.usable} trials")
@@ -306,7 +307,7 @@ class Since:
 
 
 def usable_ids(workspace: Folder) -> list[str]:
-    """The trials that a diagnosis can use, in order of arrival.
+    """Return the ids of the trials that a diagnosis can use, in order of arrival.
 
     Raises:
         GroundedError: if a stored file is damaged.
@@ -315,11 +316,11 @@ def usable_ids(workspace: Folder) -> list[str]:
 
 
 def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[str]) -> Since:
-    """What a diagnosis does not know.
+    """Return what changed since a diagnosis was made.
 
     Args:
-        workspace: whose model it was about.
-        diagnosis: as it was kept.
+        workspace: the workspace with the current model.
+        diagnosis: the diagnosis.
         usable: the trials that can be used now, in order of arrival.
     """
     model, made = workspace.config.model, diagnosis.made or Made()
@@ -340,7 +341,7 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
 
 
 def _other_value(diagnosis: Diagnosis, name: str, params: Mapping[str, float]) -> bool:
-    """Whether a claimed parameter has another value now than was claimed: it was not adopted."""
+    """Return whether a claimed parameter differs from the claimed value: it was not adopted."""
     family, _, own = name.partition(":")
     row, made = diagnosis.ranked(name), diagnosis.made or Made()
     if family != "parameter" or own not in params or own not in made.nominal or row is None:

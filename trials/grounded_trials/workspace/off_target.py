@@ -1,7 +1,8 @@
-"""How far runs are off their target, in the unit of the state: what a utility does not say.
+"""How far runs are off their target, in the units of the states.
 
-The states of a position count as one distance. What [reward] weighs along the way is told as its
-rms and its largest error; what it weighs at the end, and what is to be reached, as the error there.
+The states of a position count as one distance. States that [reward] weighs along the way are
+reported by their rms and largest error; those weighed at the end, or to be reached, by their error
+at the end.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ from grounded.search.scatter import beyond_noise
 from grounded.task import Task
 from grounded.trial import Trial
 
-FEW = 2  # groups of states that are told: positions and angles before their rates, then by cost
-MOST = 0.5  # of the cost of being off: what makes more of it is told, too
-REST = 0.1  # of the mean step of a target: one that moves less in the last step is at rest
+FEW = 2  # groups of states reported: positions and angles before their rates, then by cost
+MOST = 0.5  # a group with more than this share of the tracking cost is reported in any case
+REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -29,12 +30,12 @@ class OffTarget(Document):
 
     Args:
         what: the state, or "position".
-        unit: of the errors.
-        rms: over the whole run; NaN where only its end is weighed.
-        most: the largest.
-        at_s: when that was, in seconds of the run.
-        end: rms at the last state; NaN where that has no weight of its own and nothing is to be
-            reached (see `reaches`), or a run ended early.
+        unit: the unit of the errors.
+        rms: rms over the whole run; NaN if only its end is weighed.
+        most: the largest error.
+        at_s: when the largest error occurred, in seconds of the run.
+        end: rms of the errors at the last state; NaN if a run ended early, or if the end has no
+            weight of its own and nothing is to be reached (see `reaches`).
     """
 
     what: str
@@ -45,7 +46,7 @@ class OffTarget(Document):
     end: float = float("nan")
 
     def summary(self) -> str:
-        """`position 2.1 mm rms, 7.3 mm at most (at 7.95 s)`."""
+        """Return a text such as `position 2.1 mm rms, 7.3 mm at most (at 7.95 s)`."""
         told = []
         rms, most, end = measured_alike([self.rms, self.most, self.end], self.unit)
         if np.isfinite(self.rms):
@@ -56,11 +57,14 @@ class OffTarget(Document):
 
 
 def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
-    """How far the runs of one candidate are off the target, the position first; () without one.
+    """Return how far the runs of one candidate are off the target, the position first.
 
     Args:
-        task: whose target and weights hold.
-        trials: of its model; one may end early, or be lost before its first state.
+        task: the task with the target and the weights.
+        trials: runs of the candidate; they may end early, or have no known state at all.
+
+    Returns:
+        The errors of the groups that matter most; () if nothing is tracked.
     """
     whole = [trial.whole(task.horizon) for trial in trials]
     errors = [tracking_error(task, trial.until(max(trial.finite_steps, 0))) for trial in whole]
@@ -93,7 +97,7 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
 
 
 def reaches(task: Task) -> bool:
-    """Whether the task is to get somewhere: the first that its reward weighs is to end at rest."""
+    """Return whether the task is to reach a point: its first weighed group is to end at rest."""
     groups = weighed_groups(task)
     if not groups:
         return False
@@ -104,9 +108,9 @@ def reaches(task: Task) -> bool:
 
 
 def weighed_groups(task: Task) -> list[tuple[list[str], str]]:
-    """The states that the reward weighs and that have a target, with what their error is called.
+    """Return the weighed states with a target, in groups, each with the name of its error.
 
-    The position comes first, as one distance.
+    The axes of a position form one group, which comes first.
     """
     names, known, reward = task.model.state_names, set(tracked(task)), task.reward
     weighed = [i for i in sorted(known) if reward.state[i] or reward.terminal[i]]
@@ -118,7 +122,7 @@ def weighed_groups(task: Task) -> list[tuple[list[str], str]]:
 
 
 def position_axes(model: Model) -> list[int]:
-    """The two or three states that are a position in space, by index; [] for a model without."""
+    """Return the indices of the two or three states that are a position in space; [] if none."""
     roles = roles_of(model)
     axes = roles.get("position", [])[:3]
     if len(axes) < 2:
@@ -128,12 +132,12 @@ def position_axes(model: Model) -> list[int]:
 
 
 def position_names(model: Model) -> list[str]:
-    """The same by name."""
+    """Return the names of the states in `position_axes`."""
     return [model.state_names[i] for i in position_axes(model)]
 
 
 def roles_of(model: Model) -> dict[str, list[int]]:
-    """The states that play each role, by index."""
+    """Return the indices of the states in each role of the model."""
     index = {name: i for i, name in enumerate(model.state_names)}
     return {
         role: [index[n] for n in ((names,) if isinstance(names, str) else names) if n in index]
@@ -142,19 +146,19 @@ def roles_of(model: Model) -> dict[str, list[int]]:
 
 
 def tracked(task: Task) -> list[int]:
-    """States with a target."""
+    """Return the indices of the states that have a target."""
     return [i for i in range(task.model.n) if np.isfinite(task.target[:, i]).all()]
 
 
 def tracking_error(task: Task, trial: Trial) -> Array:
-    """s_t - target_t, (T + 1, n), angles wrapped; NaN where there is no target."""
+    """Return s_t - target_t, (T + 1, n), with angles wrapped; NaN where there is no target."""
     return task.model.difference(trial.states, task.target[: trial.steps + 1])
 
 
 def began_elsewhere(task: Task, trials: Sequence[Trial]) -> tuple[str, ...]:
-    """The states in which runs of one candidate began elsewhere than [task] start has them.
+    """Return the names of the states in which runs of one candidate began away from [task] start.
 
-    A first row that is off by no more than its sensor's noise shows nothing of where a run began.
+    Differences within the sensors' noise do not count.
     """
     off = np.array([task.model.difference(t.states[0], task.start) for t in trials])
     names = np.array(task.model.state_names)

@@ -1,4 +1,4 @@
-"""propose and status in a workspace: the search's answers, with the candidate's file written."""
+"""propose and status in a workspace: ask the search, and write the candidate's file."""
 
 from __future__ import annotations
 
@@ -31,57 +31,57 @@ PROPOSE = NextCommand("propose")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Proposed(Result):
-    """What `propose` answers."""
+    """The result of `propose`."""
 
     proposal: Proposal
-    file: Path | None  # the candidate's; None: the search has ended
+    file: Path | None  # the candidate's file; None if the search has ended
     then: NextCommand
-    noise_cost: float = 0.0  # of sensors in a log of it, beyond its predicted utility
+    noise_cost: float = 0.0  # expected cost of sensor noise in its log, beyond what is predicted
 
     @property
     def candidate(self) -> Candidate | None:
-        """What to run next."""
+        """The candidate to run next; None if the search has ended."""
         return self.proposal.candidate
 
     @property
     def standing(self) -> Standing:
-        """Where the search stands."""
+        """The standing of the search."""
         return self.proposal.standing
 
     def summary(self) -> str:
-        """The candidate, or the end of the search."""
+        """Return the candidate, or the end of the search."""
         return self.proposal.summary()
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `propose --json`; candidate is null when the search has ended."""
+        """Return the document of `propose --json`; candidate is null if the search has ended."""
         found = self.proposal.to_json() | {"file": str(self.file) if self.file else None}
         return found | {"noise_cost": self.noise_cost}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Status(Result):
-    """What `status` answers: where the search stands, and what to do next."""
+    """The result of `status`: where the search stands, and what to do next."""
 
     standing: Standing
     then: NextCommand
-    again: NextCommand  # one more trial of the best candidate, or its log
-    outdated: str = ""  # why the last diagnosis is not the last word
-    notes: tuple[str, ...] = ()  # of the search, where it has ended; trials of namesakes
+    again: NextCommand  # runs the best candidate once more, or ingests its log
+    outdated: str = ""  # why the last diagnosis is outdated
+    notes: tuple[str, ...] = ()  # notes on the end of the search, and on trials that don't count
     discarded: dict[str, str] = field(default_factory=dict)  # t0004 -> why it is set aside
-    off_target: tuple[OffTarget, ...] = ()  # how far the runs of the best are off it, in units
-    diagnosis: Diagnosis | None = None  # the last one; a damaged one counts as none
-    since: Since | None = None  # what happened after it
+    off_target: tuple[OffTarget, ...] = ()  # errors of the best candidate's runs, in units
+    diagnosis: Diagnosis | None = None  # the last one; None if there is none or it is damaged
+    since: Since | None = None  # what changed since the diagnosis
 
     def summary(self) -> str:
-        """The phase and the best candidate."""
+        """Return the phase and the best candidate."""
         return self.standing.summary()
 
     def figures(self) -> Sequence[Figure]:
-        """Utility by candidate."""
+        """Return the figure of the utility by candidate."""
         return self.standing.figures()
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `status --json`, the whole history in it."""
+        """Return the document of `status --json`, with the whole history."""
         found = self.standing.to_json() | {"discarded": self.discarded}
         if found["best"] is not None:
             found["best"] |= {"off_target": [one.to_json() for one in self.off_target]}
@@ -89,9 +89,9 @@ class Status(Result):
 
 
 def propose_in(workspace: Folder) -> Proposed:
-    """The next candidate of a workspace; the outstanding one again while its trial is missing.
+    """Propose the next candidate, or the outstanding one again while its trial is missing.
 
-    An outstanding candidate that is void by now, and was not run, is replaced.
+    An outstanding candidate that has become void, and was not run, is replaced.
 
     Raises:
         GroundedError: if the candidate must not be handed over (see `handover`), a stored file is
@@ -99,8 +99,8 @@ def propose_in(workspace: Folder) -> Proposed:
     """
     if not workspace.config.task.target:
         raise GroundedError(
-            "there is no manoeuvre to learn: [task] names no target. `grounded target` draws one; "
-            "`fit` and `diagnose` need none",
+            "there is no manoeuvre to learn: [task] names no target. Draw one with `grounded "
+            "target`; `fit` and `diagnose` need none",
             NextCommand("target", ("SHAPE",)),
         )
     before = workspace.candidate_ids()
@@ -109,7 +109,7 @@ def propose_in(workspace: Folder) -> Proposed:
     notes = [f"{name} was not run and is void: {why}" for name, why in void.items()]
     if candidate is not None and proposal.is_new:
         notes = notes or _void(workspace, before)
-        notes = [f"{note}; run {candidate.id} in its place" for note in notes]
+        notes = [f"{note}; run {candidate.id} instead" for note in notes]
     held: list[str] = []
     if not proposal.standing.trials and (candidate is None or proposal.is_new):
         from grounded_trials.workspace.first_plan import held_before, left_open
@@ -126,13 +126,13 @@ def propose_in(workspace: Folder) -> Proposed:
     if candidate is None:
         then = status_of(workspace, proposal.standing).then
         if held:
-            then = PROPOSE  # once [task] start is as the note says
+            then = PROPOSE  # after [task] start was changed as the note says
         return Proposed(proposal, None, then)
     path = workspace.candidate_path(candidate.id)
-    # what holds the robot is to be said first: asked again, it is handed out as it is
+    # the user should first correct the held input; a second `propose` hands the candidate out
     then = PROPOSE if held else to_run(workspace, candidate.id)
     cost = 0.0
-    if not candidate.grounded:  # else the model replays a log, its noise with it
+    if not candidate.grounded:  # else the model replays a log, and its noise is included
         from grounded_trials.workspace.first_plan import sensor_noise
 
         cost = noise_cost(workspace.task, candidate.policy, sensor_noise(workspace))
@@ -140,10 +140,15 @@ def propose_in(workspace: Folder) -> Proposed:
 
 
 def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
-    """How a candidate is run: `run` with its name as given; by people: its export, then its log.
+    """Return the command that runs a candidate: `run`, or `export` and then `next` if run by hand.
 
-    Its export counts as made where its file lies in the workspace or the current folder; a file
-    of that name may as well be another workspace's, or a log.
+    It counts as exported if a file with the contents of its export is in the workspace or in the
+    current folder; the name of a file alone proves nothing.
+
+    Args:
+        workspace: the workspace.
+        candidate: the candidate's id.
+        named: the name to use in the command; () for the outstanding candidate.
     """
     if workspace.config.system.reachable:
         return NextCommand("run", named)
@@ -158,7 +163,7 @@ def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
 
 
 def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
-    """What may be run, written and checked; and what may not, though it was waiting: id -> why."""
+    """Write and check the next candidate; also return outstanding ones that are void: id -> why."""
     void: dict[str, str] = {}
     while True:
         seen = workspace.names()
@@ -168,7 +173,7 @@ def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
             return proposal, void
         if proposal.is_new:
             candidate = workspace.save_candidate(candidate, seen)
-            if candidate is None:  # somebody was quicker
+            if candidate is None:  # another process stored something meanwhile
                 workspace.forget_trials()
                 continue
             proposal = replace(proposal, candidate=candidate)
@@ -181,8 +186,8 @@ def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
                 raise
             if any(t.trial.candidate == candidate.id for t in workspace.trials()):
                 raise GroundedError(
-                    f"{proposal.standing.sentence}, but {'; '.join(error.reasons)}. Take back what "
-                    f"was changed, or run {candidate.id} all the same with --anyway"
+                    f"{proposal.standing.sentence}, but {'; '.join(error.reasons)}. Undo what was "
+                    f"changed, or run {candidate.id} regardless with --anyway"
                 ) from None
             void[candidate.id] = "; ".join(error.reasons)
         else:
@@ -190,7 +195,7 @@ def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
 
 
 def _proposal(workspace: Folder, without: Collection[str]) -> Proposal:
-    """What the search says if some candidates, which are void, had not been proposed."""
+    """Ask the search for a proposal as if some (void) candidates had never been proposed."""
     from grounded.search.improve import propose
 
     return propose(
@@ -204,7 +209,7 @@ def _proposal(workspace: Folder, without: Collection[str]) -> Proposal:
 
 
 def _not_run(workspace: Folder, before: Sequence[str]) -> tuple[Candidate, dict[str, str]] | None:
-    """The search's last candidate of those, if no trial ran it, with what its file says of it."""
+    """Return the last candidate of the search with its metadata if no trial ran it, else None."""
     for name in reversed(before):
         made, meta = workspace.candidate(name)
         if meta.get("kind") == "search":
@@ -215,7 +220,7 @@ def _not_run(workspace: Folder, before: Sequence[str]) -> tuple[Candidate, dict[
 
 
 def _other_model(workspace: Folder, before: Sequence[str]) -> bool:
-    """Whether the search's last candidate was planned with another model, and never run."""
+    """Return whether the search's last candidate was planned with another model, and never run."""
     last = _not_run(workspace, before)
     if last is None or last[1].get("task") != workspace.task.hash:
         return False
@@ -223,7 +228,7 @@ def _other_model(workspace: Folder, before: Sequence[str]) -> bool:
 
 
 def _void(workspace: Folder, before: Sequence[str]) -> list[str]:
-    """That the search's last candidate, which was never run, is replaced by a new one, and why."""
+    """Explain why the search's last candidate, never run, is replaced; [] if it is not."""
     if (last := _not_run(workspace, before)) is None:
         return []
     made, meta = last
@@ -245,13 +250,13 @@ def _void(workspace: Folder, before: Sequence[str]) -> list[str]:
 def standing_in(
     workspace: Folder, *, ahead: bool = False, contents: Contents | None = None
 ) -> Standing:
-    """Where the search of a workspace stands.
+    """Return the standing of the search in a workspace.
 
     Args:
-        workspace: whose trials and candidates say it.
-        ahead: plan the next candidate too, without writing it: only that tells a search that has
-            nothing left to gain from one that goes on.
-        contents: what the folder holds, where it was read already.
+        workspace: the workspace with the trials and candidates.
+        ahead: also plan the next candidate, without writing it, which shows whether the search has
+            anything left to gain.
+        contents: the contents of the folder, if they were read already.
 
     Raises:
         GroundedError: if a stored file is damaged, or the task can't be planned.
@@ -271,7 +276,7 @@ def standing_in(
 
 
 def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()) -> Status:
-    """A standing with the command to type next, and what became of the last diagnosis.
+    """Return a standing with the command to type next and the state of the last diagnosis.
 
     Raises:
         GroundedError: if a stored file is damaged.
@@ -282,7 +287,7 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
     usable = usable_ids(workspace)
     try:
         found = read_diagnosis(workspace.reports)
-    except GroundedError:  # a damaged one is made again
+    except GroundedError:  # a damaged one counts as none
         found = None
     since = since_diagnosis(workspace, found, usable) if found else None
     return Status(
@@ -303,17 +308,17 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
 
 
 def again_best(workspace: Folder, now: Standing) -> NextCommand:
-    """One more trial of the best candidate: its run, or where people run the robot, its log."""
+    """Return the command for one more trial of the best: `run`, or `ingest` if run by hand."""
     if workspace.config.system.reachable:
         return NextCommand("run", ("best",))
-    best = now.incumbent.candidate.id if now.incumbent else "best"  # another one may be, by then
+    best = now.incumbent.candidate.id if now.incumbent else "best"  # "best" may change meanwhile
     return NextCommand("ingest", ("LOG", "--candidate", best))
 
 
 def uncounted(workspace: Folder, trials: Sequence[StoredTrial], now: Standing) -> list[str]:
-    """Trials of this model whose candidates are none of the search's: of another task, or probes.
+    """Return trials of this model that ran no candidate of the search: of another task, or probes.
 
-    Namesakes are told of by themselves.
+    Trials of another policy with the name of a candidate (see `_namesakes`) are left out.
     """
     own = {tried.candidate.id for tried in now.history}
     ran = [t for t in trials if t.trial.candidate and workspace.fits(t.trial)]
@@ -323,48 +328,51 @@ def uncounted(workspace: Folder, trials: Sequence[StoredTrial], now: Standing) -
 
 
 def not_counted(names: Sequence[str]) -> list[str]:
-    """What these trials are good for, in a sentence; nothing of none."""
+    """Return a sentence saying that these trials only serve fit and diagnose; [] for none."""
     if not names:
         return []
     one, ran = len(names) < 2, "candidates of another task, or probes"
     return [
-        f"{ranges(names)} {'counts' if one else 'count'} as data alone, for fit and diagnose: "
+        f"{ranges(names)} {'counts' if one else 'count'} only as data, for fit and diagnose: "
         f"{'it' if one else 'they'} ran {ran}"
     ]
 
 
 def _namesakes(workspace: Folder) -> list[str]:
-    """Which trials ran another policy of a candidate's name, as in two folders that were joined."""
+    """Report trials that ran another policy of a candidate's name (after merging two folders)."""
     names: dict[str, list[str]] = {}
     for one in workspace.trials():
         if "~" in one.trial.candidate:
             names.setdefault(one.trial.candidate, []).append(one.stored.id)
     return [
-        f"{', '.join(ids)} ran another policy that is called {name.split('~')[0]} too: data, for "
-        "fit and diagnose"
+        f"{', '.join(ids)} ran another policy that is also called {name.split('~')[0]}: only data, "
+        "for fit and diagnose"
         for name, ids in names.items()
     ]
 
 
 def candidate_named(workspace: Folder, name: str | None, now: Standing | None = None) -> str:
-    """The id of a candidate: itself, that of the best so far for `best`, of the one that waits.
+    """Return the id of the named candidate, of the best for `best`, of the outstanding for None.
 
-    `now` is where the search stands, where that is known.
+    Args:
+        workspace: the workspace.
+        name: an id, "best" or None.
+        now: the standing of the search, if known.
 
     Raises:
-        GroundedError: if there is none of that name, no best one yet, or none waits.
+        GroundedError: if there is none of that name, no best one yet, or none is outstanding.
     """
     if name is None:
         waiting = standing_in(workspace).outstanding
         if waiting is None:
             raise GroundedError(
-                "no candidate is waiting to be run: `propose` makes the next one, or says that "
-                "the search has ended; name a candidate to run it again",
+                "no candidate is waiting to be run: make the next one with `propose`, or name a "
+                "candidate to run it again",
                 PROPOSE,
             )
         return waiting.id
     if name != "best":
-        workspace.candidate_bytes(name)  # or says which names there are
+        workspace.candidate_bytes(name)  # raises if there is none
         return name
     best = (now or standing_in(workspace)).incumbent
     if best is None:
@@ -373,10 +381,10 @@ def candidate_named(workspace: Folder, name: str | None, now: Standing | None = 
 
 
 def latest_candidates(workspace: Folder, most: int) -> list[Candidate]:
-    """The latest candidates, those of the task, probes and void ones too: any may have been run."""
+    """Return the latest candidates of the task, including probes and void ones."""
     found = []
     for identity in workspace.candidate_ids()[-most:]:
-        with suppress(GroundedError):  # a damaged file was not run now
+        with suppress(GroundedError):  # a damaged file can't have been run
             candidate, meta = workspace.candidate(identity)
             found += [candidate] * (meta.get("task") == workspace.task.hash)
     return found

@@ -1,9 +1,9 @@
 """run: hand a candidate to the real system and get a trial file back.
 
-The real system is a command of the user's (a robot, another simulator), which is given the paths of
-the candidate and of the trial that it must write; or a simulated one, a model in the workspace.
-Where it is simulated, `optimum` says for studies and demos how good a candidate could get, by the
-same search in the true model; the search of the workspace never sees that.
+The real system is a command of the user (for a robot, another simulator), which gets the paths of
+the candidate and of the trial that it must write; or it is simulated by a model in the workspace.
+For a simulated system `optimum` finds how good a candidate could get, by the same search in the
+true model; it is for studies and demos, and the search of the workspace never uses it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from grounded_trials.workspace.handover import Handed, checked_candidate
 from grounded_trials.workspace.model_file import load_module, model_in
 from grounded_trials.workspace.proposing import candidate_named
 
-TRIALS = 30  # of the search for the optimum
+TRIALS = 30  # limit of the search for the optimum
 
 
 @dataclass(frozen=True, repr=False)
@@ -41,20 +41,20 @@ class Ran(Result):
 
     candidate: str
     trial_file: Path
-    notes: tuple[str, ...] = ()  # what to know about the candidate
-    overridden: tuple[str, ...] = ()  # what spoke against it, with `anyway`
+    notes: tuple[str, ...] = ()  # remarks on the candidate
+    overridden: tuple[str, ...] = ()  # reasons against it, overridden by `anyway`
 
     @property
     def then(self) -> NextCommand:
-        """Take the trial in."""
+        """The command that ingests the trial."""
         return NextCommand("ingest", (str(self.trial_file),))
 
     def summary(self) -> str:
-        """What was run, and where its trial is."""
+        """Return what was run, and where its trial is."""
         return f"{self.candidate}: {self.trial_file}"
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `run --json`."""
+        """Return the document of `run --json`."""
         return {"trial_file": str(self.trial_file), "candidate": self.candidate}
 
 
@@ -65,12 +65,12 @@ def run_candidate(
     anyway: bool = False,
     warn: Callable[[str], None] | None = None,
 ) -> Ran:
-    """Runs a candidate once; its trial file is runs/cNNNN-K.mcap. See `Workspace.run`."""
+    """Run a candidate once and write its trial to runs/cNNNN-K.mcap, see `Workspace.run`."""
     system, identity = workspace.config.system, candidate_named(workspace, candidate)
     handed = checked_candidate(workspace, identity, anyway=anyway)
     if warn is not None:
         for reason in handed.overridden:
-            warn(f"{identity} is run all the same: {reason}")
+            warn(f"{identity} is run anyway: {reason}")
     path = _next_run(workspace.folder / "runs", identity)
     if system.command:
         _call(workspace, system.command, handed, path)
@@ -87,10 +87,10 @@ def run_candidate(
 
 
 def simulated_plant(workspace: Folder) -> Plant:
-    """The simulated system of [system] model.
+    """Return the simulated system of [system] model.
 
     Raises:
-        GroundedError: if its file holds no model.
+        GroundedError: if its file defines no model, or [system.noise] names an unknown state.
     """
     system = workspace.config.system
     module = load_module(workspace.folder, file=system.model, key="[system] model")
@@ -120,7 +120,7 @@ def _next_run(folder: Path, identity: str) -> Path:
 
 
 def _call(workspace: Folder, command: str, handed: Handed, path: Path) -> None:
-    """The user's command, its output passed on to stderr."""
+    """Call the user's command; its stdout goes to stderr."""
     check_own(workspace.folder, [workspace.folder / FILE])
     file = workspace.bring_back(handed.candidate.id)
     words = {
@@ -148,7 +148,7 @@ def _call(workspace: Folder, command: str, handed: Handed, path: Path) -> None:
             f"[system] command ended with exit code {done.returncode}: {shlex.join(parts)}{hint}"
         )
     if not path.exists():
-        raise GroundedError(f"[system] command ended well but wrote no trial to {{trial}} = {path}")
+        raise GroundedError(f"[system] command succeeded but wrote no trial to {{trial}} = {path}")
 
 
 def _simulate(workspace: Folder, handed: Handed, path: Path) -> None:
@@ -176,9 +176,10 @@ def _simulate(workspace: Folder, handed: Handed, path: Path) -> None:
 
 
 def optimum(workspace: Folder) -> float | None:
-    """The best utility found with the true model; None where the system is not simulated.
+    """Return the best utility found with the true model.
 
-    Also None where the true model has other states than the crude one: then no task fits it.
+    Returns None if the system is not simulated, or if the true model has other states or inputs
+    than the crude one, so that the task does not fit it.
     """
     if not workspace.config.system.model:
         return None

@@ -1,6 +1,6 @@
-"""From grounded.toml, target.csv and a loaded model to the Task of the method.
+"""Build the Task of the method from grounded.toml, target.csv and a loaded model.
 
-target.csv says what the states are to do, a row a control step; a state without a column is free.
+target.csv has the desired states, one row per control step; a state without a column is free.
 """
 
 from __future__ import annotations
@@ -23,20 +23,21 @@ from grounded_trials.plain_file import open_file
 from grounded_trials.workspace.config import Config, set_target
 from grounded_trials.workspace.model_file import check_names
 
-Reader = Callable[[Path], tuple[list[str], Array]]  # of a target, as `read_target`
+Reader = Callable[[Path], tuple[list[str], Array]]  # reads a target, as `read_target` does
 
 
 def build_task(config: Config, model: Model, folder: Path, read: Reader | None = None) -> Task:
-    """The task that the files describe; errors name the file and the key.
+    """Build the task that the files describe.
 
     Args:
         config: the checked grounded.toml.
-        model: whose states and inputs the target names.
-        folder: where they lie.
-        read: what reads the target; None: `read_target`.
+        model: the model whose states and inputs the files name.
+        folder: the folder of the files.
+        read: the function that reads the target; None: `read_target`.
 
     Raises:
-        GroundedError: for a name that is not in the model, or sizes that do not fit.
+        GroundedError: for a name that is not in the model, or sizes that do not fit; the message
+            names the file and the key.
     """
     try:
         return _build(config, model, folder, read or read_target)
@@ -62,7 +63,7 @@ def _build(config: Config, model: Model, folder: Path, read: Reader) -> Task:
     start = np.array([table.start.get(s, first[i]) for i, s in enumerate(states)])
     low, high = _limits(config, inputs)
     held = np.zeros(len(inputs)) if input_target is None else input_target[0]
-    aimed = np.clip(held, low, high)  # what a run holds first, where nothing else is said
+    aimed = np.clip(held, low, high)  # default of the input held before a run
     past = np.array([table.start.get(name, aimed[i]) for i, name in enumerate(inputs)])
     safety = config.safety.pairs(states)
     safe = np.array([safety.get(s, (-np.inf, np.inf)) for s in states])
@@ -92,7 +93,7 @@ def _limits(config: Config, inputs: list[str]) -> tuple[Array, Array]:
 
 
 def seen_in(config: Config) -> str:
-    """The log whose commands the limits were read off, by its file's name; "" for limits proper."""
+    """Return the file name of the log that [limits] were taken from; "" if the user set them."""
     log: str = config.limits.take("seen_in", str, "")
     return log
 
@@ -106,31 +107,33 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
         weights[kind] = np.array([given.get(name, 0.0) for name in names])
     table.finish()
     tracked = any(w.any() for w in (weights["state"], weights["terminal"]))
-    if not config.task.target:  # nothing to follow: what errors would cost says nothing
+    if not config.task.target:  # nothing to follow: weights on errors have no meaning
         weights |= {kind: np.zeros(len(states)) for kind in ("state", "terminal")}
     elif not tracked:
         raise GroundedError(
-            "[reward] weighs no state: there is nothing to follow; add for example "
+            "[reward] weighs no state, so there is nothing to follow; add for example "
             f"state = {{ {states[0]} = 1.0 }}"
         )
     return Reward(**weights)
 
 
 ROW_LIMIT = 200_002
-LEAST = 0.1  # range of a column of the target that weights go by
-STILL, HARDLY = 0.01, 1e-4  # of its size, at most of LEAST, and in its unit: less is no way
-NARROW = 0.2  # of a position's largest range: the least that its smallest one counts for
-UNKNOWN = 1.0  # in its own unit: that of a column that is constant, as all of its unit
-FULL = {"%": (-100.0, 100.0)}  # what an input may be, by its unit, where nothing says it
-CHANGE = 0.01  # the weight on the changes of an input from -1 to 1
+LEAST = 0.1  # smallest range of a target column used for its weight
+# a column counts as constant if its range is below STILL of its size (of LEAST if that is less), or
+# below HARDLY in its unit
+STILL, HARDLY = 0.01, 1e-4
+NARROW = 0.2  # smallest range used for a position's axis, as a fraction of the largest one
+UNKNOWN = 1.0  # range assumed for a constant column if no column of its unit moves
+FULL = {"%": (-100.0, 100.0)}  # range assumed for an input without limits, by unit
+CHANGE = 0.01  # weight on the changes of an input with range -1 to 1
 CHANGES = 4 * CHANGE
 
 
 def read_target(path: Path) -> tuple[list[str], Array]:
-    """The columns' names (first `t`) and the values, (rows, columns).
+    """Read the names of the columns (`t` first) and their values, (rows, columns).
 
     Raises:
-        GroundedError: naming the line and column that is not a number.
+        GroundedError: naming the line and the column of a value that is not a number.
     """
     try:
         with TextIOWrapper(open_file(path), encoding="utf-8-sig", newline="") as stream:
@@ -151,7 +154,7 @@ def read_target(path: Path) -> tuple[list[str], Array]:
                     values = _numbers(path, line, names, row)
                 rows.append(values)
     except FileNotFoundError:
-        raise GroundedError(f"{path} does not exist; [task] target asks for it") from None
+        raise GroundedError(f"{path} does not exist, but [task] target names it") from None
     except IsADirectoryError:
         raise GroundedError(f"{path} is a folder; [task] target must name a CSV file") from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -168,7 +171,7 @@ def _check_header(path: Path, names: list[str]) -> None:
         )
     twice = [name for name in names if names.count(name) > 1]
     if twice:
-        raise GroundedError(f"{path.name}: the column '{twice[0]}' is there twice")
+        raise GroundedError(f"{path.name}: there are two columns named '{twice[0]}'")
 
 
 def _numbers(path: Path, line: int, names: list[str], row: list[str]) -> list[float]:
@@ -188,7 +191,7 @@ def _numbers(path: Path, line: int, names: list[str], row: list[str]) -> list[fl
         if not math.isfinite(value):
             raise GroundedError(
                 f"{path.name} line {line}: {cell.strip()} in column '{name}'; every tracked value "
-                "must be finite, leave out the column of a state that is free"
+                "must be finite; omit the column if the state is free"
             )
         values.append(value)
     return values
@@ -202,7 +205,15 @@ def target_arrays(
     horizon: int,
     read: Reader | None = None,
 ) -> tuple[Array, Array | None]:
-    """The target (H + 1, n), NaN in free columns, and the inputs' target (H, m) if there is one.
+    """Return the target (H + 1, n), NaN where free, and the inputs' target (H, m) or None.
+
+    Args:
+        path: the CSV file.
+        states: the model's states, n.
+        inputs: the model's inputs, m.
+        dt: control interval [s].
+        horizon: control steps, H.
+        read: the function that reads the file; None: `read_target`.
 
     Raises:
         GroundedError: for an unknown column, too few rows, or times off the control grid.
@@ -216,7 +227,7 @@ def target_arrays(
             )
     if len(values) < horizon + 1:
         raise GroundedError(
-            f"{path.name} has {len(values)} rows, a horizon of {horizon} steps needs "
+            f"{path.name} has {len(values)} rows, but a horizon of {horizon} steps needs "
             f"{horizon + 1}: add rows or set [task] horizon = {max(len(values) - 1, 0)}"
         )
     t = values[: horizon + 1, 0]
@@ -225,7 +236,7 @@ def target_arrays(
         i = int(np.argmax(off > 0.01 * dt))
         raise GroundedError(
             f"{path.name} line {i + 2}: t = {t[i]:g} s, expected {t[0] + i * dt:g} s: rows must be "
-            f"[task] dt = {dt:g} s apart; the command below resamples them",
+            f"[task] dt = {dt:g} s apart; resample them with the command below",
             NextCommand("target", (str(path),)),
         )
     target = np.full((horizon + 1, len(states)), np.nan)
@@ -240,7 +251,7 @@ def target_arrays(
 
 
 def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -> Path:
-    """Writes target.csv and its length to grounded.toml, see `Workspace.target`."""
+    """Write target.csv, and its length and weights to grounded.toml, see `Workspace.target`."""
     from grounded_trials.workspace.off_target import position_names
 
     units, place = model.states, position_names(model)
@@ -248,7 +259,7 @@ def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -
     path = config.file.parent / name
     before: dict[str, float] = {}
     if path.is_file():
-        with suppress(GroundedError, ValueError):  # one that can't be read is replaced
+        with suppress(GroundedError, ValueError):  # an unreadable target is replaced
             names, values = read_target(path)
             given = dict(zip(names[1:], values.T[1:], strict=True))
             before = equal_weights(given, units, place)
@@ -262,7 +273,7 @@ def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -
 
 
 def limited_changes(config: Config, model: Model) -> dict[str, tuple[float, float]]:
-    """The weights on changes of inputs that have [limits]: without them, and by them."""
+    """Return the weights on changes of inputs with [limits]: (ignoring the limits, using them)."""
     both = zip(*_limits(config, list(model.input_names)), model.inputs.items(), strict=True)
     return {
         name: (change_weight(None, unit), float(f"{change_weight((low, high), unit):.4g}"))
@@ -274,17 +285,17 @@ def limited_changes(config: Config, model: Model) -> dict[str, tuple[float, floa
 def equal_weights(
     columns: Mapping[str, Array], units: Mapping[str, str], together: Collection[str] = ()
 ) -> dict[str, float]:
-    """Weights by which an error as large as a column's range, at least LEAST, costs 1.
+    """Return weights by which an error as large as a column's range (at least LEAST) costs 1.
 
-    A column that is constant has no range: it gets the largest of its unit (a y that stays while x
-    moves), where nothing of its unit moves UNKNOWN: what is small for it nobody has said. Its size
-    counts where that is more, as of a step: an offset of 0.02 says nothing, 5 m does.
+    A constant column has no range of its own. It gets the largest range or size among the columns
+    of its unit (a y that is constant while x moves; a step to a constant 5 m), or UNKNOWN if no
+    column of its unit moves or is larger than UNKNOWN.
 
     Args:
-        columns: of the target, by state.
-        units: of the model's states.
-        together: axes of one position: a metre costs the same along each, by the smallest range,
-            but of one that is hardly any.
+        columns: the columns of the target, by state.
+        units: the units of the model's states.
+        together: the axes of one position, which share a weight: that of the smallest range, but
+            of at least NARROW of the largest.
     """
     ranges = {name: range_of(values) for name, values in columns.items()}
     if axes := [own for name, own in ranges.items() if name in together and own > 0]:
@@ -303,17 +314,19 @@ def equal_weights(
 
 
 def range_of(values: Array) -> float:
-    """How far a column of a target goes: nothing from a start of 0.02591 rad to 0.0259."""
+    """Return the range of a target column, 0 if it hardly moves (from 0.02591 to 0.0259 rad)."""
     own = float(np.ptp(values))
     return own if own > max(STILL * min(float(np.abs(values).max()), LEAST), HARDLY) else 0.0
 
 
 def without_range(columns: Mapping[str, Array], units: Mapping[str, str]) -> list[str]:
-    """The states of whose unit no column moves, nor is as large as UNKNOWN: no error is small.
+    """Return the states for whose unit no column moves or exceeds UNKNOWN.
+
+    The target does not show what a small error of such a state is.
 
     Args:
-        columns: of a target, by state.
-        units: of the model's states.
+        columns: the columns of a target, by state.
+        units: the units of the model's states.
     """
     told = {
         units.get(name, "")
@@ -324,25 +337,30 @@ def without_range(columns: Mapping[str, Array], units: Mapping[str, str]) -> lis
 
 
 def change_weight(limits: tuple[float, float] | None, unit: str) -> float:
-    """The first weight on an input's changes: a part of its whole range costs as much in any unit.
+    """Return the default weight on an input's changes, scaled by its range.
 
     Args:
-        limits: lowest and highest value; None where nothing says them: -1 to 1, or -100 to 100 %.
-        unit: of the input.
+        limits: lowest and highest value; None if unknown: -1 to 1, or -100 to 100 for unit %.
+        unit: the unit of the input.
     """
     low, high = limits or FULL.get(unit, (-1.0, 1.0))
     return CHANGES / (high - low) ** 2 if high > low else CHANGE
 
 
 def write_target(path: Path, dt: float, columns: dict[str, Array]) -> None:
-    """Writes a target, see `target_text`."""
+    """Write a target file, see `target_text`."""
     from grounded_trials.store.store import write_atomically
 
     write_atomically(path, target_text(dt, columns).encode())
 
 
 def target_text(dt: float, columns: dict[str, Array]) -> str:
-    """A target as CSV; `columns` are states in the order of the file, (H + 1,) each."""
+    """Format a target as CSV.
+
+    Args:
+        dt: control interval [s].
+        columns: states in the order of the file, (H + 1,) each.
+    """
     H = len(next(iter(columns.values())))
     lines = [",".join(["t", *columns])]
     for i in range(H):

@@ -1,4 +1,4 @@
-"""verify: is everything that is kept what it was?"""
+"""verify: check whether stored files were changed, damaged or removed."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from grounded_trials.workspace.identity import Noted, noted, sha256
 
 @dataclass(frozen=True, repr=False)
 class Verified(Result):
-    """How many files were checked, and those that are not what they were, or are gone."""
+    """How many files were checked, and which are changed, damaged or missing."""
 
     checked: int
     damaged: tuple[Lost, ...]
 
     def summary(self) -> str:
-        """How many are good, how many not."""
+        """Return how many files were checked and how many are damaged."""
         return f"{self.checked} files, {len(self.damaged)} damaged"
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `verify --json`."""
+        """Return the document of `verify --json`."""
         return {"checked": self.checked, "damaged": [vars(one) for one in self.damaged]}
 
 
 def verify_in(workspace: Folder) -> Verified:
-    """Checks every file of a workspace that a result rests on."""
+    """Check every file of a workspace that results depend on."""
     broken = [*workspace.store.verify()]
     known = noted(workspace.notes.read(broken))
     broken += known.gone(workspace.store)
@@ -52,7 +52,7 @@ def verify_in(workspace: Folder) -> Verified:
 
 
 def _candidates(workspace: Folder, known: Noted) -> Iterator[tuple[Path, Callable[[], None]]]:
-    """Each candidate that there is or was, and how it is checked."""
+    """Yield the path of each candidate that exists or existed, with a function that checks it."""
     folder = workspace.folder / "candidates"
     names = {path.stem for path in folder.glob("*.mcap")} | set(known.handed)
     for name in sorted(names):
@@ -66,20 +66,20 @@ def _candidates(workspace: Folder, known: Noted) -> Iterator[tuple[Path, Callabl
             intact(data, name)
             if handed and sha256(data) not in handed:
                 raise GroundedError(
-                    f"{path} is not what was handed out as {name}: it was rewritten"
+                    f"{path} is not the file that was handed out as {name}: it was rewritten"
                 )
 
         yield path, check
 
 
 def _carried(workspace: Folder, handed: set[str]) -> bool:
-    """Whether a trial carries a candidate whose file is gone."""
+    """Return whether a trial contains one of the candidate files with these hashes."""
     trials = workspace.read(strict=False).trials
     return any(one.ran in handed for one in trials)
 
 
 def _documents(workspace: Folder) -> Iterator[tuple[Path, Callable[[], Any]]]:
-    """The documents of reports/ that there are, and how they are checked."""
+    """Yield the path of each document in reports/, with a function that checks it."""
     if (path := workspace.reports / "diagnosis.json").exists():
         yield path, lambda: read_diagnosis(workspace.reports)
     for name in ("optimum.json", "adoptions.json", "fit.json"):

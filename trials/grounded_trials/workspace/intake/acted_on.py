@@ -1,10 +1,10 @@
-"""What a program acted on: the samples of a log that it had when it sent a command.
+"""Find the samples of a log that the robot's program acted on when it sent a command.
 
-A controller acts on the last sample that reached it, older by the way there than what the log has
-by then: 20 ms of transport and sampling are 5 % of a lively command, more than most candidates
-differ by. So each candidate is asked for its commands on the samples of a log at the age that suits
-it best, each topic's its own, held as a program holds what it received last, or interpolated where
-it filters. The one that ran sends what was logged, most of the time to the last digits.
+A controller acts on the last sample that reached it, which is older than the latest one in the log:
+20 ms of transport and sampling change a command by 5 %, more than most candidates differ by. So the
+commands of each candidate are computed from the samples of the age that fits best, separately for
+each topic, either held (zero-order hold) or interpolated, as for a program that filters. The
+candidate that ran reproduces the logged commands, mostly to the last digits.
 """
 
 from __future__ import annotations
@@ -35,63 +35,63 @@ from grounded_trials.workspace.intake.who_drove import (
 if TYPE_CHECKING:
     from grounded_trials.workspace.intake.run_start import Recording, Start
 
-OLDEST = 2.0  # steps: what a program acts on is no older
-AGES = 128  # at most are tried of a topic
-PARTS = 8  # ages tried in the time between samples
-ROUNDS = 2  # in which each topic's age is sought, the others' held
-EXACT = 1e-3  # of an input's size: so near is half of what was sent to the candidate that ran
-LUCK = float(np.log(2) / 2)  # [nats] a step: half the squares, which lower gains may leave as well
-FEW, FEWEST = 4, 0.2  # steps of a part that tell, and the share of them that is exact in each
-CLEARLY = 6.0  # [nats] beyond luck, by which another one is nearer
+OLDEST = 2.0  # largest age of a sample, in steps
+AGES = 128  # largest number of ages tried per topic
+PARTS = 8  # number of ages tried in the time between samples
+ROUNDS = 2  # rounds of coordinate search over the topics' ages
+EXACT = 1e-3  # median difference, relative to an input's size, of the candidate that ran
+LUCK = float(np.log(2) / 2)  # [nats] per step: half the squares, which lower gains also give
+FEW, FEWEST = 4, 0.2  # smallest number of informative steps in a part, and their share to be exact
+CLEARLY = 6.0  # [nats] of evidence, beyond LUCK, for another candidate
 LATEST = 3  # steps by which commands may be logged late
-ONE = 3e-3  # of an input's size: candidates that differ by less are one to whoever drives
+ONE = 3e-3  # rms difference, relative to size, below which two candidates count as equal
 
 
 @dataclass(frozen=True, eq=False)
 class ActedOn:
-    """How near a log's commands are to a policy's, on the samples that it may have acted on."""
+    """The differences of a log's commands from a policy's, on the samples it may have acted on."""
 
-    off: Array  # (T,) rms over inputs, in units of each one's largest; NaN: all at their limits
+    off: Array  # (T,) rms over inputs, in units of their size; NaN if all are at their limits
     asked: Array  # (T, m) what the policy sends
-    size: Array  # (m,) the largest of each input
+    size: Array  # (m,) the largest value of each input
 
     @cached_property
     def told(self) -> Array:
-        """The steps that say who drove, (T,) bool."""
+        """The informative steps, (T,) bool: those with an input inside its limits."""
         return np.isfinite(self.off)
 
     @property
     def exact(self) -> bool:
-        """Whether half of the commands are the policy's to the last digits."""
+        """Whether at least half of the commands are the policy's to the last digits."""
         return bool(self.told.sum() >= LEAST and self.left < EXACT)
 
     @property
     def throughout(self) -> bool:
-        """Whether they are so, and at no time somebody else's."""
+        """Whether the commands are exact, also in every part of the run."""
         parts = (one[np.isfinite(one)] for one in np.array_split(self.off, WINDOWS))
         return self.exact and all(len(one) < FEW or np.mean(one < EXACT) > FEWEST for one in parts)
 
     @property
     def left(self) -> float:
-        """What half of the commands are off by, at most: lost packets do not count."""
+        """The median difference of the commands, which is robust to lost packets."""
         return float(np.median(self.off[self.told])) if self.told.any() else np.inf
 
     @property
     def percent(self) -> str:
-        """The same in words."""
+        """The median difference as a text."""
         return f"{max(100 * self.left, 0.01):.2g} %"
 
 
 def acted_on(log: Recording, policy: Policy, start: float) -> ActedOn | None:
-    """The commands of a log against a policy's, at the ages of its samples that suit it best.
+    """Compare the commands of a log with a policy's, at the ages of samples that fit best.
 
     Args:
-        log: which the policy may have driven.
-        policy: of its states and inputs.
+        log: the log.
+        policy: a policy for its states and inputs.
         start: when the run begins, seconds after the log's first sample.
 
     Returns:
-        None where the log can't be cut there, or is too short to tell.
+        The differences; None if the log can't be cut there, or is too short.
     """
     trial = log.trial_from(start)
     if trial is None or (T := min(trial.finite_steps, policy.horizon)) < LEAST:
@@ -106,7 +106,7 @@ def acted_on(log: Recording, policy: Policy, start: float) -> ActedOn | None:
 
     def scores(states: Array) -> Array:
         squares = (((asked(states) - sent) / size) ** 2).mean(axis=2)
-        mean: Array = np.log(squares + FINE**2).mean(axis=1)  # a step that strays counts little
+        mean: Array = np.log(squares + FINE**2).mean(axis=1)  # outliers count little
         return mean
 
     if policy.gain is None:
@@ -125,11 +125,11 @@ class _Samples:
     """The samples of a log's states around the times at which commands were sent."""
 
     states: tuple[Samples, ...]
-    wrapped: tuple[bool, ...]  # states that are angles
-    guessed: tuple[bool, ...]  # those that a smoother found: no program was sent them
-    topics: tuple[tuple[int, ...], ...]  # states that came together
-    at: Ints  # (T,) [ns]
-    ages: Array  # tried of each topic [s]
+    wrapped: tuple[bool, ...]  # whether a state is an angle
+    guessed: tuple[bool, ...]  # whether a state was estimated by the smoother, not logged
+    topics: tuple[tuple[int, ...], ...]  # states with the same time stamps
+    at: Ints  # (T,) when commands were sent [ns]
+    ages: Array  # the ages to try for each topic [s]
 
     @classmethod
     def of(cls, log: Recording, start: int, steps: int) -> _Samples:
@@ -151,7 +151,7 @@ class _Samples:
         )
 
     def best(self, scores: Callable[[Array], Array], held: bool) -> Array:
-        """The states at the ages that suit best, (1, T, n)."""
+        """Return the states at the ages that fit best, (1, T, n)."""
         first = np.stack([self._aged(i, self.ages, held) for i in range(len(self.states))], axis=2)
         found = first[[int(np.argmin(scores(first)))]]
         for _ in range(ROUNDS if len(self.topics) > 1 else 0):
@@ -162,7 +162,7 @@ class _Samples:
         return found
 
     def _aged(self, i: int, ages: Array, held: bool) -> Array:
-        """A state at all ages when each command was sent, (A, T)."""
+        """Return a state at all ages when each command was sent, (A, T)."""
         one = self.states[i]
         at = self.at - np.round(ages[:, None] * 1e9).astype(np.int64)
         last = np.clip(np.searchsorted(one.t, at, "right") - 1, 0, len(one.t) - 1)
@@ -174,7 +174,7 @@ class _Samples:
 
 
 def _sent_at(sent: Sequence[Samples], begin: int, dt: float, steps: int) -> Ints:
-    """When each step's command was logged first [ns]; its time on the grid where it was held on."""
+    """Return when each step's command was logged first [ns]; its grid time if it did not change."""
     step = round(dt * 1e9)
     grid = begin + np.round(dt * 1e9 * np.arange(steps)).astype(np.int64)
     found = np.full(steps, np.iinfo(np.int64).min)
@@ -188,10 +188,11 @@ def _sent_at(sent: Sequence[Samples], begin: int, dt: float, steps: int) -> Ints
 
 
 def nats(own: ActedOn, other: ActedOn) -> float:
-    """The evidence that another candidate sent the commands, not the own one.
+    """Return the evidence [nats] that another candidate sent the commands, not the own one.
 
-    The logarithm of the ratio of what each leaves, summed over the steps: heavy-tailed, as what
-    lost packets do. A ratio that luck, or lower gains, give as well counts for nothing.
+    It is the logarithm of the ratio of the differences that each leaves, summed over the steps,
+    which corresponds to heavy-tailed noise (lost packets). Ratios that chance or lower gains could
+    also give do not count.
     """
     T = min(len(own.off), len(other.off))
     both = np.isfinite(own.off[:T] + other.off[:T])
@@ -202,15 +203,15 @@ def nats(own: ActedOn, other: ActedOn) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Sender:
-    """Who sent the commands of a log, as far as the samples that it acted on tell."""
+    """The candidate that sent the commands of a log, judged on the samples that it acted on."""
 
-    own: ActedOn | None  # None: the log is too short to tell
-    other: str = ""  # the candidate whose commands they are; "": the own one's, or nobody's
-    why: str = ""  # what says so
+    own: ActedOn | None  # None if the log is too short
+    other: str = ""  # another candidate whose commands they are, or ""
+    why: str = ""  # the reason
 
     @property
     def sure(self) -> bool:
-        """Whether the own candidate sent them, most to the last digits, at no time another."""
+        """Whether the own candidate sent them throughout, mostly to the last digits."""
         return self.own is not None and self.own.throughout
 
 
@@ -220,13 +221,13 @@ def sender_of(
     candidates: Sequence[Candidate],
     start_of: Callable[[Candidate], Start | None],
 ) -> Sender:
-    """Whether another candidate sent the commands of a log than it is said to have run.
+    """Check whether another candidate than the stated one sent the commands of a log.
 
     Args:
-        log: in which the run begins.
+        log: the log with the run.
         own: the candidate that it is said to have run.
-        candidates: those that may have been run instead.
-        start_of: where a candidate's run seems to begin in the log.
+        candidates: candidates that may have been run instead.
+        start_of: returns where a candidate's run seems to begin in the log.
     """
     found = start_of(own)
     begins = log.first if found is None else found.seconds
@@ -235,7 +236,7 @@ def sender_of(
         return Sender(mine)
     best, name, theirs = CLEARLY, "", mine
     ran = _following(log, own.policy, begins)
-    late = ran is not None and ran.alike and ran.late != 0  # logged late, they are at other steps
+    late = ran is not None and ran.alike and ran.late != 0  # late commands belong to other steps
     for one in reversed(candidates):
         at = begins
         if (found is None or not found.alike) and (begun := start_of(one)) and begun.opens_alike:
@@ -254,8 +255,8 @@ def sender_of(
     are = "are" if theirs.exact else "seem to be"
     why = (
         f"on the samples that it had, half of its commands are within {theirs.percent} of what "
-        f"{name} sends, and within {mine.percent} of what {own.id} sends: they {are} those of "
-        f"{name}. Was the robot given {own.id}?"
+        f"{name} sends, but only within {mine.percent} of what {own.id} sends: they {are} those of "
+        f"{name}. Was {own.id} copied to the robot?"
     )
     return Sender(mine, name, why)
 
@@ -266,7 +267,7 @@ def rival_in(
     candidates: Sequence[Candidate],
     start_of: Callable[[Candidate], Start | None],
 ) -> Trial | None:
-    """The log from where another candidate fits it much better than the own one anywhere."""
+    """Return the log cut where another candidate fits much better than the own one anywhere."""
     found = start_of(own)
     best, bound = None, SAME * found.apart if found and found.alike else np.inf
     for one in candidates:
@@ -277,13 +278,13 @@ def rival_in(
 
 
 def _one(mine: ActedOn, fit: ActedOn) -> bool:
-    """Whether two candidates send the same, but for what nobody at the robot would see."""
+    """Return whether two candidates send the same commands within ONE."""
     T = min(len(mine.asked), len(fit.asked))
     apart = (mine.asked[:T] - fit.asked[:T]) / mine.size
     return float(np.sqrt((apart**2).mean())) < ONE
 
 
 def _following(log: Recording, policy: Policy, start: float) -> Following | None:
-    """How the commands compare with a policy's: of nobody's, one candidate is the nearest too."""
+    """Compare commands with a policy's by `follows`; even of unrelated ones some is nearest."""
     trial = log.trial_from(start)
     return follows(policy, trial.until(policy.horizon), LATEST) if trial else None

@@ -1,8 +1,8 @@
-"""Two signals that [log] reads from each other's column, by what the columns are called.
+"""Detect two signals that [log] reads from each other's columns, by the names of the columns.
 
-A state and an input have no relation that data must keep: an angle of a beam that is read from the
-servo's column is as smooth as its own. The names tell, where each fits the other signal better, and
-the units that ROS's conventions give a path, where each is the other signal's.
+The data alone may not show it: a beam's angle read from the servo's column is as smooth as its own.
+Two signals count as exchanged if each column's name fits the other signal better, or if the unit of
+each path by ROS conventions is that of the other signal.
 """
 
 from __future__ import annotations
@@ -16,15 +16,17 @@ from grounded_trials.logs.log_table import LogMapping
 from grounded_trials.logs.stated_units import LENGTHS, bare_command, is_angle, unit_of
 from grounded_trials.workspace.config import FILE
 
-UNNAMED = ("data", "value")  # what a number is called that its topic names
+UNNAMED = ("data", "value")  # field names without meaning: the topic is the name
 
 
 def crossed(model: Model, mapping: LogMapping) -> tuple[str, ...]:
-    """Sentences on signals that are read from each other's column; axes may be called as one likes.
+    """Return warnings on signals that are read from each other's columns, or lengths from angles.
+
+    Axes of a position are exempt, since their names vary.
 
     Args:
-        model: whose states and inputs they are.
-        mapping: which column each is read from.
+        model: the model with the states and inputs.
+        mapping: the column of each signal.
     """
     paths = {name: one.path for name, one in {**mapping.states, **mapping.inputs}.items()}
     units = {**model.states, **model.inputs}
@@ -37,7 +39,7 @@ def crossed(model: Model, mapping: LogMapping) -> tuple[str, ...]:
         if _of_the_other(a, b, paths, units) or _crossed(a, b, paths)
     }
     no_lengths = tuple(
-        f"{n} [{units[n]}] is read from {paths[n]}, by its name an angle: see {FILE}'s [log]"
+        f"{n} [{units[n]}] is read from {paths[n]}, an angle by its name: check {FILE}'s [log]"
         for n in lengths
     )
     return no_lengths + tuple(
@@ -49,13 +51,13 @@ def crossed(model: Model, mapping: LogMapping) -> tuple[str, ...]:
 
 
 def _of_the_other(a: str, b: str, paths: Mapping[str, str], units: Mapping[str, str]) -> bool:
-    """Whether each path's number is in the other signal's unit, and not in its own."""
+    """Return whether each path's number is in the other signal's unit, and not in its own."""
     found = unit_of(paths[a]), unit_of(paths[b])
     return found == (units[b], units[a]) != (units[a], units[b])
 
 
 def _crossed(a: str, b: str, paths: Mapping[str, str]) -> bool:
-    """Whether each name fits the other's column better, and that one well enough."""
+    """Return whether each name fits the other's column better than its own."""
     return all(
         _alike(one, paths[other]) > _alike(one, paths[one])
         and _alike(one, paths[other]) >= _alike(other, paths[other])
@@ -64,9 +66,9 @@ def _crossed(a: str, b: str, paths: Mapping[str, str]) -> bool:
 
 
 def _alike(name: str, path: str) -> float:
-    """The share of words that a name and the end of a path have in common, without the unit.
+    """Return the share of words that a name and the end of a path have in common, without units.
 
-    Of a message that holds a number alone, `/cmd/port.data`, the topic is what names it.
+    For a message with a single number, such as `/cmd/port.data`, the topic is the name.
     """
     words = re.split(r"[./]", bare_command(path).strip('"'))
     last = next((one for one in reversed(words) if one and one not in UNNAMED), "")

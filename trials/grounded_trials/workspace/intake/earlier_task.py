@@ -1,7 +1,7 @@
-"""Whether a log ran a candidate of an earlier task: one that was left on the robot.
+"""Detect logs of a candidate of an earlier task that was left on the robot.
 
-The candidates that a log is compared with are those of the task as it is. After its target, reward
-or start was changed the others are void, and still the likeliest to have been run by mistake.
+A log is normally compared with the candidates of the current task. After the target, reward or
+start was changed, the earlier candidates are void but likely to have been run by mistake.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.run_start import Recording
 from grounded_trials.workspace.intake.who_drove import OTHERS, follows, latest
 
-NEAR = 0.05  # of an input's size: the mean difference of a run from its policy's commands
+NEAR = 0.05  # largest mean difference from the policy's commands, relative to an input's size
 
 
 class OfEarlierTask(GroundedError):
-    """A log that ran a candidate which the task has left behind."""
+    """Raised for a log that ran a candidate of an earlier task."""
 
 
 def of_earlier_task(workspace: Folder, log: Recording | None, trial: Trial) -> str:
-    """The candidate of an earlier task whose commands a trial has; "" where there is none.
+    """Return the candidate of an earlier task whose commands a trial has, or "".
 
     Args:
-        workspace: whose candidates they are.
-        log: the foreign log that the trial is from, in which a run may begin anywhere; else None.
-        trial: with gaps bridged.
+        workspace: the workspace with the candidates.
+        log: the foreign log of the trial, in which a run may begin anywhere; else None.
+        trial: the trial, with gaps bridged.
     """
     least, name, task = NEAR, "", workspace.task
     void = []
     for identity in workspace.candidate_ids():
-        with suppress(GroundedError):  # a damaged file was not run now
+        with suppress(GroundedError):  # a damaged file can't have been run
             candidate, meta = workspace.candidate(identity)
             void += [candidate] * (meta.get("task") != task.hash)
     for one in reversed(void[-OTHERS:]):

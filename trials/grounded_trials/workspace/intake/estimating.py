@@ -1,15 +1,14 @@
-"""States that no sensor gives: the smoother of `grounded.estimate`, along a whole log.
+"""Estimate states that are not measured, with the smoother of `grounded.estimate`.
 
     [estimate]
     measured = { x = 0.002, y = 0.002, psi = 0.005 }   # standard deviation of each measured state
-    process = { v = 0.05 }                             # optional, a control step; else estimated
+    process = { v = 0.05 }                             # optional, per control step; else estimated
 
-The measured states are filtered forth and back through the model that plans, the crude one with all
-effects that were adopted, on a clock about as fine as
-they were sampled. Its process noise is estimated from the same log by maximum likelihood, where
-commands change: what the model gets wrong shows in motion, not while the robot waits. All of a log
-is smoothed before a run is sought in it or cut out of it, since what comes before the start of a
-run and after its end says how fast the robot was there.
+The measured states are smoothed with the model that plans (the crude one with all adopted effects),
+on a time grid about as fine as they were sampled. The process noise is estimated from the same log
+by maximum likelihood, where commands change, since model errors show in motion and not while the
+robot waits. The whole log is smoothed before a run is located in it, since the samples before the
+start and after the end of a run carry information about its speeds.
 """
 
 from __future__ import annotations
@@ -30,26 +29,26 @@ from grounded_trials.logs.samples import Samples, check_overlap, tidy
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.toml_table import Table
 
-FINEST = 8  # rows of the smoother in a control step
-PIECE_S = 5.0  # of the log are filtered in step with others: half an hour costs little more
-OVERLAP_S = 1.5  # by which they know of each other
-LEAST = 3  # rows that can be smoothed
-MARGIN_S = 0.5  # of motion after the last change of a command
-WIDE = 10.0  # times as large as a state gets in a log: what is known of its first value
-EXACT = 1e-3  # of a step of the smoother: it is a whole multiple of a simulator's own
-SIZED = 256  # moments at which that is asked
+FINEST = 8  # largest number of smoother rows in a control step
+PIECE_S = 5.0  # length of the pieces of a log, which are smoothed in parallel [s]
+OVERLAP_S = 1.5  # overlap of the pieces on each side [s]
+LEAST = 3  # smallest number of rows that can be smoothed
+MARGIN_S = 0.5  # time after the last change of a command that still counts as motion [s]
+WIDE = 10.0  # std of an initial state, relative to the state's size
+EXACT = 1e-3  # relative tolerance for a step to be a multiple of a simulator's own
+SIZED = 256  # instants at which the size of states is computed
 
 
 @dataclass(frozen=True)
 class EstimateTable:
-    """[estimate]: which states are measured, and how well."""
+    """[estimate]: std of the noise of measured states, and of the process noise."""
 
     measured: dict[str, float]
     process: dict[str, float]
 
 
 def read_estimate(table: Table, model: Model) -> EstimateTable:
-    """The checked [estimate] table, what is measured in the model's order.
+    """Read and check the [estimate] table; measured states are in the model's order.
 
     Raises:
         GroundedError: for an unknown state, or a standard deviation that is not positive.
@@ -60,7 +59,9 @@ def read_estimate(table: Table, model: Model) -> EstimateTable:
     for kind, values in (("measured", measured), ("process", process)):
         for name, std in values.items():
             if std <= 0:
-                raise table.error(f"{kind}.{name}", f"must be a positive deviation, found {std:g}")
+                raise table.error(
+                    f"{kind}.{name}", f"must be a positive standard deviation, found {std:g}"
+                )
     if not measured:
         raise table.error("measured", "names no state; give { x = 0.002, ... }")
     ordered = {name: measured[name] for name in model.state_names if name in measured}
@@ -73,16 +74,17 @@ def with_estimates(
     task: Task,
     asked: Sequence[str] | None = None,
 ) -> dict[str, Series]:
-    """A log's signals, and beside them those of the states that nothing measures.
+    """Add estimates of the states that are not measured to a log's signals.
 
     Args:
         series: the samples of every measured state and every input, in any order.
-        table: which are measured, and how well.
-        task: with the model, its latency and the control step.
-        asked: states to estimate; None: all of the model's. Memories of effects are no signals.
+        table: the measured states and the noise.
+        task: the task with the model, its latency and the control step.
+        asked: states to estimate; None: all of the model's. Pass names to leave out the memory
+            states of effects, which are not signals.
 
     Raises:
-        GroundedError: for samples that can't be used, or where the smoother fails.
+        GroundedError: for unusable samples, or if the smoother fails.
     """
     model = task.model
     guessed = [name for name in asked or model.state_names if name not in table.measured]
@@ -108,7 +110,7 @@ def with_estimates(
 
 @dataclass(frozen=True)
 class _Clock:
-    """Rows every `step` seconds from `origin`, a little beyond the samples on both sides."""
+    """A time grid with rows every `step` seconds from `origin`, slightly wider than the samples."""
 
     origin: int  # [ns]
     step: float  # [s]
@@ -116,12 +118,12 @@ class _Clock:
 
     @classmethod
     def of(cls, samples: Sequence[Samples], earliest: int, task: Task) -> _Clock:
-        """Of the measured samples, not before the earliest of all: a log's time begins there."""
+        """Return the grid for the measured samples, not before the earliest sample of the log."""
         dt, every = task.dt, min(s.interval for s in samples)
         finest = int(np.clip(np.ceil(dt / every - 0.01), 1, FINEST))
         parts = (k for k in range(finest, 0, -1) if _makes(task.model, dt / k))
         step = dt / next(parts, 1)
-        margin = round(dt * 1e9)  # half an interval beyond its samples a signal is still known
+        margin = round(dt * 1e9)  # a signal is known half an interval beyond its samples
         first, last = max(s.t[0] for s in samples), min(s.t[-1] for s in samples)
         origin = max(int(first) - margin, earliest)
         rows = int(np.ceil((int(last) + margin - origin) * 1e-9 / step)) + 1
@@ -132,14 +134,14 @@ class _Clock:
 
 
 def _makes(model: Model, step: float) -> bool:
-    """Whether the model's simulator, if it is one, can make a step so long [s]."""
+    """Return whether the model, if it is a simulator, can make a step of this length [s]."""
     return abs(probe(model, step) - step) < EXACT * step
 
 
 def _records(
     samples: Sequence[Samples], sent: Sequence[Samples], clock: _Clock, dt: float
 ) -> list[Record]:
-    """The stretches of a log in which nothing is lost for long, every sample at the nearest row."""
+    """Return the stretches of a log without long gaps, with every sample at the nearest row."""
     times: Array = np.arange(clock.rows, dtype=np.float64) * clock.step
     measured, known = np.full((len(times), len(samples)), np.nan), np.ones(len(times), bool)
     for column, s in zip(measured.T, samples, strict=True):
@@ -163,7 +165,10 @@ def _records(
 
 
 def _sizes(samples: Sequence[Samples], task: Task) -> Array:
-    """About how large states get, (n,): as what they make of measured ones in a step; else 1."""
+    """Estimate the size of states, (n,), from the changes of measured ones they cause in a step.
+
+    It is 1 for measured states, and for states that no measured one depends on.
+    """
     model, n = task.model, task.model.n
     own = [model.state_names.index(s.name) for s in samples]
     first, last = max(s.t[0] for s in samples), min(s.t[-1] for s in samples)
@@ -184,7 +189,7 @@ def _sizes(samples: Sequence[Samples], task: Task) -> Array:
 def _smoothed(
     records: list[Record], table: EstimateTable, task: Task, sizes: Array
 ) -> tuple[Array, Array]:
-    """When states are known, (N,) [s], and the states, (N, n)."""
+    """Smooth records; return the times, (N,) [s], and the states, (N, n)."""
     from grounded.estimate import NoiseStd, noise_of, of_states, smooth_trials
 
     model, known = task.model, np.array(list(table.measured.values()))
@@ -203,14 +208,14 @@ def _smoothed(
     if not np.isfinite(states).all():
         raise GroundedError(
             f"the smoother finds no finite states for this log ({smooth[0].status}): the "
-            "model is too far off to tell what was not measured; check its units and the [log] "
-            "mapping"
+            "model is too far off to estimate what was not measured; check its units and the "
+            "[log] mapping"
         )
     return np.concatenate([one.times[core] for one, core in parts]), states
 
 
 def _overlapping(record: Record) -> Iterator[tuple[Record, slice]]:
-    """Pieces that begin before what is kept of them and end after it, and the rows to keep."""
+    """Yield overlapping pieces of a record, each with the rows of it to keep."""
     from grounded.estimate.record import part
 
     h = float(record.times[1] - record.times[0])
@@ -223,7 +228,7 @@ def _overlapping(record: Record) -> Iterator[tuple[Record, slice]]:
 
 
 def _moving(records: Sequence[Record]) -> list[Record]:
-    """The parts of records in which commands change, in pieces; all of it where none does."""
+    """Return the parts of records in which commands change, in pieces; everything if none does."""
     from grounded.estimate.record import cut, part
 
     sent = records[0]

@@ -1,9 +1,9 @@
-"""A run that failed in a log that goes on: the robot fell, its motors were cut, nobody took over.
+"""Detect runs that failed although their log goes on: the robot fell, or its motors were cut.
 
-Once a robot is down its program sends something else than the policy, zeros mostly, and the log has
-that, too. Where the run had left [safety] by then it is the candidate's, and failed there, as if
-the log had ended with it: also where so little of the run was left that its commands are like the
-candidate's on the whole, as one input is held to the end that the policy would have moved.
+After a fall a robot's program sends other commands than the policy, mostly zeros, and the log
+contains them too. If the run had left [safety] by then, it counts as a failed run of the candidate,
+cut there. This also covers falls near the end, where the commands as a whole still resemble the
+candidate's.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from grounded_trials.workspace.intake.who_drove import FINE, LEAST, SAME, Follow
 
 @dataclass(frozen=True)
 class Fall:
-    """Where a run failed, and what a person should know of it."""
+    """Where a run failed, and the warning for the user."""
 
-    steps: int  # of the run until there
+    steps: int  # steps of the run before it failed
     told: str
 
 
 def fall_in(task: Task, own: Candidate, trial: Trial, ran: Following | None) -> Fall | None:
-    """Where a run had left [safety] when its commands ceased to be its candidate's.
+    """Find where a run left [safety], if its commands ceased to be the candidate's about then.
 
     Args:
-        task: whose [safety] and horizon hold.
+        task: the task with [safety] and the horizon.
         own: the candidate.
-        trial: the run and what follows it, of the task's states and inputs.
-        ran: how its commands compare with the candidate's.
+        trial: the run and what follows it, with the task's states and inputs.
+        ran: the comparison of its commands with the candidate's.
 
     Returns:
-        None where they are the candidate's to the end, or never were, where the run was in [safety]
-        for `LEAST` steps before and after they ceased to be, or was all but over.
+        None if the commands are the candidate's to the end, or never were; if the run was inside
+        [safety] for `LEAST` steps before and after they ceased to be; or if it was almost complete.
     """
     ceased = None if ran is None else _ceased(task, trial, ran)
     if ceased is None or ceased < LEAST:
@@ -68,17 +68,18 @@ def fall_in(task: Task, own: Candidate, trial: Trial, ran: Following | None) -> 
     return Fall(
         steps,
         f"{state} left [safety] = [{low:g}, {high:g}] at {first * task.dt:.2f} s (it was {was}, "
-        f"where {predicted} was predicted), and the commands are those of {name} up to "
-        f"{ceased * task.dt:.2f} s only: this counts as a failed run of {name}, cut at "
-        f"{steps * task.dt:.2f} s; what came before is kept for fit and diagnose, what follows is "
+        f"where {predicted} was predicted), and the commands are those of {name} only up to "
+        f"{ceased * task.dt:.2f} s: this counts as a failed run of {name}, cut at "
+        f"{steps * task.dt:.2f} s; the part before is kept for fit and diagnose, the rest is "
         "not judged. If something disturbed it, `discard` it",
     )
 
 
 def _ceased(task: Task, trial: Trial, ran: Following) -> int | None:
-    """The step at which the commands of a run cease to be its candidate's; None: they don't.
+    """Return the step at which the commands of a run cease to be its candidate's, or None.
 
-    Held from there to the end, where the policy would have moved them; or unlike the policy's.
+    From there they are constant although the policy would have changed them, or they are unlike the
+    policy's.
     """
     T = len(ran.off)
     sent, off = trial.inputs[:T], np.nan_to_num(ran.off) / (ran.fine / FINE)
@@ -90,8 +91,8 @@ def _ceased(task: Task, trial: Trial, ran: Following) -> int | None:
     return None if ran.alike else round(ran.until_s / task.dt)
 
 
-FEW = 5  # steps for which inputs are held at least when the motors are cut,
-STOPPED = 0.1  # of an input: by so much the policy would have moved it, rms
+FEW = 5  # smallest number of steps with constant inputs that counts as motors cut
+STOPPED = 0.1  # rms difference from the policy during these steps, relative to an input's size
 
 
 def who_fell(
@@ -101,13 +102,13 @@ def who_fell(
     start_of: Callable[[Candidate], Start | None],
     end: float,
 ) -> str:
-    """The candidate whose commands were sent until a fall; "" if the own one's are as near.
+    """Return another candidate whose commands were sent until a fall; "" if the own fits as well.
 
     Args:
-        log: in which the run begins, and fails.
+        log: the log with the failed run.
         own: the candidate that it is said to have run.
-        candidates: those that may have been run instead.
-        start_of: where a candidate's run seems to begin in the log.
+        candidates: candidates that may have been run instead.
+        start_of: returns where a candidate's run seems to begin in the log.
         end: when the run had failed, seconds after the log's first sample.
     """
 

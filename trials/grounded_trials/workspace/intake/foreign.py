@@ -1,6 +1,6 @@
-"""A log that grounded did not write: read once, mapped by [log], cut to the trial it holds.
+"""Foreign logs (not written by grounded): read once, mapped by [log], cut to their trial.
 
-States that no sensor gives are estimated along the whole of it, see `estimating`.
+States that are not measured are estimated along the whole log, see `estimating`.
 """
 
 from __future__ import annotations
@@ -37,31 +37,31 @@ from grounded_trials.workspace.intake.estimating import (
 from grounded_trials.workspace.intake.run_start import Recording, recording
 from grounded_trials.workspace.intake.where_to_mend import read_by
 
-SLOWER = 1.5  # times dt: commands that come so seldom were sent on another grid
-FEW = 12  # numbers of a log that a message can name
+SLOWER = 1.5  # commands with intervals above this multiple of dt were sent on another grid
+FEW = 12  # largest number of a log's signals that a message lists
 
 
 @dataclass(frozen=True, eq=False)
 class ForeignLog:
-    """The samples of somebody else's log, to be cut where its run begins."""
+    """The samples of a foreign log, to be cut where its run begins."""
 
     workspace: Folder
     path: Path
     mapping: LogMapping
     estimate: EstimateTable | None
-    series: dict[str, Series]  # what it holds
+    series: dict[str, Series]  # the mapped signals
     source: dict[str, str]  # its name, hash and estimated states, for the trial's metadata
-    own: Mapping[str, Series] = field(default_factory=dict)  # states that its program made itself
+    own: Mapping[str, Series] = field(default_factory=dict)  # states its program estimated itself
 
     def cut(self, candidate: str, start: float | None = None) -> tuple[Trial, Gridded]:
-        """The trial in it, and how it was sampled.
+        """Cut the trial from the log; also return how it was sampled.
 
         Args:
-            candidate: that it ran; "" for data, which may be longer than the task.
-            start: where it begins, seconds after the log's first sample; None: as [log.span] says.
+            candidate: the candidate that it ran; "" for data, which may be longer than the task.
+            start: where it begins, seconds after the log's first sample; None: as in [log.span].
 
         Raises:
-            GroundedError: if no whole trial is in it.
+            GroundedError: if the log contains no complete trial.
         """
         model, task = self.workspace.base_model, self.workspace.config.task
         rest = np.array([task.start.get(name, 0.0) for name in model.input_names])
@@ -91,10 +91,10 @@ class ForeignLog:
         return trial, found
 
     def refuse_late(self, found: Gridded) -> None:
-        """Refuses a candidate's run of which the beginning was not seen.
+        """Refuse a candidate's run if its beginning was not recorded.
 
         Raises:
-            GroundedError: if a state is first known after it began.
+            GroundedError: if a state is not known when the run begins.
         """
         dt = self.workspace.config.task.dt
         if found.late_s > dt / 2:
@@ -106,44 +106,44 @@ class ForeignLog:
             mend = "Start recording before the run"
             if put_off:
                 mend = (
-                    f"{listed(put_off)} put{'s' * (len(put_off) == 1)} states later by about as "
-                    "much: take that out, unless the clocks do differ so; else start recording "
+                    f"{listed(put_off)} shift{'s' * (len(put_off) == 1)} states later by about as "
+                    "much: remove that, unless the clocks really differ; otherwise start recording "
                     "before the run"
                 )
             raise GroundedError(
                 f"{self.path}: the run starts {found.late_s:.2f} s before every state is known: "
-                f"the trial's time would not be the candidate's. {mend}, or take it in with --data"
+                f"the trial's time would not be the candidate's. {mend}, or ingest it with --data"
             )
 
     @property
     def unlike_units(self) -> tuple[str, ...]:
-        """Where a log states a multiple of the model's unit that no scale makes up for."""
+        """Warnings on columns in a multiple of the model's unit without a scale in [log]."""
         from grounded_trials.logs.stated_units import Stated
 
         model, found = self.workspace.base_model, []
         said = Stated.by(log_files(self.path))
         units = {**model.states, **model.inputs}
-        for name, one in self.series.items():  # of [log.span], too
+        for name, one in self.series.items():  # including that of [log.span]
             path, wanted = one.spec.path, units.get(name, "")
             factor = said.factor(path, wanted)
             if one.spec.scale == 1 and abs(factor - 1) > 1e-9:
                 named = f"whose name says {said.unit(path)}"
                 column = f"in {said.unit(path)}" if path in said.heads else named
                 found.append(
-                    f"{name} is read as it is from a column {column}, the model has {wanted}: "
-                    f"[log] scale = {factor:.6g} would make it that"
+                    f"{name} is read without a scale from a column {column}, but the model has "
+                    f"{wanted}: [log] scale = {factor:.6g} would convert it"
                 )
         return tuple(found)
 
     @cached_property
     def stored(self) -> tuple[StoredTrial, ...]:
-        """The trials that were made from a file of the same bytes, whatever its name was."""
+        """The trials that were made from a file with the same bytes, whatever its name."""
         key = "source_sha256"
         trials = self.workspace.whole_trials()
         return tuple(one for one in trials if one.meta.get(key) == self.source[key])
 
     def complete(self, series: Mapping[str, Series]) -> Mapping[str, Series]:
-        """Signals as this log holds them, and those of the states that nothing measures."""
+        """Add the estimated states to the signals of this log."""
         if not self.estimate:
             return series
         names = self.workspace.base_model.state_names
@@ -151,7 +151,7 @@ class ForeignLog:
 
     @cached_property
     def _estimating(self) -> Task:
-        """The task with the model that estimates states."""
+        """The task with the model that is used to estimate states."""
         effects = self.workspace.config.model.effects
         kept = but_late_sensors(effects)
         if len(kept) == len(effects):
@@ -160,7 +160,7 @@ class ForeignLog:
 
     @property
     def _beside(self) -> tuple[str, ...]:
-        """States that [log] maps and [estimate] calls not measured."""
+        """States that are mapped in [log] but not listed in [estimate] measured."""
         if not self.estimate:
             return ()
         names, measured = self.workspace.base_model.state_names, self.estimate.measured
@@ -168,11 +168,11 @@ class ForeignLog:
 
     @property
     def unread(self) -> tuple[str, ...]:
-        """What becomes of those: a run is known by them, but its trial has estimates instead."""
+        """Warnings that such states only identify a run, while its trial has estimates."""
         return tuple(
-            f"{name} is in [log], but not in [estimate] measured: a run is known by it, and its "
-            f"trial has an estimate in its place. For the logged one add {name} = its scatter at "
-            "standstill there"
+            f"{name} is in [log], but not in [estimate] measured: it is used to identify a run, "
+            f"but the trial has an estimate in its place. To use the logged one add {name} = its "
+            "scatter at standstill there"
             for name in self._beside
         )
 
@@ -183,11 +183,11 @@ class ForeignLog:
 
     @cached_property
     def as_seen(self) -> ForeignLog | None:
-        """The log as the robot's program had it, if it is not this; None: it is.
+        """The log as the robot's program saw it; None if it is the same.
 
-        Its late states are as late as they came, and speeds that the program made itself by
-        differences, a filter, an observer are its own, not the smoother's. A delay of more than
-        MIXED_S, or of less than nothing, is of another clock: as late as that no program is.
+        Late states are as late as they arrived, and speeds that the program computed itself (by
+        differences, a filter, an observer) replace those of the smoother. A delay_s above MIXED_S
+        or below zero corrects another clock and is kept.
         """
         states = self.workspace.base_model.state_names
         late = {
@@ -206,43 +206,43 @@ class ForeignLog:
 
     @cached_property
     def recording(self) -> Recording | None:
-        """The log where its run may begin anywhere; None where [log.span] is set."""
+        """The log in which a run may begin anywhere; None if [log.span] is set."""
         return None if self.spanned else self.anywhere
 
     @cached_property
     def anywhere(self) -> Recording | None:
-        """The log, to be cut anywhere, whatever [log.span] says; None where it can't be."""
+        """The log in which a run may begin anywhere, ignoring [log.span]; None if unusable."""
         return recording(self.series, self.workspace.task, self.complete, self.whole)
 
     @property
     def spanned(self) -> bool:
-        """Whether [log.span] says where its run begins."""
+        """Whether [log.span] sets where its run begins."""
         return bool(self.workspace.config.log.sub("span").names())
 
 
 def mapping_of(workspace: Folder, path: Path) -> LogMapping:
-    """The [log] table, for this log.
+    """Return the [log] table, for this log.
 
     Raises:
-        GroundedError: if there is none, or the log is no log at all.
+        GroundedError: if there is no [log] table, or the file is not a log.
     """
     model, files = workspace.base_model, log_files(path)
     mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
     if mapping is not None:
         return mapping
     if (path / FILE).is_file():
-        raise GroundedError(f"{path} is a workspace: name the log, or its folder, inside")
+        raise GroundedError(f"{path} is a workspace: name the log in it, or the log's folder")
     for file in files:
         next(iter(log_records(file)), None)
     raise GroundedError(
-        f"{path} is not a trial that grounded wrote, and grounded.toml has no [log] table to map "
+        f"{path} is not a trial written by grounded, and grounded.toml has no [log] table to map "
         "it: `inspect` prints one",
         NextCommand("inspect", (str(path),)),
     )
 
 
 def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignLog:
-    """Reads a log through the [log] table.
+    """Read a log through the [log] table.
 
     Raises:
         GroundedError: if a state or an input is not mapped, or the log can't be read.
@@ -269,15 +269,15 @@ def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignL
 def _unmapped(
     model: Model, mapping: LogMapping, name: str, path: Path, *, estimated: bool
 ) -> GroundedError:
-    """What to do about a state or an input that [log] does not map."""
+    """Return the error for a state or an input that [log] does not map."""
     if name in model.input_names:
         return GroundedError(
-            f"[log] maps no '{name}': every input has to be logged, map it{_numbers(path)}"
+            f"[log] maps no '{name}': every input must be logged, map it{_numbers(path)}"
         )
     if estimated:
         return GroundedError(
-            f"[log] maps no '{name}', which [estimate] says is measured: map it, or take it out "
-            "of measured"
+            f"[log] maps no '{name}', but [estimate] lists it in measured: map it, or remove it "
+            "there"
         )
     known = [f"{one} = 0.01" for one in model.state_names if one in mapping.states]
     if not known:
@@ -285,26 +285,26 @@ def _unmapped(
             f"[log] maps no '{name}', nor any other state: map what is measured{_numbers(path)}"
         )
     return GroundedError(
-        f"[log] maps no '{name}': map it. Where no sensor measures it, a smoother finds it from "
-        "the others: add to grounded.toml, each with its own noise (standard deviation, in the "
-        f"state's unit),\n[estimate]\nmeasured = {{ {', '.join(known)} }}"
+        f"[log] maps no '{name}': map it. If no sensor measures it, a smoother can estimate it "
+        "from the others: add to grounded.toml, each with its own noise (standard deviation, in "
+        f"the state's unit),\n[estimate]\nmeasured = {{ {', '.join(known)} }}"
     )
 
 
 def _numbers(path: Path) -> str:
-    """The numbers that a log has, where they are few."""
+    """List the numbers in a log that change, if they are few; else ""."""
     found = [f.path for t in inspect_log(path).topics for f in t.fields if f.low != f.high]
     return f". {path.name} has {', '.join(found)}" if 0 < len(found) <= FEW else ""
 
 
 def _hashed(files: Sequence[Path]) -> str:
-    """SHA-256 over a log's files, or over their hashes when there are several."""
+    """Return the SHA-256 of a log's file, or of the hashes if it has several files."""
     hashes = [hash_file(file) for file in files]
     return hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode())
 
 
 def _rates(model: Model) -> tuple[str, ...]:
-    """The states that are velocities: zero where a robot stands still."""
+    """Return the states that are velocities, which are zero while the robot is at rest."""
     from grounded.instruments.kinematics import integrals
 
     said = (model.roles.get("speed"), model.roles.get("heading_rate"))
@@ -313,12 +313,12 @@ def _rates(model: Model) -> tuple[str, ...]:
 
 
 def begun(found: Gridded, dt: float, inputs: Sequence[str]) -> Iterator[str]:
-    """Where data were begun, how well the time of their commands is known, and if dt is theirs."""
-    at = f"it is taken from {(found.start_ns - found.origin_ns) * 1e-9:.3f} s on"
+    """Yield notes on where data begin, the timing of their commands, and a dt that does not fit."""
+    at = f"it is used from {(found.start_ns - found.origin_ns) * 1e-9:.3f} s on"
     if found.moved_s > dt:
         yield (
-            f"{at}: the log does not say what was sent before its first command, nor was the robot "
-            "seen at rest"
+            f"{at}: what was sent before the first command is not in the log, and the robot was "
+            "not at rest"
         )
     elif found.moved_s > 0:
         yield f"{at}, where a step of the commands begins"
@@ -328,11 +328,11 @@ def begun(found: Gridded, dt: float, inputs: Sequence[str]) -> Iterator[str]:
     if slow:
         every = 1 / max(one.rate_hz for one in slow)
         yield (
-            f"the commands of {listed(one.name for one in slow)} come every {every:.3g} s, "
-            f"[task] dt is {dt:g} s: is dt = {every:.3g} meant?"
+            f"the commands of {listed(one.name for one in slow)} come every {every:.3g} s, but "
+            f"[task] dt is {dt:g} s: did you mean dt = {every:.3g}?"
         )
     if found.row_s > dt / 20:
         yield (
-            f"its rows come every {found.row_s:.3g} s, so a command was sent up to that much "
-            "before it is seen, and a delay is known no better"
+            f"its rows come every {found.row_s:.3g} s, so commands were sent up to that much "
+            "before their rows, which limits the accuracy of delays"
         )

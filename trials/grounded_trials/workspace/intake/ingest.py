@@ -1,9 +1,9 @@
-"""ingest: what came back from the real system is checked, resampled and stored.
+"""ingest: check, resample and store logs of the real system.
 
-A trial of ours is stored byte for byte. A foreign log is mapped to the states and inputs of the
-model ([log]), sampled on the control grid, and stored as a trial of ours that names its source by
-hash; the log itself stays where it is. The same input gives the same bytes, so that a second ingest
-finds the first.
+A trial written by grounded is stored byte for byte. A foreign log is mapped to the states and
+inputs of the model ([log]), sampled on the control grid, and stored as a trial that names its
+source by hash; the log itself stays where it is. The same input gives the same bytes, so that a
+second ingest finds the first.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of
 from grounded_trials.workspace.proposing import candidate_named, latest_candidates, standing_in
 
-ASIDE = "set aside"  # the verdict of a run that does not count
-EXACT = 0.1  # of how finely commands are known: a log of what the program saw and sent
+ASIDE = "set aside"  # the verdict on a run that does not count
+EXACT = 0.1  # largest difference, relative to the resolution of commands, of an exact match
 
 
 def ingest_log(
@@ -80,18 +80,16 @@ def ingest_log(
     data: bool = False,
     ahead: bool = False,
 ) -> Ingested:
-    """Checks a log and stores it as a trial, see `Workspace.ingest`; or else stores nothing.
+    """Check a log and store it as a trial, see `Workspace.ingest`; store nothing on an error.
 
-    `ahead`: plan on where only that tells what follows, see `standing_in`.
+    With `ahead` the next candidate is planned if the next command depends on it, see `standing_in`.
     """
     candidate = candidate and candidate_named(workspace, candidate)
     kind = "" if path.is_dir() else kind_of(path)
     if kind == CANDIDATE:
-        raise GroundedError(
-            f"{path} is a candidate, the policy to run, not the trial that came back from it"
-        )
+        raise GroundedError(f"{path} is a candidate, the policy to run, not the trial of its run")
     if candidate is not None and data:
-        raise GroundedError("--data is for a log that ran no candidate; drop it or --candidate")
+        raise GroundedError("--data is for a log that ran no candidate; omit it or --candidate")
     if kind == TRIAL:
         read = read_own_trial(workspace, path, candidate, data)
     else:
@@ -106,9 +104,9 @@ def ingest_log(
     if read.log and read.log.stored:
         read = replace(read, data=as_stored(workspace, read.log, read.trial, read.data))
     before = "" if read.copy else repeated(workspace, path, read.trial, read.data)
-    with ExitStack() as new:  # what can't be judged is not stored: the log stays where it is
+    with ExitStack() as new:  # nothing is stored if judging the trial fails
         added = new.enter_context(workspace.store.adding(read.data, again=before != ""))
-        if read.bare:  # what it ran is kept beside it
+        if read.bare:  # record which candidate file it ran
             ran = sha256(workspace.candidate_bytes(read.trial.candidate))
             note = {"note": "run", "trial": added.sha256[:DIGITS], "sha256": ran}
             new.enter_context(workspace.notes.adding(note))
@@ -117,7 +115,7 @@ def ingest_log(
 
 
 def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: bool) -> Ingested:
-    """What is to be said of a trial that has just been stored."""
+    """Return the result for a trial that was just stored: warnings, verdict, next command."""
     workspace.forget_trials()
     trial = replace(read.trial, id=added.id)
     faults = log_faults(workspace, interpolate_gaps(trial).trial)
@@ -130,7 +128,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     if before:
         warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
     if aside := added.known and added.id in workspace.discarded():
-        warnings = (*warnings, f"{added.id} stays set aside, and does not count: {_undo(added.id)}")
+        warnings = (*warnings, f"{added.id} stays set aside and does not count: {_undo(added.id)}")
     now = standing_in(workspace) if trial.candidate else None
     history = now.history if now else ()
     tried = next((t for t in history if t.candidate.id == trial.candidate), None)
@@ -159,7 +157,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
 
 
 def _by_its_commands(workspace: Folder, path: Path, error: NoneWaits) -> GroundedError:
-    """The same error with the command that fits the log: of the best, another one, or data."""
+    """Return the error with the command that fits the log: the best, another candidate, or data."""
     if not error.best:
         return error
     try:
@@ -172,7 +170,7 @@ def _by_its_commands(workspace: Folder, path: Path, error: NoneWaits) -> Grounde
 
 
 def _whole(read: Read, task: Task) -> Trial | None:
-    """A foreign log of a whole run with the seconds that follow it, None for others."""
+    """Return a complete run of a foreign log with the seconds that follow it, else None."""
     log = read.log.recording if read.log else None
     if log is None or read.cut is None or read.trial.steps < task.horizon:
         return None
@@ -181,20 +179,23 @@ def _whole(read: Read, task: Task) -> Trial | None:
 
 
 def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None) -> Read:
-    """Refuses a log whose commands are not its candidate's; with a warning if one was named.
+    """Refuse a log whose commands are not its candidate's; only warn if the user named a candidate.
 
-    A foreign log without a [log.span] may begin before the run: it is taken from where that fits.
+    A foreign log without a [log.span] may begin before the run: it is cut where the run begins.
+
+    Raises:
+        GroundedError: if it is not a run of its candidate, with what it is instead if known.
     """
     ran = read.trial.candidate
     if not ran or (is_stored(workspace, read.data) and not (read.log and not read.log.stored)):
-        return read  # but for a log that is set aside: where its run begins is sought anew
+        return read  # a log whose trial is set aside is examined again
     (own, _), candidates = workspace.candidate(ran), _may_have_run(workspace)
     logs = [read.log]
-    if read.log and (late := read.log.as_seen):  # its program may have acted on these
+    if read.log and (late := read.log.as_seen):  # its program may have acted on these samples
         logs.append(late)
     looks = [_Look(read, one, own, candidates, workspace.task) for one in logs]
     look = min(looks, key=lambda one: one.doubt)
-    if look.read.log and look.read.cut:  # a command may have come before the states, and the run
+    if look.read.log and look.read.cut:  # states may be unknown when the run begins
         look.read.log.refuse_late(look.read.cut)
     read, log, found, whole, seen = look.read, look.log, look.found, look.whole, look.suspicion
     if found and found.alike and found.loose_s > LOOSE * workspace.task.dt:
@@ -202,7 +203,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     why, other = seen.why, seen.other
     fell, stored = look.fell, read.log.stored if read.log else ()
     if before := [one.trial.steps for one in stored if one.trial.candidate == ran]:
-        # it was believed when it came; what was made of it since is like it
+        # the log was accepted when it was stored first
         return cut_short(read, fell.steps, "") if fell and fell.steps in before else read
     units, by = other_units(workspace.task, whole, own, seen.ran)
     units = () if other else units
@@ -212,7 +213,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             read = cut_short(read, fell.steps, fell.told)
         return replace(read, warnings=(*read.warnings, *told))
     slow = pace_of(log, workspace.task, own.policy) if log else None
-    if slow:  # drawn out, it may pass for one in another unit
+    if slow:  # a recording at another rate may look like one in another unit
         units = ()
     elif log and not units and not other:
         units, by = unit_of(log, workspace.task, own.policy)
@@ -220,15 +221,15 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         return cut_short(read, fell.steps, fell.told)
     pace = slow and (
         f"a second of its stamps is {slow:g} s of the run (a recording played at another rate?): "
-        f"correct the stamps, times {slow:g}, and ingest it again"
+        f"multiply the stamps by {slow:g} and ingest it again"
     )
     if candidate is not None:
-        seem = f"{listed(units)}, times {by:.6g}, would be its run: another unit, or sign?"
+        seem = f"with {listed(units)} times {by:.6g} it would be its run: another unit, or sign?"
         doubts = [seem if units else pace or misled(log, workspace.task, own.policy) or why]
         if log and not (found and found.opens_alike):
             doubts.append(
-                f"no start of {ran} was found in it: it is taken from {log.first:.3f} s on, its "
-                "first command; [log.span] start = SECONDS names another"
+                f"no start of {ran} was found in it: the run is assumed to begin with the first "
+                f"command, at {log.first:.3f} s; set another with [log.span] start = SECONDS"
             )
         return replace(read, warnings=(*read.warnings, *doubts), doubted=True)
     if units:
@@ -237,15 +238,15 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         raise GroundedError(f"{path} ran {ran}, but {pace}")
     if read.bare:
         raise GroundedError(
-            f"{path} says that it ran {ran}, but carries no copy of it, and {why}. If it ran the "
-            f"{ran} of another workspace, ingest it there. Take it in with --data for fitting and "
-            f"diagnosis, or with --candidate {ran} all the same",
+            f"{path} says that it ran {ran}, but contains no copy of it, and {why}. If it ran the "
+            f"{ran} of another workspace, ingest it there. Ingest it with --data for fitting and "
+            f"diagnosis, or with --candidate {ran} anyway",
             NextCommand("ingest", (str(path), "--data")),
         )
     if not other and (left := of_earlier_task(workspace, log, whole)):
         raise OfEarlierTask(
             f"{path} ran {left}, which was made for an earlier task (other target, reward, limits, "
-            "start or horizon): its utility can't be compared. Take it in with --data for fitting "
+            "start or horizon): its utility can't be compared. Ingest it with --data for fitting "
             "and diagnosis, and run a candidate of this task",
             NextCommand("ingest", (str(path), "--data")),
         )
@@ -256,30 +257,30 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     if not named and not other:
         named += filter(None, [misled(log, workspace.task, own.policy)])
     if named:
-        raise GroundedError(f"{path} is not read as a run of {ran}: {'; '.join(named)}")
+        raise GroundedError(f"{path} can't be read as a run of {ran}: {'; '.join(named)}")
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
     if log and (guessed := [n for n in log.names[0] if n not in log.logged]):
         said += (
             f" Or {listed(guessed)}, which [estimate] finds here, {_is(guessed)} not what "
-            "its program steered by: have it log its own, and map that in [log] too."
+            "its program used: make it log its own estimate, and map that in [log] too."
         )
     said += read.hole
     if other:
         raise GroundedError(
-            f"{said} Take it in with --candidate {other}, with --candidate {ran} all the same, or "
-            "with --data for fitting and diagnosis only",
+            f"{said} Ingest it with --candidate {other}, with --candidate {ran} anyway, or with "
+            "--data for fitting and diagnosis only",
             NextCommand("ingest", (str(path), "--candidate", other)),
         )
-    begins = "; [log.span] start = SECONDS says where the run begins" * (read.log is not None)
+    begins = "; set where the run begins with [log.span] start = SECONDS" * (read.log is not None)
     raise GroundedError(
-        f"{said} Take it in with --data for fitting and diagnosis, or with --candidate {ran} all "
-        f"the same{begins}",
+        f"{said} Ingest it with --data for fitting and diagnosis, or with --candidate {ran} "
+        f"anyway{begins}",
         NextCommand("ingest", (str(path), "--data")),
     )
 
 
 def _undo(identity: str) -> str:
-    return f"`restore {identity}` takes that back"
+    return f"`restore {identity}` undoes that"
 
 
 def _is(names: Sequence[str]) -> str:
@@ -287,7 +288,7 @@ def _is(names: Sequence[str]) -> str:
 
 
 def _may_have_run(workspace: Folder) -> list[Candidate]:
-    """The latest candidates, and before them the best, which is on the robot though it is older."""
+    """Return the latest candidates, preceded by the best one, which may still be on the robot."""
     latest = latest_candidates(workspace, OTHERS)
     if len(workspace.candidate_ids()) <= OTHERS:
         return latest
@@ -297,25 +298,25 @@ def _may_have_run(workspace: Folder) -> list[Candidate]:
 
 
 def _like(read: Read, ran: str, found: Following | None) -> tuple[str, ...]:
-    """That a trial of ours may be of another workspace: its commands are not quite its policy's."""
+    """Return a warning if a trial's commands are not exactly its policy's: another workspace's?"""
     if not read.bare or found is None or np.nanmax(np.abs(found.off) / found.fine) < EXACT:
         return ()
     return (
-        f"its commands are like those of {ran}, but not the same, and it carries no copy of what "
-        f"it ran: if that was the {ran} of another workspace, `discard` it. TrialWriter(..., "
-        "policy=Path(candidate).read_bytes()) makes sure",
+        f"its commands are like those of {ran}, but not the same, and it contains no copy of what "
+        f"it ran: if that was the {ran} of another workspace, `discard` it. To be sure, write "
+        "trials with TrialWriter(..., policy=Path(candidate).read_bytes())",
     )
 
 
 class _Look:
-    """Where a candidate's run begins in a log, and whether it is its run.
+    """The search for a candidate's run in a log: where it begins, and whether it is its run.
 
     Args:
         read: the trial that would be stored.
-        log: the log that its commands are judged in; None: `read` is a trial of ours.
+        log: the log in which its commands are judged; None if `read` was written by grounded.
         own: the candidate.
-        candidates: that may have been run instead.
-        task: of all of them.
+        candidates: candidates that may have been run instead.
+        task: the task of all candidates.
     """
 
     def __init__(
@@ -327,19 +328,19 @@ class _Look:
         task: Task,
     ) -> None:
         ran, judged = read.trial.candidate, partial(suspicion, task, own=own, others=candidates)
-        apart = None if log is read.log else log  # judged otherwise than it is stored
+        apart = None if log is read.log else log  # set if judged on other samples than stored
         self.read, self.found = read, None
         self.whole = interpolate_gaps(apart.cut(ran)[0] if apart else read.trial).trial
         seen = judged(self.whole)
         if read.bare and (alone := judged(self.whole, others=())).why:
-            seen = alone  # it may be of another workspace: that it looks like one of these is luck
+            seen = alone  # it may be of another workspace: resembling one of these is coincidence
         self.log = log.recording if log else None
         if log and read.log and self.log:
             start_of = cache(partial(_start_of, self.log))
             self.found = found = start_of(own)
             if found and elsewhere(self.log, found, own.policy, seen.why):
                 begins = found.seconds + (_sooner(apart, read.log) if apart else 0)
-                note = f"the log begins {begins:.3f} s before {ran} does: it is taken from there"
+                note = f"the log begins {begins:.3f} s before {ran} does: that part is left out"
                 there = cut_log(read.log, ran, begins)
                 warnings, notes = list(there.warnings), list(read.notes)
                 if found.missed:
@@ -356,7 +357,7 @@ class _Look:
             elif sender.other:
                 seen = replace(seen, why=sender.why, other=sender.other)
             elif (rival := rival_in(self.log, own, candidates, start_of)) is not None:
-                best = judged(rival)  # as it lies where that one fits best
+                best = judged(rival)  # cut where the other candidate fits best
                 told = best if best.other else seen if seen.why else replace(seen, why=best.why)
                 seen = replace(told, ran=seen.ran)
         elif log and read.cut and log.spanned and (seen.why or seen.other) and log.anywhere:
@@ -380,12 +381,12 @@ class _Look:
 
 
 def _start_of(log: Recording, candidate: Candidate) -> Start | None:
-    """Where a candidate's run seems to begin in a log."""
+    """Return where a candidate's run seems to begin in a log."""
     return log.start_of(candidate.policy)
 
 
 def _sooner(log: ForeignLog, stored: ForeignLog) -> float:
-    """By how much the first sample of the log that is stored comes sooner [s]."""
+    """Return by how much the first sample of the stored log is earlier [s]."""
     assert log.recording is not None and stored.recording is not None
     return (log.recording.whole.origin_ns - stored.recording.whole.origin_ns) * 1e-9
 

@@ -1,4 +1,4 @@
-"""What `ingest` answers of one log: its trial, what became of the candidate, what to know."""
+"""The result of `ingest` for one log: its trial, the verdict on the candidate, warnings."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from grounded_trials.workspace.off_target import OffTarget
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Ingested(Result):
-    """One log that was taken in."""
+    """One ingested log."""
 
     trial: str  # its short name, t0007
     sha256: str
     known: bool  # it had been stored before
     candidate: str  # "" for data
     utility: float | None  # None for data; -inf for a run that failed
-    accepted: bool | None  # None: data, or not decided yet
+    accepted: bool | None  # None for data, or if not decided yet
     warnings: tuple[str, ...]
     signals: tuple[SignalReport, ...]  # for a foreign log
     verdict: str = ""  # a word of `wording.verdict`, run again, probe; "" for data
-    crashed: tuple[str, ...] = ()  # the candidate's trials that ended early, where it crashed
+    crashed: tuple[str, ...] = ()  # the candidate's trials that ended early, if it crashed
     notes: tuple[str, ...] = ()  # where in a longer log the run was found
-    off_target: tuple[OffTarget, ...] = ()  # how far the run is off it, in units
-    faults: tuple[str, ...] = ()  # of the warnings those that say that its columns are wrong
+    off_target: tuple[OffTarget, ...] = ()  # errors of the run, in units
+    faults: tuple[str, ...] = ()  # those warnings that say that columns of the log are wrong
     then: NextCommand = PROPOSE
 
     def summary(self) -> str:
-        """The trial, what it ran and what became of that."""
+        """Return the trial, what it ran and the verdict."""
         return f"{self.trial}: {f'{self.candidate}, {self.verdict}' if self.candidate else 'data'}"
 
     def to_json(self) -> dict[str, Any]:
-        """Its entry in `ingest --json`; a failed run's utility is null and `failed` true."""
+        """Return its entry in `ingest --json`; for a failed run utility is null, `failed` true."""
         return {
             "trial": self.trial,
             "sha256": self.sha256,

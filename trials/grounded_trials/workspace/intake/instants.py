@@ -1,7 +1,7 @@
-"""How far the commands of a log are from a policy's, if its run began at this instant or that one.
+"""Compare the commands of a log with a policy's, for every instant at which its run may begin.
 
-At every instant of the log, as finely as it was sampled, what was sent is compared with what the
-policy would send on the states logged from there on, feedback and all.
+The commands are compared with what the policy would send, including feedback, on the states logged
+from that instant on. Instants are as fine as the log was sampled.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from grounded.trial import LAST
 from grounded_trials.logs.resample import Gridded
 from grounded_trials.workspace.intake.who_drove import LEAST
 
-QUIET_S = 1.0  # without a change of commands, before a run that the log does not have whole
-SHORT = 4  # at least 1 / SHORT of a run tells that it was one
-EXACTLY = 0.02  # of an input's size: the mean difference of a run that is sought by how it begins
+QUIET_S = 1.0  # time without a change of commands before a run that is cut short in the log
+SHORT = 4  # at least 1 / SHORT of a run must be in the log
+EXACTLY = 0.02  # mean difference, relative to an input's size, below which commands are alike
 BATCH = 256  # instants compared at once
 
 
 def instants_apart(
     log: Gridded, parts: int, policy: Policy, instants: Sequence[int] | None = None
 ) -> tuple[Array, Array, Array]:
-    """Three measures of every instant, infinite where it can't begin a run, (N,) each.
+    """Return three measures for every instant, infinite where no run can begin, (N,) each.
 
     Args:
         log: states and inputs at N instants.
-        parts: so many a step of the policy.
-        policy: for these states and inputs.
-        instants: those that are asked for; None: all.
+        parts: instants per step of the policy.
+        policy: the policy for these states and inputs.
+        instants: the indices to compute; None: all.
 
     Returns:
-        The mean difference of the commands, where the log has the run whole, or begins it after a
-        rest. The part of the run after which commands are the policy's no more: of one that was
-        cut, or stopped, in a log in which something moved before it. And the share of the first
-        commands that are not the policy's.
+        The mean difference of the commands, if the log has the complete run or commands are
+        constant before it; the share of the run after which commands are no longer the policy's,
+        for runs that were cut or stopped; and the share of the first commands that are not the
+        policy's.
     """
     sent, H = np.clip(log.inputs, policy.low, policy.high), policy.horizon
     changed = np.any(np.diff(sent, axis=0, prepend=sent[:1]) != 0, axis=1)
@@ -58,21 +58,21 @@ def instants_apart(
         mean = np.where(known, np.cumsum(off, axis=1) / steps, np.inf)
         alike = np.where(mean < EXACTLY, steps, 0).max(axis=1)
         at = mean[np.arange(len(ks)), np.maximum(alike - 1, 0)]
-        lost = 1 - alike / H + 0.1 * at / EXACTLY  # a step more is no better, for more apart
+        lost = 1 - alike / H + 0.1 * at / EXACTLY  # one more step must not cost a worse fit
         until[ks] = np.where(alike >= least, lost, np.inf)
         strays[ks] = (off[:, :least] > EXACTLY).mean(axis=1)
     return apart, until, strays
 
 
 def least_of(horizon: int) -> int:
-    """Steps at the beginning of a run that tell that it was one."""
+    """Return the number of steps at the beginning that identify a run."""
     return max(LEAST, horizon // SHORT)
 
 
 def _off(
     log: Gridded, parts: int, policy: Policy, wanted: Sequence[int]
 ) -> Iterator[tuple[Any, Any, Any]]:
-    """Differences of the commands (K, H), of instants (K,), and whether they are known."""
+    """Yield instants (K,), differences of the commands from there (K, H), and which are known."""
     states, H = log.states, policy.horizon
     sent, width = np.clip(log.inputs, policy.low, policy.high), policy.high - policy.low
     size = np.maximum(np.abs(sent).max(axis=0), np.abs(policy.feedforward).max(axis=0))

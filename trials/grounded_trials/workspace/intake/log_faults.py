@@ -1,7 +1,7 @@
-"""Columns that are not what the model calls by their names: other units, signs, places, clocks.
+"""Detect columns that are not what their names say: other units, signs, places or clocks.
 
-A plan is made of what such a log says, so whoever runs the robot has to know before the next run.
-Each fault is told with what mends it: in [log], or in the program that wrote the trial.
+The next plan is based on the log, so the operator has to know before the next run. Each fault is
+reported with its correction, in [log] or in the program that wrote the trial.
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.estimating import read_estimate
 
 PART = re.compile(r"((?:^|[._])(?:orientation|rotation|quaternion))\.([xyzw])$")
-ABOUT = {"x": "roll", "y": "pitch", "z": "yaw", "w": "yaw"}  # the angle that a part says most of
-SMALL = 2.0  # times sin(a / 2): a small angle, which somebody who writes that knows
-TURNS, WIDER = 5.0, 2.0  # of [safety]: beyond it in radians, about inside it in degrees
+ABOUT = {"x": "roll", "y": "pitch", "z": "yaw", "w": "yaw"}  # the angle closest to each component
+SMALL = 2.0  # a scale of 2 is intended: 2 sin(a / 2) is a for small angles
+# multiples of [safety]: an angle beyond TURNS as radians, but inside WIDER as degrees, is suspect
+TURNS, WIDER = 5.0, 2.0
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a log, and what mends it.
+    """A fault of a log and its correction.
 
     Args:
-        said: a clause or two.
-        mend: what to change in [log], an imperative; "" where `said` has it.
-        program: what the program that writes trials should do instead; "": what `said` says.
-        inputs: those that are in another unit.
+        said: the fault, in a clause or two.
+        mend: what to change in [log], an imperative; "" if `said` includes it.
+        program: what the program that writes trials should do instead; "" if `said` includes it.
+        inputs: the inputs that are in another unit.
     """
 
     said: str
@@ -44,12 +45,12 @@ class Fault:
     inputs: tuple[str, ...] = ()
 
     def told(self, trial: Trial, *, own: bool) -> str:
-        """The warning, of a trial that `own` writes in the model's units, or of a log."""
+        """Return the warning; `own` is for a trial that was written by grounded, not a log."""
         if own:
             should = f": it should {self.program}" * bool(self.program)
             again = f", `discard {trial.id}`" * bool(trial.id)
             again += f" and run {trial.candidate} again" * bool(trial.candidate)
-            return f"{self.said}. Mend the program that writes the trials{should}{again}"
+            return f"{self.said}. Fix the program that writes the trials{should}{again}"
         if not self.mend:
             return self.said
         return f"{self.said}. {self.mend}, and ingest it again" + f", without {trial.id}" * bool(
@@ -58,11 +59,11 @@ class Fault:
 
 
 def log_faults(workspace: Folder, trial: Trial) -> tuple[Fault, ...]:
-    """All that is wrong with the columns of a trial without gaps.
+    """Return all faults found in the columns of a trial.
 
     Args:
-        workspace: whose model names them, and whose [safety] says what is too much.
-        trial: as it is stored, or is to be.
+        workspace: the workspace with the model and [safety].
+        trial: the trial, with gaps bridged.
     """
     model, known = workspace.base_model, trial.until(trial.known_steps)
     found = [*_exchanged(model, known), *dead_sensors(model, trial), *_thousands(model, known)]
@@ -84,7 +85,7 @@ def _exchanged(model: Model, known: Trial) -> Iterator[Fault]:
 
 
 def dead_sensors(model: Model, trial: Trial) -> list[Fault]:
-    """Velocities that show nothing of what their positions do."""
+    """Return faults for velocities that do not follow the motion of their positions."""
     from grounded.instruments.dead import dead_rates
 
     return [
@@ -97,7 +98,7 @@ def dead_sensors(model: Model, trial: Trial) -> list[Fault]:
 
 
 def _thousands(model: Model, known: Trial) -> list[Fault]:
-    """That a position, or its velocity, is in mm, or a thousand times too large twice over."""
+    """Return faults for positions or velocities that are too large by powers of a thousand."""
     from grounded.instruments.other_units import MEND, units_apart
 
     with np.errstate(all="ignore"):
@@ -106,7 +107,7 @@ def _thousands(model: Model, known: Trial) -> list[Fault]:
 
 
 def way_faults(model: Model, known: Trial) -> list[Fault]:
-    """What the way that was travelled says of heading and speeds: other axes, a compass, knots."""
+    """Return faults of heading and speeds found from the path: other axes, a compass, knots."""
     from grounded.instruments.rows import kinematic_rows, tied
     from grounded.instruments.way import judge_way
 
@@ -123,18 +124,18 @@ def way_faults(model: Model, known: Trial) -> list[Fault]:
 
 
 def _degrees(model: Model, known: Trial) -> list[Fault]:
-    """Degrees that a diagnosis would put right."""
+    """Return faults for angles in degrees that a diagnosis would correct."""
     from grounded.instruments.preflight import preflight
 
     try:
         findings = preflight(model, [replace(known, id="")]).findings
-    except GroundedError:  # it stops the diagnosis, which tells it
+    except GroundedError:  # the diagnosis reports it
         return []
     return [
         Fault(
             f"{one.signal} {one.finding}",
             f"Multiply the scale in [log.state.{one.signal}] by {one.log.split(' = ')[1]} (1 "
-            "where none is given)",
+            "if none is given)",
             f"write {model.states[one.signal]}",
         )
         for one in findings
@@ -143,7 +144,7 @@ def _degrees(model: Model, known: Trial) -> list[Fault]:
 
 
 def _beyond_safety(task: Task, trial: Trial) -> list[Fault]:
-    """Angles far beyond [safety] that would be inside, were they degrees."""
+    """Return faults for angles far beyond [safety] that would be inside if they were degrees."""
     assert task.safety_low is not None and task.safety_high is not None
     found = []
     for i, (name, unit) in enumerate(task.model.states.items()):
@@ -154,8 +155,8 @@ def _beyond_safety(task: Task, trial: Trial) -> list[Fault]:
         if unit == "rad" and np.isfinite(allowed) and most > TURNS * allowed and inside:
             found.append(
                 Fault(
-                    f"{name} goes to {most:.3g} rad, [safety] is [{low:g}, {high:g}]: in degrees? "
-                    f"It would be {np.deg2rad(most):.3g} rad then",
+                    f"{name} goes to {most:.3g} rad, but [safety] is [{low:g}, {high:g}]: is it in "
+                    f"degrees? Then it would be {np.deg2rad(most):.3g} rad",
                     f"Set scale = {np.pi / 180:.8g} in [log.state.{name}] if so",
                     "write rad",
                 )
@@ -164,7 +165,7 @@ def _beyond_safety(task: Task, trial: Trial) -> list[Fault]:
 
 
 def _clocks_apart(workspace: Folder, trial: Trial) -> list[Fault]:
-    """That measured states answer commands before they are sent."""
+    """Return a fault if measured states respond to commands before they are sent."""
     from grounded.instruments.clocks import answers_early, one_clock, too_soon
 
     model, table = workspace.base_model, workspace.config.estimate
@@ -177,7 +178,7 @@ def _clocks_apart(workspace: Folder, trial: Trial) -> list[Fault]:
 
 
 def mistaken_in(model: Model, known: Trial) -> list[Fault]:
-    """What the model says of exchanged commands or other units."""
+    """Return a fault if the model explains the log better with exchanged columns or other units."""
     from grounded.instruments.mistaken import as_logged, described, mended_by, mistaken
     from grounded.instruments.preflight import preflight
 
@@ -185,7 +186,7 @@ def mistaken_in(model: Model, known: Trial) -> list[Fault]:
     if told is not None:
         try:
             looked = preflight(model, [known])
-        except GroundedError:  # of other instruments: the diagnosis tells what looks turned so
+        except GroundedError:  # another instrument fault: it may look like a sign error
             told = None if told.mistake.turned else told
         else:
             told = mistaken(model, looked.trials, range(model.n))
@@ -199,14 +200,14 @@ def mistaken_in(model: Model, known: Trial) -> list[Fault]:
 
 
 def no_angles(model: Model, mapping: LogMapping | None) -> Mapping[str, str]:
-    """States in rad or deg that are read from a part of a quaternion, and what to say of each.
+    """Return states in rad or deg that are read from a component of a quaternion, with a message.
 
-    The z of an orientation is sin(yaw / 2): as smooth as a yaw, about half as large, and from a
-    quarter turn on something else. No instrument tells it from a gain, but the path does.
+    The z of an orientation is sin(yaw / 2): as smooth as a yaw, about half as large, but different
+    beyond a quarter turn. The data can't distinguish it from a gain, but the path can.
 
     Args:
-        model: whose states they are.
-        mapping: which column each is read from; None: nothing is read.
+        model: the model with the states.
+        mapping: the column of each signal; None if there is no [log].
     """
     found = {}
     for name, one in (mapping.states if mapping else {}).items():
@@ -215,7 +216,7 @@ def no_angles(model: Model, mapping: LogMapping | None) -> Mapping[str, str]:
         if part and angle and abs(one.scale) != SMALL:
             instead = f"{one.path[: part.end(1)]}.@rpy.{ABOUT[part[2]]}"
             found[name] = (
-                f"is read from {one.path}, a part of a quaternion, which is no angle: "
-                f"{instead} is, in {FILE}'s [log.state.{name}]"
+                f"is read from {one.path}, a part of a quaternion, which is not an angle: "
+                f"use {instead} in {FILE}'s [log.state.{name}]"
             )
     return found

@@ -1,10 +1,10 @@
-"""A run whose first steps were never sent: it begins before its log's first command.
+"""Detect runs whose first steps were never sent, so that they begin before the first command.
 
-A program whose timer came late skips step 0, as the runner does for calls that were missed, and the
-log's first command is that of step 1. Counted as step 0, every command is judged by its neighbour's
-gains and reference; where those differ little from step to step, it looks like the run. So the log
-is laid so many steps earlier, too, with what was held before the run in place of what was not sent,
-and the commands that were sent are compared with what the policy makes of the states there.
+A program whose timer fires late skips step 0, as the runner does for missed calls, and the first
+command in the log is that of step 1. If it is taken as step 0, every command is compared with the
+gains and reference of its neighbour, and may still look alike if those change little from step to
+step. So starts some steps earlier are tried as well, with the input held before the run in place of
+the missing commands, and the commands that were sent are compared with the policy's.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from grounded_trials.workspace.intake.who_drove import LEAST, follows
 if TYPE_CHECKING:
     from grounded_trials.workspace.intake.run_start import Recording
 
-MOST = 5  # steps that a program misses before its first
-BY_FAR = 0.25  # of what is left of the commands elsewhere: the run lies where no more is left
+MOST = 5  # largest number of missed steps that is tried
+BY_FAR = 0.25  # the difference of the commands must fall below this share of that elsewhere
 
 
 def missed_steps(log: Recording, policy: Policy, first: float, found: float) -> int:
-    """How many steps of a policy's run lie before the log's first command; 0: none, or unclear.
+    """Return how many steps of a policy's run lie before the log's first command; 0 if unclear.
 
     Args:
-        log: in which the run begins.
-        policy: of its states and inputs.
-        first: the first command, moved to where a step begins [s].
-        found: where else the run seems to begin [s].
+        log: the log with the run.
+        policy: the policy, for the states and inputs of the log.
+        first: the time of the first command, moved to where a step begins [s].
+        found: where the run seems to begin otherwise [s].
     """
     usual = acted_on(log, policy, found)
     if usual is not None and usual.exact:
@@ -54,7 +54,7 @@ def missed_steps(log: Recording, policy: Policy, first: float, found: float) -> 
 
 
 def _left(log: Recording, policy: Policy, first: float, missed: int) -> float:
-    """What half of the commands that were sent are off by, on the states of their time."""
+    """Return the median difference of the sent commands from the policy's, in units of size."""
     trial = log.trial_from(first - missed * log.dt)
     T = 0 if trial is None else min(trial.finite_steps, policy.horizon)
     if trial is None or T - missed < LEAST:
@@ -67,15 +67,15 @@ def _left(log: Recording, policy: Policy, first: float, missed: int) -> float:
 
 
 def not_sent(task: Task, ran: str, missed: int) -> str:
-    """What a person should know of it."""
+    """Return the warning about missed steps."""
     held = listed(
         f"{name} = {with_unit(f'{value:g}', unit)}"
         for (name, unit), value in zip(task.model.inputs.items(), task.past, strict=True)
     )
     gone = "step 0 was" if missed == 1 else f"steps 0 to {missed - 1} were"
     return (
-        f"the log's first command is that of step {missed} of {ran}: {gone} not sent, or not "
+        f"the first command in the log is that of step {missed} of {ran}: {gone} not sent, or not "
         f"logged. The run begins {count(missed, 'step')} ({missed * task.dt:.3g} s) before it, "
-        f"with {held} held until then. Let the program send from step 0 on (a timer that fires "
-        "late skips it), and record from before that"
+        f"with {held} held until then. Make the program send from step 0 on (a timer that fires "
+        "late skips it), and start recording before that"
     )

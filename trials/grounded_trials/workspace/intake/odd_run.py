@@ -1,7 +1,7 @@
-"""A run that its candidate's others contradict: what averaging it did to the candidate, in a note.
+"""Detect a run that contradicts its candidate's other runs, and report its effect on the mean.
 
-The mean of a candidate's runs is what the search compares. One that does not belong there, taken in
-with `--candidate` although a warning told against it, may dethrone the best.
+The search compares the means of candidates' runs. A run that does not belong to a candidate,
+ingested with `--candidate` despite a warning, may change which one is the best.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from grounded.search.candidate import Tried
     from grounded.search.standing import Standing
 
-FAR = 5.0  # deviations of a single run: its candidate's others hardly ever scatter so far
+FAR = 5.0  # standard deviations of a candidate's other runs by which a run counts as odd
 
 
 def odd_run(workspace: Folder, now: Standing, identity: str) -> tuple[str, ...]:
-    """What a run did to its candidate's utility, where its other runs say that it is none of them.
+    """Return a note on how a run changed its candidate's utility, if it is far from the others.
 
     Args:
-        workspace: whose trials are averaged.
-        now: with the run.
-        identity: the run's, t0011.
+        workspace: the workspace with the trials.
+        now: the standing of the search including the run.
+        identity: the run's id, such as t0011.
     """
     from grounded.search.standing import standing
 
@@ -46,13 +46,13 @@ def odd_run(workspace: Folder, now: Standing, identity: str) -> tuple[str, ...]:
     dethroned = was.incumbent is not None and was.incumbent.candidate.id == name != best
     undo = rendered(NextCommand("discard", (identity,)), workspace.address)
     return (
-        f"{name}'s utility goes from {before.utility:.4g} to {after.utility:.4g}"
-        f"{f', and {best} is the best now' * dethroned}: this run's, {run:.4g}, is far from those "
-        f"of its other {n}, which scatter by {before.deviation:.2g}. To take it back: `{undo}`",
+        f"the utility of {name} changes from {before.utility:.4g} to {after.utility:.4g}"
+        f"{f', and {best} is the best now' * dethroned}: that of this run, {run:.4g}, is far from "
+        f"its other {n}, which scatter by {before.deviation:.2g}. To undo this: `{undo}`",
     )
 
 
 def _of(now: Standing, identity: str) -> Tried | None:
-    """The candidate that a run is averaged into."""
+    """Return the candidate that a run is averaged into."""
     runs = ((tried, [trial.id for trial in tried.trials]) for tried in now.history)
     return next((tried for tried, ids in runs if identity in ids), None)

@@ -1,9 +1,9 @@
-"""Whether a log is a run of its candidate once some of its columns are multiplied.
+"""Check whether a log is a run of its candidate if some of its columns are multiplied by a factor.
 
-Units are tried first: degrees for radians, percent, thousandths, the other sign. Else any constant
-factor is sought: the one with which the policy sends what was logged (Gauss-Newton, since commands
-are linear in the states up to limits). A wheel of another size than the program believes scales
-every length that it measures, a gyro that is mounted upside down turns the sign of the angles.
+Units are tried first: degrees instead of radians, percent, thousandths, the other sign. Then any
+constant factor with which the policy sends the logged commands (by Gauss-Newton, since commands are
+linear in the states up to limits). A wheel of another size than in the program, for example, scales
+every length that it measures; a gyro mounted upside down flips the sign of angles.
 """
 
 from __future__ import annotations
@@ -34,30 +34,36 @@ from grounded_trials.workspace.intake.who_drove import (
 THOUSAND, PERCENT = (1e-3, 1e3), (1e-2, 1e2)
 ANGULAR = (("rad", "rad/s"), ("rad",), ("rad/s",))  # groups of units that may be in degrees
 IN_DEGREES = ("deg", "deg/s")  # units that may be in radians
-LENGTHS = (("m", "m/s"), ("m",), ("m/s",))  # what one wheel measures
-NAMED = (  # by what a column is multiplied, and what that says of it
+LENGTHS = (("m", "m/s"), ("m",), ("m/s",))  # units of what one wheel measures
+NAMED = (  # factor of a column and its meaning
     (np.pi / 180, " (in degrees)"),
     (180 / np.pi, " (radians for degrees)"),
     (1e-2, " (in percent)"),
     (1e2, " (not in percent)"),
     *((factor, "") for factor in THOUSAND),
 )
-NEARLY = 0.1  # of an input's size: what other units must leave of the difference
-EXACT, CLOSE = 0.01, 0.05  # of an input's size: leaves a unit, or any factor, that is surely it
-UNITS_LEAVE, LEAVES = 0.5, 0.25  # of the difference at most: units, any factor (many are tried)
-LARGEST = 100.0  # factor, or its inverse
-ONE, FAR = 0.03, 0.2  # factors nearer to 1 say nothing; of commands that are alike as they are
-ROUNDS = 12  # of Gauss-Newton, more than two only where limits or turns make it no straight line
+NEARLY = 0.1  # largest difference of commands with another unit, relative to an input's size
+EXACT, CLOSE = 0.01, 0.05  # the same for a unit that is certain, and for any factor
+# largest share of the original difference left by a unit, and by any factor (many are tried)
+UNITS_LEAVE, LEAVES = 0.5, 0.25
+LARGEST = 100.0  # largest factor, or its inverse
+ONE, FAR = 0.03, 0.2  # factors nearer to 1 are ignored; FAR if the commands are alike without one
+ROUNDS = 12  # Gauss-Newton iterations; more than two are only needed at limits or wrapped angles
 
 
 def other_units(
     task: Task, trial: Trial, own: Candidate, plain: Following | None
 ) -> tuple[tuple[str, ...], float]:
-    """The signals with which a log is a run of its candidate once they are multiplied, and by what.
+    """Return the signals and the factor with which a log is a run of its candidate.
 
-    Degrees for radians or the other way round, thousandths or thousands; (), 1 where nothing helps,
-    or nothing needs to: a log so noisy that any commands could follow from it is nobody's.
-    `plain`: how its commands follow as they are.
+    Args:
+        task: the task of the candidate.
+        trial: the trial cut from the log.
+        own: the candidate.
+        plain: the comparison of its commands without a factor.
+
+    Returns:
+        Signals and factor; (), 1 if none helps or is needed, or if the log is too noisy to compare.
     """
     if plain is None or (plain.alike and plain.error < NEARLY):
         return (), 1.0
@@ -81,7 +87,7 @@ def other_units(
 
 
 def any_factor(task: Task, policy: Policy, trial: Trial) -> tuple[tuple[str, ...], float]:
-    """The columns and the factor with which a trial is a run of a policy; (), 1 for nothing."""
+    """Return columns and a factor with which a trial is a run of a policy; (), 1 for none."""
     trial, late = trial.until(task.horizon), latest(task)
     if (plain := follows(policy, trial, late)) is None:
         return (), 1.0
@@ -91,7 +97,7 @@ def any_factor(task: Task, policy: Policy, trial: Trial) -> tuple[tuple[str, ...
 def _any_factor(
     model: Model, policy: Policy, trial: Trial, plain: Following, late: int, most: float
 ) -> tuple[tuple[str, ...], float]:
-    """What makes a trial follow a policy best, which leaves less than `most`; (), 1 for nothing."""
+    """Return the columns and factor that fit best and leave less than `most`; (), 1 for none."""
     best, found = min(most, CLOSE), (tuple[str, ...](), 1.0)
     trial = trial.until(min(trial.finite_steps, policy.horizon))
     least = FAR if plain.alike else ONE
@@ -110,7 +116,7 @@ def _any_factor(
 def any_offset(
     task: Task, policy: Policy, trial: Trial, names: Sequence[str]
 ) -> tuple[str, float] | None:
-    """The state, one of `names`, and the constant without which a trial is a run of a policy."""
+    """Return the state in `names` and the offset to subtract so that a trial is a policy's run."""
     trial, late = trial.until(task.horizon), latest(task)
     if (plain := follows(policy, trial, late)) is None or plain.alike:
         return None
@@ -127,12 +133,12 @@ def any_offset(
 
 
 def _left(ran: Following) -> float:
-    """Root mean square of the commands less those of the policy, in units of the largest."""
+    """Return the rms difference of the commands from the policy's, in units of their size."""
     return float(np.sqrt(np.nanmean((ran.off / ran.fine) ** 2))) * FINE
 
 
 def _scaled_together(model: Model) -> Iterator[tuple[str, ...]]:
-    """Columns that one wrong constant may scale: each alone, those of a wheel or of a gyro."""
+    """Yield groups of columns that one wrong constant may scale: single, a wheel's, a gyro's."""
     yield from ((name,) for name in (*model.state_names, *model.input_names))
     for units in (*LENGTHS, *ANGULAR, (*LENGTHS[0], *ANGULAR[0])):
         names = tuple(name for name, unit in model.states.items() if unit in units)
@@ -142,7 +148,7 @@ def _scaled_together(model: Model) -> Iterator[tuple[str, ...]]:
 
 
 def _of_one_sensor(model: Model) -> list[tuple[str, ...]]:
-    """A position and its velocity: an encoder that is mounted the other way round turns both."""
+    """Return pairs of a position and its velocity: a reversed encoder flips both."""
     from grounded.instruments.kinematics import integrals
 
     names = model.state_names
@@ -150,19 +156,19 @@ def _of_one_sensor(model: Model) -> list[tuple[str, ...]]:
 
 
 def _of_one_unit(model: Model) -> list[tuple[str, ...]]:
-    """Inputs of one unit: whoever logs one torque in N mm does so with all."""
+    """Return groups of inputs with the same unit, which are probably logged alike."""
     units = list(model.inputs.values())
     every = dict.fromkeys(unit for unit in units if units.count(unit) > 1)
     return [tuple(n for n, own in model.inputs.items() if own == unit) for unit in every]
 
 
 def _factor(policy: Policy, trial: Trial, names: Sequence[str], start: float) -> float:
-    """What columns are multiplied by, so that the policy sends the logged commands."""
+    """Return the factor of columns with which the policy sends the logged commands best."""
     return _solved(lambda by: _off(policy, _multiplied(trial, names, by)), start, 1e-4 * start)
 
 
 def _solved(off: Callable[[float], Array], start: float, small: float) -> float:
-    """The number at which what is off is least, by Gauss-Newton; NaN where nothing hangs on it."""
+    """Minimise residuals over one number by Gauss-Newton; return NaN if they don't depend on it."""
     by = start
     for _ in range(ROUNDS):
         here, near = off(by), off(by + small)
@@ -178,7 +184,7 @@ def _solved(off: Callable[[float], Array], start: float, small: float) -> float:
 
 
 def _off(policy: Policy, trial: Trial) -> Array:
-    """What was logged as sent, less what the policy sends, in units of the largest, (T, m)."""
+    """Return the logged commands minus the policy's, in units of the largest, (T, m)."""
     past = policy.past if trial.start_inputs is None else trial.start_inputs
     asked = policy.commands(trial.states[None, : trial.steps], past)[0]
     off: Array = (np.clip(trial.inputs, policy.low, policy.high) - asked) / np.maximum(
@@ -206,7 +212,7 @@ def _less(trial: Trial, name: str, constant: float) -> Trial:
 
 
 def units_tried(model: Model) -> Iterator[tuple[Sequence[str], float]]:
-    """Signals that may be in another unit together, or of the other sign, and what mends it."""
+    """Yield groups of signals and factors that correct another unit or sign of the group."""
     angular = [[n for n, u in model.states.items() if u in units] for units in ANGULAR]
     turns = (*ANGULAR[0], *IN_DEGREES)
     angular += [[n] for n, u in model.states.items() if u in turns]
@@ -220,19 +226,25 @@ def units_tried(model: Model) -> Iterator[tuple[Sequence[str], float]]:
 
 
 def units_told(names: Sequence[str], by: float, mapped: bool) -> str:
-    """What is wrong with the units of a log, and what mends it; `mapped`: by a [log] table."""
+    """Describe a wrong unit or sign in a log and how to correct it.
+
+    Args:
+        names: the signals.
+        by: the factor that corrects them.
+        mapped: whether the log is read through a [log] table.
+    """
     which = listed(names)
     if by == -1:
         its = "its scale" if len(names) == 1 else "the scale of each"
-        mend = f"multiply {its} by -1 in {FILE}'s [log] (1 where none is given)"
-        alone = f"append {which} times -1 and run it again, or take it in with --data"
+        mend = f"multiply {its} by -1 in {FILE}'s [log] (1 if none is given)"
+        alone = f"append {which} times -1 and run it again, or ingest it with --data"
         return f"with {which} of the other sign: {mend if mapped else alone}"
     size = f"{max(abs(by), 1 / abs(by)):.4g} times too {'large' if abs(by) < 1 else 'small'}"
     size += " and of the other sign" * (by < 0)
     told = next((text for factor, text in NAMED if np.isclose(by, factor, rtol=1e-6)), None)
-    mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (1 where none is given)"
+    mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (1 if none is given)"
     if told is None:
         mend += "; if the log is right, the robot's program measures it wrong"
     if not mapped:
-        mend = f"append {which} times {by:.6g} and run it again, or take it in with --data"
+        mend = f"append {which} times {by:.6g} and run it again, or ingest it with --data"
     return f"with {which} {size}{told or ''}: {mend}"

@@ -1,6 +1,6 @@
-"""Whether a run begins in a log that is read otherwise.
+"""Check whether a log contains a candidate's run if it is read differently.
 
-At another pace, in another unit, with two signals in each other's column, or from another zero.
+Tried are: another rate, another unit, two signals in each other's columns, and an offset.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from grounded_trials.workspace.intake.other_scale import (
 from grounded_trials.workspace.intake.run_start import TRIED, Recording, recording
 from grounded_trials.workspace.intake.who_drove import follows
 
-PAIRS = 28  # of states, and of inputs, that are tried in each other's column: all of eight
-PACES = (2.0, 0.5)  # of a recording that was played twice as fast, or half
+PAIRS = 28  # largest number of pairs of states, and of inputs, that are tried exchanged
+PACES = (2.0, 0.5)  # rates of a recording that are tried
 
 
 def pace_of(log: Recording, task: Task, policy: Policy) -> float | None:
-    """How many seconds of a policy's run a second of the log's stamps is, where not one.
+    """Return how many seconds of a policy's run one second of the log's stamps is; None if one.
 
     Args:
-        log: in which no run of the policy begins.
-        task: whose steps it is cut into.
-        policy: what is sought.
+        log: a log in which no run of the policy was found.
+        task: the task with the control step.
+        policy: the policy.
     """
     for pace in PACES:
         paced = {name: _paced(one, pace) for name, one in log.logged.items()}
@@ -44,12 +44,12 @@ def pace_of(log: Recording, task: Task, policy: Policy) -> float | None:
 
 
 def unit_of(log: Recording, task: Task, policy: Policy) -> tuple[tuple[str, ...], float]:
-    """Signals in another unit, times what a run of a policy begins in a log; (), 1 where none does.
+    """Return signals and a factor with which the log contains a run of a policy; (), 1 for none.
 
     Args:
-        log: in which none begins as it is.
-        task: whose steps it is cut into.
-        policy: what is sought.
+        log: a log in which no run of the policy was found.
+        task: the task with the control step.
+        policy: the policy.
     """
     tried = set[tuple[tuple[str, ...], float]]()
     for group, by in units_tried(task.model):
@@ -58,7 +58,7 @@ def unit_of(log: Recording, task: Task, policy: Policy) -> tuple[tuple[str, ...]
             continue
         tried.add((names, by))
         scaled = {n: replace(log.logged[n], values=log.logged[n].values * by) for n in names}
-        known = None  # what was estimated does not hang on the size of what was sent
+        known = None  # for inputs alone, the estimates need not be repeated
         if set(names) <= set(task.model.input_names):
             known = {**log.series, **scaled}
         run = _run_in(recording({**log.logged, **scaled}, task, log.complete, known), policy)
@@ -74,7 +74,7 @@ def unit_of(log: Recording, task: Task, policy: Policy) -> tuple[tuple[str, ...]
 
 
 def misled(log: Recording | None, task: Task, policy: Policy) -> str:
-    """What else a log has wrong that makes it look like nobody's run, and what mends it; or ""."""
+    """Return another fault of a log that hides its run, and how to correct it; or ""."""
     if log is None:
         return ""
     if pair := exchanged_in(log, task, policy):
@@ -82,27 +82,27 @@ def misled(log: Recording | None, task: Task, policy: Policy) -> str:
         of = "state" if a in task.model.state_names else "input"
         return (
             f"it would be, with {a} and {b} in each other's column: exchange the paths in "
-            f"[log.{of}.{a}] and [log.{of}.{b}], or the columns' heads in the log"
+            f"[log.{of}.{a}] and [log.{of}.{b}], or the column headers in the log"
         )
     if off := offset_in(log, task, policy):
         name, by = off
         much = with_unit(f"{abs(by):.3g}", task.model.states[name])
         return (
-            f"it would be, were {name} {much} {'less' if by > 0 else 'more'}: is its zero "
-            f"elsewhere than that of the program? Add {-by:.3g} to the offset in "
-            f"[log.state.{name}] (0 where none is given); if the log is right, the robot's program "
+            f"it would be, were {name} {much} {'less' if by > 0 else 'more'}: does its zero "
+            f"differ from that of the program? Add {-by:.3g} to the offset in "
+            f"[log.state.{name}] (0 if none is given); if the log is right, the robot's program "
             "measures it wrong"
         )
     return ""
 
 
 def exchanged_in(log: Recording, task: Task, policy: Policy) -> tuple[str, str] | None:
-    """Two states, or inputs, in each other's column: back, a run of a policy begins in a log.
+    """Return two states, or inputs, whose exchange makes the log contain a run of a policy.
 
     Args:
-        log: in which none begins as it is.
-        task: whose steps it is cut into.
-        policy: what is sought.
+        log: a log in which no run of the policy was found.
+        task: the task with the control step.
+        policy: the policy.
     """
     inputs = list(combinations(task.model.input_names, 2))[:PAIRS]
     states = [name for name in task.model.state_names if name in log.logged]
@@ -117,12 +117,12 @@ def exchanged_in(log: Recording, task: Task, policy: Policy) -> tuple[str, str] 
 
 
 def offset_in(log: Recording, task: Task, policy: Policy) -> tuple[str, float] | None:
-    """The state that is off by a constant, and by how much, in a log that is else a policy's run.
+    """Return a state and its constant error, without which the log contains a run of a policy.
 
     Args:
-        log: in which no run of the policy begins.
-        task: whose steps it is cut into.
-        policy: what is sought.
+        log: a log in which no run of the policy was found.
+        task: the task with the control step.
+        policy: the policy.
     """
     for begins in (log.first, *log.openings[:TRIED]):
         if trial := log.trial_from(begins):
@@ -133,13 +133,13 @@ def offset_in(log: Recording, task: Task, policy: Policy) -> tuple[str, float] |
 
 
 def _run_in(log: Recording | None, policy: Policy) -> Trial | None:
-    """The run of a policy that begins in a log, wherever; None where none does."""
+    """Return the run of a policy in a log, or None if there is none."""
     found = log.start_of(policy) if log else None
     return log.trial_from(found.seconds) if log and found and found.alike else None
 
 
 def _paced(series: Series, pace: float) -> Series:
-    """The same samples, `pace` times as far apart."""
+    """Scale the time between samples by `pace`."""
     t, log = (
         at[:1] + np.round((at - at[:1]) * pace).astype(at.dtype)
         for at in (series.t, series.log_times)

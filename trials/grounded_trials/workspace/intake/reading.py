@@ -1,7 +1,7 @@
-"""A file as it is read, a trial of ours or a log, before anybody asks what it ran.
+"""Read a file, a trial written by grounded or a log, before it is checked what it ran.
 
-A trial of ours must be of this workspace's model, time grid and task, and where it carries the
-policy that it ran, of this workspace's candidate to the last bit.
+A trial written by grounded must have this workspace's model, time grid and task. If it contains the
+policy that it ran, that must equal this workspace's candidate to the last bit.
 """
 
 from __future__ import annotations
@@ -35,34 +35,34 @@ from grounded_trials.workspace.intake.stored_before import (
 )
 from grounded_trials.workspace.proposing import standing_in
 
-HOLE = 10.0  # usual intervals without a sample
+HOLE = 10.0  # length of a gap, in usual intervals between samples, that is reported
 
 
 @dataclass(frozen=True, eq=False)
 class Read:
-    """A trial that may be stored, and what is to be said of it."""
+    """A trial that may be stored, with its warnings and notes."""
 
     trial: Trial
     data: bytes
     warnings: tuple[str, ...] = ()
     signals: tuple[SignalReport, ...] = ()
     notes: tuple[str, ...] = ()
-    copy: bool = False  # of a stored trial, or a part of one
-    bare: bool = False  # it ran a candidate, and carries no copy of it
-    doubted: bool = False  # taken in as a candidate's run, though its commands say otherwise
+    copy: bool = False  # a copy of a stored trial, or of a part of one
+    bare: bool = False  # it ran a candidate but contains no copy of it
+    doubted: bool = False  # ingested as a candidate's run although its commands differ
     log: ForeignLog | None = None
-    cut: Gridded | None = None  # of a foreign log: how it was sampled
-    fell: bool = False  # it failed before the log ends, which its warnings say
-    last_s: float = math.nan  # its last sample of every state, since the start; of a foreign log
+    cut: Gridded | None = None  # how a foreign log was sampled
+    fell: bool = False  # it failed before the log ends, as a warning says
+    last_s: float = math.nan  # when all states of a foreign log were last known [s from the start]
 
     @property
     def own(self) -> bool:
-        """Whether it was written in the model's units, with no [log] to read it by."""
+        """Whether it was written by grounded, in the model's units, and not read through [log]."""
         return self.log is None and not self.copy
 
     @property
     def hole(self) -> str:
-        """The longest time of which a log tells nothing; "" where its samples never stop."""
+        """A sentence on the longest gap in a log; "" if there is no long one."""
         longest = max(self.signals, key=lambda one: one.largest_gap_s, default=None)
         if longest is None or not longest.largest_gap_s * longest.rate_hz > HOLE:
             return ""
@@ -73,10 +73,10 @@ class Read:
 
 
 def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: bool) -> Read:
-    """A trial of ours: every name, the time grid and the task must be this workspace's.
+    """Read a trial written by grounded; its names, time grid and task must be this workspace's.
 
     Raises:
-        GroundedError: if they are not, or its candidate is none of this workspace's.
+        GroundedError: if they are not, or its candidate is not of this workspace.
     """
     content = read_file(path, FILE_LIMIT)
     trial, meta, policy = read_trial(content, str(path))
@@ -87,18 +87,18 @@ def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: b
     ):
         if found != own:
             raise GroundedError(
-                f"{path} has the {what} {', '.join(found)}; this workspace's model has "
+                f"{path} has the {what} {', '.join(found)}, but this workspace's model has "
                 f"{', '.join(own)}: it is a trial of another robot"
             )
     if other := list(_other_units(workspace, meta)):
         raise GroundedError(
-            f"{path}: {'; '.join(other)}. A trial is stored as it is: write its signals in the "
+            f"{path}: {'; '.join(other)}. A trial is stored unchanged: write its signals in the "
             "model's units and name those, or ingest them as a CSV with a scale in [log]"
         )
     if abs(trial.dt - dt) > 1e-9:
         raise GroundedError(
-            f"{path} was recorded every {trial.dt:g} s, this workspace's [task] dt is {dt:g} s: "
-            "it belongs to another task"
+            f"{path} was recorded every {trial.dt:g} s, but this workspace's [task] dt is {dt:g} "
+            "s: it belongs to another task"
         )
     if data:
         if not trial.candidate:
@@ -120,29 +120,33 @@ def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: b
 
 
 def _other_units(workspace: Folder, meta: dict[str, str]) -> Iterator[str]:
-    """The signals of a trial whose units are stated, and not the model's: `N m` is `N·m`, too."""
+    """Yield the signals of a trial with stated units that differ from the model's."""
     model = workspace.base_model
     for kind, own in (("states", model.states), ("inputs", model.inputs)):
         for name, unit in json.loads(meta[kind]).items():
             if unit and "1" not in (unit.strip(), own[name]) and not same_unit(unit, own[name]):
-                yield f"{name} is in {unit}, the model has {own[name]}"
+                yield f"{name} is in {unit}, but the model has it in {own[name]}"
 
 
 def _elsewhere(workspace: Folder, candidate: str, policy: bytes | None) -> tuple[str, ...]:
-    """That the policy which a trial carries is none of this workspace's."""
+    """Return a note if the policy in a trial is not this workspace's candidate."""
     known = candidate in workspace.candidate_ids()
     if policy is None or (known and policy == workspace.candidate_bytes(candidate)):
         return ()
-    return (f"the {candidate} that it ran is of another workspace, or was made again since",)
+    return (f"the {candidate} that it ran is from another workspace, or was made again since",)
 
 
 def _check_candidate(
     workspace: Folder, path: Path, candidate: str, task: str = "", policy: bytes | None = None
 ) -> None:
-    """The candidate must be one of this workspace and task, the policy the one in its file."""
+    """Check that a candidate is of this workspace and task, and the policy equals its file.
+
+    Raises:
+        GroundedError: if not.
+    """
     if candidate not in workspace.candidate_ids():
         raise GroundedError(
-            f"{path} ran {candidate}, which this workspace never proposed; take it in with --data "
+            f"{path} ran {candidate}, which this workspace never proposed; ingest it with --data "
             "to use it for fitting and diagnosis"
         )
     own = workspace.task.hash
@@ -150,21 +154,21 @@ def _check_candidate(
     if meta.get("task") != own or task not in ("", own):
         raise GroundedError(
             f"{path} ran {candidate} for another task (other target, reward, limits, start or "
-            "horizon); its utility can't be compared. Take it in with --data to use it for fitting "
+            "horizon); its utility can't be compared. Ingest it with --data to use it for fitting "
             "and diagnosis"
         )
     if policy is not None and policy != workspace.candidate_bytes(candidate):
         raise GroundedError(
-            f"{path} carries a policy that is not the {candidate} of this workspace: it comes from "
-            "another one, or the candidate was made again since. Take it in with --data"
+            f"{path} contains a policy that is not the {candidate} of this workspace: it comes "
+            "from another one, or the candidate was made again since. Ingest it with --data"
         )
 
 
 def read_log_file(workspace: Folder, path: Path, candidate: str | None, data: bool) -> Read:
-    """Somebody else's log, through [log].
+    """Read a foreign log through [log].
 
     Raises:
-        GroundedError: if it can't be mapped or sampled, or no candidate waits for it.
+        GroundedError: if it can't be mapped or sampled, or no candidate is outstanding.
     """
     log = read_foreign(workspace, path, mapping_of(workspace, path))
     ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
@@ -181,7 +185,7 @@ def read_log_file(workspace: Folder, path: Path, candidate: str | None, data: bo
 
 
 def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read:
-    """The trial in a log, from `start` on [s]; None: as [log.span] says, or its first command."""
+    """Cut the trial from a log, from `start` [s] on; None: from [log.span] or the first command."""
     trial, found = log.cut(candidate, start)
     about = _about(log.workspace, candidate) | log.source
     about |= {ROWS: f"{found.row_s:.6g}"} if found.row_s and not candidate else {}
@@ -205,7 +209,7 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
 
 
 def cut_short(read: Read, steps: int, told: str) -> Read:
-    """A run in a foreign log up to so many steps, as it is where the log is no longer; and why."""
+    """Cut a run in a foreign log after `steps`, with the warning `told`, if it is longer."""
     if read.log is None or read.cut is None or read.trial.steps <= steps:
         return read
     trial, workspace = read.trial.until(steps), read.log.workspace
@@ -216,14 +220,14 @@ def cut_short(read: Read, steps: int, told: str) -> Read:
 
 
 def misread(log: ForeignLog) -> tuple[str, ...]:
-    """The signals that [log] seems to read from each other's column, or from what is no angle."""
+    """Return warnings on signals read from each other's column, or angles from something else."""
     model = log.workspace.base_model
     odd = no_angles(model, log.mapping)
     return (*crossed(model, log.mapping), *(f"{name} {said}" for name, said in odd.items()))
 
 
 class NoneWaits(GroundedError):
-    """No candidate is waiting for a trial; `best` may have been run again."""
+    """Raised if no candidate is waiting for a trial; `best` may have been run again."""
 
     def __init__(self, path: Path, best: str) -> None:
         super().__init__(
@@ -242,7 +246,7 @@ def _outstanding(workspace: Folder, path: Path) -> str:
 
 
 def _about(workspace: Folder, candidate: str) -> dict[str, str]:
-    """The metadata of a trial that is written here."""
+    """Return the metadata of a trial that is written here."""
     if not candidate:
         return {"kind": "data"}
     _, meta = workspace.candidate(candidate)
@@ -263,7 +267,7 @@ def _encode(workspace: Folder, trial: Trial, about: dict[str, str], start_ns: in
 
 
 def copied(workspace: Folder, path: Path, read: Read, wanted: str | None) -> Read:
-    """The stored trial in place of a file that is a copy of it, or a part."""
+    """Replace a file that is a copy or a part of a stored trial by that trial."""
     if is_stored(workspace, read.data) or (read.log and read.log.stored):
         return read
     if (one := same_recording(workspace, path, read.data, read.log)) is None:
@@ -274,5 +278,5 @@ def copied(workspace: Folder, path: Path, read: Read, wanted: str | None) -> Rea
 
 
 def is_stored(workspace: Folder, data: bytes) -> bool:
-    """Whether a file is in the store, be it set aside."""
+    """Return whether a file is in the store, even if its trial is set aside."""
     return sha256(data)[:DIGITS] in workspace.store.digests()

@@ -1,15 +1,15 @@
-"""Where in a recording the run of a candidate begins: whoever records begins before the run.
+"""Find where in a recording the run of a candidate begins; recordings start before the run.
 
-Without a [log.span] the run is taken to begin with the first command in the log. A robot that sends
-zeros while it waits has sent commands for a second by then, and its log looks like somebody else's
-run. So at every instant of the log, as finely as it was sampled, the logged commands are compared
-with what the policy would send on the states logged from there on, feedback and all. The instants
-at which commands change say the rest. A log that ends before the run would have is compared as far
-as it goes, where it was quiet before.
+Without a [log.span] the run is assumed to begin with the first command in the log. That is wrong if
+the robot sends zeros while it waits. So at every instant of the log, as finely as it was sampled,
+the logged commands are compared with what the policy would send (including feedback) on the states
+logged from there on. The result is refined to the instants at which commands change. If the log
+ends before the run would have, it is compared as far as it goes, provided that the commands were
+constant before.
 
-A table of rows shows a command that is held with the first row after its change, up to a row late:
-at 2 m/s and 100 Hz that is 2 cm. Feedback tells when within that row the run began, since what was
-sent answers to where the robot was then.
+A table shows a new command only with the first row after its change, up to one row late: at 2 m/s
+and 100 Hz that is 2 cm. Feedback determines when within that row the run began, since the commands
+respond to where the robot was then.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ from grounded_trials.workspace.intake.who_drove import (
     follows,
 )
 
-TRIED = 5  # instants at which the commands fit best
-BESIDE = 4  # steps before the best of them, within which the commands may be the policy's exactly
-HELD = 3.5  # steps: what changes no sooner may begin a run
-FINEST = 8  # parts of a step, between which the start is sought
-ALIGNED = 0.75  # of the time between samples: a start nearer than that is as good
-CLEARLY = 0.7  # of the commands' difference at the first command: the start is elsewhere
-KNOWN = 0.25  # of a row: the standard deviation from which feedback tells when in it a run began
-EXACT = 0.1  # of what a row's lateness does to commands: with less, the states were the policy's
-LOOSE = 0.1  # of a step: a start that is known no better is told
-SOUGHT = 24  # instants at which the samples that the program acted on are sought
-MOVES = 0.05  # of an input's size: commands that move by less fit whatever was held before
-EXACT_TO = 1e-3  # of an input's size: half of the first commands are so near to the policy's there
+TRIED = 5  # number of best-fitting instants that are examined
+BESIDE = 4  # steps before the best of them that are checked for an exact fit
+HELD = 3.5  # steps without a change of commands before an instant that may begin a run
+FINEST = 8  # largest number of instants per step at which a start is tried
+ALIGNED = 0.75  # starts closer than this, in sample intervals, are considered equal
+CLEARLY = 0.7  # a start is elsewhere if its difference is below this share of the first command's
+KNOWN = 0.25  # largest std, in rows, with which feedback determines the start within a row
+EXACT = 0.1  # share of the effect of a late row below which the logged states were the policy's
+LOOSE = 0.1  # uncertainty of a start, in steps, above which a warning is given
+SOUGHT = 24  # number of instants at which samples of different ages are tried
+MOVES = 0.05  # smallest change of commands, relative to an input's size, that identifies a run
+EXACT_TO = 1e-3  # largest median difference of the first commands, relative to an input's size
 
-# the samples of a log, with those of the states that nothing measures: estimated from the others
+# adds the estimated states to the samples of a log
 Complete = Callable[[Mapping[str, Series]], Mapping[str, Series]]
 
 
@@ -62,38 +62,38 @@ class Start:
     seconds: float  # after the log's first sample
     apart: float  # mean difference of the commands there, in units of each input's size
     alike: bool  # the commands are the policy's from there on
-    opens_alike: bool  # they are at the beginning at least; somebody may have taken over
-    between_rows: bool = False  # found below the time between rows, by the feedback
-    loose_s: float = 0.0  # it may be off by as much
-    missed: int = 0  # steps of it before the log's first command, which nobody sent
-    exact: bool = False  # most commands are the policy's to the last digits, none somebody else's
+    opens_alike: bool  # at least the first commands are; somebody may have taken over later
+    between_rows: bool = False  # determined by feedback, finer than the time between rows
+    loose_s: float = 0.0  # uncertainty of the start [s]
+    missed: int = 0  # steps of the run before the first command, which were not sent
+    exact: bool = False  # most commands are the policy's to the last digits, and no part is not
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A foreign log, to be cut anywhere; on a grid of `parts` instants a control step."""
+    """A foreign log in which a run may begin anywhere, on a grid of `parts` instants per step."""
 
     series: Mapping[str, Series]  # of every state and input
-    logged: Mapping[str, Series]  # those of them that nothing estimated
+    logged: Mapping[str, Series]  # those that were logged, not estimated
     complete: Complete
     names: tuple[tuple[str, ...], tuple[str, ...]]
     angles: tuple[str, ...]
     dt: float
     steps: int
-    past: Array  # (m,) what inputs hold before a run
+    past: Array  # (m,) inputs held before a run
     parts: int
     whole: Gridded
-    changes: Array  # when a command was seen to change, seconds after the log's first sample
-    late: Array  # by how much each may have been seen late [s]; 0 where it has its own stamp
+    changes: Array  # when a command changed in the log, seconds after the log's first sample
+    late: Array  # by how much each change may appear late [s]; 0 if commands have own stamps
     interval: float  # between samples [s]
 
     @property
     def first(self) -> float:
-        """The first command, where a run begins if nothing else is known [s]."""
+        """The time of the first command, the default start of a run [s]."""
         return (self.whole.start_ns - self.whole.origin_ns) * 1e-9
 
     def trial_from(self, start: float) -> Trial | None:
-        """The log as a trial that begins then, None where a state is not known in time."""
+        """Return the log as a trial from `start` [s] on, or None if a state is not known there."""
         span = Span(start=start)
         try:
             cut = to_grid(
@@ -112,15 +112,15 @@ class Recording:
 
     @property
     def openings(self) -> list[float]:
-        """Instants from which commands change after they were held for some steps [s]."""
+        """Instants at which commands change after being constant for some steps [s]."""
         held = np.diff(self.changes, prepend=-np.inf)
         return [float(at) for at in self.changes[held > HELD * self.dt]]
 
     def start_of(self, policy: Policy) -> Start | None:
-        """Where a policy's run begins: the best of all instants; None for a log too short to tell.
+        """Find where a policy's run begins; return None if the log is too short.
 
         Args:
-            policy: what is sought, for the states and inputs of this log.
+            policy: the policy, for the states and inputs of this log.
         """
         if (policy.state_names, policy.input_names) != self.names or policy.dt != self.dt:
             return None
@@ -140,11 +140,11 @@ class Recording:
         return Start(first - missed * self.dt, apart_s, True, True, missed=missed)
 
     def _surest(self, policy: Policy, starts: Sequence[Start]) -> Start | None:
-        """Of a run's likeliest places, where most of its commands are the policy's; None: nowhere.
+        """Choose among likely starts where most commands are the policy's; None if there is none.
 
-        A mean counts what a program sent in the first steps' place, and what is at its limits as
-        much as what says when it was sent; half of the commands, on the samples that they were
-        made from, count neither.
+        The mean difference is affected by other commands sent in place of the first steps, and by
+        commands at their limits, which contain no timing. The median on the samples that the
+        program acted on is not.
         """
         alike = [one for one in starts if one.alike]
         likeliest = min(alike or starts, key=lambda one: one.apart, default=None)
@@ -164,15 +164,15 @@ class Recording:
         return likeliest if alike else None
 
     def _by_its_samples(self, policy: Policy, strays: Array) -> Start | None:
-        """Where the first commands are the policy's to the last digits, on samples of some age.
+        """Find where the first commands are the policy's to the last digits, on samples of any age.
 
-        Gains that throw an input from limit to limit make another command of a state that is a
-        millisecond younger, and a run that fell is not whole.
+        This finds runs with high gains, whose commands change completely if a state is a
+        millisecond older, and runs that failed early.
         """
         first = least_of(policy.horizon)
 
         def off(at: float) -> float:
-            """Of half of the first commands, which must tell something; infinite if they don't."""
+            """Return the median difference of the first commands; infinite if they don't move."""
             fit = acted_on(self, policy, at)
             told = np.zeros(0, int) if fit is None else np.flatnonzero(fit.told[:first])
             if fit is None or len(told) < LEAST:
@@ -192,14 +192,14 @@ class Recording:
         return Start(best, self.apart_at(policy, best), alike=False, opens_alike=True)
 
     def _exactly(self, policy: Policy, found: Start) -> Start:
-        """A start some steps sooner, where the commands are the policy's exactly, if they are.
+        """Move a start some steps earlier if the commands are exactly the policy's there.
 
-        Where lively gains throw noise from limit to limit, a mean may be less some rows off.
+        With high gains that amplify noise, the mean difference may be smaller some rows off.
         """
         here = acted_on(self, policy, found.seconds) if found.opens_alike else None
         if policy.gain is None or here is None or here.exact:
             return found
-        for steps in range(1, BESIDE + 1):  # later they are, too, in a log that has them late
+        for steps in range(1, BESIDE + 1):  # not later: a log with late commands fits there too
             at = found.seconds - steps * self.dt
             fit = acted_on(self, policy, at)
             if fit is not None and fit.throughout:
@@ -208,7 +208,7 @@ class Recording:
         return found
 
     def _starts(self, policy: Policy, apart: Array) -> list[Start]:
-        """The likeliest places, by how little differs from each instant on."""
+        """Return the likeliest starts, by the difference of the commands from each instant on."""
         found, left = list[Start](), apart.copy()
         while len(found) < TRIED and np.isfinite(left).any():
             k = int(np.argmin(left))
@@ -225,14 +225,14 @@ class Recording:
         return found
 
     def apart_at(self, policy: Policy, start: float) -> float:
-        """The mean difference of the commands from an instant on, as `Start.apart`."""
+        """Return the mean difference of the commands from an instant on, as `Start.apart`."""
         k = round((start - self.first) * self.parts / self.dt)
         if not 0 <= k < len(self.whole.inputs):
             return np.inf
         return float(instants_apart(self.whole, self.parts, policy, range(k, k + 1))[0][k])
 
     def _on_step(self, policy: Policy, start: float) -> tuple[float, float]:
-        """A start moved to where commands change, by less than a step, and the room before it."""
+        """Move a start by less than a step to where commands change; return its uncertainty too."""
         dt, length = self.dt, self.dt * policy.horizon
         inside = (self.changes > start - dt / 2) & (self.changes < start + length)
         late = self.late[inside]
@@ -245,7 +245,7 @@ class Recording:
         return min(tried, key=lambda one: self._misfit(policy, one)), room
 
     def _misfit(self, policy: Policy, start: float) -> float:
-        """The mean difference of the commands of the trial from there, in units of their size."""
+        """Return the mean difference of the commands from a start on, in units of their size."""
         trial = self.trial_from(start)
         T = 0 if trial is None else min(trial.finite_steps, policy.horizon)
         if trial is None or T < LEAST:
@@ -255,10 +255,16 @@ class Recording:
         return float((np.abs(asked - sent) / (np.abs(sent).max(axis=0) + 1e-12)).mean())
 
     def _between_rows(self, policy: Policy, start: float, row: float) -> tuple[float, float]:
-        """A start moved back by less than a row, to where the feedback says that it was [s].
+        """Move a start back by less than a row, to where the feedback commands fit best.
 
-        And how far it may be off: a row, where what was sent is not what the policy makes of the
-        logged states at any time within it. `row`: what the changes of the commands leave of it.
+        Args:
+            policy: the policy.
+            start: the start [s].
+            row: the remaining uncertainty from the changes of the commands [s].
+
+        Returns:
+            The start [s], and its uncertainty [s]: `row` if the commands do not follow from the
+            logged states at any time within the row, else 0.
         """
         if policy.gain is None or not row:
             return start, 0.0
@@ -286,10 +292,10 @@ class Recording:
 
 
 def _close(policy: Policy, trial: Trial) -> bool:
-    """Whether commands differ by little of what unrelated ones do.
+    """Return whether commands differ by a small share of what unrelated ones differ by.
 
-    A start that is sought over a whole log fits by luck where one that is given does not: states
-    of any age within two steps, which `follows` allows, are not enough.
+    A search over a whole log finds coincidental fits, so the test is stricter than `follows`, which
+    allows states of any age within two steps.
     """
     T = min(trial.finite_steps, policy.horizon)
     sent = np.clip(trial.inputs[:T], policy.low, policy.high)
@@ -305,13 +311,13 @@ def recording(
     complete: Complete,
     series: Mapping[str, Series] | None = None,
 ) -> Recording | None:
-    """A log whose run may begin anywhere; None where it can't be cut.
+    """Return a log in which a run may begin anywhere, or None if it can't be sampled.
 
     Args:
-        logged: the samples that it has.
-        task: whose steps it is cut into.
-        complete: how those of every state and input come of them.
-        series: those, where they are known.
+        logged: its samples.
+        task: the task with the control step and the horizon.
+        complete: adds the estimated states to the samples.
+        series: the completed samples, if they are known already.
     """
     series = complete(logged) if series is None else series
     model, dt = task.model, task.dt
@@ -349,13 +355,13 @@ def recording(
 
 
 def _bridged(series: Series) -> Series:
-    """Samples whose gaps are no reason not to look: the run that is found is cut with them."""
+    """Allow gaps of any length in samples; the trial cut from the log has the gaps again."""
     longest = float(np.ptp(series.t)) * 1e-9 if len(series.t) else 0.0
     return replace(series, spec=replace(series.spec, max_age_s=longest))
 
 
 def elsewhere(log: Recording, found: Start, policy: Policy, why: str) -> bool:
-    """Whether a run begins where it was found, not with the log's first command."""
+    """Return whether a run begins at the start found rather than at the log's first command."""
     if found.missed or (found.between_rows and found.alike):
         return True
     if not found.opens_alike or abs(found.seconds - log.first) <= ALIGNED * log.interval:
@@ -364,10 +370,10 @@ def elsewhere(log: Recording, found: Start, policy: Policy, why: str) -> bool:
 
 
 def loosely(seconds: float, ran: str) -> str:
-    """What a person should know of a start that the feedback does not tell within a row."""
+    """Return the warning for a start that feedback does not determine within a row."""
     return (
-        f"where the run begins is known to {1e3 * seconds:.3g} ms only, the time between the log's "
-        f"rows: its commands are not exactly what {ran} sends on the logged states, which would "
-        "tell. Log the states that the controller used (no velocities that were differentiated or "
-        "filtered afterwards), or the time at which it sent each command"
+        f"the start of the run is only known to {1e3 * seconds:.3g} ms, the time between rows of "
+        f"the log: its commands are not exactly what {ran} sends on the logged states. Log the "
+        "states that the controller used (no velocities differentiated or filtered afterwards), or "
+        "the time at which it sent each command"
     )

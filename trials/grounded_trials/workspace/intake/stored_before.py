@@ -1,7 +1,7 @@
-"""A recording that is stored already: the same trial, a new run like it, or another reading of it.
+"""Detect recordings that are stored already: the same trial, a repeat, or another reading of it.
 
-One log, or one part of it, is one trial. Read through another [log] it would be a second one that
-repeats the first with other numbers, which no diagnosis survives.
+One log, or one part of it, is one trial. Read through another [log] it would become a second trial
+that repeats the first with other numbers, which would invalidate any diagnosis.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, StoredTri
 from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.proposing import standing_in
 
-EDGE = 2  # last rows of a cut log, which its end may have changed
-LEAST = 10  # rows that two recordings must share to be told as one
+EDGE = 2  # last rows of a cut log that are ignored, since its end affects them
+LEAST = 10  # rows that two recordings must share to count as the same
 
 
 def refuse_as_another(path: Path, stored: Sequence[StoredTrial], wanted: str | None) -> None:
-    """Refuses a log that is stored as a run of another candidate, or as data.
+    """Refuse a log that is stored as a run of another candidate, or as data.
 
     Args:
         path: the log.
         stored: the trials that were made from it.
-        wanted: the candidate that it is to be a run of, "" for data, None: whatever it was.
+        wanted: the requested candidate, "" for data, None for no preference.
 
     Raises:
-        GroundedError: with the trial to discard.
+        GroundedError: if it is stored as something else, with the trial to discard.
     """
     if not stored or wanted in (None, *(one.trial.candidate for one in stored)):
         return
     identity, as_run = stored[-1].stored.id, stored[-1].trial.candidate
     raise GroundedError(
         f"{path} is stored already, as {identity}, {_what(as_run)}: one log is one trial. To "
-        f"have it as {_what(wanted)} instead, discard {identity} first",
+        f"use it as {_what(wanted)} instead, discard {identity} first",
         NextCommand("discard", (identity,)),
     )
 
@@ -56,24 +56,24 @@ def _what(candidate: str | None) -> str:
 
 @dataclass(frozen=True)
 class Aside:
-    """A trial that was made of a log, and is set aside since."""
+    """A trial that was made from a log and is set aside."""
 
     id: str
     candidate: str  # "" for data
 
     def told(self) -> str:
-        """Whose run the log is, and what says otherwise."""
+        """Return the note that the log is used as before, and how to change that."""
         return (
             f"it was stored before, as {self.id}, {_what(self.candidate)}, which is set aside: it "
-            f"is taken for {_what(self.candidate)} again. --candidate ID says otherwise"
+            f"is used as {_what(self.candidate)} again. To change that, use --candidate ID"
         )
 
 
 def set_aside_of(workspace: Folder, digest: str) -> Aside | None:
-    """The last trial that was made of a log, by the hash of its bytes, of those set aside."""
+    """Return the last trial, among those set aside, that was made from a log with this hash."""
     aside = workspace.discarded()
     for stored in reversed([one for one in workspace.store.list() if one.id in aside]):
-        with suppress(GroundedError):  # a damaged one tells nothing
+        with suppress(GroundedError):  # skip damaged files
             trial, meta, _ = read_trial(workspace.store.read(stored))
             if meta.get("source_sha256") == digest:
                 return Aside(stored.id, trial.candidate or "")
@@ -81,16 +81,16 @@ def set_aside_of(workspace: Folder, digest: str) -> Aside | None:
 
 
 def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> bytes:
-    """The file of the trial that a log was stored as, whatever the log's name is now.
+    """Return the stored file of a log's trial if it is stored, else the new one.
 
     Args:
-        workspace: that has stored it.
-        log: with `stored` trials.
-        trial: as it was read now.
-        data: that trial's file.
+        workspace: the workspace.
+        log: the log, with its `stored` trials.
+        trial: the trial as it was read now.
+        data: the file of that trial.
 
     Raises:
-        GroundedError: if it was stored with other numbers, read in another way.
+        GroundedError: if the same part of the log is stored with other numbers.
     """
     digest, now = sha256(data), log.source.get(ESTIMATED_WITH, "")
     for one in log.stored:
@@ -114,7 +114,7 @@ def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> 
 
 
 def estimated_otherwise(workspace: Folder, log: ForeignLog) -> tuple[str, ...]:
-    """What to do about trials whose speeds another model estimated; said until the next trial."""
+    """Return a note if the latest estimated trials were estimated with another model."""
     if (now := log.source.get(ESTIMATED_WITH)) is None:
         return ()
     known = [one for one in workspace.whole_trials() if one.meta.get("estimated")]
@@ -128,8 +128,8 @@ def estimated_otherwise(workspace: Folder, log: ForeignLog) -> tuple[str, ...]:
     with_, was = (", ".join(s.split(",")) or "no effect" for s in (now, before))
     return (
         f"{listed(log.source['estimated'].split(','))} is estimated with {with_} in the "
-        f"model, in {names} with {was}: to have them alike, `discard` those and ingest their logs "
-        "again",
+        f"model, but in {names} with {was}: for consistent estimates, `discard` those and ingest "
+        "their logs again",
     )
 
 
@@ -145,20 +145,20 @@ def _read_otherwise(path: Path, names: tuple[str, ...]) -> GroundedError:
 def same_recording(
     workspace: Folder, path: Path, data: bytes, log: ForeignLog | None
 ) -> StoredTrial | None:
-    """The stored trial that a file is a copy of, or a part: what is left of a damaged one, say.
+    """Return the stored trial that a file is a copy or a part of (recovered from damage, say).
 
-    The bytes of the file don't tell. That at the same times of its clock all rows are the same
-    does; whole runs whose clock begins at zero may be alike where a simulator repeats itself, in a
-    log as long as the other.
+    Trials are the same recording if all rows are equal at the same times of the log's clock.
+    Complete runs of a deterministic simulator whose clock starts at zero are not: they may be equal
+    in logs of equal length.
 
     Args:
-        workspace: that may have stored it.
+        workspace: the workspace.
         path: the file.
         data: the trial in it, as it would be stored.
-        log: which that was read from; None: the file is a trial of ours.
+        log: the log from which the trial was read; None if the file was written by grounded.
 
     Raises:
-        GroundedError: if it has more of the recording than what is stored.
+        GroundedError: if it has more of the recording than the stored trial, or other numbers.
     """
     trial, meta, _ = read_trial(data)
     begin, end = _span(meta, trial)
@@ -173,14 +173,14 @@ def same_recording(
                 continue
             here = there
         alike = _alike(one, here)
-        stamped = first > ABSOLUTE_S  # else every log's clock may begin at zero
+        stamped = first > ABSOLUTE_S  # absolute time; else the clock of each log may start at zero
         if alike == "none" or (alike == "some" and not stamped):
             continue
         if alike == "some":
             raise _read_otherwise(path, (one.stored.id,))
         if here.finite_steps > one.measured.finite_steps:
             raise GroundedError(
-                f"{path}: {one.stored.id} is a part of the same recording, which goes on here: "
+                f"{path}: {one.stored.id} is a part of the same recording, which is longer here: "
                 f"discard {one.stored.id}, then ingest it again",
                 NextCommand("discard", (one.stored.id,)),
             )
@@ -192,7 +192,7 @@ def same_recording(
 
 
 def _from(log: ForeignLog, one: StoredTrial) -> Trial | None:
-    """A log as a trial that begins when a stored one does; None where it can't be cut there."""
+    """Return a log as a trial that begins when a stored one does, or None if it can't be cut."""
     with suppress(GroundedError):
         _, found = log.cut("")
         after = 1e-9 * (int(one.meta["start_ns"]) - found.origin_ns)
@@ -201,9 +201,10 @@ def _from(log: ForeignLog, one: StoredTrial) -> Trial | None:
 
 
 def _alike(one: StoredTrial, here: Trial) -> Literal["all", "some", "none"]:
-    """Which signals are the same row by row: all; the inputs and some states, read in another way.
+    """Return which signals are equal row by row: all, some (the inputs and some states), or none.
 
-    A signal that stays, and one that was estimated, tells nothing.
+    "some" means that the recording was read in another way. Constant and estimated signals are
+    ignored.
     """
     before = one.measured
     names = (before.state_names, before.input_names)
@@ -221,16 +222,16 @@ def _alike(one: StoredTrial, here: Trial) -> Literal["all", "some", "none"]:
 
 
 def _span(meta: Mapping[str, str], trial: Trial) -> tuple[float, float]:
-    """From when to when a trial lasts, on its log's clock [s]."""
+    """Return the start and the end of a trial on its log's clock [s]."""
     start = int(meta["start_ns"]) * 1e-9
     return start, start + trial.steps * trial.dt
 
 
 def repeated(workspace: Folder, path: Path, trial: Trial, data: bytes) -> str:
-    """The stored trial that a new run repeats to the last bit, "" for none.
+    """Return the stored trial that a new run repeats to the last bit, or "".
 
-    The same bytes are a new run, not the old one ingested twice, where a run of that candidate is
-    being waited for and the file was written after the stored one.
+    The same bytes count as a new run, not as the old one ingested twice, if that candidate is
+    outstanding and the file was written after the stored one.
     """
     digest = sha256(data)
     known = [one for one in workspace.store.list() if digest.startswith(one.digest)]
@@ -244,12 +245,12 @@ def repeated(workspace: Folder, path: Path, trial: Trial, data: bytes) -> str:
 
 
 def what_repeats(workspace: Folder) -> str:
-    """What an exact repeat says: no noise, or a copy where other trials of a candidate differ."""
+    """Explain an exact repeat: no noise, or a copy if other trials of a candidate differ."""
     ran = [trial for trial in workspace.task_trials() if trial.candidate]
     if scattered([trial.whole(workspace.task.horizon) for trial in ran]):
         return (
-            "other trials of one candidate differ, so it looks like a copy, or a program with a "
-            "fixed seed: `discard` it and run again"
+            "other trials of one candidate differ, so it is probably a copy, or from a program "
+            "with a fixed seed: `discard` it and run again"
         )
-    taken = "the system is taken as deterministic"
+    taken = "the system is treated as deterministic"
     return f"{taken}, and no candidate is run a second time from now on"

@@ -1,7 +1,7 @@
-"""What a person should know about a trial before believing it, in sentences.
+"""Warnings about a trial that the user should know before relying on it.
 
-Whether it ran its candidate at all is asked in `who_drove.py`, whether its columns are what the
-model calls by their names in `log_faults.py`.
+`who_drove.py` checks whether it ran its candidate at all, `log_faults.py` whether its columns
+contain what their names say.
 """
 
 from __future__ import annotations
@@ -20,15 +20,16 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.who_drove import UNLIKE, follows, latest, second_differences
 from grounded_trials.workspace.off_target import reaches, weighed_groups
 
-FAR = 0.1  # of a run's mean cost a step: a start this far from s_0 is worth a warning (or of its
-# range in the run, of a state that [reward] does not weigh along the way),
-SURE = 3.0  # if it is so many standard deviations of the sensor's noise off, and of earlier starts
-MUCH = 1.0  # of a mean step's cost: the run's utility is another for it, however starts scatter
-FEWEST = 2  # earlier runs whose starts say how they scatter
-LATEST = 3  # steps by which inputs may be logged late, and are told so
-WHITE = 0.6745 * 6**0.5  # the median of its second differences, in its standard deviations
-AWAY = 0.02  # of its way: how much farther off after a run than at its end is told
-WIDEN = "no plan will ask for that; widen them if the robot may get it"
+# share of the mean cost of a step above which a start away from s_0 brings a warning; for a state
+# without weight along the way, share of its range in the run
+FAR = 0.1
+SURE = 3.0  # the start must also be off by this many std of sensor noise and of earlier starts
+MUCH = 1.0  # share of a mean step's cost above which the start changes the utility too much
+FEWEST = 2  # smallest number of earlier runs from which the scatter of starts is estimated
+LATEST = 3  # largest number of steps by which late inputs are reported
+WHITE = 0.6745 * 6**0.5  # median of absolute second differences of white noise of std 1
+AWAY = 0.02  # drift after a run, relative to the target's extent, above which it is reported
+WIDEN = "no plan will use that; widen them if the robot can take it"
 
 
 def warnings_about(
@@ -38,15 +39,15 @@ def warnings_about(
     fell: bool = False,
     scaled: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """Gaps, an early end, a start far from s_0, what left [limits] or [safety].
+    """Return warnings on gaps, an early end, a start far from s_0, and exceeded bounds.
 
     Args:
-        workspace: whose task and candidates hold.
-        trial: as it is stored.
-        last_s: when the last of its states was logged, seconds of the run; NaN where all are on
-            the control grid.
-        fell: whether it is known, and told, that the run failed where the trial ends.
-        scaled: inputs that are known, and told, to be logged in another unit.
+        workspace: the workspace with the task and the candidates.
+        trial: the trial as stored.
+        last_s: when the last of its states was logged, in seconds of the run; NaN if all are on the
+            control grid.
+        fell: whether it was already reported that the run failed where the trial ends.
+        scaled: inputs for which another unit was already reported.
     """
     task = workspace.task
     filled = interpolate_gaps(trial)
@@ -60,8 +61,8 @@ def warnings_about(
     if whole.finite_steps < whole.steps:
         name, step = _first_bad(whole)
         found.append(
-            f"'{name}' is not a finite number at {step * trial.dt:.2f} s: the trial counts as "
-            "ended there"
+            f"'{name}' is not a finite number at {step * trial.dt:.2f} s: the trial is treated "
+            "as ended there"
         )
     if not trial.candidate:
         return (*found, *_beyond(task, whole, scaled))
@@ -71,12 +72,12 @@ def warnings_about(
             f"the run ended {ends}: a failed candidate; its data stay usable for fit and diagnose"
             f". {_if_stopped(workspace, trial)}"
             if whole.whole(task.horizon) is whole
-            else f"the log ends {ends}{_lacking(task, last_s)}: the rest is judged as if the robot "
-            "had gone on as it did last. Log at least one more row after the last command"
+            else f"the log ends {ends}{_lacking(task, last_s)}: the rest is extrapolated from the "
+            "last steps. Log at least one more row after the last command"
         )
     if whole.steps > task.horizon:
         found.append(
-            f"the log goes on for {whole.steps - task.horizon} steps after the horizon of "
+            f"the log continues for {whole.steps - task.horizon} steps after the horizon of "
             f"{task.horizon}: they are not judged"
         )
     whole = whole.until(task.horizon)
@@ -88,7 +89,7 @@ def warnings_about(
     if ran is not None and ran.alike and ran.late and ran.moved < UNLIKE:
         by = count(abs(ran.late), "step")
         found.append(
-            f"the inputs fit the policy better when moved by {by}: they seem to be logged {by} "
+            f"the inputs fit the policy better when shifted by {by}: they seem to be logged {by} "
             f"{'late' if ran.late > 0 else 'early'}. Log each command at the time it is sent; "
             f"if it is, [log.span] start is {by} too {'early' if ran.late > 0 else 'late'}"
         )
@@ -96,24 +97,24 @@ def warnings_about(
 
 
 def _if_stopped(workspace: Folder, trial: Trial) -> str:
-    """When a run that ended early is no loss of its candidate, and what takes it out."""
+    """Return how to discard a run that ended early for a reason other than its candidate."""
     horizon = workspace.task.horizon
     ran = [
         one.id
         for one in workspace.task_trials()
         if one.candidate == trial.candidate and one.whole(horizon).finite_steps >= horizon
     ]
-    stopped = f"If you stopped it for a reason of your own, `discard {trial.id}`"
+    stopped = f"Use `discard {trial.id}`"
     if not ran:
-        return f"{stopped} takes it out"
+        return f"{stopped} if you stopped it for another reason"
     return (
-        f"{trial.candidate} ran to the end before ({', '.join(ran)}). {stopped} takes it out, as "
-        "where only the log was cut"
+        f"{trial.candidate} ran to the end before ({', '.join(ran)}). {stopped} if you stopped it "
+        "for another reason, or if only the log was cut"
     )
 
 
 def _first_bad(trial: Trial) -> tuple[str, int]:
-    """The first state or input that is not a finite number, and its step."""
+    """Return the first state or input that is not a finite number, and its step."""
     places = [
         (int(step), name)
         for values, names in ((trial.states, trial.state_names), (trial.inputs, trial.input_names))
@@ -125,15 +126,15 @@ def _first_bad(trial: Trial) -> tuple[str, int]:
 
 
 def _lacking(task: Task, last_s: float) -> str:
-    """By how much a log of a run misses the last state of the plan, as a part of a sentence."""
+    """Return by how much a log misses the plan's last state, as a clause of a sentence; or ""."""
     missing = task.horizon * task.dt - last_s
-    if not missing > 0:  # its commands end, or its rows are the control steps
+    if not missing > 0:  # only its commands end early, or its rows are the control steps
         return ""
-    return f", its last state {1e3 * missing:.3g} ms before the plan's last"
+    return f", with its last state {1e3 * missing:.3g} ms before the plan's last"
 
 
 def _starts_before(workspace: Folder, identity: str) -> Array:
-    """How far from s_0 the other runs of this task started, (N, n)."""
+    """Return how far from s_0 the other runs of this task started, (N, n)."""
     task = workspace.task
     runs = [one for one in workspace.task_trials() if one.candidate and one.id != identity]
     off = [task.model.difference(one.states[0], task.start) for one in runs]
@@ -141,11 +142,11 @@ def _starts_before(workspace: Folder, identity: str) -> Array:
 
 
 def _start(task: Task, trial: Trial, before: Array) -> list[str]:
-    """Where a run did not start at s_0, by more than the noise that its sensor shows.
+    """Return warnings for states in which a run did not start at s_0, beyond their sensor noise.
 
-    What [reward] weighs along the way counts by what the first state costs beside a mean step of
-    the run, the dearest first; another state by how far the run takes it. A robot is never set
-    down twice at one place: as far as the starts `before` (N, n) scatter, nobody can mend it.
+    A state that [reward] weighs along the way is judged by the cost of its offset relative to a
+    mean step of the run, the most costly first; another state relative to its range in the run.
+    Offsets within the scatter of earlier starts `before`, (N, n), are unavoidable and tolerated.
     """
     if trial.finite_steps < 0:
         return []
@@ -169,21 +170,22 @@ def _start(task: Task, trial: Trial, before: Array) -> list[str]:
         began, start = in_digits_apart(float(trial.states[0, i]), float(task.start[i]))
         turned = f" ({np.rad2deg(off[i]):+.2g} degrees)" if unit == "rad" else ""
         does = (
-            "its utility is another for it. Set the robot down nearer to the start, `discard "
+            "this changes its utility. Place the robot nearer to the start, `discard "
             f"{trial.id}` and run it again"
             if share[i] > MUCH
-            else "it counts as it is, no need to run it again. Set the robot down nearer next time"
+            else "the run counts, no need to repeat it. Place the robot nearer to the start next "
+            "time"
         )
         found.append(
             f"the run started with {name} = {with_unit(began, unit)}, the task's start is {start}: "
-            f"{with_unit(f'{off[i]:+.2g}', unit)}{turned} off, more than the noise of its log. "
+            f"{with_unit(f'{off[i]:+.2g}', unit)}{turned} off, more than the noise in the log. "
             f"{does[0].upper()}{does[1:]}"
         )
     return found
 
 
 def _unsafe(task: Task, trial: Trial, ran: Candidate) -> list[str]:
-    """Where a run left [safety], which holds of predictions: by most, and what was predicted."""
+    """Return warnings for states that left [safety], with the predicted value."""
     assert task.safety_low is not None and task.safety_high is not None
     states = trial.states[: trial.finite_steps + 1]
     found = []
@@ -203,14 +205,14 @@ def _unsafe(task: Task, trial: Trial, ran: Candidate) -> list[str]:
 
 
 def afterwards(task: Task, whole: Trial) -> list[str]:
-    """What a robot did after a run, as far as its log goes on: left [safety], or moved on."""
+    """Return warnings on what the robot did after the run: it left [safety], or moved on."""
     return _left_afterwards(task, whole) or _moved_on(task, whole)
 
 
 def _moved_on(task: Task, whole: Trial) -> list[str]:
-    """How far a robot that was to get somewhere is from there once the run is over.
+    """Return a warning if a robot that was to reach a point drifts away from it after the run.
 
-    Where the same inputs are held after the run: what somebody drove is another matter.
+    Only if the inputs are constant after the run, so that nobody drove it.
     """
     end, last = task.horizon, whole.finite_steps
     groups = weighed_groups(task) if reaches(task) else []
@@ -228,13 +230,13 @@ def _moved_on(task: Task, whole: Trial) -> list[str]:
     later, then = measured_alike([far[worst], far[end]], task.model.states[names[0]])
     return [
         f"{(worst - end) * task.dt:.2g} s after the run {what} was {later} from its target, at its "
-        f"end {then}: [reward] judges the run alone. For a robot that stays there let the target "
-        "hold still at its end (target --hold), or weigh the end's rates ([reward] terminal)"
+        f"end {then}: [reward] only judges the run. To make the robot stay there, let the target "
+        "rest at its end (target --hold), or weigh the rates at the end ([reward] terminal)"
     ]
 
 
 def _left_afterwards(task: Task, whole: Trial) -> list[str]:
-    """Where a robot left [safety] after a run that stayed inside."""
+    """Return a warning if the robot left [safety] after a run that stayed inside."""
     assert task.safety_low is not None and task.safety_high is not None
     states = whole.states[: whole.finite_steps + 1]
     out = np.maximum(task.safety_low - states, states - task.safety_high)
@@ -247,7 +249,7 @@ def _left_afterwards(task: Task, whole: Trial) -> list[str]:
     return [
         f"{first * whole.dt:.2g} s after its end the robot left [safety] {name} = [{low:g}, "
         f"{high:g}]: {name} was {with_unit(f'{states[t, i]:.3g}', unit)}. Stop it in time, or let "
-        "the target come to rest inside"
+        "the target end at rest inside"
     ]
 
 
@@ -256,7 +258,7 @@ def _inputs(task: Task, trial: Trial) -> list[str]:
         return []
     excess = np.maximum(task.low - trial.inputs, trial.inputs - task.high).max(axis=0)
     return [
-        f"the log has {name} up to {excess[i]:.3g} outside its [limits]: log the COMMANDS, after "
+        f"{name} in the log is up to {excess[i]:.3g} outside its [limits]: log the COMMANDS, after "
         "clipping"
         for i, name in enumerate(trial.input_names)
         if excess[i] > 1e-6
@@ -264,7 +266,7 @@ def _inputs(task: Task, trial: Trial) -> list[str]:
 
 
 def _beyond(task: Task, trial: Trial, scaled: Sequence[str]) -> list[str]:
-    """Where data show that the robot got more than a plan may ask for: [limits] of one log."""
+    """Return warnings if logged inputs exceed [limits] that were taken from another log."""
     from grounded.instruments.inputs import beyond_limits, in_percent, limits_of, span
 
     past = np.any(beyond_limits(task, trial.inputs), axis=0)

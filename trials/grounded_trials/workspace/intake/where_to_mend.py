@@ -1,7 +1,7 @@
-"""Where a person mends what instruments show: in [log], or in the program that writes the trials.
+"""Say where to correct an instrument finding: in [log], or in the program that writes the trials.
 
-A finding is about signals as they were read, so what mends it comes on top of how [log] read them:
-scales multiply, delays add. Each trial that was made from a log says how it was.
+A finding refers to signals as they were read, so its correction is combined with the keys of [log]
+at that time: scales multiply, delays add. The metadata of each trial records these keys.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from grounded_trials.logs.log_table import LogMapping
     from grounded_trials.workspace.folder import Folder
 
-PLAIN = {"scale": 1.0, "offset": 0.0, "delay_s": 0.0}  # a signal that is read as it was logged
+PLAIN = {"scale": 1.0, "offset": 0.0, "delay_s": 0.0}  # keys of a signal that is read unchanged
 
 
 def read_by(mapping: LogMapping) -> dict[str, str]:
-    """Metadata of a trial: the keys of [log] that changed its signals; {} where none did."""
+    """Return the metadata of a trial with the keys of [log] that changed its signals, or {}."""
     found = {}
     for name, spec in {**mapping.states, **mapping.inputs}.items():
         keys = {key: float(getattr(spec, key)) for key in PLAIN}
@@ -40,8 +40,8 @@ def read_by(mapping: LogMapping) -> dict[str, str]:
 def where_to_mend(
     workspace: Folder, used: Sequence[Trial], findings: Sequence[Finding]
 ) -> tuple[Finding, ...]:
-    """Findings with the whole key of [log], or with advice where it read none of the trials."""
-    from grounded_trials.workspace.intake.log_faults import no_angles  # and with it all of effects
+    """Complete findings with the whole key of [log], or with advice if no trial was read by it."""
+    from grounded_trials.workspace.intake.log_faults import no_angles  # a slow import
 
     about = {one.stored.id: one.meta for one in workspace.trials()}
     findings = _at_limits(workspace, used, findings)
@@ -53,8 +53,8 @@ def where_to_mend(
         odd = [Finding(n, said, "mismatch") for n, said in no_angles(model, mapping).items()]
         findings = (*odd, *findings)
         ahead = (
-            "the robot's program gets it late, too, and should predict it ahead by as much, unless "
-            "the plan knows it, by `adopt` of {} in place of delay_s"
+            "the robot's program also gets it late and should predict it ahead by as much, unless "
+            "the plan allows for it: `adopt` {} instead of delay_s"
         )
         return tuple(
             replace(
@@ -66,9 +66,9 @@ def where_to_mend(
             )
             for one in findings
         )
-    fed = ": the runner's feedback gets it late, too" * feedback
+    fed = ": the runner's feedback also gets it late" * feedback
     late = f"should read it with less delay, or filter it less{fed}"
-    mend = {"delay": late, "lag": late, "sign": "should turn its sign"}
+    mend = {"delay": late, "lag": late, "sign": "should flip its sign"}
     mend["degrees"] = "should write it in the model's unit"
     whose = "the program that writes the trials"
     return tuple(
@@ -80,11 +80,11 @@ def where_to_mend(
 
 
 def in_time_now(workspace: Folder, findings: Sequence[Finding]) -> dict[str, float]:
-    """What [log] takes out by now of the delays that a diagnosis found, as effects by name [s].
+    """Return the delays found by a diagnosis that [log] now removes, by effect name [s].
 
     Args:
-        workspace: whose logs are read from now on.
-        findings: as the diagnosis kept them, with the whole key of [log].
+        workspace: the workspace with the current [log].
+        findings: the findings of the diagnosis, with the whole key of [log].
     """
     late = [one for one in findings if one.kind == "delay" and "delay_s = " in one.log]
     if not late:
@@ -95,7 +95,7 @@ def in_time_now(workspace: Folder, findings: Sequence[Finding]) -> dict[str, flo
     for one in late:
         whole = float(dict(part.split(" = ") for part in one.log.split(", "))["delay_s"])
         now = states[one.signal].delay_s if one.signal in states else 0.0
-        if now > whole - one.delay_s / 2:  # it was read with whole - delay_s
+        if now > whole - one.delay_s / 2:  # the trial was read with whole - delay_s
             found |= dict.fromkeys(late_effects([one]), now)
     return found
 
@@ -103,9 +103,9 @@ def in_time_now(workspace: Folder, findings: Sequence[Finding]) -> dict[str, flo
 def _at_limits(
     workspace: Folder, used: Sequence[Trial], findings: Sequence[Finding]
 ) -> Sequence[Finding]:
-    """Findings in which only plans are at limits that were read off a log: no plan kept it to them.
+    """Limit findings of saturated inputs to runs of candidates if [limits] were taken from a log.
 
-    The log itself is at them by its making, and so is what the same hand drove on the same stick.
+    The log itself reaches these limits by construction, and so do other manual drives.
     """
     from grounded.instruments.inputs import judge_limits
 
@@ -122,7 +122,7 @@ def _at_limits(
 
 
 def _whole(finding: Finding, meta: Mapping[str, str]) -> str:
-    """What [log] has to say of a signal, given what it said when a trial was read."""
+    """Return the whole key of [log] for a finding, combined with the keys used for a trial."""
     now = _keys(meta, finding.signal)
     if not finding.log or not now:
         return finding.log
@@ -138,7 +138,7 @@ def _whole(finding: Finding, meta: Mapping[str, str]) -> str:
 
 
 def _keys(meta: Mapping[str, str], signal: str) -> dict[str, float]:
-    """How a signal was read, {} for as it was logged; a trial's file may come from anybody."""
+    """Return the keys by which a signal was read, {} if unchanged or invalid (untrusted file)."""
     try:
         found = json.loads(meta.get(READ_BY, "{}")).get(signal, {})
         keys = PLAIN | {key: float(found[key]) for key in PLAIN if key in found}

@@ -1,8 +1,8 @@
-"""Whether a trial ran its candidate: who drove.
+"""Check whether a trial ran its candidate, by its commands.
 
-What the policy sends on the LOGGED states, feedback and clipping included, is compared with the
-logged commands (`follows`). A log may be a little late, noisy, or resampled; a person's driving, or
-another candidate, is something else.
+The commands that the policy sends on the LOGGED states, including feedback and clipping, are
+compared with the logged ones (`follows`). A log may be a little late, noisy or resampled; commands
+of a person or of another candidate differ by more.
 """
 
 from __future__ import annotations
@@ -19,43 +19,44 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import with_unit
 
-LEAST = 10  # steps: less says nothing of who drove
+LEAST = 10  # smallest number of steps that can be judged
 UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
-WINDOWS = 8  # parts of a trial that must each be alike, twice as loosely: somebody may take over
-DECISIVE = 12.0  # [nats] of evidence that another candidate ran: luck gives it to 1 run in 10^6
-SAME, CLEAR = 0.5, 0.01  # of the own one's difference, and of an input: it is the other's run
-ROUGH = 4.0  # steps over which noise keeps its sign: what strays for longer, somebody steers
-FINE = 1e-4  # of an input's size: how finely commands are logged at best
-BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # steps: states of the log older than those acted on
-AGES = 1.0  # steps by which that varies in a run: packets are lost, clocks drift and jitter
-OTHERS = 20  # candidates to compare with, the latest
+WINDOWS = 8  # parts of a trial that must each be alike (within 2x): somebody may take over
+DECISIVE = 12.0  # [nats] of evidence that another candidate ran; by chance in 1 of 10^6 runs
+# it is the other's run if its difference is below SAME of the own one's, or below CLEAR of an input
+SAME, CLEAR = 0.5, 0.01
+ROUGH = 4.0  # steps over which noise may be correlated; longer deviations count more
+FINE = 1e-4  # resolution of logged commands at best, relative to an input's size
+BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # ages of the states acted on that are tried, in steps
+AGES = 1.0  # steps by which that age varies in a run (lost packets, clock drift and jitter)
+OTHERS = 20  # number of latest candidates to compare with
 
 
 @dataclass(frozen=True)
 class Following:
-    """How the commands of a trial compare with what a policy sends on its states."""
+    """The comparison of a trial's commands with what a policy sends on its states."""
 
     alike: bool
     error: float  # rms over steps and inputs, in units of each input's largest value
-    input: str  # the one that differs most
-    rms: float  # by so much, in its unit
-    until_s: float  # the commands are alike up to here
+    input: str  # the input that differs most
+    rms: float  # its rms difference, in its unit
+    until_s: float  # the commands are alike up to this time [s]
     late: int  # steps by which the log is late
-    moved: float  # the squared difference at `late` over that without moving
-    off: Array  # (T, m) what was sent less what was asked; NaN: not compared
-    fine: Array  # (m,) how finely that is known
+    moved: float  # squared difference at `late`, relative to that without shift
+    off: Array  # (T, m) sent minus policy's commands; NaN if not compared
+    fine: Array  # (m,) resolution of the commands
 
 
 def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
-    """Compares the commands of a trial with a policy's, at the alignment that fits best.
+    """Compare the commands of a trial with a policy's, at the alignment that fits best.
 
     Args:
-        policy: what should have been run.
-        trial: of the policy's states and inputs, not longer than its horizon.
+        policy: the policy that should have been run.
+        trial: a trial not longer than the policy's horizon.
         latest: steps by which inputs may be logged late.
 
     Returns:
-        None where the trial is too short to tell, or is of other states or inputs.
+        The comparison; None if the trial is too short, or has other states or inputs.
     """
     T = min(trial.finite_steps, policy.horizon)
     names = (policy.state_names, policy.input_names)
@@ -72,7 +73,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
         a, b = free[:, max(0, -late) : T - max(0, late)], sent[max(0, late) : T - max(0, -late)]
         squares = (((a - b) / size[:, None]) ** 2).mean(axis=2)
         usual, mean = np.median(squares, axis=1), squares.mean(axis=1)
-        for back, score in enumerate(usual + 1e-3 * mean):  # a takeover must not move the rest
+        for back, score in enumerate(usual + 1e-3 * mean):  # robust to a takeover in some steps
             fits[back, late] = (float(score), float(mean[back]), a[back], b, size[back])
     back, late = min(fits, key=lambda key: fits[key][0])
     _, error, asked, sent, size = fits[back, late]
@@ -84,7 +85,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     within = free[near, start : start + len(sent)]
     off = (sent - np.clip(sent, within.min(axis=0), within.max(axis=0))) ** 2
     unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
-    noise = _noise_sent(policy, trial.states[:T], free[0])  # between samples there is less
+    noise = _noise_sent(policy, trial.states[:T], free[0])  # at samples, where it is largest
     room = np.maximum(UNLIKE * unrelated, (0.02 * size) ** 2 + 4 * noise[: len(off)])
     parts = np.array_split(np.arange(len(off)), max(1, min(WINDOWS, len(off) // LEAST)))
     bad = [bool((off[k].mean(axis=0) > 2 * room[k].mean(axis=0)).any()) for k in parts]
@@ -93,7 +94,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     first = parts[bad.index(True)] if any(bad) else parts[0][:1]
     left = first[int(np.argmax((off[first] > 2 * room[first]).any(axis=1)))]
     beyond = np.abs(trial.inputs[:T] - np.clip(trial.inputs[:T], policy.low, policy.high))
-    sane = not (beyond.mean(axis=0) > width).any()  # clipped, any such commands are alike
+    sane = not (beyond.mean(axis=0) > width).any()  # such commands are only alike due to clipping
     alike, j = bool(sane and share.max() <= 1 and not any(bad)), int(np.argmax(share))
     return Following(
         alike=alike,
@@ -109,12 +110,13 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
 
 
 def evidence(own: Following, other: Following) -> float:
-    """The log likelihood ratio of another policy over the own one [nats], given the commands.
+    """Return the log likelihood ratio [nats] of another policy over the own one.
 
-    What the other leaves is taken for noise, Gaussian, as large and as coloured as it is. If the
-    own policy ran, noise gives the other more than z^2/2 nats no more often than a normal number
-    exceeds z, however close the two are. But where the robot acted on other samples than the log
-    has, lower gains leave less, whichever ran: down to half the squares, which count for nothing.
+    The difference that the other leaves is treated as Gaussian noise with its own size and
+    autocorrelation. If the own policy ran, noise gives the other more than z^2/2 nats at most as
+    often as a normal variable exceeds z, however close the two are. If the robot acted on other
+    samples than the log has, lower gains leave smaller differences, whichever ran: a reduction of
+    the squares by up to half does not count.
     """
     known = np.isfinite(own.off + other.off).all(axis=1)
     a, b = own.off[known], other.off[known]
@@ -125,7 +127,7 @@ def evidence(own: Following, other: Following) -> float:
 
 
 def steps_alike(noise: Array) -> float:
-    """How many successive samples say as much as one: the autocorrelation, summed to its zero."""
+    """Return the number of successive samples worth one: the autocorrelation summed to its zero."""
     noise = noise - noise.mean()
     power = np.correlate(noise, noise, "full")[len(noise) - 1 :]
     if not power[0] > 0:
@@ -136,21 +138,21 @@ def steps_alike(noise: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Suspicion:
-    """What a trial's commands say of who drove."""
+    """The result of comparing a trial's commands with its candidate's and others'."""
 
-    ran: Following | None  # beside what its candidate asks for
-    why: str = ""  # why it is not its candidate's run; "" where nothing says so
-    other: str = ""  # whose run it is
+    ran: Following | None  # the comparison with its candidate
+    why: str = ""  # why it is not its candidate's run, or ""
+    other: str = ""  # the candidate whose run it is instead, or ""
 
 
 def suspicion(task: Task, trial: Trial, own: Candidate, others: Sequence[Candidate]) -> Suspicion:
-    """Why a trial is not a run of its candidate, and whose it is.
+    """Check whether a trial is a run of its candidate, and if not, whose it is.
 
     Args:
-        task: whose latency and units hold.
-        trial: with gaps bridged; its candidate is `own`.
+        task: the task with latency and units.
+        trial: the trial, with gaps bridged; its candidate is `own`.
         own: the candidate that it is said to have run.
-        others: those that it may have run instead, in order of proposal.
+        others: candidates that it may have run instead, in order of proposal.
     """
     trial, late = trial.until(task.horizon), latest(task)
     found = follows(own.policy, trial, late)
@@ -182,13 +184,13 @@ def suspicion(task: Task, trial: Trial, own: Candidate, others: Sequence[Candida
 
 
 def latest(task: Task) -> int:
-    """Steps by which a log of what the actuators got, not of what was sent, is late."""
+    """Return by how many steps a log of the actuators' inputs lags the commands, at most."""
     assert task.latency is not None
     return 1 + int(np.ceil(task.latency.max() / task.dt))
 
 
 def _earlier(states: Array, steps: float, angles: tuple[bool, ...]) -> Array:
-    """The states some steps ago, between samples by a straight line, (T, n)."""
+    """Return the states some steps ago, (T, n), linearly interpolated between samples."""
     whole, part = divmod(steps, 1)
     at, last = np.arange(len(states)) - int(whole), len(states) - 1
     now, before = states[np.clip(at, 0, last)], states[np.clip(at - 1, 0, last)]
@@ -197,7 +199,7 @@ def _earlier(states: Array, steps: float, angles: tuple[bool, ...]) -> Array:
 
 
 def _noise_sent(policy: Policy, states: Array, asked: Array) -> Array:
-    """Square of what the policy makes of the noise of the states, found by adding it, (T, m)."""
+    """Return the squared effect of the states' noise on the commands, (T, m), by adding noise."""
     change = second_differences(states, policy.angles)
     power = (change**2).mean(axis=0) / 6  # of white noise
     noisy = states + np.random.default_rng(0).normal(size=states.shape) * np.sqrt(power)
@@ -206,7 +208,7 @@ def _noise_sent(policy: Policy, states: Array, asked: Array) -> Array:
 
 
 def second_differences(states: Array, angles: Sequence[bool] | Array) -> Array:
-    """Of states (T, n), (T - 2, n): motion leaves little in them, noise most of it."""
+    """Return second differences of states (T, n), (T - 2, n), which consist mostly of noise."""
     turns = tuple(map(bool, angles))
     change: Array = np.diff(z_difference(states[1:], states[:-1], turns), axis=0)
     return change
