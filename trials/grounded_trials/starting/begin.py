@@ -160,7 +160,7 @@ def _begin(
         raise GroundedError(report.damage, NextCommand("recover", (str(log),)))
     report, notes = _one_run(report)
     joints = joint_names(report)
-    chosen, why = (kind, "as you said") if kind else kind_in(report, joints)
+    chosen, why = (kind, "as you specified") if kind else kind_in(report, joints)
     if own:
         why, found = "your model", own.bring(folder)
     else:
@@ -296,7 +296,7 @@ def _asked(guess: Guess, ask: Ask, stated: Callable[..., Guess]) -> Guess:
     path = ask(guess)
     if path == guess.path:
         return replace(guess, sure=bool(path))
-    why = ("as you said",)
+    why = ("as you specified",)
     return stated(replace(guess, path=path, sure=bool(path), reasons=why, field=None, scale=1.0))
 
 

@@ -150,10 +150,10 @@ def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
         return kind, f"{where} has {len(names)} joints: {', '.join(names[:6])}"
     flying = next((t.topic for t in log.topics if FLYING.search(t.topic.lower())), None)
     if flying is not None:
-        return "drone", f"{flying} is named after one"
+        return "drone", f"{flying} is named like a drone"
     for wanted, kind, what in (
-        (("steer",), "car", "names a steering"),
-        (("thrust", "attitude_setpoint", "actuator_outputs"), "drone", "names a thrust"),
+        (("steer",), "car", "has a steering signal"),
+        (("thrust", "attitude_setpoint", "actuator_outputs"), "drone", "has a drone's commands"),
         (("cmd_vel",), "rover", "holds velocity commands"),
     ):
         for topic in log.topics:
@@ -161,14 +161,14 @@ def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
                 return kind, f"{topic.topic} {what}"
     words = {_word(one.path).lower() for topic in log.topics for one in topic.fields}
     if both := _both_sides(log):
-        return "differential", f"{' and '.join(both)} drive it, and it has a heading"
+        return "differential", f"it has the commands {' and '.join(both)}, and a heading"
     if command := _balancing(log):
-        return "balance", f"it pitches, rolls on and has one command, {command}"
+        return "balance", f"it has a pitch, a position or speed, and one command, {command}"
     if words & {"theta", "angle", "q", "q_rad", "position"} and words & {"torque", "tau", "u"}:
-        return "pendulum", "an angle and a torque"
+        return "pendulum", "the log has an angle and a torque"
     if flat := next((t.topic for t in log.topics if _in_the_plane(t)), None):
-        return "rover", f"{flat} moves in the plane and no steering is named"
-    return "generic", "the kind of robot is not known, --kind sets it: the names are the log's"
+        return "rover", f"{flat} moves in a plane, and there is no steering signal"
+    return "generic", "the kind of robot is unknown (--kind sets it): the names are the log's"
 
 
 def of_arms(joints: Joints) -> Joints:
@@ -194,11 +194,11 @@ def _hung(log: LogReport, joints: Joints) -> str:
     (topic, names), found = own[0], moving(log)
     slide, others = next(filter(slides, names)), [name for name in names if not slides(name)]
     if len(others) == 1:
-        return f"{topic} has '{slide}', which slides, and '{others[0]}'"
+        return f"{topic} has the sliding joint '{slide}', and '{others[0]}'"
     angles = [n for n, one in found.items() if SWINGS.search(n) and not called_input(n, one.path)]
     if others or not angles:
         return ""
-    return f"{topic} has '{slide}', which slides, and {found[angles[0]].path} is an angle"
+    return f"{topic} has the sliding joint '{slide}', and {found[angles[0]].path} is an angle"
 
 
 def _crane(log: LogReport, units: Units) -> Skeleton:

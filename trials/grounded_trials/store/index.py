@@ -66,7 +66,7 @@ class Index:
                 except sqlite3.Error:
                     file.close()
                     raise
-            with suppress(OSError):  # it is damaged
+            with suppress(OSError):  # it is damaged, or of another version
                 self._path.unlink(missing_ok=True)
         raise AssertionError("a database in memory can always be made")
 
