@@ -163,7 +163,7 @@ class Findings:
 
     @cached_property
     def lately(self) -> Run | None:
-        """The latest single run of the best candidate, for replays, which need no averaged run."""
+        """The latest run of the best candidate, else the latest run; unlike `best`, no average."""
         best = self.best and self.runs_of(self.best.candidate.id)[-1]
         return best or self.latest
 

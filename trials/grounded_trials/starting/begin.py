@@ -168,7 +168,7 @@ def _begin(
         found = _model_in(folder, text)
     states, inputs = _matched(report, found, joints, unnamed=not own)
     if not (kind or own or any(g.path for g in states)):
-        why = f"no number in the log matches a state of kind {chosen}: the names are the log's"
+        why = f"no number in the log matches a state of kind {chosen}; names are the log's"
         chosen = "generic"
         text = skeleton(chosen, report, joints, named, column_units(files[0])).source()
         found = _model_in(folder, text)
@@ -266,7 +266,7 @@ def _model_in(folder: Path, text: str) -> Model:
 
 def _only_named(guess: Guess, of: str) -> Guess:
     """Mark a generic skeleton's signal as a guess: only its name comes from the log."""
-    why = f"named as in the log; it is a guess that it is a{'n' * (of == 'input')} {of}"
+    why = f"named as in the log; assumed to be a{'n' * (of == 'input')} {of}"
     return replace(guess, sure=False, reasons=(*guess.reasons, why)) if guess.path else guess
 
 

@@ -74,7 +74,7 @@ def write_first(
         "latency = { }                 # [s] transport delay of inputs: `fit --latency` finds it",
         "",
         "[reward]                      # quadratic weights: 1 / (range in the target)^2; a",
-        "                              # constant column gets the largest range of its unit, else",
+        "                              # constant column uses the largest range of its unit, else",
         "                              # 1. `target` updates them until you change one",
         f"state = {_inline(weights)}",
         "# terminal: weights of the last step only. If the run must END at rest on its target",
@@ -113,7 +113,7 @@ def held_first(
 
     A controller may sag at first and its commands may jitter, so inputs only need to stay nearly
     constant in the second half of the first `STOOD` seconds. Returns {} if the robot moves, if an
-    input changes, or if all inputs are zero: inputs then count as 0 before a run, which is also
+    input changes, or if no input has to hold it: inputs then count as 0 before a run, which is also
     what is sent after it. Also returns {} for a model without a speed, since a slow drift could
     not be detected.
 
