@@ -145,7 +145,7 @@ def test_methods_that_need_too_many_trials_are_cut_and_say_so():
     (panel,) = PICTURES["baselines"](results()["baselines"]).panels
     grounded, refit, differences = panel.bars
     assert (grounded.value, grounded.text, grounded.role) == (3, "3", "best")
-    assert refit.text == "never: ends at 90.0%" and refit.role == "model"
+    assert refit.text == "not reached: ends at 90.0%" and refit.role == "model"
     assert differences.value == 40 and differences.text == "600"
 
 

@@ -156,7 +156,7 @@ def test_nothing_is_said_to_improve_that_did_not(car):
     first = now.history[0]
     assert "Nothing" in heading(replace(findings, standing=replace(now, incumbent=first)))
     none = replace(now, incumbent=first, history=(first,))
-    assert heading(replace(findings, standing=none)) == "What the runs gave"
+    assert heading(replace(findings, standing=none)) == "Results"
     best = findings.best
     assert best is not None
     states = best.trial.states.copy()

@@ -394,7 +394,7 @@ def test_a_mean_of_two_trials_is_no_trial(cart):
     diagnosis = Diagnosis.from_json(DIAGNOSIS | {"diagnosed": seen})
     twice = replace(findings, runs=(*findings.runs, again), diagnosis=diagnosis)
     figure = forecast_figures(twice)[0]
-    assert "t0099" in figure.title and "saw this trial too" in figure.caption
+    assert "t0099" in figure.title and "used this trial" in figure.caption
     np.testing.assert_array_equal(figure.panels[0].curves[0].y, again.trial.states[:, 0])
 
 

@@ -93,4 +93,4 @@ def test_the_page_and_its_figure_of_many_candidates_say_how_many_are_left_out(mo
     text = page(findings)
     assert len(text) < len(everything)
     body = re.search(r'id="candidates".*?</table>', text, re.DOTALL)[0]
-    assert body.count("<tr") == 11 and "20 candidates between them" in text
+    assert body.count("<tr") == 11 and "20 candidates are left out" in text

@@ -209,8 +209,10 @@ def test_the_order_of_candidates_is_explained(cart):
     bases = [row[made.header.index("from")] for row in made.rows]
     assert bases == [t.candidate.base or "-" for t in findings.history]
     iterations = [t.candidate.iteration for t in findings.history]
-    assert iterations == sorted(iterations) and not rest and "falls" not in words(cart, "status")
-    assert "falls" in legend("alpha", [0, 1, 2, 1]) and legend("alpha", [0, 1, 1]) == "alpha"
+    assert (
+        iterations == sorted(iterations) and not rest and "decreases" not in words(cart, "status")
+    )
+    assert "decreases" in legend("alpha", [0, 1, 2, 1]) and legend("alpha", [0, 1, 1]) == "alpha"
 
 
 def test_numbers_that_differ_are_told_apart():

@@ -1,16 +1,17 @@
-"""The disk: logs, the store, the workspace, reports. A file is data, never code.
+"""File access: logs, the store, the workspace, reports. A file is data and is never executed.
 
-`from grounded_trials import Workspace` is the front door (`door.py`): a method for every command.
+The entry point is `from grounded_trials import Workspace` (`door.py`), with a method for every
+command.
 
 workspace/  START HERE: a folder with a task, and what each command does in it
-starting/   how a workspace is made: of a log, a model, an example
-store/      our own files, content-addressed
-logs/       foreign logs: which signal is which state, samples on the control grid
-formats/    bytes of log files as arrays
+starting/   making a workspace from a log, a model or an example
+store/      grounded's own files, content-addressed
+logs/       foreign logs: mapping signals to states, resampling to the control interval
+formats/    decoding the bytes of log files into arrays
 report/     text, page, pictures, recording
 
-`challenge.py` writes and scores blind cases on the disk;
-`toml_table.py` takes a user's table apart key by key; `wording.py` puts numbers and units in words.
+`challenge.py` writes and scores the blind challenge; `toml_table.py` reads a user's TOML table key
+by key; `wording.py` formats numbers and units.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ __all__ = ["Workspace"]
 
 
 def __getattr__(name: str) -> Any:
-    """Imports the door when it is opened: `import grounded_trials` alone costs nothing."""
+    """Import `Workspace` on first access, so that `import grounded_trials` stays fast."""
     if name != "Workspace":
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
     from grounded_trials.door import Workspace

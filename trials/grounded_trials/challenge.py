@@ -1,13 +1,13 @@
-"""The blind challenge on disk: cases are written, diagnosed without their labels, then scored.
+"""The blind challenge on disk: writes cases, diagnoses them without their labels, scores them.
 
-    DIR/single-0007/       a workspace: module, parameters, target, trials; nothing says the answer
+    DIR/single-0007/       a workspace: module, parameters, target, trials, but no label
     DIR/manifest.json      for each case the SHA-256 of its label and of each of its trials
     DIR/times.json         CPU time of the diagnoses [s]
-    LABELS/single-0007.json  the answer; it is opened only if it has the announced hash
+    LABELS/single-0007.json  the label; it is accepted only with the hash in the manifest
 
-Labels belong on another disk while the cases are diagnosed. Cases are independent jobs, on one
-machine or on a Dask cluster that sees the same disk (`grounded.experiments.jobs`). A diagnosis is
-kept in its own workspace, so a run that was cut off goes on where it was.
+Keep the labels on another disk while the cases are diagnosed. Cases are independent jobs, on one
+machine or on a Dask cluster that shares the disk (`grounded.experiments.jobs`). Each diagnosis is
+stored in its own workspace, so an interrupted run continues where it stopped.
 """
 
 from __future__ import annotations
@@ -43,26 +43,33 @@ MANIFEST, TIMES = "manifest.json", "times.json"
 def write_cases(
     cases: Iterator[Case], folder: Path, labels: Path, tick: Callable[[int], None]
 ) -> list[str]:
-    """Writes the workspaces, then the labels, then the manifest; returns the cases' names.
+    """Write the workspaces and labels of all cases, then the manifest; return the cases' names.
 
-    The manifest comes last: a folder without one was interrupted, and the same cases go on in it.
+    The manifest is written last: a folder without one was interrupted, and writing the same cases
+    again continues there.
+
+    Args:
+        cases: the cases, each with its trials and its label.
+        folder: receives the workspaces and the manifest.
+        labels: receives the labels; must lie outside `folder`.
+        tick: called with the number of cases written so far.
 
     Raises:
-        GroundedError: if the folder holds a challenge already, or cases that are others, or the
-            labels would lie inside it.
+        GroundedError: if the folder already holds a challenge or other cases, or if `labels` lies
+            inside it.
     """
     from grounded.challenge import sealed
 
     if (folder / MANIFEST).exists():
-        raise GroundedError(f"{folder} holds a challenge already: name another folder")
+        raise GroundedError(f"{folder} already holds a challenge: name another folder")
     if labels.resolve().is_relative_to(folder.resolve()):
-        raise GroundedError(f"the labels ({labels}) must lie outside {folder}: they are sealed")
+        raise GroundedError(f"the labels ({labels}) must lie outside {folder}, to keep it blind")
     for place in (folder, labels):
         try:
             place.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise GroundedError(
-                f"{place} can't be made: {error.strerror}; name a folder that can"
+                f"{place} can't be created: {error.strerror}; name another folder"
             ) from None
     entries: dict[str, Any] = {}
     for number, case in enumerate(cases, start=1):
@@ -77,7 +84,7 @@ def write_cases(
 
 
 def _write_case(case: Case, folder: Path) -> list[str]:
-    """A case as a workspace; the hashes of its trials."""
+    """Write a case as a workspace; return the SHA-256 of each of its trials."""
     from grounded.challenge import task_of
 
     store = Store(folder / "trials")
@@ -86,8 +93,8 @@ def _write_case(case: Case, folder: Path) -> list[str]:
     stored = [entry.digest for entry in store.list()]
     if stored != [digest[:DIGITS] for digest in hashes[: len(stored)]]:
         raise GroundedError(
-            f"{folder} holds trials of another challenge: make the same one again, or name another "
-            "folder"
+            f"{folder} holds trials of another challenge: repeat the command that made it, or name "
+            "another folder"
         )
     folder.mkdir(parents=True, exist_ok=True)
     task, names = task_of(case), case.model.state_names
@@ -106,10 +113,10 @@ def _write_case(case: Case, folder: Path) -> list[str]:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """The cases of a challenge.
+    """Read the cases of a challenge from its manifest.
 
     Raises:
-        GroundedError: if there is none.
+        GroundedError: if there is no manifest, or it can't be read.
     """
     path, advice = folder / MANIFEST, "name the folder that `challenge make` wrote"
     if not folder.is_dir():
@@ -119,7 +126,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         return dict(document["cases"])
     except FileNotFoundError:
         raise GroundedError(
-            f"{folder} holds no challenge, it has no {MANIFEST}: {advice}"
+            f"{folder} holds no challenge: it has no {MANIFEST}; {advice}"
         ) from None
     except OSError as error:
         raise GroundedError(f"{path} can't be read: {error.strerror}; {advice}") from None
@@ -128,7 +135,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def open_label(labels: Path, name: str, entry: dict[str, Any]) -> dict[str, Any]:
-    """A case's label, if it is the one that was announced.
+    """Read a case's label and check its hash against the manifest's entry.
 
     Raises:
         GroundedError: if it is missing or was changed.
@@ -139,22 +146,22 @@ def open_label(labels: Path, name: str, entry: dict[str, Any]) -> dict[str, Any]
     except FileNotFoundError:
         there = f"{labels} holds no {path.name}" if labels.is_dir() else f"there is no {labels}"
         raise GroundedError(
-            f"{there}: expected the folder in which `challenge make` put the label of "
-            f"every case; look for {path.name}"
+            f"{there}: expected the folder with the label of every case, written by "
+            f"`challenge make`; look for {path.name}"
         ) from None
     except OSError as error:
         raise GroundedError(
-            f"{path} can't be read: {error.strerror}; make it readable, it is the case's label"
+            f"{path}, the case's label, can't be read: {error.strerror}; make it readable"
         ) from None
     if hashlib.sha256(data).hexdigest() != entry["label_sha256"]:
-        raise GroundedError(f"{path} is not the label that the manifest announced: it was changed")
+        raise GroundedError(f"{path} was changed: its hash differs from the one in the manifest")
     return dict(json.loads(data))
 
 
 def score_case(
     folder: str | Path, labels: str | Path, name: str, entry: dict[str, Any]
 ) -> dict[str, Any]:
-    """A job: one case's marks, from its reports/diagnosis.json.
+    """Score one case from its reports/diagnosis.json (a job).
 
     Raises:
         GroundedError: if it was not diagnosed, or a trial or label was changed.
@@ -164,7 +171,7 @@ def score_case(
     workspace = Folder(Path(folder) / name)
     hashes = [hashlib.sha256(workspace.store.read(s)).hexdigest() for s in workspace.store.list()]
     if hashes != entry["trials_sha256"]:
-        raise GroundedError(f"{workspace.folder}: its trials are not those that were made")
+        raise GroundedError(f"{workspace.folder}: its trials differ from those in the manifest")
     path = workspace.reports / "diagnosis.json"
     try:
         diagnosis = read_document(path)
@@ -187,14 +194,14 @@ def diagnose_cases(
     engine: Engine | None = None,
     progress: Progress | None = None,
 ) -> dict[str, float]:
-    """Diagnoses every case that was not; CPU seconds of each that is known [s].
+    """Diagnose every case that has no diagnosis yet; return the known CPU time [s] by case.
 
     Args:
         folder: the challenge.
-        without: families of the built-in library that may not be blamed.
-        again: those that were diagnosed before too.
+        without: effect families of the built-in library to exclude.
+        again: also repeat the diagnoses that exist.
         engine: where the jobs run.
-        progress: called with jobs done and jobs in all.
+        progress: called with the number of jobs done and the total.
 
     Raises:
         GroundedError: if the folder holds no challenge, or workers keep dying.
@@ -217,7 +224,7 @@ def diagnose_cases(
 
 
 def undiagnosed(folder: Path, *, again: bool = False) -> list[str]:
-    """The cases that were not diagnosed yet, or all of them.
+    """Return the names of the cases without a diagnosis, or with `again` of all cases.
 
     Raises:
         GroundedError: if the folder holds no challenge.
@@ -227,7 +234,7 @@ def undiagnosed(folder: Path, *, again: bool = False) -> list[str]:
 
 
 def diagnose_case(folder: str, name: str, without: Sequence[str]) -> dict[str, Any]:
-    """A job: one case, diagnosed in its workspace."""
+    """Diagnose one case in its workspace (a job); return its name and CPU time [s]."""
     begin = time.process_time()
     diagnose_in(Folder(Path(folder) / name), without=without)
     return {"case": name, "cpu_s": time.process_time() - begin}
@@ -240,7 +247,7 @@ def score_cases(
     engine: Engine | None = None,
     progress: Progress | None = None,
 ) -> list[dict[str, Any]]:
-    """The marks of every case, beside an oracle that knows its label; with CPU time [s] if known.
+    """Score every case against an oracle that knows its label; adds the CPU time [s] if known.
 
     Raises:
         GroundedError: if a case was not diagnosed, or a trial or label was changed.
@@ -256,7 +263,7 @@ def score_cases(
 
 
 def read_times(folder: Path) -> dict[str, float]:
-    """CPU seconds by case; nothing where the file is missing or can't be read."""
+    """Read the CPU time [s] by case; empty if the file is missing or can't be read."""
     try:
         return dict(json.loads((folder / TIMES).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):

@@ -1,4 +1,4 @@
-"""The front door: a workspace with a method for every command.
+"""The entry point of the package: a workspace with a method for every command.
 
     from grounded_trials import Workspace
 
@@ -7,8 +7,8 @@
     w.diagnose()
     w.report(html=True)
 
-Each method does what the command of its name does, on the files as they are now, and returns a
-frozen result whose `to_json()` is the document that the command prints with --json.
+Each method does what the command of the same name does, on the current files, and returns a frozen
+result; its `to_json()` is the document that the command prints with --json.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ if TYPE_CHECKING:
 
 
 class Workspace(Folder):
-    """A folder with a task, its trials and its candidates, and what can be done in it.
+    """A folder with a task, its trials and its candidates, with a method for every command.
 
-    Every method raises a GroundedError for what is the user's to mend: a file that is missing or
-    damaged, a name that is not known, a system that fails.
+    Every method raises a GroundedError for problems that the user can fix: a missing or damaged
+    file, an unknown name, a system that fails.
 
     Args:
-        folder: where grounded.toml lies.
+        folder: the folder of grounded.toml.
 
     Raises:
-        GroundedError: if there is none, or it is wrong.
+        GroundedError: if there is no grounded.toml, or it is invalid.
     """
 
     def __init__(self, folder: str | Path = ".") -> None:
@@ -68,22 +68,23 @@ class Workspace(Folder):
         model: str | Path | None = None,
         dt: float | None = None,
     ) -> Self:
-        """Makes a workspace from an example, a log or a model; nothing is ever overwritten.
+        """Create a workspace from an example, a log or a model; never overwrites a file.
 
         Args:
-            folder: where it is made.
+            folder: the workspace to create.
             example: car-turn, car-circle, car-figure8, flight-figure8 or pendulum.
-            log: of your robot, any format; `starting.begin.begin` says what it found.
-            model: your model.py, or an MJCF or URDF file, beside `log`, where None writes a
-                skeleton; or alone: target, weights and drive.py are to be filled in then.
-            dt: control interval [s]; None: the log's, 0.05 for a model alone.
+            log: a log of your robot, in any format. `starting.begin.begin` also returns what was
+                found in it.
+            model: your model.py, or an MJCF or URDF file. With `log`, None writes a model skeleton.
+                Without `log`, the target, weights and drive.py are placeholders to fill in.
+            dt: control interval [s]; None: that of the log, 0.05 without a log.
 
         Raises:
-            GroundedError: if there is no such example, the log can't be read, or the folder holds
-                a workspace already.
+            GroundedError: if there is no such example, the log can't be read, or the folder already
+                holds a workspace.
         """
         if (example is None) == (log is None and model is None):
-            raise GroundedError("give an example, a log or a model to make a workspace from")
+            raise GroundedError("give either an example, or a log or model, to create a workspace")
         if log is None and model is not None:
             from grounded_trials.starting.blank import write_blank
 
@@ -102,9 +103,9 @@ class Workspace(Folder):
         return f"Workspace({str(self.folder)!r})"
 
     def propose(self) -> Proposed:
-        """Says what to run next and writes its candidate file.
+        """Propose the next candidate to run and write its file.
 
-        The outstanding candidate is named again while its trial is missing.
+        While a candidate's trial is outstanding, the same candidate is returned.
         """
         from grounded_trials.workspace.proposing import propose_in
 
@@ -117,15 +118,15 @@ class Workspace(Folder):
         anyway: bool = False,
         warn: Callable[[str], None] | None = None,
     ) -> Ran:
-        """Runs a candidate on [system] and writes a trial file to be ingested.
+        """Run a candidate on [system] and write a trial file, to be ingested.
 
-        It is refused if it is not the file that was proposed, or is void by now: [limits],
-        [safety], the task or the model were changed.
+        The candidate is refused if its file was altered since it was proposed, or if it is void
+        because [limits], [safety], the task or the model have changed.
 
         Args:
             candidate: c0003, or `best`; None: the outstanding one.
-            anyway: run it though it is void.
-            warn: told what is overridden, before the robot moves.
+            anyway: run it although it is void.
+            warn: called with each check that is overridden, before the robot moves.
         """
         from grounded_trials.workspace.running import run_candidate
 
@@ -134,13 +135,13 @@ class Workspace(Folder):
     def ingest(
         self, path: str | Path, *, candidate: str | None = None, data: bool = False
     ) -> Ingested:
-        """Checks, resamples and stores a trial; one that is known already is stored once.
+        """Check, resample and store a trial; a trial that is already stored is not added again.
 
         Args:
-            path: a trial of grounded's, another MCAP log, or the folder of a bag.
-            candidate: which candidate was run, or `best`; None: as the trial says, else the
-                outstanding one.
-            data: the log ran no candidate: for fitting and diagnosis only.
+            path: a trial file of grounded's, a log of another format, or the folder of a bag.
+            candidate: the candidate that was run, or `best`; None: the one that the trial names,
+                else the outstanding one.
+            data: the log ran no candidate and serves fitting and diagnosis only.
         """
         from grounded_trials.workspace.intake.ingest import ingest_log
 
@@ -149,22 +150,23 @@ class Workspace(Folder):
     def next(
         self, log: str | Path, *, candidate: str | None = None, runner: bool = True
     ) -> NextRun:
-        """The loop at the track in one call: takes a log in, proposes, exports for the robot.
+        """Ingest a log, propose the next candidate and export it for the robot, in one call.
 
         Args:
-            log: what came back.
-            candidate: which one was run; None: the outstanding one.
-            runner: write the program that runs the candidate beside it, see `export`.
+            log: the log of the run.
+            candidate: the candidate that was run; None: the outstanding one.
+            runner: also write the program that runs the exported candidate, see `export`.
         """
         from grounded_trials.workspace.looping import next_in
 
         return next_in(self._afresh(), Path(log), candidate, runner=runner)
 
     def target(self, columns: Mapping[str, Array]) -> Path:
-        """Writes target.csv and its length to grounded.toml; the old one is kept as target.csv.bak.
+        """Write target.csv and set the horizon in grounded.toml; the old target is kept as .bak.
 
         Args:
-            columns: what each state is to do, (H + 1,) each, a row a control step; see `starting`.
+            columns: the desired values of each state, (H + 1,), one per control step. The functions
+                of `starting.shapes` return such columns.
         """
         from grounded_trials.workspace.task_file import replace_target
 
@@ -180,19 +182,19 @@ class Workspace(Folder):
         progress: Callable[[str], None] | None = None,
         each: Callable[[Candidate, Ingested], None] | None = None,
     ) -> Status:
-        """Proposes, runs and ingests until the search ends.
+        """Propose, run and ingest until the search ends.
 
         Args:
-            trials: at most so many now; None: until the search ends.
-            progress: told what is being done.
-            each: given every candidate with its trial, once that is stored.
+            trials: maximum number of trials in this call; None: until the search ends.
+            progress: called with a description of each step.
+            each: called with every candidate and its trial, once that is stored.
         """
         from grounded_trials.workspace.looping import learn_in
 
         return learn_in(self._afresh(), trials, progress, each)
 
     def status(self) -> Status:
-        """Where the search stands; nothing is written."""
+        """Return the state of the search; writes nothing."""
         from grounded_trials.workspace.proposing import standing_in, status_of
 
         return status_of(self._afresh(), standing_in(self, ahead=True))
@@ -206,17 +208,17 @@ class Workspace(Folder):
         engine: Engine | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> Fitted:
-        """Estimates the model's parameters from all trials, their instruments corrected first.
+        """Estimate the model's parameters from all trials, after correcting sensor errors.
 
         Args:
-            params: only these; None: all of them.
-            latency: fit one transport delay of all inputs too.
+            params: names of the parameters to fit; None: all.
+            latency: also fit one transport delay, common to all inputs.
             apply: write the values to grounded.toml.
-            engine: workers for the trials' likelihoods; the same comes out on any number.
-            progress: told of the stage, the share done and the time left.
+            engine: workers for the trials' likelihoods; their number does not change the result.
+            progress: called with the stage, the share done and the time left.
 
         Raises:
-            GroundedError: if they should be written and predict held-out time worse.
+            GroundedError: with `apply`, if the fitted values predict held-out data worse.
         """
         from grounded_trials.workspace.fitting import fit_in
 
@@ -237,17 +239,19 @@ class Workspace(Folder):
         engine: Engine | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> Diagnosis:
-        """Explains the gap between model and trials; keeps reports/diagnosis.json.
+        """Explain the gap between model and trials; writes reports/diagnosis.json.
 
         Args:
-            trials: short names, t0007; none: all that can be used.
-            max_effects: blame at most so many at once; None: 3, and more where those leave a gap.
-            without: families not to blame.
-            compare: a second group of trials; what changed from the first is `changed`.
-            probe: write the most instructive candidate also where nothing ties.
-            engine: workers that fit hypotheses; the same comes out on any number.
-            library: the effects that may be blamed; None: those that are installed.
-            progress: told of each stage.
+            trials: short names such as t0007; empty: all usable trials.
+            max_effects: largest number of effects in one hypothesis; None: 3, and more if those
+                leave a gap.
+            without: effect families to exclude.
+            compare: a second group of trials; the result's `changed` lists what differs from the
+                first group.
+            probe: write the most informative probe even if no two explanations tie.
+            engine: workers that fit hypotheses; their number does not change the result.
+            library: the effects to consider; None: the installed ones.
+            progress: called with each stage.
         """
         from grounded_trials.workspace.adopted import installed_effects
         from grounded_trials.workspace.diagnosing import diagnose_in
@@ -265,17 +269,17 @@ class Workspace(Folder):
         )
 
     def preflight(self, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
-        """Judges the instruments of some trials, or all, from their own signals: late, scaled."""
+        """Check the sensors of some or all trials for delays and scale errors, from their data."""
         from grounded_trials.workspace.diagnosing import instruments_in
 
         return instruments_in(self._afresh(), trials)
 
     def adopt(self, *effects: str, parameters: bool = True) -> Adopted:
-        """Adds effects of the last diagnosis to the model of grounded.toml.
+        """Add effects of the last diagnosis to the model in grounded.toml.
 
         Args:
-            effects: `family:target`; those that were claimed together, or one alone.
-            parameters: take over the model's own parameters that were calibrated beside them.
+            effects: `family:target` names of effects that were claimed together, or of one effect.
+            parameters: also take over the model parameters that were calibrated together with them.
         """
         from grounded_trials.workspace.adopting import adopt_effects
 
@@ -284,7 +288,7 @@ class Workspace(Folder):
         return done
 
     def undo_adoption(self) -> Undone:
-        """Gives the model of grounded.toml what it had before the last `adopt`: effects, params."""
+        """Undo the last `adopt`: restore the effects and params of grounded.toml."""
         from grounded_trials.workspace.adopting import undo_adoption
 
         done = undo_adoption(self._afresh())
@@ -292,17 +296,17 @@ class Workspace(Folder):
         return done
 
     def report(self, *, html: bool = False, png: bool = False, rrd: bool = False) -> Report:
-        """Utilities, trajectories, bias and gap of all stored trials.
+        """Report utilities, trajectories, model bias and gap of all stored trials.
 
-        A damaged or missing file is left out, and named in `findings.lost`.
+        A damaged or missing file is left out and listed in `findings.lost`.
 
         Args:
-            html: write reports/report.html, and layouts for Foxglove and PlotJuggler beside it.
-            png: write its figures, reports/*.png.
+            html: write reports/report.html, and layouts for Foxglove and PlotJuggler.
+            png: write the figures of the page as reports/*.png.
             rrd: write reports/recording.rrd for the Rerun viewer, and the layouts.
 
         Raises:
-            GroundedError: if an extra is missing that one of them needs; nothing is written then.
+            GroundedError: if an extra that one of them needs is missing; nothing is written then.
         """
         from grounded_trials.report.reporting import report_in
 
@@ -311,14 +315,14 @@ class Workspace(Folder):
     def watch(
         self, *, every: float = 1.0, trouble: Callable[[GroundedError], None] = lambda error: None
     ) -> Iterator[Report]:
-        """Keeps reports/report.html current while trials come in; open in a browser, it reloads.
+        """Rewrite reports/report.html whenever its files change; an open page reloads itself.
 
         Args:
-            every: how often the files are looked at [s].
-            trouble: told what keeps the page from being written for now.
+            every: polling interval [s].
+            trouble: called with each error that keeps the page from being written.
 
         Yields:
-            A report each time that the page was written; it ends when it is no longer asked.
+            A report each time the page has been written. The iterator never ends by itself.
 
         Raises:
             GroundedError: if the extra `report` is missing.
@@ -338,16 +342,17 @@ class Workspace(Folder):
         runner: bool = False,
         anyway: bool = False,
     ) -> Exported:
-        """Writes a candidate for other languages; refused as in `run`, an earlier task's is not.
+        """Export a candidate for other languages, or a trial or predicted run for viewing.
 
-        A trial, or the run that a candidate predicts (form "bag"), is written to be looked at.
+        Candidates are refused as in `run`, except that one of an earlier task is allowed. A trial,
+        or a candidate with form "bag", is exported as a recorded or predicted run.
 
         Args:
             candidate: c0003, `best`, or a trial, t0007.
             path: the file; None: named after the candidate, in the current folder.
-            form: csv, json or npz, of a run bag, csv or npz; None: as the file is named.
-            runner: npz, and beside it the program that runs it on a robot with numpy alone.
-            anyway: write it though it is void.
+            form: csv, json or npz; for a run bag, csv or npz; None: by the file's suffix.
+            runner: write npz, and beside it the program that runs it on a robot with only numpy.
+            anyway: write it although it is void.
         """
         from grounded_trials.workspace.exporting import export_candidate
 
@@ -359,40 +364,40 @@ class Workspace(Folder):
         return export_candidate(here, candidate, form, file, runner=runner, anyway=anyway)
 
     def verify(self) -> Verified:
-        """Checks everything that is kept: what was changed, damaged, deleted or put in its place.
+        """Check all stored files for changes, damage, deletion and replacement.
 
-        Trials and notes against their hashes, and whether all are there that were stored;
-        candidates against their checksums, what was handed out under their names and what they
-        predict; the last diagnosis and the optimum against their checksums.
+        Trials and notes are checked against their hashes and for completeness; candidates against
+        their checksums, the records of what was handed out, and their predictions; the last
+        diagnosis and the optimum against their checksums.
         """
         from grounded_trials.workspace.verifying import verify_in
 
         return verify_in(self._afresh())
 
     def discard(self, *trials: str, why: str = "") -> SetAside:
-        """Sets trials aside: search, fit, diagnosis and report leave them out; nothing is deleted.
+        """Exclude trials from search, fit, diagnosis and report; nothing is deleted.
 
         Args:
-            trials: short names, t0004.
-            why: kept with it, for who asks later.
+            trials: short names such as t0004.
+            why: the reason, stored with the note.
         """
         from grounded_trials.workspace.identity import set_aside
 
         return set_aside(self._afresh(), "discard", trials, why)
 
     def restore(self, *trials: str) -> SetAside:
-        """Takes back what `discard` did."""
+        """Undo `discard` for some trials."""
         from grounded_trials.workspace.identity import set_aside
 
         return set_aside(self._afresh(), "restore", trials, "")
 
     def inspect(self, log: str | Path) -> Inspected:
-        """Shows what a log holds, and guesses a [log] table for this workspace's model."""
+        """List the signals of a log, and guess a [log] table for this workspace's model."""
         from grounded_trials.workspace.inspecting import inspect_in
 
         return inspect_in(self._afresh(), log)
 
     def _afresh(self) -> Self:
-        """The folder as it is now: what was read for an earlier call may have been changed."""
+        """Drop cached contents and return self: files may have changed since the last call."""
         self.forget()
         return self

@@ -1,7 +1,6 @@
-"""Opening files that somebody else may have put there: regular ones, of a size that makes sense.
+"""Opens files that somebody else may have put there: regular files up to a size limit.
 
-A pipe would be waited for, a device has no end. Either is refused at once, whatever was to be read
-from it.
+Reading a pipe would block and a device has no end, so both are refused at once.
 """
 
 from __future__ import annotations
@@ -15,18 +14,18 @@ from grounded.errors import GroundedError
 
 
 def open_file(path: Path, *, follow: bool = True) -> BinaryIO:
-    """Opens a regular file for reading, without waiting for it.
+    """Open a regular file for reading, without blocking.
 
     Args:
         path: the file.
-        follow: it may be a link.
+        follow: whether symbolic links are followed; False refuses them.
 
     Raises:
-        GroundedError: if it is something else: a pipe, a device, a socket, a link.
+        GroundedError: if it is a pipe, a device, a socket, or a link that must not be followed.
         OSError: as `open`.
     """
     if not follow and path.is_symlink():
-        raise GroundedError(f"{path} is a link, expected a file: it may lead anywhere")
+        raise GroundedError(f"{path} is a link, expected a regular file: links are not followed")
     links = 0 if follow else os.O_NOFOLLOW
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | links)
     try:
@@ -35,7 +34,7 @@ def open_file(path: Path, *, follow: bool = True) -> BinaryIO:
             raise IsADirectoryError(21, "Is a directory", str(path))
         if not stat.S_ISREG(mode):
             what = "a pipe" if stat.S_ISFIFO(mode) else "a device"
-            raise GroundedError(f"{path} is {what}, not a file: save what comes from it first")
+            raise GroundedError(f"{path} is {what}, not a file: save its contents to a file first")
         return os.fdopen(descriptor, "rb")
     except BaseException:
         os.close(descriptor)
@@ -43,7 +42,7 @@ def open_file(path: Path, *, follow: bool = True) -> BinaryIO:
 
 
 def read_file(path: Path, limit: int) -> bytes:
-    """The bytes of a regular file.
+    """Return the bytes of a regular file.
 
     Raises:
         GroundedError: if it is missing, unreadable, or larger than `limit` bytes.
@@ -56,5 +55,5 @@ def read_file(path: Path, limit: int) -> bytes:
     except OSError as error:
         raise GroundedError(f"{path} can't be read: {error.strerror}") from None
     if len(data) > limit:
-        raise GroundedError(f"{path} is larger than {limit} bytes: expected no such file here")
+        raise GroundedError(f"{path} is larger than {limit} bytes, the limit for such a file")
     return data

@@ -1,6 +1,6 @@
-"""A TOML table that is taken apart key by key: what is left over is a mistake of the user's.
+"""Reads a TOML table key by key and reports every key that nothing asked for.
 
-Every complaint names the file, the key with its table, what was found, and what would be right.
+Every error names the file, the key with its table, what was found, and what was expected.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _REQUIRED = object()
 class Table:
     """One table of a TOML file; `where` is its dotted name, "" for the whole file.
 
-    It stays whole: what was taken can be taken again, as for the second of two logs.
+    Taking a key does not remove it: it can be taken again, for example for a second log.
     """
 
     def __init__(self, values: Mapping[str, Any], file: Path, where: str = "") -> None:
@@ -33,27 +33,27 @@ class Table:
         self.file, self.where = file, where
 
     def error(self, key: str, text: str) -> GroundedError:
-        """A complaint about one key."""
+        """Return an error about one key."""
         name = f"[{self.where}] {key}" if self.where else key
         return GroundedError(f"{self.file.name}: {name}: {text}")
 
     def expect(self, *names: str) -> None:
-        """Complains about a key that is none of these, before a missing one is complained about."""
+        """Raise an error for a key that is not among `names`; called before any key is taken."""
         for key in self._values:
             if key not in names:
                 raise self.error(key, f"is not known here: {nearest(key, names)}")
 
     def has(self, key: str) -> bool:
-        """Whether the key is there."""
+        """Return whether the key is present."""
         self._known.add(key)
         return key in self._values
 
     def peek(self, key: str) -> Any:
-        """The value of a key as it stands, None when it is not there."""
+        """Return the unchecked value of a key, None if it is absent."""
         return self._values.get(key)
 
     def take(self, key: str, kind: type, default: Any = _REQUIRED) -> Any:
-        """The value of a key, checked to be of a kind; a whole number does for a number."""
+        """Return the value of a key, checked to be of `kind`; an integer is accepted as a float."""
         self._known.add(key)
         if key not in self._values:
             if default is _REQUIRED:
@@ -75,7 +75,7 @@ class Table:
         return value
 
     def choice(self, key: str, options: Iterable[str], default: Any = _REQUIRED) -> str:
-        """A text that is one of the options."""
+        """Return the text of a key, which must be one of the options."""
         value: str = self.take(key, str, default)
         names = list(options)
         if value not in names:
@@ -83,7 +83,7 @@ class Table:
         return value
 
     def sub(self, key: str) -> Table:
-        """The table under a key, empty when it is not there."""
+        """Return the table under a key, empty if it is absent."""
         self._known.add(key)
         self._taken.add(key)
         value = self._values.get(key, {})
@@ -92,18 +92,18 @@ class Table:
         return Table(value, self.file, f"{self.where}.{key}" if self.where else key)
 
     def numbers(self, key: str, names: Iterable[str]) -> dict[str, float]:
-        """A table name -> number under a key, whose names must be among `names`."""
+        """Return the table name -> number under a key; its names must be among `names`."""
         table, valid = self.sub(key), list(names)
         found = {name: table.take(name, float) for name in valid if table.has(name)}
         table.finish(valid)
         return found
 
     def all_numbers(self) -> dict[str, float]:
-        """This table as name -> number, whatever the names."""
+        """Return this table as name -> number, with any names."""
         return {name: self.take(name, float) for name in self.names()}
 
     def pairs(self, names: Iterable[str]) -> dict[str, tuple[float, float]]:
-        """This table as name -> [low, high]."""
+        """Return this table as name -> (low, high); its names must be among `names`."""
         valid, found = list(names), {}
         for name in valid:
             if self.has(name):
@@ -116,21 +116,22 @@ class Table:
         return found
 
     def names(self) -> list[str]:
-        """All keys."""
+        """Return all keys."""
         return list(self._values)
 
     def finish(self, valid: Iterable[str] | None = None) -> None:
-        """Complains about a key that nobody took."""
+        """Raise an error for a key that was not taken; suggests one of the `valid` names."""
         for key in self._values.keys() - self._taken:
             known = self._known if valid is None else valid
             raise self.error(key, f"is not known here: {nearest(key, sorted(known))}")
 
 
 def read_toml(path: Path) -> Table:
-    """A TOML file as a table.
+    """Read a TOML file as a table.
 
     Raises:
-        GroundedError: if it isn't there, can't be read, or isn't TOML (with line and column).
+        GroundedError: if it does not exist, can't be read, or is not valid TOML (with line and
+            column).
     """
     import tomllib
 
@@ -163,5 +164,5 @@ def read_toml(path: Path) -> Table:
 
 
 def key(name: str) -> str:
-    """A name as a key of a TOML file: quoted where it has other letters than ASCII's."""
+    """Return a name as a key of a TOML file, quoted if it is not a bare key."""
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name, ensure_ascii=False)

@@ -1,4 +1,4 @@
-"""Numbers, units and verdicts in words for people."""
+"""Formats numbers, units and commands for people."""
 
 from __future__ import annotations
 
@@ -19,35 +19,36 @@ if TYPE_CHECKING:
     from grounded.errors import NextCommand
 
 ITERATION = (
-    "iter.: improvements that a candidate builds on; it falls where the search goes back to "
+    "iter.: improvements that a candidate builds on; it decreases where the search returns to "
     "an earlier one"
 )
-PIECES = 4  # of a list of trials that are named
-NARROW, WIDE = 60, 80  # columns: what every line can do with, and what a reader likes at most
-MARKS = "\ufdd0\ufdd1\ufdd2\ufdd3\ufdd4"  # of colours in a text: they take no column
-_WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")  # of a command; what is quoted stays whole
+PIECES = 4  # largest number of ranges that a list of trials names
+NARROW, WIDE = 60, 80  # columns: smallest and largest line width
+MARKS = "\ufdd0\ufdd1\ufdd2\ufdd3\ufdd4"  # colour marks in a text, of zero width
+_WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")  # a word of a command; quotes stay together
 _GLUE = re.compile(
     r"(?<=[<>]) (?=[\d.-])| (?=[<>] )| (?=-> )| (?=%)"
     r"| (?=(?:\+-|±) )|(?<= (?:\+-)) |(?<= ±) |^ |(?<=^[ *]) "
     r"|(?<=\d) (?=(?:[mµc]?(?:m|s|rad)|deg|kg|N|Nm|V|A|Hz|nats)\b)| (?=[+-]\d[\d.]* %)"
     r"|(?<=noise:) |(?<=\bN) (?=m\b)|(?<=\bN m) (?=s\b)"
-)  # blanks where no line is broken
+)  # blanks at which a line must not be broken
 
 
 def columns() -> int:
-    """How wide a line is: the terminal's width (or COLUMNS) from 60 to 80; 80 in a file."""
+    """Return the line width: that of the terminal (or COLUMNS), 60 to 80; 80 in a file."""
     return min(max(shutil.get_terminal_size((WIDE, 24)).columns, NARROW), WIDE)
 
 
 def count(number: int, word: str, many: str = "") -> str:
-    """`1 trial`, `2 trials`; `many` where the plural is another one."""
+    """Return `1 trial`, `2 trials`; `many` is an irregular plural."""
     return f"{number} {word if number == 1 else many or word + 's'}"
 
 
 def ranges(names: Sequence[str]) -> str:
-    """`t0001, t0007 to t0016`: names in order, those that follow each other as a range.
+    """Return `t0001, t0007 to t0016`: names in order, consecutive ones as a range.
 
-    Of many pieces the ends, and how many are not among them.
+    More than `PIECES` ranges become the first and last name and the number of names missing
+    between them.
     """
     digits = [name[1:] for name in names]
     if not all(map(str.isdecimal, digits)):
@@ -61,12 +62,12 @@ def ranges(names: Sequence[str]) -> str:
 
 
 def changed(name: str, old: float, new: float, unit: str) -> str:
-    """`m 1.00 -> 1.30 kg`, in as many digits as tell the two apart."""
+    """Return `m 1.00 -> 1.30 kg`, with enough digits to distinguish the two values."""
     return with_unit(f"{name} {' -> '.join(in_digits_apart(old, new))}", unit)
 
 
 def in_digits_apart(one: float, other: float) -> tuple[str, str]:
-    """Two numbers in as many digits, three or more, as tell them apart."""
+    """Format two numbers with enough digits to distinguish them, at least three."""
     for digits in range(3, 9):
         if float(f"{one:.{digits}g}") != float(f"{other:.{digits}g}"):
             return figure(one, digits), figure(other, digits)
@@ -74,48 +75,48 @@ def in_digits_apart(one: float, other: float) -> tuple[str, str]:
 
 
 def legend(text: str, iterations: Sequence[int]) -> str:
-    """What a table's columns mean; why iterations fall, where they do."""
+    """Return a table's legend; explains `iter.` if the iterations decrease anywhere."""
     falls = any(b < a for a, b in pairwise(iterations))
     return "; ".join(part for part in (text, ITERATION * falls) if part)
 
 
 def labelled(name: str, unit: str) -> str:
-    """`v [m/s]`; the name alone where there is no unit."""
+    """Return `v [m/s]`, or the name alone if there is no unit."""
     return f"{name} [{unit}]" if shown(unit) else name
 
 
 def per_second(unit: str) -> str:
-    """The unit of a rate of change: rad/s of rad, m/s^2 of m/s."""
+    """Return the unit of a rate of change: rad/s for rad, m/s^2 for m/s."""
     if found := re.fullmatch(r"(.*)/s(?:\^(\d))?", unit):
         return f"{found[1]}/s^{int(found[2] or 1) + 1}"
     return f"{unit} per s" if set(unit) & set("/ ") else f"{unit}/s"
 
 
 def wrapped(text: str, first: str, rest: str) -> list[str]:
-    """Lines of a terminal's width, the first and the others begun as said."""
+    """Wrap a text to the terminal's width; `first` and `rest` are the lines' indents."""
     wrapper = TextWrapper(columns(), initial_indent=first, subsequent_indent=rest)
     wrapper.break_on_hyphens = wrapper.break_long_words = False
     return [line.replace("\xa0", " ") for line in wrapper.wrap(glued(text))]
 
 
 def glued(text: str) -> str:
-    """Text whose numbers keep their %, unit, bound and spread when lines are broken."""
+    """Join numbers with their %, unit, bound and spread by blanks at which no line is broken."""
     return _GLUE.sub("\xa0", text)
 
 
 def rendered(then: NextCommand, folder: str | None = None) -> str:
-    """A command as a shell takes it: `grounded run c0003`, with `-C DIR` where a folder is given.
+    """Return a command for the shell: `grounded run c0003`, with `-C DIR` if a folder is given.
 
     Args:
         then: the command as data.
-        folder: the workspace as the user named it, None where it is the current folder.
+        folder: the workspace as the user named it, None for the current folder.
     """
     words = ["grounded", *(["-C", folder] if folder is not None else []), then.verb]
     return shlex.join([*words, *then.arguments])
 
 
 def folded(command: str, lead: str = "next: ") -> str:
-    """A command after its lead, broken as a shell allows where it is wider than a terminal."""
+    """Return a command after its lead, continued with a backslash if wider than the terminal."""
     lines = [lead]
     for word in _WORD.findall(command):
         if len(lines[-1]) + len(word) + 3 > columns() and lines[-1].strip():

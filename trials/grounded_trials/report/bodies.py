@@ -1,15 +1,15 @@
-"""Bodies: what a robot looks like in each of its states, from the roles of its model.
+"""Bodies: the shape and pose of a robot in each state, from the roles of its model.
 
     position                    a car from above, or an aircraft, along its path
-    hanging, upright, level     links in a vertical plane, one on the other: the angles of their
-                                joints, the first of which is zero downwards, upwards, along x
-    rail                        the place of a carriage that such links stand on
-    altitude, without position  a cabin that goes up and down
+    hanging, upright, level     a chain of links in a vertical plane: the angles of their joints,
+                                where the first is zero downwards, upwards, or along x
+    rail                        the position of a carriage that carries the links
+    altitude, without position  a cabin that moves up and down
     a MuJoCo model              the geometry of its file
-    nothing of these            a dot in the plane of the first two states
+    none of these               a dot in the plane of the first two states
 
-Links are as long as the parameters l1, l2 ..., or l, L or length, say in m; the only link as the
-only parameter in m, whatever its name. Else their lengths aren't known: they are drawn alike.
+The lengths of links are the parameters l1, l2 ..., or l, L or length, in m. A single link takes the
+only parameter in m, whatever its name. If the lengths are unknown, links have equal length.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ AIRCRAFT = (
     [(-0.4, 0, 0), (-0.65, 0, 0.25), (-0.6, 0, 0)],
 )
 ZEROS = {"hanging": (-np.pi / 2, 1), "upright": (np.pi / 2, -1), "level": (0.0, 1)}
-LENGTH = 0.07  # of the paths' size: a body that has no length of its own
-SLIM = 0.06  # of a link's length: its radius
-CARRIAGE = (0.25, 0.12, 0.1)  # of the links' length: half its edges, where it travels far
+LENGTH = 0.07  # size of a body of unknown length, as a fraction of the paths' size
+SLIM = 0.06  # radius of a link, as a fraction of the longest link
+CARRIAGE = (0.25, 0.12, 0.1)  # half edges of the carriage, as fractions of the links' length
 
 
 def body_in(findings: Findings) -> Body:
-    """The body of a workspace's model, of a length that can be seen beside the path."""
+    """Return the body of a workspace's model, in a size that is visible next to the path."""
     model = findings.task.model
     scene, shown = scene_of(model), findings.runs or findings.logs
     points = scene.finite(shown[0].trial.states if shown else findings.task.target)
@@ -51,14 +51,14 @@ def body_in(findings: Findings) -> Body:
 
 
 def body_of(model: Model, scene: Scene, size: float) -> Body:
-    """The body of a model.
+    """Return the body of a model.
 
     Args:
-        model: its roles and parameters are used.
-        scene: where it stands.
-        size: the length of a body that has none of its own.
+        model: provides roles and parameters.
+        scene: the position and orientation of the body.
+        size: length of a body of unknown length.
     """
-    own: Body | None = getattr(model.step, "body", None)  # an adapter's
+    own: Body | None = getattr(model.step, "body", None)  # provided by an adapter
     if own is not None:
         return own
     for role, (zero, sign) in ZEROS.items():
@@ -75,7 +75,7 @@ def body_of(model: Model, scene: Scene, size: float) -> Body:
 
 
 def is_mechanism(body: Body) -> bool:
-    """Whether it is seen from the side, as it stands; else it is a mark along a path."""
+    """Return whether a body is drawn from the side; otherwise it is a mark along a path."""
     return not isinstance(body, Vehicle)
 
 
@@ -86,7 +86,7 @@ def _columns(model: Model, role: str) -> tuple[int, ...]:
 
 
 def _lengths(model: Model, count: int) -> tuple[float, ...]:
-    """Of the links [m], zero where the model has none."""
+    """Return the lengths of the links [m], 0 where unknown."""
     metres = {name.lower(): p.value for name, p in model.params.items() if p.unit == "m"}
     shared = metres.get("l", metres.get("length", 0.0))
     if len(metres) == count == 1:
@@ -104,43 +104,43 @@ class Vehicle:
 
     @property
     def unit(self) -> str:
-        """Of the first axis."""
+        """The unit of the first axis."""
         return self.scene.units[0]
 
     @property
     def parts(self) -> Sequence[Part]:
-        """One."""
+        """The single part."""
         if not self.scene.spatial:
             return (Part("", "dot"),)
         drawn = AIRCRAFT if self.scene.volume else CAR
         return (Part("", "lines", strips=tuple(self.size * np.array(s) for s in drawn)),)
 
     def poses(self, states: Array) -> list[Pose]:
-        """At the position, turned as the heading or the attitude says."""
+        """Return the pose given by position, and heading or attitude."""
         return [(self.scene.points(states), self.scene.rotations(states))]
 
     def path(self, states: Array) -> Array:
-        """The position."""
+        """Return the positions (T, 3)."""
         return self.scene.points(states)
 
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """Links in the plane of x and z, one on the other, perhaps on a carriage along x."""
+    """A chain of links in the plane of x and z, optionally on a carriage along x."""
 
-    angles: tuple[int, ...]  # states
+    angles: tuple[int, ...]  # indices of the states
     lengths: tuple[float, ...]
-    zero: float  # [rad] from x towards z, where the first angle is zero
+    zero: float  # [rad] direction of the first link at angle zero, from x towards z
     sign: int
     unit: str
-    rail: tuple[int, ...] = ()  # a state, or none
-    wide: float = CARRIAGE[0]  # of the carriage, half
+    rail: tuple[int, ...] = ()  # index of the carriage's state, or empty
+    wide: float = CARRIAGE[0]  # half width of the carriage
 
     @property
     def watched(self) -> str:
         """The end of the last link."""
         hangs = self.rail and (self.zero, self.sign) == ZEROS["hanging"]
-        return "the load, the end of what hangs" if hangs else "the tip"
+        return "the load, at the end of the last link" if hangs else "the tip"
 
     @property
     def parts(self) -> Sequence[Part]:
@@ -153,7 +153,7 @@ class Links:
         return links + [Part("carriage", "box", size)] * bool(self.rail)
 
     def poses(self, states: Array) -> list[Pose]:
-        """Of each link at its joint, z along it."""
+        """Return the pose of each link at its joint, with z along the link, then the carriage's."""
         joints, along = self._chain(states)
         found: list[Pose] = []
         for joint, angle in zip(joints, along, strict=False):
@@ -165,11 +165,11 @@ class Links:
         return found + [(joints[0], still)] * bool(self.rail)
 
     def path(self, states: Array) -> Array:
-        """The tip."""
+        """Return the positions of the tip (T, 3)."""
         return self._chain(states)[0][-1]
 
     def _chain(self, states: Array) -> tuple[list[Array], list[Array]]:
-        """Where the joints and the tip are (T, 3), and each link's angle from x towards z (T,)."""
+        """Return positions of joints and tip (T, 3), and each link's angle from x to z (T,)."""
         base = np.zeros((len(states), 3))
         if self.rail:
             base[:, 0] = states[:, self.rail[0]]
@@ -183,9 +183,9 @@ class Links:
 
 @dataclass(frozen=True, eq=False)
 class Cabin:
-    """What goes up and down."""
+    """A cabin that moves up and down."""
 
-    height: int  # a state
+    height: int  # index of the state
     size: float
     unit: str
     watched = "its middle"
@@ -196,18 +196,18 @@ class Cabin:
         return (Part("cabin", "box", (self.size, self.size, 1.4 * self.size)),)
 
     def poses(self, states: Array) -> list[Pose]:
-        """At its height."""
+        """Return its pose at its height."""
         return [(self.path(states), np.tile(np.eye(3), (len(states), 1, 1)))]
 
     def path(self, states: Array) -> Array:
-        """Its middle."""
+        """Return the positions of its middle (T, 3)."""
         found = np.zeros((len(states), 3))
         found[:, 2] = states[:, self.height]
         return found
 
 
 def reach(body: Body, states: Array) -> Array:
-    """Points (k, 3) that a body reaches in those of some states that are known."""
+    """Return points (k, 3) that a body reaches in the finite ones of some states."""
     path = body.path(states)
     known = states[np.isfinite(path).all(axis=1)]
     filled = np.where(np.isfinite(known), known, 0.0)

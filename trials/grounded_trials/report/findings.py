@@ -1,6 +1,6 @@
-"""Findings: all that a report shows, read once, in the words in which it is shown.
+"""Findings: all contents of a report, read once.
 
-Text, page, pictures and recording are four ways to show the same findings; none reads a file.
+Text, page, pictures and recording show the same findings and read no files themselves.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.adopted import Better
 
 One = TypeVar("One")
-SHOWN = 4  # numbers of what improved
-AT_END = "at the end: "  # of what is to be reached, the first group is always told
-MOVED = 0.02  # of what the utility gained: a number that moved it less is left out
-WORSE = 1.05  # times the first trial's error, from which it is said that it rose
+SHOWN = 4  # largest number of rows of improvements
+AT_END = "at the end: "  # label of errors of the last state
+MOVED = 0.02  # share of the change in cost below which a row is left out
+WORSE = 1.05  # ratio to the first trial's error above which a row is reported as worse
 TERMS = {  # tables of [reward]
     "state": "states, along the way",
     "terminal": "states, at the end",
@@ -48,18 +48,18 @@ TERMS = {  # tables of [reward]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A trial, what the crude model lacks along it, and what had been predicted."""
+    """A trial of a candidate, with the crude model's residual along it."""
 
     trial: Trial  # .id is its short name
     candidate: Candidate
     accepted: bool | None
     utility: float
     residual: Array  # (T, n): s_{t+1} - f(s_t, a_t) of the crude model; NaN where not finite
-    explained: Array | None = None  # (T, n): the same of the better model
+    explained: Array | None = None  # (T, n): the residual of the better model
 
     @property
     def label(self) -> str:
-        """For a legend: t0007 (c0005)."""
+        """The name in legends: t0007 (c0005)."""
         return f"{self.trial.id} ({self.candidate.id})" if self.trial.id else self.candidate.id
 
 
@@ -73,46 +73,46 @@ class Log:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """A workspace as a report shows it; `lost` says what could not be shown."""
+    """The contents of a workspace's report; `lost` lists what could not be read."""
 
     name: str
-    task: Task  # with the crude model, which judges and is measured; effects are named beside it
+    task: Task  # with the crude model, whose errors are shown; `effects` are not part of it
     nominal: Mapping[str, float]  # parameters as model.py has them, before [model] params
-    effects: tuple[str, ...]  # adopted
-    method: str  # the [search] table in a few words
+    effects: tuple[str, ...]  # adopted effects
+    method: str  # summary of the [search] table
     standing: Standing
     runs: tuple[Run, ...]  # trials of this task's candidates, in order of arrival; see `left_runs`
-    logs: tuple[Log, ...]  # data of this robot that ran no candidate; the latest of many
+    logs: tuple[Log, ...]  # logs of this robot that ran no candidate; the latest of many
     others: int  # stored trials of earlier tasks or other robots
     lost: tuple[Lost, ...]
     diagnosis: Diagnosis | None
-    optimum: float | None  # of the real system, where a study computed it
+    optimum: float | None  # of the real system, if a study computed it
     then: NextCommand
     better: Better | None = None  # the model as diagnosed, or with adopted effects
-    since: Since = field(default_factory=Since)  # the diagnosis
+    since: Since = field(default_factory=Since)  # changes since the diagnosis
     settled: Settled | None = None  # what was adopted, and what it gained
     discarded: tuple[str, ...] = ()  # trials that were set aside
-    uncounted: tuple[str, ...] = ()  # of this model, that ran another task or a probe: data alone
-    left_runs: int = 0  # that are counted, but not read: there are too many to show
-    left_logs: int = 0
-    folder: str | None = None  # as the user named it, None where it is the current one
+    uncounted: tuple[str, ...] = ()  # trials of another task or a probe, used only as data
+    left_runs: int = 0  # runs that were not read, since there are too many
+    left_logs: int = 0  # logs that were not read
+    folder: str | None = None  # as the user named it, None for the current folder
 
     @property
     def next_command(self) -> str:
-        """What to type next, where the workspace was named."""
+        """The next command, with the workspace as the user named it."""
         return rendered(self.then, self.folder)
 
     @property
     def next_trial(self) -> str:
-        """What the last diagnosis asks for; "" once it is not the last word, see `Since`."""
+        """The trial that the last diagnosis asks for; "" if it is outdated, see `Since`."""
         fresh = self.diagnosis is not None and not self.since.sentence
         return self.diagnosis.next_trial if self.diagnosis is not None and fresh else ""
 
     @property
     def ahead_s(self) -> float:
-        """How far ahead errors are shown [s]: a second, or as far as the diagnosis judged by.
+        """Horizon of the prediction errors shown [s]: a second, or less if the diagnosis used less.
 
-        What falls over by itself is told by no model a second ahead.
+        A diagnosis uses shorter horizons for unstable systems, which can't be predicted for long.
         """
         rows = () if self.diagnosis is None else self.diagnosis.prediction_error
         row = furthest(rows)
@@ -125,14 +125,14 @@ class Findings:
 
     @property
     def plain(self) -> str:
-        """What the model is called that judges: no effect that was adopted is in it."""
+        """The name of the task's model, which contains no adopted effects."""
         changed = any(self.values[name] != value for name, value in self.nominal.items())
         model = "calibrated model" if changed else "model" if self.effects else "crude model"
         return f"{model} without adopted effects" if self.effects else model
 
     @property
     def values(self) -> dict[str, float]:
-        """The model's parameters as they are now, by name."""
+        """The model's current parameters, by name."""
         return {name: param.value for name, param in self.task.model.params.items()}
 
     @property
@@ -141,35 +141,35 @@ class Findings:
         return self.standing.history
 
     def runs_of(self, candidate: str) -> tuple[Run, ...]:
-        """The runs of a candidate."""
+        """Return the runs of a candidate."""
         return tuple(r for r in self.runs if r.candidate.id == candidate)
 
     @cached_property
     def first(self) -> Run | None:
-        """The model's own policy on the real system: the first candidate that has a trial."""
+        """The run of the model's own policy, if that is the first candidate with a trial."""
         run = next((t for t in self.history if t.trials), None)
         return None if run is None or run.candidate.base else self._mean(run.candidate.id)
 
     @cached_property
     def best(self) -> Run | None:
-        """The best candidate so far; several trials of it are averaged."""
+        """The run of the best candidate so far; several trials of it are averaged."""
         best = self.standing.incumbent
         return None if best is None else self._mean(best.candidate.id)
 
     @cached_property
     def latest(self) -> Run | None:
-        """The last trial that came back."""
+        """The last run."""
         return self.runs[-1] if self.runs else None
 
     @cached_property
     def lately(self) -> Run | None:
-        """A single trial, the best candidate's latest: a model replays no mean of several."""
+        """The latest run of the best candidate, else the latest run; unlike `best`, no average."""
         best = self.best and self.runs_of(self.best.candidate.id)[-1]
         return best or self.latest
 
     @cached_property
     def improvements(self) -> tuple[Run, ...]:
-        """The accepted candidates, by iteration: the model's policy, then each better one."""
+        """The runs of the accepted candidates, by iteration, starting with the model's policy."""
         found = [self._mean(t.candidate.id) for t in self.history if t.accepted]
         return tuple(run for run in found if run is not None)
 
@@ -192,7 +192,7 @@ class Findings:
 
 
 def compared(findings: Findings) -> list[tuple[str, Run]]:
-    """The two runs that all views compare, by role: the model's policy and the best so far."""
+    """Return the runs that all views compare, by role: the model's policy and the best so far."""
     first, best = findings.first, findings.best
     if first is not None and best is not None and first.candidate is best.candidate:
         return [("model", first)]
@@ -201,7 +201,7 @@ def compared(findings: Findings) -> list[tuple[str, Run]]:
 
 @dataclass(frozen=True)
 class Improved:
-    """An rms error of the first trial and of the best one, in one unit; NaN before there is one."""
+    """An rms error of the first and of the best trial; `before` is NaN if there is only one."""
 
     what: str
     unit: str
@@ -215,7 +215,7 @@ class Improved:
 
     @property
     def is_same(self) -> bool:
-        """Whether both read the same, as they are told."""
+        """Whether both are equal as displayed."""
         return len(set(measured_alike((self.before, self.after), self.unit))) == 1
 
     @property
@@ -224,10 +224,10 @@ class Improved:
 
 
 def improvements_in(findings: Findings) -> list[Improved]:
-    """How far the model's own policy missed the target, and the best trial does, rms over the run.
+    """Return the rms errors from the target of the model's own policy and of the best trial.
 
-    Where the reward weighs the last state, or something is to be reached, that one too. What moved
-    the utility most comes first.
+    Errors of the last state are added if the reward weighs it, or if the target is to be reached.
+    Errors that changed the utility most come first.
     """
     task, runs, found = findings.task, compared(findings), []
     if not runs:
@@ -236,7 +236,7 @@ def improvements_in(findings: Findings) -> list[Improved]:
     short = [one.label for one in each if one.trial.finite_steps < task.horizon]
     note = f"; {', '.join(short)} ended early" if short else ""
     arrives = reaches(task)
-    worse = "; here the best trial is worse than the first, and better in other terms of the reward"
+    worse = "; here the best trial is worse than the first, but better in other terms of the reward"
     for names, what in weighed_groups(task):
         states = [task.model.state_names.index(name) for name in names]
         errors = [[e[:, states] for e in off_target(findings, r)] for _, r in runs]
@@ -262,7 +262,7 @@ def improvements_in(findings: Findings) -> list[Improved]:
 
 
 def utility_terms(findings: Findings) -> tuple[list[tuple[str, ...]], tuple[str, ...]]:
-    """(rows, header): the utility of what is compared, by the terms of the reward."""
+    """Return rows and header of the table of the compared utilities, by terms of the reward."""
     task, runs = findings.task, [run for _, run in compared(findings)]
     each = [[task.terms(one.trial) for one in findings.runs_of(run.candidate.id)] for run in runs]
     rows = [
@@ -277,7 +277,7 @@ def utility_terms(findings: Findings) -> tuple[list[tuple[str, ...]], tuple[str,
 def by_state(
     model: Model, columns: Sequence[Array], unit: Callable[[str], str] = shown
 ) -> list[tuple[str, ...]]:
-    """Rows of a table: each state's name, its unit, and its number in each column (n,)."""
+    """Return table rows: each state's name, its unit, and its number in each column (n,)."""
     return [
         (name, unit(each), *(figure(float(column[i]), 3) for column in columns))
         for i, (name, each) in enumerate(model.states.items())
@@ -285,25 +285,28 @@ def by_state(
 
 
 def prediction_error(task: Task, run: Run) -> Array:
-    """The real states minus those predicted for the same policy, (T + 1, n), angles wrapped."""
+    """Return real minus predicted states of the same candidate, (T + 1, n), angles wrapped."""
     T = run.trial.steps
     return task.model.difference(run.trial.states, run.candidate.predicted_states[: T + 1])
 
 
 def off_target(findings: Findings, run: Run) -> list[Array]:
-    """The tracking errors of each trial of a run's candidate: those of their mean are smaller."""
+    """Return the tracking errors (T + 1, n) of each trial of a run's candidate.
+
+    The errors of the averaged run would be smaller.
+    """
     runs = findings.runs_of(run.candidate.id)
     return [tracking_error(findings.task, one.trial) for one in runs]
 
 
 def off_prediction(findings: Findings, run: Run) -> list[Array]:
-    """What each trial of a run's candidate misses its prediction by."""
+    """Return the prediction errors (T + 1, n) of each trial of a run's candidate."""
     runs = findings.runs_of(run.candidate.id)
     return [prediction_error(findings.task, one) for one in runs]
 
 
 def rms(values: Array | list[Array]) -> Array:
-    """Root mean square of each column over all finite rows; NaN where there is none."""
+    """Return the root mean square of each column over its finite values; NaN if it has none."""
     values = np.vstack(values) if isinstance(values, list) else values
     finite = np.isfinite(values)
     count = finite.sum(axis=0)
@@ -314,7 +317,7 @@ def rms(values: Array | list[Array]) -> Array:
 
 
 def selection(runs: Sequence[One], most: int) -> tuple[One, ...]:
-    """At most `most` of them: the first, the last, and those between that are evenly spread."""
+    """Return at most `most` of them: the first, the last, and evenly spaced ones between."""
     if len(runs) <= most:
         return tuple(runs)
     index = np.unique(np.rint(np.linspace(0, len(runs) - 1, most)).astype(int))

@@ -1,7 +1,7 @@
-"""Forecasts: the crude model is set on the real state again and again, and runs on its own between.
+"""Forecasts: rollouts of a model along a trial, restarted from the measured state periodically.
 
-This is the gap as one feels it: started from what was measured, with the inputs that were sent,
-where is the model a second later? Every start is simulated at once.
+They show the gap between model and reality: from a measured state, with the inputs that were sent,
+where does the model predict the robot a second later? All rollouts are simulated at once.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ SECONDS = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """States (W, k + 1, n) of W windows; steps (W, k + 1) of the trial, -1 beyond its end."""
+    """W rollouts: states (W, k + 1, n) and steps of the trial (W, k + 1), -1 beyond its end."""
 
     states: Array
     steps: np.ndarray
 
     def curve(self, column: int, dt: float) -> tuple[Array, Array]:
-        """Times [s] and values of one state, windows in a row with NaN between."""
+        """Return times [s] and values of one state, with NaN between rollouts."""
         values = np.where(self.steps >= 0, self.states[:, :, column], np.nan)
         steps = np.hstack([self.steps, self.steps[:, -1:]]).reshape(-1)
         gap = np.full((len(values), 1), np.nan)
         return np.maximum.accumulate(steps) * dt, np.hstack([values, gap]).reshape(-1)
 
     def along(self, trial: Trial) -> Array:
-        """States (T + 1, n) of the trial as it was forecast; NaN where it was not.
+        """Return the forecast states (T + 1, n) along the trial; NaN where there is no forecast.
 
-        Where a window ends and the next one starts, it is the end that counts.
+        At a step where one rollout ends and the next one starts, the value is that of the end.
         """
         found = np.full_like(trial.states, np.nan)
         found[self.steps[:, 0]] = self.states[:, 0]
@@ -47,12 +47,15 @@ class Forecast:
 
 
 def forecast(planner: Planner, trial: Trial, seconds: float = SECONDS) -> Forecast | None:
-    """The planner's model along a trial, started anew every `seconds`; None for less than a step.
+    """Forecast a trial with the planner's model, restarted every `seconds`.
 
     Args:
-        planner: of the crude model, or of one with effects.
-        trial: its finite part is used.
-        seconds: between two starts.
+        planner: planner of the crude model, or of one with effects.
+        trial: the trial, of which the finite part is used.
+        seconds: time between two starts [s].
+
+    Returns:
+        The forecast; None if the trial has no complete step.
     """
     whole, n = trial.finite_steps, planner.task.model.n
     if whole < 1:
@@ -77,10 +80,10 @@ def forecast(planner: Planner, trial: Trial, seconds: float = SECONDS) -> Foreca
 
 
 def anchored(planner: Planner, trial: Trial) -> Trial:
-    """A finite trial with the planning model's memory, which keeps to the log where it can.
+    """Extend a finite trial by the planning model's memory states, without their drift.
 
-    The true value behind an old or lagging log is carried on by the model alone and drifts. What
-    the model then misses of the log is that drift: it is added to the memory.
+    The true value of a state that is logged late or with a lag follows from the model alone, and
+    drifts. The model's residual of that state is the drift, and is added to the memory.
     """
     from grounded.effects.memory import true_values
 
@@ -95,7 +98,7 @@ def anchored(planner: Planner, trial: Trial) -> Trial:
 
 
 def forecast_error(planner: Planner, trial: Trial, seconds: float = SECONDS) -> Array:
-    """Rms error (n,) at the end of whole windows; NaN where no window is whole."""
+    """Return the rms error (n,) at the end of complete rollouts; NaN if none is complete."""
     found, n = forecast(planner, trial, seconds), planner.task.model.n
     if found is None:
         return np.full(n, np.nan)

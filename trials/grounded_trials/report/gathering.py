@@ -1,7 +1,7 @@
-"""From a workspace to the findings of a report, whatever state its files are in.
+"""Reads the findings of a report from a workspace, even if some of its files are damaged.
 
-A trial that is damaged or gone is left out and named: the rest is shown all the same. Only the task
-itself (grounded.toml, model.py, target.csv) must be whole, for without it nothing has a meaning.
+A damaged or missing trial is left out and listed in `lost`; the rest is still shown. Only the task
+(grounded.toml, model.py, target.csv) must be intact.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from grounded_trials.workspace.folder import Contents, Folder, Lost
 from grounded_trials.workspace.next_step import Since, next_command, since_diagnosis
 from grounded_trials.workspace.proposing import standing_in, uncounted
 
-MOST = 200  # runs that are read; of more, the latest and those of what is compared
-LOGS = 50  # that are read, the latest
-KEPT = 5  # improvements whose runs are among them
-RUNAWAY = 1e15  # in any unit: the number of a run that diverged
+MOST = 200  # number of runs that are read: the latest, and those of compared candidates
+LOGS = 50  # number of logs that are read, the latest
+KEPT = 5  # number of improvements whose runs are always read
+RUNAWAY = 1e15  # in any unit: larger values mean that a run diverged
 
 
 def gather(workspace: Folder) -> Findings:
-    """Reads all that a report shows.
+    """Read the findings of a report.
 
     Raises:
         GroundedError: if the task can't be built.
@@ -79,7 +79,7 @@ def gather(workspace: Folder) -> Findings:
 
 
 def _shown(now: Standing, trials: list[Trial]) -> list[Trial]:
-    """The trials that are read: all, or of many the latest, and those of what is compared."""
+    """Return the trials to read: all, or of many the latest and those of compared candidates."""
     if len(trials) <= MOST:
         return trials
     compared = [t for t in now.history if t.trials][:1]
@@ -90,7 +90,7 @@ def _shown(now: Standing, trials: list[Trial]) -> list[Trial]:
 
 
 def _standing(workspace: Folder, contents: Contents) -> Standing:
-    """The standing, ended where the model sees nothing more to gain: only planning can tell."""
+    """Return the standing, by planning ahead if possible, to know whether the search has ended."""
     try:
         ahead = not workspace.config.search.refit
         return standing_in(workspace, ahead=ahead, contents=contents)
@@ -115,7 +115,7 @@ def _runs(
     for trial in trials:
         tried = by_id[trial.candidate]
         if trial.steps > task.horizon:
-            reason = f"it has {trial.steps} steps, the task has {task.horizon}: not drawn"
+            reason = f"not drawn: it has {trial.steps} steps, the task has {task.horizon}"
             lost.append(Lost(trial.id, reason))
             continue
         utility, trial = task.utility(trial), _drawable(trial)
@@ -126,7 +126,7 @@ def _runs(
 
 
 def _drawable(trial: Trial) -> Trial:
-    """A trial whose runaway numbers are NaN, as lost samples are: they can't be drawn."""
+    """Replace values beyond `RUNAWAY`, which can't be drawn, by NaN."""
     if max(np.abs(trial.states).max(initial=0.0), np.abs(trial.inputs).max(initial=0.0)) < RUNAWAY:
         return trial
     states, inputs = (
@@ -136,7 +136,7 @@ def _drawable(trial: Trial) -> Trial:
 
 
 def _residual(planner: Planner, trial: Trial) -> Array:
-    """One-step residuals of the planning model, (T, n), NaN after the last finite step."""
+    """Return one-step residuals of the planning model, (T, n), NaN after the last finite step."""
     whole, n = trial.finite_steps, planner.task.model.n
     residual = np.full((trial.steps, n), np.nan)
     if whole > 0:
@@ -154,7 +154,7 @@ def _diagnosis(workspace: Folder, lost: list[Lost]) -> Diagnosis | None:
 
 
 def known_optimum(reports: Path) -> float | None:
-    """reports/optimum.json, {"utility": U}: written by studies that know the real system."""
+    """Read the optimum from reports/optimum.json, {"utility": U}, which studies write."""
     try:
         value = float(read_document(reports / "optimum.json")["utility"])
     except (OSError, GroundedError, ValueError, KeyError, TypeError):

@@ -1,8 +1,8 @@
-"""Layouts beside the report that show a trial in Foxglove (or Lichtblick) and in PlotJuggler.
+"""Writes layouts that show a trial in Foxglove (or Lichtblick) and in PlotJuggler.
 
-Both plot each state against the prediction of the candidate that was run, and each input; Foxglove
-also shows the robot in space where a bag of standard messages is opened (`export t0007 --format
-bag`). Open the layout, then a trial from trials/ and its candidate from candidates/.
+Both plot each state and input with the prediction of the candidate that was run. Foxglove also
+shows the robot in space if a bag of standard messages is opened (`export t0007 --format bag`). Open
+the layout, then a trial from trials/ and its candidate from candidates/.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from grounded_trials.report.scene import scene_of
 from grounded_trials.store.store import write_atomically
 
 FOXGLOVE, PLOTJUGGLER = "foxglove-layout.json", "plotjuggler-layout.xml"
-REAL, PREDICTED = "#d55e00", "#0072b2"  # told apart by everybody
+REAL, PREDICTED = "#d55e00", "#0072b2"  # distinguishable for colour-blind readers
 
 
 def write_layouts(folder: Path, model: Model) -> tuple[Path, Path]:
-    """Writes both layouts into a folder, which exists; returns their paths."""
+    """Write both layouts into an existing folder; return their paths."""
     foxglove, plotjuggler = folder / FOXGLOVE, folder / PLOTJUGGLER
     write_atomically(foxglove, (json.dumps(foxglove_layout(model), indent=1) + "\n").encode())
     write_atomically(plotjuggler, plotjuggler_layout(model))
@@ -29,7 +29,7 @@ def write_layouts(folder: Path, model: Model) -> tuple[Path, Path]:
 
 
 def _curves(model: Model) -> list[tuple[str, str, list[tuple[str, str]]]]:
-    """Of each plot its name, its unit, and (topic and field, colour) of its curves."""
+    """Return for each plot its name, its unit, and (topic and field, colour) of its curves."""
     plots = [
         (name, unit, [(f"state.{name}", REAL), (f"predicted_state.{name}", PREDICTED)])
         for name, unit in model.states.items()
@@ -41,7 +41,7 @@ def _curves(model: Model) -> list[tuple[str, str, list[tuple[str, str]]]]:
 
 
 def foxglove_layout(model: Model) -> dict[str, Any]:
-    """The layout as Foxglove imports it."""
+    """Return the layout in Foxglove's format."""
     panels: dict[str, Any] = {}
     for i, (name, unit, curves) in enumerate(_curves(model)):
         panels[f"Plot!grounded{i}"] = {
@@ -84,7 +84,7 @@ def foxglove_layout(model: Model) -> dict[str, Any]:
 
 
 def _stacked(names: list[str]) -> Any:
-    """Panels one below the other, of equal height."""
+    """Stack panels of equal height."""
     if len(names) == 1:
         return names[0]
     share = 100 / len(names)
@@ -93,7 +93,7 @@ def _stacked(names: list[str]) -> Any:
 
 
 def plotjuggler_layout(model: Model) -> bytes:
-    """The layout as PlotJuggler loads it: a tab of the states, one of the inputs."""
+    """Return the layout in PlotJuggler's format: a tab of the states, one of the inputs."""
     root = ElementTree.Element("root")
     window = {"parent": "main_window", "name": "Main Window"}
     tabs = ElementTree.SubElement(root, "tabbed_widget", window)

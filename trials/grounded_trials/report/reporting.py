@@ -1,6 +1,6 @@
-"""report: the findings of a workspace and the files that show them, in reports/.
+"""The command report: gathers the findings of a workspace and writes the files in reports/.
 
-All of reports/ may be deleted and made again.
+All files in reports/ are derived and may be deleted.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ STAMP = "watched.svg"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Report(Result):
-    """What `report` shows: the findings, and the files that were written."""
+    """The result of `report`: the findings, and the files that were written."""
 
     findings: Findings
     paths: tuple[Path, ...]
 
     def summary(self) -> str:
-        """How much it shows, and its files."""
+        """Return the number of trials and the files."""
         trials = len(self.findings.runs) + self.findings.left_runs
         return ", ".join([f"{trials} trials", *map(str, self.paths)])
 
     def figures(self) -> Sequence[Figure]:
-        """All that the page shows."""
+        """Return all figures of the page."""
         from grounded_trials.report.figures.runs import all_figures
 
         return all_figures(self.findings)
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `report --json`, with the figures of the text by state and input."""
+        """Return the document of `report --json`, with the numbers of the text report by state."""
         findings, diagnosis = self.findings, self.findings.diagnosis
         document: dict[str, Any] = {
             "paths": {_kind(path): str(path) for path in self.paths if path.suffix != ".png"},
@@ -77,13 +77,13 @@ class Report(Result):
 
 
 def _kind(path: Path) -> str:
-    """html, rrd, foxglove or plotjuggler."""
+    """Return the kind of a file: html, rrd, foxglove or plotjuggler."""
     name, _, layout = path.stem.partition("-")
     return name if layout else path.suffix[1:]
 
 
 def _measures(findings: Findings, run: Run | None) -> dict[str, Any] | None:
-    """How far a run was from its target, from its prediction and from the model's, by state."""
+    """Return a run's rms tracking error, prediction error and model bias, by state."""
     if run is None:
         return None
     task = findings.task
@@ -99,7 +99,7 @@ def _measures(findings: Findings, run: Run | None) -> dict[str, Any] | None:
 
 
 def report_in(workspace: Folder, *, html: bool, png: bool, rrd: bool) -> Report:
-    """The findings, and the files that were asked for, see `Workspace.report`."""
+    """Gather the findings and write the requested files, see `Workspace.report`."""
     for module, asked, extra in (
         ("jinja2", html, "report"),
         ("matplotlib", png, "png"),
@@ -120,7 +120,7 @@ def report_in(workspace: Folder, *, html: bool, png: bool, rrd: bool) -> Report:
 
 
 def save_recording(workspace: Folder, findings: Findings | None = None) -> Path:
-    """reports/recording.rrd for the Rerun viewer."""
+    """Write reports/recording.rrd for the Rerun viewer; return its path."""
     from grounded_trials.report.recording.recording import write_recording
 
     path = _place(workspace) / RECORDING
@@ -129,17 +129,17 @@ def save_recording(workspace: Folder, findings: Findings | None = None) -> Path:
 
 
 def save_layouts(workspace: Folder, findings: Findings) -> tuple[Path, Path]:
-    """The layouts in reports/ that show a trial in Foxglove and in PlotJuggler."""
+    """Write the layouts for Foxglove and PlotJuggler to reports/; return their paths."""
     from grounded_trials.report.layouts import write_layouts
 
     return write_layouts(_place(workspace), findings.task.model)
 
 
 def save_page(workspace: Folder, findings: Findings, watched: int = 0) -> Path:
-    """reports/report.html; where it is `watched`, a revision beside it that makes it reload.
+    """Write reports/report.html; with `watched`, also the revision that makes it reload.
 
-    A page from a file may load pictures from beside it, but no data: the revision is the width of
-    an empty picture.
+    A page opened from a file may load pictures from its folder, but no data. So the revision is
+    stored as the width of an empty picture.
     """
     from grounded_trials.report.page.page import page
 
@@ -154,7 +154,7 @@ def save_page(workspace: Folder, findings: Findings, watched: int = 0) -> Path:
 def watched(
     workspace: Folder, every: float, trouble: Callable[[GroundedError], None]
 ) -> Iterator[Report]:
-    """Writes the page now and whenever a file that it shows has changed, see `Workspace.watch`."""
+    """Write the page now and whenever one of its files changes, see `Workspace.watch`."""
     before: object = None
     revision = int(time.time()) % 30_000
     while True:
@@ -171,18 +171,18 @@ def watched(
 
 
 def _changed(workspace: Folder) -> list[tuple[str, int, int]]:
-    """Names, sizes and times of the files that a page is made of."""
+    """Return names, sizes and times of the files that the page depends on."""
     found = []
     for pattern in ("*.*", "candidates/*", "trials/**/*", f"{workspace.reports.name}/*.json"):
         for path in workspace.folder.glob(pattern):
-            with suppress(OSError):  # gone meanwhile
+            with suppress(OSError):  # deleted meanwhile
                 about = path.stat()
                 found.append((str(path), about.st_size, about.st_mtime_ns))
     return sorted(found)
 
 
 def save_pictures(workspace: Folder, findings: Findings) -> list[Path]:
-    """reports/utility.png, paths.png and so on: the figures of the page."""
+    """Write the figures of the page as reports/utility.png, paths.png etc.; return their paths."""
     from grounded_trials.report.figures.png import png
     from grounded_trials.report.figures.runs import all_figures
 
@@ -195,7 +195,7 @@ def save_pictures(workspace: Folder, findings: Findings) -> list[Path]:
 
 
 def save_optimum(workspace: Folder, utility: float | None) -> None:
-    """Leaves the optimum of the real system, where a study knows it, for the report to show."""
+    """Write the optimum of the real system, known in a study, for the report; None: do nothing."""
     if utility is not None:
         write_document(_place(workspace) / OPTIMUM, {"utility": utility})
 
@@ -204,5 +204,5 @@ def _place(workspace: Folder) -> Path:
     try:
         workspace.reports.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise GroundedError(f"{workspace.reports} can't be made: {error.strerror}") from None
+        raise GroundedError(f"{workspace.reports} can't be created: {error.strerror}") from None
     return workspace.reports

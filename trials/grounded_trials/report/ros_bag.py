@@ -1,7 +1,7 @@
-"""A trial or a candidate as a ROS 2 bag of standard messages, for `ros2 bag play`, RViz and others.
+"""Exports a trial or candidate as a ROS 2 bag of standard messages, for `ros2 bag play`, RViz etc.
 
-Every state and input is a number of its own topic; where the model's roles say what moves, the
-robot is seen as well:
+Every state and input is a number on its own topic. If the model's roles name a position or joints,
+the robot's pose is written too:
 
     /state/NAME, /input/NAME      std_msgs/Float64
     /pose, /odom, /tf             PoseStamped, Odometry, TFMessage of the body: roles position,
@@ -9,7 +9,7 @@ robot is seen as well:
     /joint_states                 JointState: states in rad and the states that are their rates
     /target                       nav_msgs/Path, once
 
-rosbags writes them; a bag is a folder, of a `.db3` or `.mcap` file and its metadata.yaml.
+A bag is a folder with a `.db3` or `.mcap` file and its metadata.yaml, written by rosbags.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Message = tuple[str, str, int, Any]  # topic, type, time [ns], message
 def _write_bag(
     path: Path, model: Model, dt: float, states: Array, inputs: Array, target: Array
 ) -> None:
-    """A run as the folder `path`, which must not exist; "mcap" in its name: MCAP, else `.db3`."""
+    """Write a run to the new folder `path`: as MCAP if "mcap" is in its name, else as `.db3`."""
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     if path.exists():
@@ -63,12 +63,12 @@ def _parent(path: Path) -> Path:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise GroundedError(f"{path.parent} can't be made: {error.strerror}") from None
+        raise GroundedError(f"{path.parent} can't be created: {error.strerror}") from None
     return path.parent
 
 
 class _Run:
-    """The messages of one run, in the order of time, which begins at 0."""
+    """The messages of one run in order of time, which starts at 0."""
 
     def __init__(self, model: Model, dt: float) -> None:
         self.model, self.dt = model, dt
@@ -78,7 +78,7 @@ class _Run:
         self.joints = {q: w for q, w in velocities(model).items() if model.states[q] == "rad"}
 
     def messages(self, states: Array, inputs: Array, target: Array) -> Iterator[Message]:
-        """All of them; a state that is not finite is left out."""
+        """Yield all messages; values that are not finite are left out."""
         if self.scene is not None and len(points := self.scene.finite(target)):
             yield "/target", "nav_msgs/msg/Path", 0, self._path(points)
         turns = self.scene.rotations(states) if self.scene is not None else None
@@ -168,7 +168,7 @@ class _Run:
 
 
 def quaternion(turn: Array) -> tuple[float, float, float, float]:
-    """x, y, z, w of a rotation matrix (3, 3)."""
+    """Return the quaternion (x, y, z, w) of a rotation matrix (3, 3)."""
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(turn).as_quat()
@@ -176,11 +176,11 @@ def quaternion(turn: Array) -> tuple[float, float, float, float]:
 
 
 def export_run(workspace: Folder, identity: str, form: str | None, path: Path | None) -> Exported:
-    """Writes a trial, or the run that a candidate predicts, see `Workspace.export`."""
+    """Write a trial, or a candidate's predicted run, see `Workspace.export`."""
     named = path.suffix.lstrip(".").lower() if path else ""
     form = form or (named if named in ("csv", "npz") else "bag")
     if form not in ("bag", "csv", "npz"):
-        raise GroundedError(f"a run is written as bag, csv or npz, not {form}")
+        raise GroundedError(f"a run can be exported as bag, csv or npz, not {form}")
     states, inputs, dt = _run_of(workspace, identity)
     path = path or Path(f"{identity}.{form}" if form != "bag" else f"{identity}_bag")
     model = workspace.base_model
@@ -200,7 +200,7 @@ def export_run(workspace: Folder, identity: str, form: str | None, path: Path | 
 
 
 def _run_of(workspace: Folder, identity: str) -> tuple[Array, Array, float]:
-    """States, inputs and control interval of a stored trial, or of a candidate's prediction."""
+    """Return states, inputs and control interval of a stored trial or a candidate's prediction."""
     for stored in workspace.trials():
         if stored.trial.id == identity:
             return stored.trial.states, stored.trial.inputs, stored.trial.dt

@@ -1,12 +1,12 @@
-"""Scene: where the model's roles put a body in space, for pictures.
+"""Scene: the position and orientation of a body in space, from the model's roles, for pictures.
 
-    position (a, b)      a plane, seen from above; named north, east: drawn as maps are, east right
+    position (a, b)      a plane seen from above; states named north and east are drawn as on a map
     altitude             the third axis, up
     attitude             roll, pitch, yaw of an aircraft (z down, Euler angles as in aviation)
     heading              the angle from the first axis towards the second
 
-Without a position the plane is the phase plane of the first two states, and of a position along one
-axis that of it and its speed: something moves in any model. Coordinates are right-handed with z up.
+Without a position, the plane is the phase plane of the first two states; with a position along one
+axis, of that and its speed. Coordinates are right-handed with z up.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # to east,
 
 @dataclass(frozen=True)
 class Scene:
-    """Which states are the axes of a picture, by index; None where a model has no such role."""
+    """The states on the axes of a picture, by index; None or () if a model has no such role."""
 
     names: tuple[str, ...]  # of the axes, horizontal first
     units: tuple[str, ...]
     axes: tuple[int, ...]  # 2 or 3 states
     heading: int | None
     attitude: tuple[int, ...]
-    map: bool  # north and east: heading counts from north
+    map: bool  # axes are north and east: the heading is measured from north
     spatial: bool  # False: a phase plane
 
     @property
@@ -40,21 +40,21 @@ class Scene:
         return len(self.axes) == 3
 
     def points(self, states: Array) -> Array:
-        """Positions (T, 3) of states (T, n); zero where there is no third axis."""
+        """Return positions (T, 3) of states (T, n); the third is 0 if there is no third axis."""
         found = np.zeros((len(states), 3))
         found[:, : len(self.axes)] = states[:, list(self.axes)]
         return found
 
     def finite(self, states: Array) -> Array:
-        """Positions (k, 3) of those states that have one."""
+        """Return the finite positions (k, 3) of states."""
         points = self.points(states)
         return points[np.isfinite(points).all(axis=1)]
 
     def rotations(self, states: Array) -> Array:
-        """Body axes (nose, left, up) as the columns of rotation matrices (T, 3, 3)."""
+        """Return body axes (nose, left, up) as the columns of rotation matrices (T, 3, 3)."""
         from scipy.spatial.transform import Rotation
 
-        if self.attitude:  # of nose, right, down in north, east, down
+        if self.attitude:  # axes nose, right, down in the frame north, east, down
             turned = Rotation.from_euler("ZYX", states[:, list(self.attitude[::-1])]).as_matrix()
             return np.asarray(NED @ turned * [1.0, -1.0, -1.0])
         psi = np.zeros(len(states)) if self.heading is None else states[:, self.heading]
@@ -63,7 +63,7 @@ class Scene:
 
 
 def scene_of(model: Model) -> Scene:
-    """The scene of a model's roles."""
+    """Return the scene given by a model's roles."""
     roles, axes = roles_of(model), position_axes(model)
     spatial, position = bool(axes), roles.get("position", [])
     first = [*position, *(roles.get("speed", []) if position else []), *range(model.n)]

@@ -1,7 +1,7 @@
-"""What was found and adopted: what the model has beyond model.py, what it gained, what is left.
+"""Describes what was adopted: the model's changes from model.py, their gain, what is still open.
 
-One ruler measured it, that of the last diagnosis: it was made with the model that plans now, or it
-claims what was adopted since. Where it did neither, nothing is said of a gain.
+The gain is the one measured by the last diagnosis, if that was made with the current planning model
+or claims what was adopted since. Otherwise no gain is reported.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ NOW = "the model now"
 
 @dataclass(frozen=True)
 class Settled:
-    """What is part of the model now; `closed`: all that the last diagnosis claims is."""
+    """What was adopted; `closed`: everything that the last diagnosis claims has been adopted."""
 
-    adopted: tuple[str, ...]  # a clause each: effects, then parameters
-    gained: str = ""  # "" where no diagnosis measured the model that plans now
+    adopted: tuple[str, ...]  # one clause each: effects, then parameters
+    gained: str = ""  # "" if no diagnosis measured the current planning model
     left: str = ""
     closed: bool = False
 
     @property
     def lines(self) -> list[str]:
-        """Sentences, a line each."""
+        """The sentences, one per line."""
         found = [f"Found and adopted: {'; '.join(self.adopted)}.", self.gained, self.left]
         return [line for line in found if line]
 
 
 def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> Settled | None:
-    """What a workspace's model has beyond model.py; None where that is nothing.
+    """Return how a workspace's model differs from model.py; None if it does not.
 
     Args:
-        workspace: whose grounded.toml says it.
-        diagnosis: the last one.
-        since: what happened after it.
+        workspace: the workspace, whose grounded.toml lists what was adopted.
+        diagnosis: the last diagnosis.
+        since: changes since then.
     """
     table, task = workspace.config.model, workspace.origin
     clauses = [_clause(effect, task.model) for effect in table.effects]
@@ -68,7 +68,7 @@ def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> 
 
 
 def measured_now(workspace: Folder) -> str:
-    """How far the model that plans now predicts, as the last diagnosis measured it, or ""."""
+    """Return the current planning model's prediction error by the last diagnosis, or ""."""
     found, since = _last(workspace)
     settled = settled_in(workspace, found, since)
     if settled is not None or found is None or since.changed:
@@ -85,13 +85,13 @@ def _last(workspace: Folder) -> tuple[Diagnosis | None, Since]:
 
 
 def told(diagnosis: Diagnosis, task: Task, since: Since, settled: Settled | None) -> list[str]:
-    """What a diagnosis says today: what was adopted first, then what is open.
+    """Return a diagnosis as lines of text, after the lines on what has been adopted since.
 
     Args:
-        diagnosis: the last one.
-        task: whose weighed states it speaks of.
-        since: what happened after it.
-        settled: what the model has.
+        diagnosis: the last diagnosis.
+        task: the task, whose weighed states are reported.
+        since: changes since the diagnosis.
+        settled: what was adopted.
     """
     lines = so_far(diagnosis, since, settled)
     if settled is not None and settled.closed:
@@ -100,26 +100,26 @@ def told(diagnosis: Diagnosis, task: Task, since: Since, settled: Settled | None
 
 
 def so_far(diagnosis: Diagnosis, since: Since, settled: Settled | None) -> list[str]:
-    """What was adopted and why the diagnosis is not the last word, before its own sentences."""
+    """Return the lines before a diagnosis: what was adopted, and why it may be outdated."""
     lines = [] if settled is None else settled.lines
     if settled is not None and settled.left and not since.changed:
-        lines = lines[:-1]  # the diagnosis is about to say it
+        lines = lines[:-1]  # the diagnosis itself follows
     if text := since.sentence:
         lines.append(f"{text[:1].upper()}{text[1:]}.")
     return [*lines, f"The diagnosis, {made_from(diagnosis)}, said:"] if lines else []
 
 
 def _still(diagnosis: Diagnosis) -> str:
-    """What a diagnosis of the model that plans now says first."""
+    """Return the first sentence of a diagnosis of the current planning model."""
     if diagnosis.effects:
         return f"Found, not adopted: {'; '.join(diagnosis.verdict.causes or diagnosis.effects)}."
     return diagnosis.verdict.lines[0]
 
 
 def _as_claimed(diagnosis: Diagnosis, table: ModelTable) -> bool:
-    """Whether the model is what the diagnosis measured: `adopt` of all that it claims made it.
+    """Return whether the model is the one that the diagnosis claims, with everything adopted.
 
-    It was measured with the filters of sensors that were found, adopted or not.
+    Late sensors that it found may be adopted or not.
     """
     if left_behind(diagnosis):
         return False
@@ -129,14 +129,14 @@ def _as_claimed(diagnosis: Diagnosis, table: ModelTable) -> bool:
     try:
         known = diagnosis.known_parameters
         own, effects = joined(diagnosis, both, made.adopted, made.nominal, known)
-    except (GroundedError, KeyError):  # of an older document
+    except (GroundedError, KeyError):  # a document of an older version
         return False
     wanted = {str(effect["name"]): effect for effect in effects}
     return bool(names) and now == wanted and dict(made.params or {}) | own == dict(table.params)
 
 
 def _clause(entry: Mapping[str, Any], model: Model) -> str:
-    """An adopted effect in words, with its values."""
+    """Return an adopted effect in words, with its values."""
     from grounded.diagnosis.cause_words import meaning
     from grounded_trials.workspace.adopted import installed_effects
 
@@ -151,6 +151,6 @@ def _clause(entry: Mapping[str, Any], model: Model) -> str:
 
 
 def _moved(model: Model, params: Mapping[str, float]) -> list[str]:
-    """`m 1.00 -> 1.30 kg` of every parameter that grounded.toml sets anew."""
+    """Return `m 1.00 -> 1.30 kg` for every parameter that grounded.toml changes."""
     known = {n: p for n, p in model.params.items() if n in params and params[n] != p.value}
     return [changed(name, p.value, params[name], p.unit) for name, p in known.items()]

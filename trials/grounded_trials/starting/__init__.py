@@ -1,7 +1,8 @@
-"""How a workspace is made: of a log, of a model alone, of an example; and a manoeuvre to follow.
+"""Creates workspaces from a log, from a model alone or from an example, and draws targets.
 
-Read `begin.py` first: it makes the folder. `kinds.py` has a model skeleton for each kind of robot
-and tells the kind from a log; `shapes.py` draws targets: lines, circles, figure-8s, steps,
-swing-ups, or a run that was recorded. `blank.py` makes a workspace of a model alone,
-`examples.py` those that come with grounded, and it writes every grounded.toml.
+Read `begin.py` first: it creates a workspace from a log. `kinds.py` guesses the kind of robot from
+a log and chooses a model skeleton; `shapes.py` draws targets: lines, circles, figure-8s, steps,
+swing-ups, or a recorded run. `blank.py` creates a workspace from a model alone, `examples.py` the
+examples that come with grounded; `first_toml.py` writes the grounded.toml of a log's workspace,
+`examples.py` all others.
 """

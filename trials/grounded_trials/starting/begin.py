@@ -1,8 +1,8 @@
-"""A workspace from a log: what it found, what it guessed and why, and what a person must decide.
+"""Creates a workspace from a log, and reports what was found, what was guessed and why.
 
-Nothing is decided silently: every signal is listed with its reasons and its rivals, every number in
-grounded.toml that was read off the log says so, and what is unsure is asked for (in a terminal) or
-marked.
+Nothing is decided silently: every signal is listed with its reasons and alternatives, every number
+in grounded.toml that was taken from the log is marked as such, and uncertain signals are asked for
+(in a terminal) or marked.
 """
 
 from __future__ import annotations
@@ -40,49 +40,49 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.model_file import load_module, model_in
 
 NONE: Mapping[str, Array] = {}  # no input was read
-SLOWEST = 0.5  # [Hz] rows of a robot's log: slower ones have times in another unit
-HORIZON = 200  # steps of a target that is a recorded run, at most
+SLOWEST = 0.5  # [Hz] smallest plausible row rate; below it, times may be in another unit
+HORIZON = 200  # largest number of steps of a target taken from a recorded run
 Ask = Callable[[Guess], str]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Begun(Result):
-    """A workspace made from a log."""
+    """The result of making a workspace from a log."""
 
     workspace: str
     log: str
     kind: str  # of the model skeleton; "" for the user's own model
-    why: str  # what says so
+    why: str  # why this kind was chosen
     dt: float  # [s]
     horizon: int
     states: tuple[Guess, ...]
     inputs: tuple[Guess, ...]
-    target: str  # what target.csv holds
+    target: str  # description of target.csv
     notes: tuple[str, ...] = ()
 
     @property
     def unsure(self) -> tuple[Guess, ...]:
-        """The signals that a person must look at."""
+        """The uncertain signals, which the user must check."""
         return tuple(g for g in (*self.states, *self.inputs) if not g.sure)
 
     @property
     def then(self) -> NextCommand:
-        """Take the log in, to fit and diagnose the model on it; where an input is missing, look."""
+        """The next command: ingest the log as data, or inspect it if an input is missing."""
         whole = all(g.path for g in self.inputs) and any(g.path for g in self.states)
         return NextCommand("ingest", ("--data", self.log)) if whole else self.look
 
     @property
     def look(self) -> NextCommand:
-        """What names the numbers of the log, for grounded.toml."""
+        """The command that lists the numbers of the log, for [log] in grounded.toml."""
         return NextCommand("inspect", (self.log,))
 
     def summary(self) -> str:
-        """How much was matched."""
+        """Return how many signals were found."""
         both = (*self.states, *self.inputs)
         return f"{self.workspace}: {sum(bool(g.path) for g in both)} of {len(both)} signals found"
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `init --from --json`."""
+        """Return the document of `init --from --json`."""
         signals = [
             {
                 "name": guess.name,
@@ -117,27 +117,26 @@ def begin(
     inputs: Sequence[str] = (),
     ask: Ask | None = None,
 ) -> Begun:
-    """Makes a workspace from a log; an existing file is never overwritten.
+    """Create a workspace from a log; never overwrites a file.
 
     Args:
-        folder: where it is made.
-        log: of any format.
-        model: the user's model.py, or an MJCF or URDF file, which is copied with what it reads
-            beside it; None: a skeleton is written.
-        kind: of the skeleton, see `KINDS`; None: as the log looks.
-        dt: control interval [s]; None: that in which the commands of the log change, see
-            `interval_of`.
-        inputs: which numbers of the log are a generic skeleton's inputs; none: as they look.
-        ask: given each unsure signal, returns the path to take; None: the best guess is taken.
+        folder: the workspace to create.
+        log: a log in any format.
+        model: the user's model.py, or an MJCF or URDF file; it is copied together with the files
+            that it reads from its folder. None: a skeleton is written.
+        kind: kind of the skeleton, see `KINDS`; None: guessed from the log.
+        dt: control interval [s]; None: the interval at which commands change, see `interval_of`.
+        inputs: names of the numbers that are inputs of a generic skeleton; empty: guessed.
+        ask: called with each uncertain signal, returns the path to use; None: use the best guess.
 
     Raises:
-        GroundedError: if the log can't be read or is ours, the folder holds a workspace, or a
-            name is unknown.
+        GroundedError: if the log can't be read or was written by grounded, if the folder already
+            holds a workspace, or if a name is unknown.
     """
     if kind is not None and kind not in KINDS:
         raise GroundedError(f"there is no kind '{kind}': {nearest(kind, KINDS)}")
     if inputs and (model is not None or kind not in (None, "generic")):
-        raise GroundedError("--inputs is for a skeleton of kind generic: others have their own")
+        raise GroundedError("--inputs needs a skeleton of kind generic: others have fixed inputs")
     own = own_model(model) if model is not None else None
     files = (FILE, "target.csv", *(own.missing(folder) if own else ("model.py",)))
     with fresh_folder(folder, files):
@@ -155,13 +154,13 @@ def _begin(
 ) -> Begun:
     files = log_files(log)
     if kind_of(files[0]):
-        raise GroundedError(f"{log} was written by grounded itself: init needs a foreign log")
+        raise GroundedError(f"{log} was written by grounded: init needs a log of your robot")
     report = inspect_log(log)
     if report.damage:
         raise GroundedError(report.damage, NextCommand("recover", (str(log),)))
     report, notes = _one_run(report)
     joints = joint_names(report)
-    chosen, why = (kind, "as you said") if kind else kind_in(report, joints)
+    chosen, why = (kind, "as you specified") if kind else kind_in(report, joints)
     if own:
         why, found = "your model", own.bring(folder)
     else:
@@ -169,7 +168,7 @@ def _begin(
         found = _model_in(folder, text)
     states, inputs = _matched(report, found, joints, unnamed=not own)
     if not (kind or own or any(g.path for g in states)):
-        why = f"no number of the log fits a state of kind {chosen}: the names are the log's"
+        why = f"no number in the log matches a state of kind {chosen}; names are the log's"
         chosen = "generic"
         text = skeleton(chosen, report, joints, named, column_units(files[0])).source()
         found = _model_in(folder, text)
@@ -191,7 +190,7 @@ def _begin(
     notes = (*notes, *_in_seconds(report), *wide_joints(states, units, joints, report))
     step, whose, note = (dt, "", "") if dt else interval_of(report, inputs, states)
     ranges = {g.name: _range(report, g) for g in (*states, *inputs)}
-    if chosen != "drone":  # what is sent after a run must be allowed: rest
+    if chosen != "drone":  # zero is sent after a run, so the limits must include it
         ranges |= {
             g.name: (min(r[0], 0.0), max(r[1], 0.0)) for g in inputs if (r := ranges[g.name])
         }
@@ -220,10 +219,11 @@ def _begin(
 def _matched(
     report: LogReport, model: Model, joints: Joints, *, unnamed: bool = False
 ) -> tuple[tuple[Guess, ...], tuple[Guess, ...]]:
-    """Where the states and inputs are; `unnamed`: a skeleton's, whose names the log need not know.
+    """Match the states and inputs to numbers of the log, by name and then by their values.
 
-    Where no name fits a position and its rate, any two numbers may be they, of which one follows
-    the derivative of the other; the one number that is left is the one input.
+    With `unnamed`, the names are a skeleton's and the log need not contain them. If no name matches
+    a position and its rate, any two numbers are tried of which one follows the other's derivative;
+    if a single number is then left over, it is matched to a single input.
     """
     units = {**model.states, **model.inputs}
     names = guess_mapping(report, model.state_names, model.input_names, units)
@@ -241,51 +241,51 @@ def _matched(
     states = tuple(replace(g, sure=False, others=()) if g.path else old for g, old in pairs)
     rest = [path for path in free if path not in {g.path for g in states}]
     if all(g.path for g in states) and len(inputs) == len(rest) == 1 and not inputs[0].path:
-        left = replace(inputs[0], path=rest[0], reasons=("the one number that is left",))
+        left = replace(inputs[0], path=rest[0], reasons=("the only number left",))
         _, (left,) = weigh(report, model, states, (left,), joints)
         inputs = (replace(left, sure=False),)
     return states, inputs
 
 
 def _one_run(report: LogReport) -> tuple[LogReport, tuple[str, ...]]:
-    """An archive of many runs with the same columns is looked at by its first one."""
+    """Reduce an archive of runs with the same columns to its first run, with a note."""
     runs = [t for t in report.topics if t.type.startswith("npz")]
     columns = {tuple(f.path.removeprefix(t.topic) for f in t.fields) for t in runs}
     same = [t for t in runs if len(t.fields) == max(len(c) for c in columns)] if columns else []
     if len(same) < 2:
         return report, ()
-    note = f"{same[0].topic} of {len(same)} runs is taken; [log] may name another"
+    note = f"{same[0].topic} of {len(same)} runs is used; [log] may name another"
     return replace(report, topics=(same[0],)), (note,)
 
 
 def _model_in(folder: Path, text: str) -> Model:
-    """Writes model.py and loads it."""
+    """Write model.py and load it."""
     write_atomically(folder / "model.py", text.encode())
     return model_in(load_module(folder, "model.py"))
 
 
 def _only_named(guess: Guess, of: str) -> Guess:
-    """A guess of the generic skeleton: the log's own name, and nothing that says what it is."""
-    why = f"named as in the log; that it is a{'n' * (of == 'input')} {of} is a guess"
+    """Mark a generic skeleton's signal as a guess: only its name comes from the log."""
+    why = f"named as in the log; assumed to be a{'n' * (of == 'input')} {of}"
     return replace(guess, sure=False, reasons=(*guess.reasons, why)) if guess.path else guess
 
 
 def _left_out(report: LogReport, model: Model) -> tuple[str, ...]:
-    """What a generic skeleton has no place for, and how to say what is an input."""
+    """Return notes on the numbers that a generic skeleton leaves out, and on missing inputs."""
     left = [name for name in moving(report) if name not in {**model.states, **model.inputs}]
     found = [f"left out of model.py: {', '.join(reversed(left))}"] * bool(left)
     if not set(model.inputs) & set(moving(report)):
         last = next(iter(moving(report)), "A")
-        found.append(f"no number looks like a command: --inputs says which are, --inputs {last}")
+        found.append(f"no number looks like a command: name the inputs, such as --inputs {last}")
     return tuple(found)
 
 
 def _in_seconds(report: LogReport) -> tuple[str, ...]:
-    """What to do where a table's times are in another unit than seconds, and do not say so."""
+    """Return a note for each table whose times seem to be in another unit than seconds."""
     slow = [t for t in report.topics if t.topic == "/csv" and 0 < t.rate_hz < SLOWEST]
     return tuple(
-        f"read in seconds, the rows come every {1 / t.rate_hz:.3g} s: are the times in ms or us? "
-        "Then end that column's name with _ms or _us, and make the workspace anew"
+        f"read as seconds, the rows are {1 / t.rate_hz:.3g} s apart: are the times in ms or us? "
+        "If so, end that column's name with _ms or _us, and create the workspace again"
         for t in slow
     )
 
@@ -296,12 +296,12 @@ def _asked(guess: Guess, ask: Ask, stated: Callable[..., Guess]) -> Guess:
     path = ask(guess)
     if path == guess.path:
         return replace(guess, sure=bool(path))
-    why = ("as you said",)
+    why = ("as you specified",)
     return stated(replace(guess, path=path, sure=bool(path), reasons=why, field=None, scale=1.0))
 
 
 def _range(report: LogReport, guess: Guess) -> tuple[float, float] | None:
-    """Lowest and highest value in the log, in the model's unit."""
+    """Return the lowest and highest value in the log, in the model's unit."""
     for topic in report.topics:
         for one in topic.fields:
             if one.path == guess.path and one.low is not None and one.high is not None:
@@ -318,13 +318,13 @@ def _recorded(
     dt: float,
     write: Callable[..., None],
 ) -> tuple[str, int, tuple[str, ...]]:
-    """target.csv from the run in the log; where that can't be sampled, a target to be replaced."""
+    """Write target.csv from the run in the log, or a placeholder if that can't be sampled."""
     here = Folder(folder)
     measured = [guess.name for guess in states if guess.path]
     mapping = log_mapping(here.config.log, model.state_names, model.input_names)
     try:
         if mapping is None or not measured:
-            raise GroundedError("no signal of the log fits a state")
+            raise GroundedError("no signal of the log matches a state")
         found = read_log(files, mapping, dt, states=measured, angles=model.angles, steps=HORIZON)
     except GroundedError as error:
         write({model.state_names[0]: np.zeros(HORIZON + 1)}, HORIZON)

@@ -1,10 +1,9 @@
-"""A workspace from a model file alone: what a robot that no example is like begins with.
+"""Creates a workspace from a model file alone, for a robot that no example resembles.
 
-Everything that has to be said about the task is there with a value that runs, to be replaced: the
-target holds every state at zero, each weighs 1, an input has the limits that an MJCF or URDF file
-states, or none. Where the model stands there under some input (a quadrotor's hover), that is what
-counts as held before the start. `drive.py` is the robot's program: it reads the candidate and
-writes the trial, and lacks two functions, `measure` and `send`.
+Every setting of the task has a placeholder value that runs: the target holds each state at zero
+with weight 1; inputs have the limits of the MJCF or URDF file, or none. If some input holds the
+model at zero (a quadrotor's hover), that is the input before the start. `drive.py` is the robot's
+program: it reads the candidate and writes the trial; the user implements `measure` and `send`.
 """
 
 from __future__ import annotations
@@ -28,8 +27,8 @@ from grounded_trials.workspace.task_file import change_weight, write_target
 
 DT, HORIZON = 0.05, 100  # [s], steps
 COMMAND = 'command = "python drive.py {candidate} {trial}"   # or by hand: propose, drive, ingest'
-CHANGES = "# for an input from -1 to 1: `target` sets it by its limits until you change a weight"
-DRIVE = '''"""The robot's program: runs a candidate, writes its trial. `grounded run` calls it so:
+CHANGES = "# for inputs from -1 to 1: `target` updates it from the limits until you change it"
+DRIVE = '''"""The robot's program: runs a candidate and writes its trial. `grounded run` calls it as
 
     python drive.py candidates/c0001.mcap runs/c0001-1.mcap
 """
@@ -50,13 +49,13 @@ INPUTS = {inputs}
 
 
 def measure():
-    """The robot's states now, in the order of STATES: one number each."""
-    raise NotImplementedError("drive.py: measure() is yours to write")
+    """Return the robot's current states in the order of STATES, one number each."""
+    raise NotImplementedError("drive.py: implement measure() for your robot")
 
 
 def send(u):
-    """Sends the inputs u, in the order of INPUTS; they are inside [limits]."""
-    raise NotImplementedError("drive.py: send() is yours to write")
+    """Send the inputs u, in the order of INPUTS; they are within [limits]."""
+    raise NotImplementedError("drive.py: implement send() for your robot")
 
 
 def main(candidate, trial):
@@ -69,7 +68,7 @@ def main(candidate, trial):
         for step in range(steps + 1):
             time.sleep(max(0.0, start + step * dt - time.monotonic()))
             state = np.asarray(measure(), dtype=float)
-            u = runner.action(step * dt, state)  # past the end: the input that was held before
+            u = runner.action(step * dt, state)  # after the last step: the input before the start
             send(u)
             log.append(step * dt, state, u if step < steps else None)
 
@@ -80,16 +79,16 @@ if __name__ == "__main__":
 
 
 def write_blank(folder: Path, file: str | Path, dt: float | None = None) -> None:
-    """Writes a workspace for the model of a file; an existing file is never overwritten.
+    """Write a workspace for a model file; never overwrites a file.
 
     Args:
-        folder: where it is made.
-        file: holds `model`, or is an MJCF or URDF file; see `own_model`.
+        folder: the workspace to create.
+        file: a Python file that defines `model`, or an MJCF or URDF file; see `own_model`.
         dt: control interval [s]; None: 0.05.
 
     Raises:
-        GroundedError: if the file holds no model, or needs its neighbours, or the folder a
-            workspace already.
+        GroundedError: if the file holds no model, if its copy does not load, or if the folder
+            already holds a workspace.
     """
     own = own_model(file)
     with fresh_folder(folder, (FILE, "target.csv", "drive.py", *own.missing(folder))):
@@ -99,15 +98,15 @@ def write_blank(folder: Path, file: str | Path, dt: float | None = None) -> None
         write_target(folder / "target.csv", task.dt, columns)
         drive = DRIVE.format(states=dict(model.states), inputs=dict(model.inputs))
         write_atomically(folder / "drive.py", drive.encode())
-        name = f"{model.name or own.file.stem}: target, weights and limits are yours"
+        name = f"{model.name or own.file.stem}: set your own target, weights and limits"
         text = toml_of(task, name, COMMAND).replace("\ninput_change", f"\n{CHANGES}\ninput_change")
         write_atomically(folder / FILE, text.encode())
 
 
 def _task(model: Model, dt: float) -> Task:
-    """Hold every state at zero for a hundred steps, from the inputs that hold it there."""
+    """Return the task of holding every state at zero for 100 steps, from the inputs that do so."""
     n, m = model.n, model.m
-    stated = getattr(model.step, "limits", {})  # in a simulator's file
+    stated = getattr(model.step, "limits", {})  # limits in an MJCF or URDF file
     ends = [stated.get(name, (-np.inf, np.inf)) for name in model.input_names]
     changes = np.array([change_weight(None, unit) for unit in model.inputs.values()])
     low, high = np.array(ends).T
@@ -121,7 +120,7 @@ def _task(model: Model, dt: float) -> Task:
         low=low,
         high=high,
     )
-    with suppress(GroundedError):  # a model that does not work says so when it is planned with
+    with suppress(GroundedError):  # a faulty model is reported when planning
         if (still := resting(task, np.zeros(n, np.bool_))) is not None:
             return replace(task, past=np.array([float(f"{u:.6g}") for u in still[n:]]))
     return task

@@ -1,4 +1,4 @@
-"""Example workspaces, written as files that a user would write: model.py, real.py, target.csv."""
+"""Writes the example workspaces: grounded.toml, model.py, real.py, target.csv."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from grounded_trials.workspace.task_file import target_text
 
 @dataclass(frozen=True)
 class Example:
-    """One example: its line in the list, and what its files say."""
+    """One example: its line in the list, and the sources of its files."""
 
     text: str
     task: Callable[[], Task]
     model: str  # import name of the crude model's module, copied to model.py
-    real: str  # text of real.py
+    real: str  # contents of real.py
 
 
-_REAL_CAR = '''"""The simulated REAL car, in place of your robot. The search never sees it."""
+_REAL_CAR = '''"""The simulated REAL car, in place of your robot. The search never reads it."""
 
 from grounded.experiments.real_car import LATENCY, real_car
 
 model = real_car()
-latency = LATENCY  # [s]; the crude model's task assumes 0.1
+latency = LATENCY  # [s]; the task assumes 0.1
 '''
 
-_REAL_AIRCRAFT = '''"""The simulated REAL aircraft: other parameters than the crude model's."""
+_REAL_AIRCRAFT = '''"""The simulated REAL aircraft: its parameters differ from the crude model's."""
 
 import numpy as np
 
@@ -109,7 +109,7 @@ EXAMPLES: Mapping[str, Example] = {
 
 
 def example(name: str) -> Example:
-    """The example of a name.
+    """Return the example of a name.
 
     Raises:
         GroundedError: if there is none.
@@ -120,10 +120,10 @@ def example(name: str) -> Example:
 
 
 def write_example(folder: Path, name: str) -> None:
-    """Writes a workspace; an existing file is never overwritten.
+    """Write the workspace of an example; never overwrites a file.
 
-    One that was cut off goes on: what is there already must be what would be written, and
-    grounded.toml, which makes it a workspace, comes last.
+    An interrupted call can be repeated: files that already exist with the same contents are
+    accepted, and grounded.toml, which makes the folder a workspace, is written last.
 
     Raises:
         GroundedError: if the folder already holds a workspace, or can't be written.
@@ -149,10 +149,10 @@ def write_example(folder: Path, name: str) -> None:
 
 
 def refuse_existing(folder: Path, names: Iterable[str]) -> None:
-    """Refuses to write where a file is.
+    """Raise an error if one of the files exists.
 
     Raises:
-        GroundedError: naming the first that exists.
+        GroundedError: naming the first file that exists.
     """
     for path in (folder / name for name in names):
         if path.exists():
@@ -165,12 +165,16 @@ def _holds(path: Path, text: str) -> bool:
 
 @contextmanager
 def fresh_folder(folder: Path, files: Iterable[str]) -> Iterator[None]:
-    """Makes the folders of a workspace in which none of these files exists yet, to be written now.
+    """Create the folders of a workspace, and clean up if the body of the `with` statement fails.
 
-    If that fails, what was made goes again: the folder if it is new, or else these files.
+    On failure a new folder is removed; from an existing folder only `files` are removed.
+
+    Args:
+        folder: the workspace.
+        files: names of the files that the body writes; none may exist yet.
 
     Raises:
-        GroundedError: if one of the files exists, or the folder can't be made.
+        GroundedError: if one of the files exists, or the folder can't be created.
     """
     refuse_existing(folder, files)
     new = not folder.exists()
@@ -179,7 +183,7 @@ def fresh_folder(folder: Path, files: Iterable[str]) -> Iterator[None]:
             for made in (folder, folder / "trials", folder / "candidates"):
                 made.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise GroundedError(f"{folder} can't be made: {error.strerror}") from None
+            raise GroundedError(f"{folder} can't be created: {error.strerror}") from None
         yield
     except BaseException:
         for path in [folder] if new else [folder / name for name in files]:
@@ -191,14 +195,14 @@ def fresh_folder(folder: Path, files: Iterable[str]) -> Iterator[None]:
 
 
 def _source(module: ModuleType) -> str:
-    return f"# From {module.__name__}: yours to change.\n" + inspect.getsource(module)
+    return f"# Copied from {module.__name__}: edit it freely.\n" + inspect.getsource(module)
 
 
-SIMULATED = 'model = "real.py"             # yours: command = "python drive.py {candidate} {trial}"'
+SIMULATED = 'model = "real.py"             # robot: command = "python drive.py {candidate} {trial}"'
 
 
 def toml_of(task: Task, name: str, system: str = SIMULATED) -> str:
-    """The grounded.toml of a task, with a comment on each table; `system`: the line of its own."""
+    """Return the grounded.toml of a task, with comments; `system` is the line under [system]."""
     states, inputs = task.model.state_names, task.model.input_names
     first = np.where(np.isfinite(task.target[0]), task.target[0], 0.0)
     start = {s: v for s, v, f in zip(states, task.start, first, strict=True) if v != f}
@@ -223,7 +227,7 @@ def toml_of(task: Task, name: str, system: str = SIMULATED) -> str:
         "[model]",
         'file = "model.py"             # the crude model'
         + ", plain NumPy" * (task.model.step is None),
-        f"smoothing = {_number(task.smoothing)}              # width over which planning blends "
+        f"smoothing = {_number(task.smoothing)}              # width over which planning smooths "
         "np.where, abs ...",
         "",
         "[task]",
@@ -242,9 +246,9 @@ def toml_of(task: Task, name: str, system: str = SIMULATED) -> str:
         "",
         "[search]",
         'method = "ddp"                # or "policy-gradient"',
-        'step = "damped"               # "full" and match_inputs = false: the paper\'s own',
-        "repeats = 1                   # trials a candidate, averaged",
-        "rerun_incumbent = true        # after a loss that may be luck",
+        'step = "damped"               # as in the paper: "full", and match_inputs = false',
+        "repeats = 1                   # trials per candidate, averaged",
+        "rerun_incumbent = true        # repeat the best candidate after a loss within the noise",
         "max_trials = 40",
         "",
         "[system]                      # how `grounded run` reaches the real system",

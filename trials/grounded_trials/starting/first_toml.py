@@ -1,4 +1,4 @@
-"""The first grounded.toml of a workspace that is made from a log, and its target.csv."""
+"""Writes the first grounded.toml of a workspace made from a log, and its target.csv."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from grounded_trials.workspace.config import FILE, OFFERED
 from grounded_trials.workspace.off_target import position_names
 from grounded_trials.workspace.task_file import change_weight, equal_weights, write_target
 
-STOOD = 0.5  # [s] at the begin of a log
-STILL = 0.05  # of how far, or how fast, a state goes later in the log: it stands
+STOOD = 0.5  # [s] at the start of a log in which the robot may stand still
+STILL = 0.05  # fraction of a state's range (or a rate's maximum) that counts as standing still
 
 
 def write_first(
@@ -32,25 +32,26 @@ def write_first(
     log: str,
     held: Mapping[str, float],
 ) -> None:
-    """Writes both.
+    """Write grounded.toml and target.csv.
 
     Args:
-        folder: of the workspace.
+        folder: the workspace.
         model: its crude model.
-        grid: control interval [s], and what to say of it.
-        columns: of the target, by state.
-        horizon: steps.
+        grid: control interval [s], and the end of its comment.
+        columns: columns of the target, by state.
+        horizon: number of steps.
         ranges: lowest and highest value of each signal in the log, in the model's unit.
-        table: [log], as text.
-        why: what says which kind of robot it is.
-        log: the file's name.
-        held: where the robot stood at the log's begin, and the inputs that held it; may be {}.
+        table: the [log] table, as text.
+        why: why this kind of robot was chosen.
+        log: name of the log file.
+        held: states in which the robot stood at the start of the log, and the inputs that held it
+            there; may be {}.
     """
     dt, whose = grid
     write_target(folder / "target.csv", dt, dict(columns))
     weights = equal_weights(columns, model.states, position_names(model))
     changes = {name: change_weight(ranges[name], model.inputs[name]) for name in model.input_names}
-    stated = getattr(model.step, "limits", {})  # in a simulator's file
+    stated = getattr(model.step, "limits", {})  # limits in an MJCF or URDF file
     limits = [
         f"{key(name)} = {_span(found)}"
         + f"  # the model's file says {_span(stated.get(name, ()))}" * (name in stated)
@@ -68,26 +69,26 @@ def write_first(
         f"horizon = {horizon}                 # steps",
         'target = "target.csv"         # `grounded target` draws another; no column: free',
         f"start = {_inline(held) if held else '{ }'}"
-        + "  # what held it where it stood in the log's first rows" * bool(held),
+        + "  # where it stood in the log's first rows, and the inputs that held it" * bool(held),
         "feedback = true               # false: open loop",
         "latency = { }                 # [s] transport delay of inputs: `fit --latency` finds it",
         "",
-        "[reward]                      # quadratic weights: 1 / (range in the target)^2; `target`",
-        "                              # sets them anew until you change one; of a column that",
-        "                              # is constant: the largest of its unit, else 1",
+        "[reward]                      # quadratic weights: 1 / (range in the target)^2; a",
+        "                              # constant column uses the largest range of its unit, else",
+        "                              # 1. `target` updates them until you change one",
         f"state = {_inline(weights)}",
-        "# terminal, of the last step alone: where the run is to END at rest on its target",
-        "# (docking, parking) and overshoots, 10 to 100 times state, the speeds' too",
+        "# terminal: weights of the last step only. If the run must END at rest on its target",
+        "# (docking, parking) but overshoots, use 10 to 100 times `state`, also for the speeds",
         f"# terminal = {_inline({name: OFFERED * weight for name, weight in weights.items()})}",
-        "# of (a_t - a_{t-1})^2: 0.04 / (range of [limits])^2, 0.01 of an input from -1 to 1",
-        "# `target` sets it anew by [limits] until you change a weight; by those seen in the log:",
+        "# weights of (a_t - a_{t-1})^2: 0.04 / (range of [limits])^2, so 0.01 for -1 to 1.",
+        "# `target` updates them from [limits] until you change one; from the ranges in the log:",
         f"# input_change = {_inline(changes)}",
         f"input_change = {_inline(changes)}",
         "",
-        "[limits]" + "                      # put in what your robot may get" * (not limits),
+        "[limits]" + "                      # enter the limits of your robot" * (not limits),
         *limits,
         *[
-            "# SEEN in the log: put in what your robot may get, then delete these two lines",
+            "# SEEN in the log: enter the limits of your robot, then delete these two lines",
             f"seen_in = {json.dumps(log, ensure_ascii=False)}",
         ]
         * bool(limits),
@@ -108,16 +109,16 @@ def held_first(
     dt: float,
     ranges: Mapping[str, tuple[float, float] | None],
 ) -> dict[str, float]:
-    """Where a robot stands as a log begins, and the inputs, not all 0, that hold it there.
+    """Return the states in which a robot stands at the start of a log, and the inputs holding it.
 
-    A controller that holds it sags at first and lets its commands tremble: what counts is that they
-    stay about where they are in the second half of the time. {} where the robot moves, where an
-    input changes, or where nothing has to hold it: then the input counts as 0 before a run, which
-    is also what is sent after one. Without a speed among the states nothing tells a robot that
-    stands from one that goes on slowly.
+    A controller may sag at first and its commands may jitter, so inputs only need to stay nearly
+    constant in the second half of the first `STOOD` seconds. Returns {} if the robot moves, if an
+    input changes, or if no input has to hold it: inputs then count as 0 before a run, which is also
+    what is sent after it. Also returns {} for a model without a speed, since a slow drift could
+    not be detected.
 
     Args:
-        model: whose states and inputs they are.
+        model: the model of the states and inputs.
         columns: states, by name (H + 1,).
         sent: inputs, by name (H,).
         dt: control interval [s].

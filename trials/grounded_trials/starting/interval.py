@@ -1,8 +1,8 @@
-"""The control interval of a log: how often its commands change, or else how often they are logged.
+"""Estimates a log's control interval from how often its commands change, or else are logged.
 
-A table has a row every 10 ms though the loop that is recorded in it sends a command every 50 ms.
-So the times between changes are asked first: nearly all must be multiples of one interval, and many
-be that interval itself; a test signal that steps once a second says nothing of the loop.
+A table may have a row every 10 ms although the recorded loop sends a command every 50 ms. So the
+times between changes are examined first: nearly all must be multiples of one interval, and many
+must equal it. A test signal that steps once a second says nothing about the loop.
 """
 
 from __future__ import annotations
@@ -21,29 +21,33 @@ from grounded_trials.logs.signals import Series, SignalSpec, read_signals
 from grounded_trials.starting.kinds import COMMANDED
 
 RATES = (1000, 500, 400, 250, 200, 125, 120, 100, 60, 50, 40, 30, 25, 20, 15, 10, 5, 2)  # [Hz]
-STEPS = tuple(float(f"{1 / rate:.6g}") for rate in RATES)  # [s], as it is written
-GUESSED = 0.05  # [s]
-LONGEST = 0.1  # [s]; what changes more rarely may be a test signal's steps
-ENOUGH = 20  # times between changes
-NEARLY_ALL = 0.95  # of them are multiples of the interval
-ONCE = 0.25  # of them are the interval itself
-APART = 1.5  # rows, from which an interval is another one than theirs
-NEAR = 0.03  # of an interval: it is one of STEPS, whose rows come that nearly so often
-OFF = 0.05  # of an interval, that the mean of the times between changes may be from it
-MOSTLY, IN_STEP = 0.5, 0.6  # of times between changes, and of their phases, where a loop jitters
-TOGETHER = 40  # changes whose phases are compared: clocks drift
-EXACT, LOOSE = 0.1, 0.25  # of an interval: how far a multiple may be off it
+STEPS = tuple(float(f"{1 / rate:.6g}") for rate in RATES)  # [s], rounded as written to files
+GUESSED = 0.05  # [s], if nothing is known
+LONGEST = 0.1  # [s]; slower changes may be the steps of a test signal
+ENOUGH = 20  # smallest number of times between changes
+NEARLY_ALL = 0.95  # share of them that must be multiples of the interval
+ONCE = 0.25  # share of them that must equal the interval
+APART = 1.5  # smallest ratio of an interval to that of the rows
+NEAR = 0.03  # relative tolerance for rounding to one of STEPS
+OFF = 0.05  # relative tolerance of the mean time between changes
+MOSTLY, IN_STEP = 0.5, 0.6  # for a loop that jitters: share of intervals, and phase coherence
+TOGETHER = 40  # changes per block of phases, short because clocks drift
+EXACT, LOOSE = 0.1, 0.25  # tolerance of a multiple, as a fraction of the interval
 
 
 def interval_of(
     report: LogReport, inputs: Sequence[Guess], states: Sequence[Guess]
 ) -> tuple[float, str, str]:
-    """(the control interval [s], whose it is, a note where it is not that of the rows).
+    """Estimate the control interval of a log.
 
     Args:
         report: the log.
-        inputs: where its commands are.
-        states: where its states are.
+        inputs: the paths of its commands.
+        states: the paths of its states.
+
+    Returns:
+        The interval [s], its origin as the end of a comment, and a note if it differs from the
+        interval of the rows.
     """
     inputs = _commanded(inputs)
     for guesses, whose in ((inputs, "log's commands"), (states, "log's states")):
@@ -56,8 +60,8 @@ def interval_of(
         held = _held(report, inputs, rows) if guesses is inputs else None
         if held is not None:
             note = (
-                f"the log has its commands every {rows:.3g} s, but they change every {held:g} s: "
-                "that is dt; --dt says otherwise"
+                f"the log has a command every {rows:.3g} s, but commands change every {held:g} s: "
+                "dt is set to that; --dt overrides it"
             )
             return held, ": that in which the log's commands change", note
         return round_interval(rows), f": that of the {whose}", ""
@@ -65,9 +69,9 @@ def interval_of(
 
 
 def round_interval(rows: float) -> float:
-    """The interval of a loop whose rows come so often [s]: of a usual rate, else of whole Hz or ms.
+    """Round the interval of a log's rows [s] to a usual rate, else to whole Hz or ms.
 
-    It is not shorter than the shortest of `STEPS`, nor longer than the longest.
+    Intervals outside the range of `STEPS` become the nearest end of it.
     """
     usual = min(STEPS, key=lambda step: abs(np.log(step / rows)))
     if abs(usual / rows - 1) < NEAR or not STEPS[0] < rows < STEPS[-1]:
@@ -78,33 +82,33 @@ def round_interval(rows: float) -> float:
 
 
 def _held(report: LogReport, inputs: Sequence[Guess], rows: float) -> float | None:
-    """The interval in which commands change that are logged more often; None: not to be told."""
+    """Return the interval at which commands change if they are logged more often, else None."""
     specs = {g.name: SignalSpec(g.path, clock=g.clock) for g in inputs if g.path}  # type: ignore[arg-type]
     try:
         found = read_signals(report.files, specs)
-    except GroundedError:  # what is wrong with it is said where the run is sampled
+    except GroundedError:  # reported later, when the run is sampled
         return None
     gaps = np.concatenate([_between_changes(one) for one in found.values()])
     return changes_every(gaps, rows)
 
 
 def _between_changes(series: Series) -> Array:
-    """The times between changes of a command [s]."""
+    """Return the times between changes of a command [s]."""
     order = np.argsort(series.t, kind="stable")
     t, values = series.t[order], series.values[order]
     return np.asarray(np.diff(t[1:][np.diff(values) != 0]) * 1e-9)
 
 
 def changes_every(gaps: Array, rows: float) -> float | None:
-    """The interval of which nearly all times between changes are multiples; None for none.
+    """Return the interval of which nearly all times between changes are multiples, else None.
 
     Args:
-        gaps: those times [s].
-        rows: the time between samples [s], by which each may be off.
+        gaps: times between changes [s].
+        rows: time between samples [s], the resolution of `gaps`.
     """
     if len(gaps) < ENOUGH:
         return None
-    found: dict[float, float] = {}  # how far the mean is off each that will do
+    found: dict[float, float] = {}  # relative deviation of the mean, by possible interval
     for step in STEPS:
         if not APART * rows < step <= LONGEST:
             continue
@@ -122,9 +126,9 @@ def changes_every(gaps: Array, rows: float) -> float | None:
 
 
 def _in_phase(gaps: Array, rows: float) -> float | None:
-    """The interval of a loop whose jitter takes changes a row earlier or later; None for none.
+    """Return the interval of a loop whose changes jitter by a row, else None.
 
-    Times between them are then off by a row now and then, but the next ones make up for it.
+    Single times between changes are then off by a row, but the phase of the changes stays the same.
     """
     changes, found = np.cumsum(gaps), dict[float, float]()
     parts = np.array_split(changes, max(1, len(changes) // TOGETHER))
@@ -138,7 +142,7 @@ def _in_phase(gaps: Array, rows: float) -> float | None:
 
 
 def _commanded(inputs: Sequence[Guess]) -> tuple[Guess, ...]:
-    """The inputs; one that was not found at what is called a command among its rivals."""
+    """Return the inputs; one without a path gets that of a rival named like a command."""
     rivals = [next((p for p in g.others if COMMANDED.search(p.lower())), "") for g in inputs]
     return tuple(
         g if g.path else replace(g, path=path) for g, path in zip(inputs, rivals, strict=True)

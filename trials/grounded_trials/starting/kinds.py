@@ -1,7 +1,7 @@
-"""Which kind of robot a log was recorded on, and the skeleton of its model, named after the log.
+"""Guesses the kind of robot from a log, and writes its model skeleton with the log's names.
 
-A skeleton is a model.py that runs as it is: the simplest equations of its kind, with parameters
-whose bounds say how little is known of them. It is meant to be changed.
+A skeleton is a model.py that runs unchanged: the simplest equations of its kind of robot, with wide
+bounds on the parameters. Users are expected to edit it.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from grounded_trials.starting.skeletons import (
     arm,
 )
 
-Joints = Mapping[str, tuple[str, ...]]  # of each topic, see `joint_names`
-Units = Mapping[str, str]  # of a number by its path
-HELD = 0.3  # of the samples that repeat the one before: what a loop sends, no sensor
-MOST, INPUTS = 6, 4  # states and inputs of a generic model, where nobody says which
-SIDES = re.compile(r"^(left|right|u\d*|u_\w+)$")  # what inputs are called, beside COMMANDED
+Joints = Mapping[str, tuple[str, ...]]  # joint names by topic, see `joint_names`
+Units = Mapping[str, str]  # unit of a number by its path
+HELD = 0.3  # share of samples equal to the previous one, above which a number is a command
+MOST, INPUTS = 6, 4  # largest number of states and of guessed inputs of a generic model
+SIDES = re.compile(r"^(left|right|u\d*|u_\w+)$")  # names of inputs, in addition to COMMANDED
 COMMANDED = re.compile(
     "cmd|command|desired|setpoint|target|input|throttle|torque|tau|effort|volt|pwm|duty|motor|steer"
     r"|goal|control|_con|_ref|stellgr|stellwert|sollwert|_soll\b|befehl|consigne|commande|comando"
 )
-ACTUATOR = re.compile("servo|actuator")  # a command, or where it stands
+ACTUATOR = re.compile("servo|actuator")  # either a command or a measured position
 
 HEADING = re.compile(r"(^|[/._])(yaw|psi|heading|theta|th|orientation)([/._\d]|$)")
 SENSED = re.compile(
@@ -44,34 +44,36 @@ SENSED = re.compile(
 )
 PITCHES, ROLLS_ON = {"pitch", "tilt", "lean"}, {"x", "v", "position", "speed", "velocity", "wheel"}
 FLIES = {"roll", "yaw", "z", "thrust", "altitude", "elevator", "rudder", "steering", "psi"}
-SWINGS = re.compile(r"angle|swing|sway|pendulum|pole|theta|tilt")  # what hangs from a trolley
+SWINGS = re.compile(r"angle|swing|sway|pendulum|pole|theta|tilt")  # angle of a load on a trolley
 FLYING = re.compile(
     r"(^|[/_])(cf\d*|crazyflie|quad(rotor|copter)?|drone|uav|mavros|copter)([/_]|$)"
 )
 
 
 def moving(log: LogReport) -> dict[str, FieldReport]:
-    """The numbers of a log that change, by the names that a generic model gives them."""
+    """Return the numbers of a log that change, by their names in a generic model."""
     fields = [one for t in log.topics for one in t.fields if one.low != one.high]
     fields = [one for one in fields if not re.search(r"covariance|layout", one.path)]
     return {_word(one.path): one for one in reversed(fields)}
 
 
 def called_input(name: str, path: str) -> bool:
-    """Whether a number of a log is called like what is sent to a robot."""
+    """Return whether a number of a log is named like a command."""
     return bool(COMMANDED.search(path.lower()) or SIDES.search(name))
 
 
 def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = None) -> Skeleton:
-    """Every number that moves is a state: one whose rate is another's value, else one with a lag.
+    """Return a skeleton for any robot, with the numbers of the log as states and inputs.
 
-    Inputs are those that are named, else those that are called like one, else those whose value is
-    held for several samples while others move, else what is called after an actuator.
+    A state whose rate is another state gets that as its derivative; every other state follows the
+    inputs with a first-order lag. Without `inputs`, the inputs are the numbers that are named like
+    commands, else those held constant over several samples while others move, else those named
+    after an actuator.
 
     Args:
-        log: whose numbers they are.
-        inputs: names of those that are inputs, in order; none: as said above.
-        units: of numbers by their path, where the log says them.
+        log: the log.
+        inputs: names of the numbers that are inputs, in order; empty: guessed as above.
+        units: units by path, where the log states them.
 
     Raises:
         GroundedError: for an input that the log does not have.
@@ -100,7 +102,7 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
     turned = {s: found[s] for s in states if unit.get(s) == "rad"}
     return Skeleton(
         "generic",
-        "Numbers that follow the inputs with a lag: write down what moves your robot",
+        "Numbers that follow the inputs with a lag: replace them by your robot's equations",
         {s: unit.get(s, "1") for s in states},
         {i: unit.get(i, "1") for i in inputs},
         {f"tau_{s}": '1.0, "s", 0.01, 100.0' for s in states if s not in rates} | gains,
@@ -116,7 +118,7 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
 
 
 def _rates(log: LogReport, paths: Mapping[str, str]) -> dict[str, str]:
-    """Of each position, by name, its rate as an expression: another number of the log."""
+    """Return for each position, by name, its rate as an expression of another number of the log."""
     names = {path: name for name, path in paths.items()}
     return {
         names[position]: f"{times:g} * " * (times != 1) + f"s.{names[rate]}"
@@ -125,7 +127,7 @@ def _rates(log: LogReport, paths: Mapping[str, str]) -> dict[str, str]:
 
 
 def _word(path: str) -> str:
-    """The end of a message path as a Python name."""
+    """Return the end of a message path as a Python name."""
     last = path.replace("@", "").rsplit(".", 1)[-1].strip('"')
     name = last if last not in ("data", "value") else path.rsplit(".", 1)[0].rsplit("/", 1)[-1]
     name = re.sub(r"\W+", "_", name).strip("_")
@@ -136,7 +138,7 @@ KINDS = ("car", "rover", "differential", "balance", "drone", "arm", "pendulum", 
 
 
 def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
-    """The kind of robot that a log was probably recorded on, and what says so."""
+    """Return the kind of robot that a log was probably recorded on, and the reason."""
     steered = next((t.topic for t in log.topics if "Ackermann" in t.type), None)
     if steered is not None:
         return "car", f"{steered} holds Ackermann commands"
@@ -148,10 +150,10 @@ def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
         return kind, f"{where} has {len(names)} joints: {', '.join(names[:6])}"
     flying = next((t.topic for t in log.topics if FLYING.search(t.topic.lower())), None)
     if flying is not None:
-        return "drone", f"{flying} is named after one"
+        return "drone", f"{flying} is named like a drone"
     for wanted, kind, what in (
-        (("steer",), "car", "names a steering"),
-        (("thrust", "attitude_setpoint", "actuator_outputs"), "drone", "names a thrust"),
+        (("steer",), "car", "has a steering signal"),
+        (("thrust", "attitude_setpoint", "actuator_outputs"), "drone", "has a drone's commands"),
         (("cmd_vel",), "rover", "holds velocity commands"),
     ):
         for topic in log.topics:
@@ -159,18 +161,18 @@ def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
                 return kind, f"{topic.topic} {what}"
     words = {_word(one.path).lower() for topic in log.topics for one in topic.fields}
     if both := _both_sides(log):
-        return "differential", f"{' and '.join(both)} drive it, and it has a heading"
+        return "differential", f"it has the commands {' and '.join(both)}, and a heading"
     if command := _balancing(log):
-        return "balance", f"it pitches, rolls on and has one command, {command}"
+        return "balance", f"it has a pitch, a position or speed, and one command, {command}"
     if words & {"theta", "angle", "q", "q_rad", "position"} and words & {"torque", "tau", "u"}:
-        return "pendulum", "an angle and a torque"
+        return "pendulum", "the log has an angle and a torque"
     if flat := next((t.topic for t in log.topics if _in_the_plane(t)), None):
-        return "rover", f"{flat} moves in the plane and no steering is named"
-    return "generic", "nothing tells what kind of robot it is, --kind does: the names are the log's"
+        return "rover", f"{flat} moves in a plane, and there is no steering signal"
+    return "generic", "the kind of robot is unknown, --kind sets it; names are the log's"
 
 
 def of_arms(joints: Joints) -> Joints:
-    """Topics of joints that are not all wheels, as those of a robot that drives are."""
+    """Return the topics whose joints are not all wheels."""
     return {
         topic: names
         for topic, names in joints.items()
@@ -179,12 +181,12 @@ def of_arms(joints: Joints) -> Joints:
 
 
 def _turning(joints: Joints) -> Joints:
-    """Topics of joints that do not all slide: a slide alone is neither an arm nor a pendulum."""
+    """Return the topics whose joints do not all slide: slides alone form no arm or pendulum."""
     return {topic: names for topic, names in joints.items() if not all(map(slides, names))}
 
 
 def _hung(log: LogReport, joints: Joints) -> str:
-    """What says that something swings on a trolley, a load or a pole; "" where nothing does."""
+    """Return the evidence that a load or pole swings on a trolley, "" if there is none."""
     own = [(topic, names) for topic, names in joints.items() if sum(map(slides, names)) == 1]
     driving = ("/Odometry", "/Twist", "/TwistStamped")
     if not own or any(t.type.endswith(driving) for t in log.topics):
@@ -192,15 +194,15 @@ def _hung(log: LogReport, joints: Joints) -> str:
     (topic, names), found = own[0], moving(log)
     slide, others = next(filter(slides, names)), [name for name in names if not slides(name)]
     if len(others) == 1:
-        return f"{topic} has '{slide}', which slides, and '{others[0]}'"
+        return f"{topic} has the sliding joint '{slide}', and '{others[0]}'"
     angles = [n for n, one in found.items() if SWINGS.search(n) and not called_input(n, one.path)]
     if others or not angles:
         return ""
-    return f"{topic} has '{slide}', which slides, and {found[angles[0]].path} is an angle"
+    return f"{topic} has the sliding joint '{slide}', and {found[angles[0]].path} is an angle"
 
 
 def _crane(log: LogReport, units: Units) -> Skeleton:
-    """The crane with its command's own name, in volts or without a unit where that is no force."""
+    """Return the crane skeleton with the log's command; unless it is a force, in V or unitless."""
     found = moving(log)
     sent = [name for name, one in found.items() if called_input(name, one.path)]
     if len(sent) != 1 or sent[0] in CRANE.inputs:
@@ -213,7 +215,7 @@ def _crane(log: LogReport, units: Units) -> Skeleton:
 
 
 def _both_sides(log: LogReport) -> tuple[str, ...]:
-    """A command of the left and one of the right, in a log that has a heading too; () for none."""
+    """Return the names of a left and a right command; () without both, or without a heading."""
     found = moving(log)
     if not any(HEADING.search(one.path.lower()) for one in found.values()):
         return ()
@@ -226,7 +228,7 @@ def _both_sides(log: LogReport) -> tuple[str, ...]:
 
 
 def _balancing(log: LogReport) -> str:
-    """The command of a robot that balances on two wheels; "" where it is another."""
+    """Return the command of a robot balancing on two wheels, "" if the log is of another kind."""
     found = moving(log)
     words = {word for name in found for word in (name.lower(), *name.lower().split("_"))}
     if not words & PITCHES or not words & ROLLS_ON or words & FLIES:
@@ -236,12 +238,12 @@ def _balancing(log: LogReport) -> str:
 
 
 def _in_volts(name: str, path: str, units: Units) -> bool:
-    """Whether a command is said to be in volts, or called so."""
+    """Return whether a command's unit is V, or its name contains "volt" and no unit is known."""
     return units.get(path, "V" if "volt" in name.lower() else "1").endswith("V")
 
 
 def _driven_by(command: str, volts: bool) -> Skeleton:
-    """The balancing robot with its command's own name, in volts or without a unit."""
+    """Return the balancing robot's skeleton with the log's command, in volts or unitless."""
     before = [line.replace("a.voltage", f"a.{command}") for line in BALANCE.before]
     if volts:
         return replace(BALANCE, inputs={command: "V"}, before=before)
@@ -251,7 +253,7 @@ def _driven_by(command: str, volts: bool) -> Skeleton:
 
 
 def _in_the_plane(topic: TopicReport) -> bool:
-    """An odometry that neither rises nor moves sideways."""
+    """Return whether a topic is odometry of a robot that moves neither up nor sideways."""
     still = ("position.z", "linear.y", "linear.z")
     fields = [one for one in topic.fields if one.path.endswith(still)]
     odometry = topic.type.endswith("/Odometry") and topic.messages > 2
@@ -264,7 +266,7 @@ def _says(topic: TopicReport, words: Sequence[str]) -> bool:
 
 
 def _car(log: LogReport) -> Skeleton:
-    """The car with a speed or a throttle as its command, its steering an angle, or a part of 1."""
+    """Return the car skeleton: driven by speed or throttle, steered in rad or unitless."""
     throttle = any(_says(topic, ("throttle",)) for topic in log.topics)
     numbers = [one.path for topic in log.topics for one in topic.fields]
     said = {unit_in_name(path) for path in numbers if "steer" in _word(path).lower()} - {""}
@@ -284,7 +286,7 @@ def skeleton(
     inputs: Sequence[str] = (),
     units: Units | None = None,
 ) -> Skeleton:
-    """The skeleton of a kind, named after what is in the log; for the rest see `generic`."""
+    """Return the skeleton of a kind with the log's names; for the arguments see `generic`."""
     if kind == "arm":
         joints = of_arms(joints) or joints
         return arm(from_base(next(iter(joints.values()))) if joints else ("joint1", "joint2"))

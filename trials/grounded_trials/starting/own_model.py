@@ -1,8 +1,8 @@
-"""The user's own model, brought into a workspace: model.py and the files beside it that it reads.
+"""Copies the user's own model into a workspace: model.py and the files that it reads.
 
-An MJCF or URDF file is a model too: model.py is then written, two lines that load it. What a model
-reads from its own folder is copied to the same place in the workspace, so that this can be moved;
-what lies elsewhere can't be.
+For an MJCF or URDF file, a model.py that loads it is written. Files that a model reads from its own
+folder are copied to the same relative place in the workspace, so that it can be moved; files
+elsewhere are not copied.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from grounded.result import listed
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.model_file import load_module, model_in
 
-SIMULATED = (".xml", ".urdf", ".mjcf")  # files that MuJoCo loads
+SIMULATED = (".xml", ".urdf", ".mjcf")  # suffixes of files that MuJoCo loads
 FILE = "model.py"
 LOADS = """from grounded.adapters import mujoco
 
@@ -27,32 +27,32 @@ model = mujoco.model({name}){remark}
 """
 STAYS = "  # not copied: it reads files outside its folder"
 MOVED = """
-# What `fit` and `diagnose` may move is named in params=, with its bounds:
+# params= names the parameters that `fit` and `diagnose` may change, with their bounds:
 # model = mujoco.model({name}, params={{{body}: ({low:.3g}, {high:.3g})}})
-# also the damping, frictionloss, armature of a joint, the gear of an actuator ...
+# others: the damping, frictionloss, armature of a joint, the gear of an actuator ...
 """
 
 
 @dataclass(frozen=True, eq=False)
 class OwnModel:
-    """A model file as it is brought into a workspace."""
+    """A model file that is to be copied into a workspace."""
 
-    file: Path  # that was named
+    file: Path  # the file that the user named
     model: Model
-    source: bytes  # of model.py
-    others: Mapping[str, Path]  # what is copied with it, by its place in the workspace
-    outside: tuple[Path, ...]  # what it reads that lies elsewhere
+    source: bytes  # contents of model.py
+    others: Mapping[str, Path]  # other files to copy, by their relative path in the workspace
+    outside: tuple[Path, ...]  # files that it reads from other folders
 
     def missing(self, folder: Path) -> tuple[str, ...]:
-        """The files that are to be written to a folder: those that do not lie there already."""
+        """Return the names of the files that a folder does not have yet."""
         files = {FILE: self.file} | dict(self.others)
         return tuple(name for name, path in files.items() if not _there(folder / name, path))
 
     def bring(self, folder: Path) -> Model:
-        """Writes what is missing of it, and loads it from there.
+        """Write the missing files to a folder, and load the model from there.
 
         Raises:
-            GroundedError: if it does not load there.
+            GroundedError: if it does not load from that folder.
         """
         for name in self.missing(folder):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -63,17 +63,17 @@ class OwnModel:
         except GroundedError as error:
             far = f" ({listed(map(str, self.outside))})" if self.outside else ""
             raise GroundedError(
-                f"{self.file} loads where it lies, but not as a copy in {folder}: {error}. Make "
-                f"{folder} yourself, put {self.file.name} there as {FILE} and beside it the files "
-                f"that it reads{far}, then give --model {folder / FILE}"
+                f"{self.file} loads from its own folder, but its copy in {folder} does not: "
+                f"{error}. Create {folder} yourself, copy {self.file.name} there as {FILE}, and "
+                f"the files that it reads{far} too, then give --model {folder / FILE}"
             ) from None
 
 
 def own_model(file: str | Path) -> OwnModel:
-    """The model of a file: one that holds `model`, or an MJCF or URDF file.
+    """Load the user's model: a Python file that defines `model`, or an MJCF or URDF file.
 
     Raises:
-        GroundedError: if there is no such file, or no model in it.
+        GroundedError: if the file does not exist, or holds no model.
     """
     file = Path(file)
     if not file.is_file():
@@ -91,7 +91,7 @@ def own_model(file: str | Path) -> OwnModel:
             model = model_in(load_module(folder, file.name, key="--model"))
     outside = tuple(dict.fromkeys(path for root, path in read if not path.is_relative_to(root)))
     others = {str(path.relative_to(root)): path for root, path in read if path not in outside}
-    if simulated:  # what can't be copied whole stays where it is
+    if simulated:  # loaded from its own folder if it reads files from elsewhere
         name, others = (str(folder / file.name), {}) if outside else (file.name, others)
         return OwnModel(file, model, _loads(folder / file.name, name).encode(), others, outside)
     try:
@@ -101,7 +101,7 @@ def own_model(file: str | Path) -> OwnModel:
 
 
 def _loads(file: Path, name: str) -> str:
-    """The text of a model.py that loads an MJCF or URDF file by a name."""
+    """Return the text of a model.py that loads an MJCF or URDF file under a name."""
     from grounded.adapters.mujoco_files import load
 
     compiled, quoted = load(file), json.dumps(name, ensure_ascii=False)
@@ -115,7 +115,7 @@ def _loads(file: Path, name: str) -> str:
 
 
 def _there(path: Path, source: Path) -> bool:
-    """Whether a file is at its place: itself, or a copy of it."""
+    """Return whether `path` already is the source file, or (except model.py) a copy of it."""
     if not path.is_file() or path.name == FILE:
         return path.is_file() and path.samefile(source)
     return path.read_bytes() == source.read_bytes()

@@ -1,8 +1,8 @@
-"""Targets: a path driven with limited speed and acceleration, a step, a swing-up, a recorded run.
+"""Draws targets: paths with limited speed and acceleration, steps, swing-ups, recorded runs.
 
-A path is given over its length; the speed starts from rest, rises with `accel` and keeps to `speed`
-and, in curves, to sqrt(lateral / curvature). Every state that the model's roles name gets its
-column: position, heading, speed, heading_rate.
+A path is parametrised by its length. The speed starts at zero, rises with `accel`, and is limited
+by `speed` and, in curves, by sqrt(lateral / curvature). Every state with one of the roles position,
+heading, speed and heading_rate gets a column.
 """
 
 from __future__ import annotations
@@ -27,29 +27,32 @@ from grounded_trials.workspace.task_file import read_target
 
 PATHS = ("line", "circle", "figure-8")
 SHAPES = (*PATHS, "step", "swing-up")
-FINE = 2000  # points of a path
+FINE = 2000  # number of points of a path
 
 
 @dataclass(frozen=True)
 class Drive:
-    """How a path is driven, SI units."""
+    """Size, speed limits and timing of a path, in SI units."""
 
     size: float = 2.0  # [m] length of a line, radius of a circle and of an 8's loops
-    speed: float = 1.0  # [m/s] at most
+    speed: float = 1.0  # [m/s] limit
     accel: float = 1.0  # [m/s^2] along the path
     lateral: float = 4.0  # [m/s^2] across it
     laps: float = 1.0
-    hold: float = 0.0  # [s] at rest at its end
+    hold: float = 0.0  # [s] of rest at the end
 
 
 def path_target(shape: str, drive: Drive, model: Model, dt: float) -> dict[str, Array]:
-    """Columns of a target that follows a path from rest.
+    """Return the columns of a target that follows a path from rest.
 
     Args:
         shape: line, circle or figure-8.
-        drive: its size and speeds.
-        model: whose roles name the states.
+        drive: size and speeds of the path.
+        model: its roles name the states.
         dt: control interval [s].
+
+    Returns:
+        The desired values of each state, (H + 1,).
 
     Raises:
         GroundedError: if the model has no position, or a number is not positive.
@@ -98,23 +101,26 @@ def line_target(
     seconds: float | None = None,
     kept: str = "",
 ) -> dict[str, Array]:
-    """Columns of a straight line in the states, from rest to rest, with their rates.
+    """Return the columns of a straight line in the states, from rest to rest, with their rates.
 
-    Of a position whose one coordinate is named the others stay where they start.
+    If one coordinate of a position is named, the others stay at their start values.
 
     Args:
-        to: where it ends, by state; none: `drive.size` further, on the model's one axis.
-        start: where states start that do not start at 0.
-        drive: speed and acceleration of the state that goes farthest, in its unit.
-        model: whose states they are.
+        to: end value by state; empty: `drive.size` further along the model's only axis.
+        start: start values of states that do not start at 0.
+        drive: speed and acceleration of the state that moves farthest, in its unit.
+        model: the model of the states.
         dt: control interval [s].
-        seconds: that it takes from rest to rest; None: as `drive` says.
-        kept: which of the drive's "speed" and "accel" holds with those, the other follows; "":
-            neither has to.
+        seconds: duration from rest to rest [s]; None: determined by `drive`.
+        kept: with `seconds`, which of "speed" and "accel" of `drive` is kept, while the other is
+            computed; "": both are computed.
+
+    Returns:
+        The desired values of each state, (H + 1,).
 
     Raises:
-        GroundedError: for a name that is no state, a line of no length, where several axes may be
-            meant, or where the line can't take so long.
+        GroundedError: for an unknown state, a line of zero length, an ambiguous axis, or a
+            duration that is not possible with the speed or acceleration kept.
     """
     _check(drive)
     to = to or {(name := _axis(model)): start.get(name, 0.0) + drive.size}
@@ -122,7 +128,7 @@ def line_target(
     way = {name: value - start.get(name, 0.0) for name, value in to.items()}
     length = max(map(abs, way.values()))
     if not 0 < length < np.inf:
-        raise GroundedError(f"the line ends where it starts, at {_told(to)}: --to says where else")
+        raise GroundedError(f"the line ends where it starts, at {_told(to)}: change --to")
     if seconds is not None:
         drive = _in_time(drive, length, seconds, kept)
     along = np.linspace(0, length, FINE)
@@ -131,7 +137,7 @@ def line_target(
     speed = _reachable(along, limit, drive.accel)
     when = np.concatenate([[0.0], np.cumsum(2 * np.diff(along) / (speed[1:] + speed[:-1]))])
     if seconds is not None:
-        when *= seconds / when[-1]  # but for what FINE points leave
+        when *= seconds / when[-1]  # correct the discretisation error
     t = _grid(when[-1] + drive.hold, dt)
     share, rate = np.interp(t, when, along) / length, np.interp(t, when, speed) / length
     columns = {name: start.get(name, 0.0) + share * far for name, far in way.items()}
@@ -142,22 +148,23 @@ def line_target(
 
 
 def _in_time(drive: Drive, length: float, seconds: float, kept: str) -> Drive:
-    """The drive with which a line takes so long: no faster than it has to be, nor more abrupt."""
+    """Return the slowest and gentlest drive that covers a line in `seconds`, see `line_target`."""
     if not 0 < seconds < np.inf:
         raise GroundedError(f"--seconds must be positive, found {seconds:g}")
-    least = 4 * length / seconds**2  # faster up to the middle, slower from there
+    least = 4 * length / seconds**2  # accelerates to the middle, then decelerates
     if kept == "speed":
         if drive.speed * seconds <= length:
             raise GroundedError(
-                f"{length:g} in {seconds:g} s is faster than --speed {drive.speed:g}: it takes "
-                f"more than {length / drive.speed:.3g} s, or leave --speed away"
+                f"{length:g} in {seconds:g} s is faster than --speed {drive.speed:g}: allow "
+                f"more than {length / drive.speed:.3g} s, or omit --speed"
             )
         accel = drive.speed**2 / (drive.speed * seconds - length)
         return replace(drive, accel=accel if drive.speed * seconds < 2 * length else least)
     if kept == "accel" and drive.accel < least * (1 - 1e-9):
         raise GroundedError(
-            f"{length:g} in {seconds:g} s from rest to rest needs --accel {least:.3g} at least, "
-            f"found {drive.accel:g}: with that it takes {2 * np.sqrt(length / drive.accel):.3g} s"
+            f"{length:g} in {seconds:g} s from rest to rest needs at least --accel {least:.3g}, "
+            f"found {drive.accel:g}, with which it takes "
+            f"{2 * np.sqrt(length / drive.accel):.3g} s"
         )
     accel = max(drive.accel, least)
     root = np.sqrt(max((accel * seconds) ** 2 - 4 * accel * length, 0.0))
@@ -165,19 +172,19 @@ def _in_time(drive: Drive, length: float, seconds: float, kept: str) -> Drive:
 
 
 def has_plane(model: Model) -> bool:
-    """Whether paths can be drawn in the model's plane."""
+    """Return whether the model has a plane to draw paths in."""
     return len(model.roles.get("position", ())) > 1
 
 
 def _axis(model: Model) -> str:
-    """The one state that a line without an end moves."""
+    """Return the state along which a line without `--to` runs."""
     named = model.roles.get("position") or model.roles.get("rail") or tuple(velocities(model))
     moved = (named,) if isinstance(named, str) else named
     if len(moved) == 1:
         return moved[0]
     raise GroundedError(
-        f"model '{model.name}' has {'several axes' if moved else 'no axis'} that a line may be "
-        f"along: name one, such as --to {next(iter(moved or model.states))}=1.0"
+        f"model '{model.name}' has {'several axes' if moved else 'no axis'} for a line: name a "
+        f"state and its end, such as --to {next(iter(moved or model.states))}=1.0"
     )
 
 
@@ -186,7 +193,7 @@ def _told(values: Mapping[str, float]) -> str:
 
 
 def _path(shape: str, drive: Drive) -> tuple[Array, Array, Array, Array]:
-    """Length, x, y and heading along a path from the origin, heading along x."""
+    """Return length, x, y and heading along a path from the origin that starts along x."""
     a, turn = drive.size, 2 * np.pi * drive.laps * np.linspace(0, 1, FINE)
     if shape == "line":
         s = np.linspace(0, a, FINE)
@@ -202,7 +209,7 @@ def _path(shape: str, drive: Drive) -> tuple[Array, Array, Array, Array]:
 
 
 def _reachable(along: Array, limit: Array, accel: float) -> Array:
-    """The fastest speed within a limit that starts at rest and needs no more than `accel`."""
+    """Return the fastest speed profile within `limit` and `accel` that starts at rest."""
     v = limit.copy()
     v[0] = 0.0
     for i in range(len(v) - 1):
@@ -219,14 +226,14 @@ def step_target(
     seconds: float,
     start: Mapping[str, float] = MappingProxyType({}),
 ) -> dict[str, Array]:
-    """Columns that ask for given values from the second row on; the first is the start, else 0.
+    """Return columns with given values from the second row on; the first row is `start`, or 0.
 
     Raises:
-        GroundedError: for a name that is no state.
+        GroundedError: for an unknown state, or without a state or a duration.
     """
     rows = round(seconds / dt) + 1
     if not to or rows < 2:
-        raise GroundedError("name a state and its value, such as --to x=1.0, and some --seconds")
+        raise GroundedError("name a state and its value, such as --to x=1.0, and --seconds")
     _check_states(to, model)
     first = np.arange(rows) < 1
     return {name: np.where(first, start.get(name, 0.0), value) for name, value in to.items()}
@@ -239,7 +246,7 @@ def _check_states(to: Mapping[str, float], model: Model) -> None:
 
 
 def swing_up(model: Model, dt: float, seconds: float) -> dict[str, Array]:
-    """The first angle to pi, everything of it at rest there; the way up is free.
+    """Return columns with the first angle at pi and its rate at 0; other states are free.
 
     Raises:
         GroundedError: if the model has no state in radians.
@@ -253,12 +260,12 @@ def swing_up(model: Model, dt: float, seconds: float) -> dict[str, Array]:
 
 
 def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[str, Array]:
-    """The states of a recorded run as a target: a log through [log], or a CSV of states.
+    """Return the states of a recorded run as a target: a log read through [log], or a CSV.
 
     Args:
-        workspace: whose model and [log] it is read by.
-        file: a log of any format; a CSV may have columns `t` and states instead.
-        shapes: what else could have been meant, for the message.
+        workspace: provides the model and [log].
+        file: a log in any format, or a CSV with columns `t` and states.
+        shapes: names of the shapes, suggested if the file does not exist.
 
     Raises:
         GroundedError: if there is no such file, or it can't be sampled.
@@ -277,7 +284,7 @@ def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[st
         return {name: np.interp(t, at, values[:, names.index(name)]) for name in known}
     if mapping is None:
         raise GroundedError(
-            f"grounded.toml has no [log] table to read {file} by: `inspect` prints one",
+            f"grounded.toml has no [log] table, which reading {file} needs: `inspect` prints one",
             NextCommand("inspect", (file,)),
         )
     found = read_log(log_files(file), mapping, dt, angles=model.angles)
@@ -285,6 +292,6 @@ def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[st
 
 
 def _holds(table: Path, mapping: LogMapping) -> bool:
-    """Whether a table has all that [log] names, inputs too, as a log has and a target has not."""
+    """Return whether a table has all states and inputs of [log]: then it is a log, no target."""
     known = {f.path for t in inspect_log(table).topics for f in t.fields}
     return all(s.path in known for s in (*mapping.states.values(), *mapping.inputs.values()))

@@ -1,4 +1,4 @@
-"""The skeletons of the kinds of robot: the simplest equations of each, as texts of a model.py."""
+"""The model skeletons: the simplest equations of each kind of robot, as the text of a model.py."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ class Skeleton:
     """A model as text: names with units, parameters, lines of equations."""
 
     kind: str
-    text: str  # what it is, one line
+    text: str  # description, one line
     states: Mapping[str, str]
     inputs: Mapping[str, str]
     params: Mapping[str, str]  # name -> the arguments of Param
-    lines: Sequence[str]  # name: expression, of ds/dt
+    lines: Sequence[str]  # `"state": expression` of ds/dt
     angles: tuple[str, ...] = ()
     roles: Mapping[str, object] = field(default_factory=dict)
-    before: Sequence[str] = ()  # lines above the equations
+    before: Sequence[str] = ()  # lines of code above the equations
 
     def source(self) -> str:
-        """The text of model.py."""
+        """Return the text of model.py."""
         params = [f'        "{name}": Param({given}),' for name, given in self.params.items()]
         return "\n".join(
             [
                 f'"""{self.text}.',
                 "",
-                "A skeleton by `grounded init --from`: make it yours.",
+                "A skeleton written by `grounded init --from`: change it to match your robot.",
                 '"""',
                 "",
                 "import numpy as np",
@@ -44,7 +44,7 @@ class Skeleton:
                 "    }",
                 "",
                 "",
-                "# Param(value, unit) is a constant; with bounds, `fit` may move it between them.",
+                "# Param(value, unit) is a constant; `fit` may change one that has bounds.",
                 "model = Model(",
                 f'    name="{self.kind}",',
                 f"    states={_dict(self.states)},",
@@ -110,7 +110,7 @@ ROVER = Skeleton(
 )
 DIFFERENTIAL = Skeleton(
     "differential",
-    "A robot on two driven wheels, each with its own command, whose speed it follows with a lag",
+    "A robot on two driven wheels, each following its own speed command with a lag",
     ROVER.states,
     {"left": "1", "right": "1"},
     {
@@ -128,7 +128,7 @@ DIFFERENTIAL = Skeleton(
 )
 DRONE = Skeleton(
     "drone",
-    "A hovering drone: attitude follows its commands with a lag, thrust lifts along its axis",
+    "A hovering drone: attitude follows its commands with a lag, thrust acts along its axis",
     {
         **dict.fromkeys("xyz", "m"),
         **{f"v{axis}": "m/s" for axis in "xyz"},
@@ -174,12 +174,12 @@ PENDULUM = Skeleton(
 
 BALANCE = Skeleton(
     "balance",
-    "A robot that balances on two wheels: pitch = 0 upright, forwards > 0; weigh its parts",
+    "A robot balancing on two wheels: pitch = 0 upright, forwards > 0; enter its masses",
     {"x": "m", "v": "m/s", "pitch": "rad", "pitch_rate": "rad/s"},
     {"voltage": "V"},
     {
-        "body": '1.0, "kg"',  # weigh it: motion tells ratios of masses and torques alone
-        "wheels": '0.15, "kg"',  # half as much again as they weigh, since they turn, too
+        "body": '1.0, "kg"',  # to be weighed: motion identifies only ratios of masses and torques
+        "wheels": '0.15, "kg"',  # 1.5 times their mass, to include their rotational inertia
         "l": '0.1, "m", 0.01, 1.0',
         "I": '0.005, "kg m^2", 0.00001, 5.0',
         "r": '0.035, "m"',
@@ -197,10 +197,10 @@ BALANCE = Skeleton(
     {"rail": "x", "upright": ("pitch",), "speed": "v"},
     before=(
         "torque = p.kt * (a.voltage - p.ke * (s.v / p.r - s.pitch_rate))  # of both motors",
-        "mass, inertia = p.body + p.wheels, p.I + p.body * p.l**2  # l: axle to its centre",
+        "mass, inertia = p.body + p.wheels, p.I + p.body * p.l**2  # l: axle to body's centre",
         "coupled = p.body * p.l * np.cos(s.pitch)",
         "push = torque / p.r + p.body * p.l * np.sin(s.pitch) * s.pitch_rate**2",
-        "fall = p.body * p.g * p.l * np.sin(s.pitch) - torque  # I: of the body, about its centre",
+        "fall = p.body * p.g * p.l * np.sin(s.pitch) - torque  # I: of the body about its centre",
         "det = mass * inertia - coupled**2",
     ),
 )
@@ -208,15 +208,15 @@ BALANCE = Skeleton(
 
 CRANE = Skeleton(
     "crane",
-    "A trolley on a rail, a load below it at x + L sin(theta): theta = 0 hanging down",
+    "A trolley on a rail with a load below it at x + L sin(theta): theta = 0 hanging down",
     {"x": "m", "v": "m/s", "theta": "rad", "omega": "rad/s"},
     {"force": "N"},
     {
-        "gain": '0.5, "m/s^2/N", 0.001, 100.0',  # of the trolley alone
+        "gain": '0.5, "m/s^2/N", 0.001, 100.0',  # without the load
         "damping": '0.5, "1/s", 0.0, 50.0',
         "ratio": '0.3, "1", 0.0, 10.0',
         "L": '1.0, "m", 0.05, 20.0',
-        "g": '9.81, "m/s^2"',  # -9.81: a pole on a cart, theta = 0 upright
+        "g": '9.81, "m/s^2"',  # -9.81 makes it a pole on a cart, theta = 0 upright
     },
     (
         '"x": s.v',
@@ -228,21 +228,21 @@ CRANE = Skeleton(
     {"rail": "x", "hanging": ("theta",)},
     before=(
         "sn, cs = np.sin(s.theta), np.cos(s.theta)",
-        "pull = p.ratio * sn * (p.L * s.omega**2 + p.g * cs)  # of the load; ratio: to the trolley",
+        "pull = p.ratio * sn * (p.L * s.omega**2 + p.g * cs)  # ratio: mass of load / trolley",
         "acc = (p.gain * a.force - p.damping * s.v + pull) / (1 + p.ratio * sn**2)",
     ),
 )
 
 
 def arm(joints: Sequence[str]) -> Skeleton:
-    """An arm whose joints don't feel each other, named after them, in order from the base."""
+    """Return an arm with uncoupled joints and their names, in order from the base."""
     short = [re.sub(r"_?joint_?", "", joint) or joint for joint in joints]
     distinct = len(set(short)) == len(joints)
     bare = [re.sub(r"\W+", "_", joint).strip("_") for joint in (short if distinct else joints)]
     names = [name if name.isidentifier() else f"joint{i}" for i, name in enumerate(bare, start=1)]
     return Skeleton(
         "arm",
-        f"An arm of {len(names)} joints that don't feel each other: write its inertia matrix",
+        f"An arm of {len(names)} uncoupled joints: replace them by its inertia matrix",
         {f"{n}_position": "rad" for n in names} | {f"{n}_velocity": "rad/s" for n in names},
         {f"{n}_effort": "N m" for n in names},
         {f"inertia_{n}": '0.1, "kg m^2", 0.0001, 10.0' for n in names}

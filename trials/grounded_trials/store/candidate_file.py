@@ -1,7 +1,7 @@
-"""A candidate as a file: the policy a robot runs and its predicted run.
+"""Writes and reads candidate files: the policy that a robot runs and its predicted run.
 
-The format is described in this folder's `__init__`. The file's own checksums find bits that
-flipped; `sha256` in its metadata finds a file that was written again with other contents.
+The format is described in this folder's `__init__`. The checksums of the file format detect flipped
+bits; `sha256` in the metadata detects a file that was rewritten with other contents.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from grounded_trials.store.own_files import (
     with_units,
 )
 
-DEPTH_LIMIT = 10_000  # past values of one input
+DEPTH_LIMIT = 10_000  # largest number of past values of one input
 
 
 def candidate_bytes(
@@ -39,7 +39,7 @@ def candidate_bytes(
     state_units: Units | None = None,
     input_units: Units | None = None,
 ) -> bytes:
-    """A candidate as the bytes of a file; equal arguments give equal bytes.
+    """Return a candidate as the bytes of a file; equal arguments give equal bytes.
 
     Args:
         policy: what the robot runs, H steps.
@@ -50,8 +50,8 @@ def candidate_bytes(
         input_units: the same for the inputs.
 
     Raises:
-        GroundedError: if the policy holds a number that is not finite, the shapes do not fit, or
-            an entry of `meta` is reserved.
+        GroundedError: if the policy holds a number that is not finite, a shape is wrong, or an
+            entry of `meta` is reserved.
     """
     from grounded_trials.formats.mcap_whole import Column, whole_file
     from grounded_trials.formats.mcap_writer import rows_of, rows_of_lists
@@ -86,13 +86,18 @@ def candidate_bytes(
 def read_candidate(
     source: str | Path | bytes, name: str = "candidate"
 ) -> tuple[Policy, Array, Array, dict[str, str]]:
-    """Reads a candidate back: (policy, predicted states, predicted inputs, metadata).
+    """Read a candidate file.
 
-    The prediction has shapes (H+1, n) and (H, m). The metadata has no `sha256` where the file was
-    written by 0.1: then its contents can't be proven.
+    Args:
+        source: the file's path, or its bytes.
+        name: name of the file in messages, if `source` is bytes.
+
+    Returns:
+        The policy, the predicted states (H+1, n), the predicted inputs (H, m) and the metadata.
+        The metadata of a file written by 0.1 has no `sha256`, so its contents are not verified.
 
     Raises:
-        GroundedError: for a file that is damaged, rewritten or not a candidate of ours.
+        GroundedError: if the file is damaged, was rewritten, or is not a candidate of grounded's.
     """
     own = read_own(source, name, CANDIDATE)
     states, inputs = own.names("states"), own.names("inputs")
@@ -131,7 +136,7 @@ def read_candidate(
 
 
 def read_policy(path: str | Path) -> tuple[Policy, str]:
-    """A candidate's policy and task hash: what `grounded.policy.load` reads a .mcap with.
+    """Read a candidate's policy and task hash; `grounded.policy.load` uses it for .mcap files.
 
     Raises:
         GroundedError: as `read_candidate`.
@@ -149,14 +154,14 @@ metadata record `grounded`.
 
 
 def _controls(policy: Policy) -> list[Array]:
-    """Feed-forward, gain and reference, a row a step; the last two are empty without feedback."""
+    """Return feed-forward, gain and reference by step; the last two are empty without feedback."""
     H, none = policy.horizon, np.zeros((policy.horizon, 0))
     gain = none if policy.gain is None else policy.gain.reshape(H, -1)
     return [policy.feedforward, gain, none if policy.reference is None else policy.reference]
 
 
 def _hash(table: Meta, arrays: Iterable[Array]) -> str:
-    """SHA-256 over the metadata, names and limits among it, and all numbers."""
+    """Return the SHA-256 of the metadata (without `sha256`) and all numbers."""
     known = {key: value for key, value in table.items() if key != "sha256"}
     digest = hashlib.sha256(json.dumps(known, sort_keys=True).encode())
     for array in arrays:
@@ -169,8 +174,8 @@ def _refuse_rewritten(own: OwnFile, arrays: Iterable[Array]) -> None:
     stated, found = own.meta.get("sha256"), _hash(own.meta, arrays)
     if stated not in (None, found):
         raise GroundedError(
-            f"{own.name} is not the candidate that was proposed: the SHA-256 of its contents is "
-            f"{found[:12]}..., its metadata says '{stated[:12]}...'. It was rewritten: delete the "
+            f"{own.name} is not the candidate that was proposed, it was rewritten: the SHA-256 of "
+            f"its contents is {found[:12]}..., its metadata states '{stated[:12]}...'. Delete the "
             "file and propose again",
             NextCommand("propose"),
         )

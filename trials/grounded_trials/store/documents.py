@@ -1,15 +1,15 @@
-"""What is kept as JSON: documents that prove themselves, results of studies, notes on trials.
+"""JSON files: documents with a checksum, results of studies, notes on trials.
 
-A document's file begins with the SHA-256 of every byte behind it, so that no flipped bit is read as
-another number:
+A document's file begins with the SHA-256 of all bytes that follow, so that a flipped bit is
+detected:
 
     {
      "sha256": "3f9a...",
      "verdict": ...
 
-A note says what a person decided, or what was handed out. Notes are files of the store, numbered
-and named by their hashes, never rewritten and never deleted: the later one holds, and copying a
-folder copies them.
+A note records a user's decision, or a file that was handed out. Notes are files of the store,
+numbered and named by their hashes, never rewritten or deleted. A later note overrides an earlier
+one, and copying the folder copies the notes.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ _SEALED = re.compile(rb'\{\n "sha256": "([0-9a-f]{64})",(\n.*)', re.DOTALL)
 
 
 def write_document(path: Path, document: Mapping[str, Any], *, nan: bool = False) -> None:
-    """Writes a JSON document with its checksum; the file appears complete or not at all.
+    """Write a JSON document with its checksum, atomically.
 
     Args:
         path: the file.
-        document: what goes in.
-        nan: allow numbers that JSON has not, which Python reads.
+        document: the contents.
+        nan: allow NaN and infinity, which are not JSON but which Python reads.
 
     Raises:
         GroundedError: if it can't be written.
-        ValueError: if a number in it is not finite, unless `nan`.
+        ValueError: if a number is not finite, unless `nan`.
     """
     text = json.dumps(dict(document), indent=1, ensure_ascii=False, allow_nan=nan)
     rest = text[1:].encode() + b"\n"
@@ -50,11 +50,11 @@ def write_document(path: Path, document: Mapping[str, Any], *, nan: bool = False
 
 
 def read_document(path: Path) -> dict[str, Any]:
-    """The document of a file, without its checksum.
+    """Read a document from a file, without its checksum.
 
     Raises:
-        FileNotFoundError: if there is none.
-        GroundedError: if it can't be read, or is not what was written.
+        FileNotFoundError: if the file does not exist.
+        GroundedError: if it can't be read, or its checksum does not match.
     """
     try:
         with open_file(path, follow=False) as stream:
@@ -67,21 +67,21 @@ def read_document(path: Path) -> dict[str, Any]:
 
 
 def proven(data: bytes, path: Path) -> dict[str, Any]:
-    """The same from the bytes of a file; `path` is for messages."""
+    """Read a document from the bytes of a file, as `read_document`; `path` is for messages."""
     found = _SEALED.fullmatch(data)
     if found is None:
-        raise GroundedError(f"{path} has no checksum: it is damaged, or of an older version")
+        raise GroundedError(f"{path} has no checksum: it is damaged, or from an older version")
     if hashlib.sha256(found[2]).hexdigest() != found[1].decode():
-        raise GroundedError(f"{path} is not what was written: its checksum does not fit")
+        raise GroundedError(f"{path} was changed or damaged: its checksum does not match")
     document: dict[str, Any] = json.loads(b"{" + found[2])
     return document
 
 
 class StudyStore(MutableMapping[str, dict[str, Any]]):
-    """Results of a study's jobs by key, a document each: a study that was cut off goes on.
+    """Results of a study's jobs by key, one document each, so that a study can be continued.
 
-    A file is named by the hash of the job's key and holds key and result; one that can't be read,
-    or that holds another key, counts as not there.
+    A file is named by the hash of the job's key and holds the key and the result. A file that can't
+    be read, or that holds another key, is treated as missing.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -89,13 +89,13 @@ class StudyStore(MutableMapping[str, dict[str, Any]]):
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise GroundedError(f"{folder} can't be made: {error.strerror}") from None
+            raise GroundedError(f"{folder} can't be created: {error.strerror}") from None
 
     def _path(self, key: str) -> Path:
         return self.folder / f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.json"
 
     def _read(self, path: Path) -> dict[str, dict[str, Any]]:
-        """A file's key and result; nothing where it can't be read."""
+        """Return the key and result of a file, {} if it can't be read."""
         try:
             entry = read_document(path)
             return {str(entry["key"]): dict(entry["result"])}
@@ -120,17 +120,17 @@ class StudyStore(MutableMapping[str, dict[str, Any]]):
 
 
 class Notes:
-    """Notes on trials and candidates, n0001-<hash>.json beside the trials."""
+    """Notes on trials and candidates, stored as n0001-<hash>.json beside the trials."""
 
     def __init__(self, folder: Path) -> None:
         self.store = Store(folder, prefix="n")
 
     def add(self, note: Mapping[str, str], *, again: bool = True) -> None:
-        """Adds a note.
+        """Add a note.
 
         Args:
-            note: what it says.
-            again: though there is one that says the same.
+            note: its contents.
+            again: add it even if an equal note exists.
 
         Raises:
             GroundedError: if it can't be written.
@@ -140,7 +140,7 @@ class Notes:
 
     @contextmanager
     def adding(self, note: Mapping[str, str]) -> Iterator[None]:
-        """Adds a note unless one says the same; it is taken back if what is done then fails."""
+        """Add a note unless an equal one exists; removed if the `with` body raises."""
         text = json.dumps(dict(note), sort_keys=True)
         with self.store.adding(text.encode(), ".json"):
             yield
@@ -148,14 +148,14 @@ class Notes:
     def read(
         self, lost: list[Damaged] | None = None, known: Known | None = None
     ) -> Iterator[dict[str, str]]:
-        """All notes in the order in which they were made.
+        """Yield all notes in order of creation.
 
         Args:
-            lost: gets those that are damaged; None: they are complained about.
-            known: what an index knows of a file, or learns by reading it.
+            lost: damaged notes are appended to it; None: they raise an error.
+            known: an index's lookup of a file's contents, which reads the file if it is not known.
 
         Raises:
-            GroundedError: for a damaged one, naming it.
+            GroundedError: naming a damaged note, if `lost` is None.
         """
         for entry in self.store.list():
             try:

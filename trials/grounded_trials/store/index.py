@@ -1,9 +1,9 @@
-"""What the files of a large workspace hold, in one file, so that not each is read at every command.
+"""An index of a workspace's files, so that commands need not read every file each time.
 
-trials/.index.sqlite is derived: it may be deleted, and is made again where it is missing, damaged
-or of another version. A row stands for a file as it was read and proven; it is believed while the
-file has the same size, times and place, and its own checksum fits. Numbers are read when they are
-asked for.
+trials/.index.sqlite is derived data: it may be deleted, and is rebuilt if it is missing, damaged or
+of another version. A row describes a file that was read and verified; it is used as long as the
+file's size, times and inode are unchanged and the row's own checksum matches. Arrays are read on
+first access.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.store.known import KnownTrial, Worth
 from grounded_trials.store.store import Stored
 
-KEPT = 2**20  # [bytes] numbers of a longer trial are read from its own file
-_VERSION = 3  # of the tables, and of what `_about` says
+KEPT = 2**20  # [bytes] arrays of larger trials are not kept in the index
+_VERSION = 3  # of the tables and of the result of `_about`
 _TABLES = """
 CREATE TABLE files (name TEXT PRIMARY KEY, stamp TEXT, about TEXT, proof BLOB);
 CREATE TABLE numbers (name TEXT PRIMARY KEY, states BLOB, inputs BLOB, proof BLOB);
@@ -39,8 +39,8 @@ class Index:
     """The index of a workspace's trials and candidates.
 
     Args:
-        folder: where the trials lie, and the index.
-        read: reads and proves a trial, `.id` its short name.
+        folder: the folder of the trials and of the index.
+        read: reads and verifies a trial; sets its `id` to its short name.
     """
 
     def __init__(self, folder: Path, read: Reader) -> None:
@@ -54,7 +54,7 @@ class Index:
             file.close()
 
     def _opened(self) -> sqlite3.Connection:
-        """The file; where it can't be used, an empty one in memory."""
+        """Open the index; if it can't be used, return an empty one in memory."""
         for path in (self._path, self._path, ":memory:"):
             with suppress(sqlite3.Error, OSError):
                 file = sqlite3.connect(path, timeout=2.0)
@@ -66,12 +66,12 @@ class Index:
                 except sqlite3.Error:
                     file.close()
                     raise
-            with suppress(OSError):  # damaged, or of another version
+            with suppress(OSError):  # it is damaged, or of another version
                 self._path.unlink(missing_ok=True)
         raise AssertionError("a database in memory can always be made")
 
     def _load(self, file: sqlite3.Connection) -> None:
-        """Takes in the rows that prove themselves; one parse of all texts is the quickest."""
+        """Load the rows whose checksums match; parsing all texts at once is the fastest."""
         query = "SELECT name, stamp, about, proof FROM files"
         rows = [row for row in file.execute(query) if _proof(row[1], row[2]) == row[3]]
         abouts = json.loads(f"[{','.join(row[2] for row in rows)}]")
@@ -82,7 +82,7 @@ class Index:
         file.execute("SELECT 1 FROM numbers LIMIT 1")
 
     def of_trial(self, stored: Stored) -> dict[str, Any]:
-        """What is known of a trial: its metadata, names, steps, and the hash of what it ran.
+        """Return a trial's metadata, names, steps, and the hash of the policy that it ran.
 
         Raises:
             GroundedError: if the file is damaged.
@@ -102,12 +102,12 @@ class Index:
         return self.known(name, stored.path, learn)
 
     def known(self, name: str, path: Path, learn: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """What was learnt of a file when it was read and proven, as it is now.
+        """Return the entry of a file; reads the file if it is new or has changed.
 
         Args:
-            name: the file's, which no other file of the workspace has.
-            path: where it is.
-            learn: reads it, where it is new or has changed.
+            name: the file's name, unique in the workspace.
+            path: its path.
+            learn: reads and verifies the file, and returns its entry.
         """
         stamp, row = _stamp(path), self._rows.get(name)
         if row is not None and row[0] == stamp:
@@ -120,12 +120,12 @@ class Index:
         return self._rows[name][1]
 
     def trial(self, stored: Stored, about: dict[str, Any], *, bridged: bool) -> Trial:
-        """A trial whose numbers are read when they are asked for.
+        """Return a trial whose arrays are read on first access.
 
         Args:
             stored: its file.
-            about: what `of_trial` said.
-            bridged: short gaps are interpolated.
+            about: its entry, from `of_trial`.
+            bridged: interpolate short gaps; a trial that has gaps is then read at once.
         """
         if bridged and about["gaps"]:
             return interpolate_gaps(self._loaded(stored, about)).trial
@@ -166,11 +166,11 @@ class Index:
         return worth
 
     def _write(self, command: str, values: tuple[Any, ...]) -> None:
-        with suppress(sqlite3.Error):  # read-only, full, or another process writes: only slower
+        with suppress(sqlite3.Error):  # read-only, disk full or locked: the next command is slower
             self._file.execute(command, values)
 
     def save(self) -> None:
-        """Keeps what was learnt; where that fails it is learnt again."""
+        """Commit new entries; if that fails, their files are read again by the next command."""
         with suppress(sqlite3.Error):
             self._file.commit()
 
@@ -194,9 +194,9 @@ def _about(trial: Trial, meta: dict[str, str], policy: bytes | None) -> dict[str
 
 
 def _stamp(path: Path) -> str:
-    """What changes with a file: size, times, place."""
+    """Return a file's size, times and inode as text, "" if it does not exist."""
     try:
-        found = os.stat(path)  # noqa: PTH116 (quicker)
+        found = os.stat(path)  # noqa: PTH116 (faster)
     except OSError:
         return ""
     return f"{found.st_size}-{found.st_mtime_ns}-{found.st_ctime_ns}-{found.st_ino}"

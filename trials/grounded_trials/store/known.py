@@ -1,4 +1,4 @@
-"""Trials and candidates known but for their numbers, which are read when they are asked for."""
+"""Trials and candidates from the index, whose arrays are read from their files on first access."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Worth = Callable[[str, Callable[[], float]], float]
 
 
 class KnownTrial(Trial):
-    """A trial whose numbers are read when they are asked for."""
+    """A trial whose arrays are read on first access."""
 
     @classmethod
     def of(cls, load: Callable[[], Trial], about: dict[str, Any], worth: Worth) -> KnownTrial:
-        """A trial of which `about` is known; `load` reads it, `worth` keeps its utility."""
+        """Create a trial from its index entry; `load` reads the file, `worth` caches utilities."""
         made = object.__new__(cls)
         held = about["start_inputs"]
         vars(made).update(
@@ -37,27 +37,27 @@ class KnownTrial(Trial):
 
     @cached_property
     def states(self) -> Array:
-        """(T + 1, n), read now."""
+        """(T + 1, n), read on first access."""
         return cast(Array, vars(self)["_load"]().states)
 
     @cached_property
     def inputs(self) -> Array:
-        """(T, m), read now."""
+        """(T, m), read on first access."""
         return cast(Array, vars(self)["_load"]().inputs)
 
     @property
     def steps(self) -> int:
-        """T, without reading the numbers."""
+        """T, without reading the arrays."""
         return self._of("steps")
 
     @property
     def finite_steps(self) -> int:
-        """As a trial's, without reading the numbers."""
+        """As `Trial.finite_steps`, without reading the arrays."""
         return self._of("finite_steps")
 
     @property
     def known_steps(self) -> int:
-        """As a trial's, without reading the numbers."""
+        """As `Trial.known_steps`, without reading the arrays."""
         return self._of("known_steps")
 
     def _of(self, name: str) -> int:
@@ -65,22 +65,22 @@ class KnownTrial(Trial):
         return int(known[name] if known else getattr(Trial, name).fget(self))
 
     def repeats(self, other: Trial) -> bool:
-        """As a trial's, by the hash of finite states."""
+        """As `Trial.repeats`, by comparing the hashes of the states where they are known."""
         mine, its = (vars(one).get("_known", {}).get("print") for one in (self, other))
         return bool(mine == its) if mine and its else super().repeats(other)
 
     def worth(self, task: str, compute: Callable[[], float]) -> float:
-        """The utility in a task, computed once."""
+        """Return the utility in a task, computed once."""
         worth = vars(self).get("_worth")
         return compute() if worth is None else worth(task, compute)
 
 
 class KnownCandidate(Candidate):
-    """A candidate whose policy and prediction are read when they are asked for."""
+    """A candidate whose policy and prediction are read on first access."""
 
     @classmethod
     def of(cls, load: Callable[[], Candidate], about: dict[str, Any]) -> KnownCandidate:
-        """A candidate of whose fields `about` holds all but the numbers; `load` reads it."""
+        """Create a candidate whose fields, except for the arrays, are in `about`."""
         made = object.__new__(cls)
         vars(made).update(about, _load=load)
         return made
@@ -91,15 +91,15 @@ class KnownCandidate(Candidate):
 
     @cached_property
     def policy(self) -> Policy:
-        """What the robot runs, read now."""
+        """What the robot runs, read on first access."""
         return self._read.policy
 
     @cached_property
     def predicted_states(self) -> Array:
-        """(H + 1, n), read now."""
+        """(H + 1, n), read on first access."""
         return self._read.predicted_states
 
     @cached_property
     def predicted_inputs(self) -> Array:
-        """(H, m), read now."""
+        """(H, m), read on first access."""
         return self._read.predicted_inputs

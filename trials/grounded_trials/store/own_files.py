@@ -1,8 +1,8 @@
-"""What trial files and candidate files share: how they state their contents, and a strict reader.
+"""The common part of trial files and candidate files: their metadata table and a strict reader.
 
-The whole file is read before any number leaves it: a data checksum must be there and must fit, so
-that no flipped bit goes unnoticed. Limits keep a file from a stranger from taking all memory. What
-is wrong with a file is a message that names the file and the place.
+The whole file is read before any number is returned: it must have a matching data checksum, so that
+flipped bits are detected. Limits keep untrusted files from exhausting the memory. Errors name the
+file and the position.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ from grounded_trials.formats.schemas import struct_of
 from grounded_trials.plain_file import read_file
 
 FILE_LIMIT = 1 * 2**30  # [bytes]
-STEP_LIMIT = 2_000_000  # messages of a channel
-MESSAGE_BYTES = 48  # that a message takes beside its numbers
-NAME_LIMIT = 1000  # states, or inputs
+STEP_LIMIT = 2_000_000  # messages per channel
+MESSAGE_BYTES = 48  # memory of a message in addition to its numbers
+NAME_LIMIT = 1000  # number of states or of inputs
 
 TRIAL, CANDIDATE = "grounded trial 1", "grounded candidate 1"
 RESERVED = ["format", "dt", "states", "inputs", "policy", "steps"]
@@ -61,7 +61,7 @@ Units = Mapping[str, str]
 
 @dataclass(frozen=True, eq=False)
 class OwnFile:
-    """What a file of ours holds: messages by topic, the table `grounded`, attached files."""
+    """The contents of a trial or candidate file: messages by topic, metadata, attachments."""
 
     name: str
     data: bytes
@@ -76,17 +76,17 @@ class OwnFile:
         return hashlib.sha256(self.data).hexdigest()
 
     def bad(self, key: str, found: str) -> GroundedError:
-        """The error that an entry of the table is not what it should be."""
+        """Return an error about an entry of the metadata."""
         return GroundedError(f"{self.name}: its metadata '{key}' {found}")
 
     def entry(self, key: str) -> str:
-        """An entry of the table, which must be there."""
+        """Return an entry of the metadata, which must exist."""
         if key not in self.meta:
             raise GroundedError(f"{self.name}: its metadata has no '{key}'")
         return self.meta[key]
 
     def number(self, key: str) -> float:
-        """A positive finite number from the table."""
+        """Return a positive finite number from the metadata."""
         text = self.entry(key)
         try:
             value = float(text)
@@ -97,7 +97,7 @@ class OwnFile:
         return value
 
     def integer(self, key: str, *, signed: bool = False) -> int:
-        """An integer of the table, not negative unless `signed`."""
+        """Return an integer from the metadata, not negative unless `signed`."""
         text = self.entry(key)
         digits = text[1:] if signed and text.startswith("-") else text
         if not (digits.isascii() and digits.isdigit() and len(digits) < 20):
@@ -105,7 +105,7 @@ class OwnFile:
         return int(text)
 
     def json(self, key: str, kind: type[list[Any] | dict[str, Any]]) -> Any:
-        """A list or an object of the table, written as JSON."""
+        """Return a JSON list or object from the metadata."""
         try:
             value = json.loads(self.entry(key))
         except (ValueError, RecursionError):
@@ -115,14 +115,14 @@ class OwnFile:
         return value
 
     def names(self, key: str) -> list[str]:
-        """The names of a JSON object of the table, in order."""
+        """Return the names of a JSON object of the metadata, in order."""
         table = self.json(key, dict)
         if not table or not all(isinstance(unit, str) for unit in table.values()):
             raise self.bad(key, "must give each name a unit")
         return list(table)
 
     def floats(self, value: Any, what: str, size: int, null: float | None = None) -> Array:
-        """A list of `size` numbers from JSON; `null` stands for None."""
+        """Return a JSON list of `size` numbers as an array; `null` replaces None."""
         if isinstance(value, list) and len(value) == size:
             numbers = [null if item is None else item for item in value]
             if all(isinstance(item, int | float) for item in numbers):
@@ -130,7 +130,7 @@ class OwnFile:
         raise self.bad(what, f"must be a list of {size} numbers")
 
     def doubles(self, topic: str, names: list[str]) -> Array:
-        """The numbers of a topic's messages, (N, len(names))."""
+        """Return the numbers of a topic's messages, (N, len(names))."""
         type, batches = self._topic(topic, names, listed=False)
         fields = [(double_tag(type.by_name[name].number), 1) for name in names]
         blocks = []
@@ -142,7 +142,7 @@ class OwnFile:
         return np.concatenate(blocks or [np.zeros((0, len(names)))])
 
     def lists(self, topic: str, sizes: Mapping[str, int]) -> list[Array]:
-        """Lists of a topic's messages, (N, size) each; (0, size) where no message has any."""
+        """Return the lists of a topic's messages, (N, size) each; (0, size) if all are empty."""
         type, batches = self._topic(topic, sizes, listed=True)
         all_there = [
             (doubles_tag(type.by_name[name].number, size), size) for name, size in sizes.items()
@@ -166,7 +166,7 @@ class OwnFile:
         return found
 
     def check_grid(self, topic: str, start_ns: int, dt: float) -> None:
-        """Refuses a topic whose samples do not lie within half a step of start + k dt."""
+        """Raise an error if a topic's sample k is over half a step away from start_ns + k dt."""
         batches = self.messages.get(topic, [])
         stamps = np.concatenate([b.publish_times for b in batches] or [np.zeros(0, np.int64)])
         times = (stamps - start_ns) * 1e-9
@@ -177,21 +177,21 @@ class OwnFile:
         for factor in (1e3, 1e-3):
             if abs(apart / (dt * factor) - 1) < 0.1:
                 raise GroundedError(
-                    f"{self.name}: {topic} has a sample every {apart:.4g} s by its stamps, its dt "
+                    f"{self.name}: {topic} has a sample every {apart:.4g} s by its stamps, but dt "
                     f"is {dt} s: they are in another unit (milliseconds, not seconds). Append each "
                     f"at {1 / factor:g} times its stamp"
                 )
         k = int(np.argmax(off))
         raise GroundedError(
-            f"{self.name}: {topic} sample {k} is stamped {times[k]:.4f} s, its place on the "
-            f"grid of {dt} s is {k * dt:.4f} s: samples are missing, or came late. A trial "
-            "needs one at every step: run it again"
+            f"{self.name}: {topic} sample {k} is stamped {times[k]:.4f} s, expected {k * dt:.4f} s "
+            f"for dt = {dt} s: samples are missing, or came late. A trial needs one at every "
+            "step: run it again"
         )
 
     def _topic(
         self, topic: str, names: Iterable[str], *, listed: bool
     ) -> tuple[Struct, list[Messages]]:
-        """A topic's messages and their type, which must have these numbers, or lists of them."""
+        """Return a topic's messages and their type, after checking that it has these fields."""
         if topic not in self.types:
             raise GroundedError(f"{self.name}: it has no channel {topic}")
         fields = self.types[topic].by_name
@@ -203,7 +203,7 @@ class OwnFile:
         return self.types[topic], self.messages.get(topic, [])
 
     def _values(self, type: Struct, batch: Messages, name: str) -> tuple[Array, Counts]:
-        """A field's numbers in the messages of a batch, and how many of them each message has."""
+        """Return a field's numbers in a batch of messages, and their count in each message."""
         try:
             root = protobuf_messages(batch.buffer, type, batch.starts, batch.ends)
             found = root.field(name)
@@ -215,15 +215,15 @@ class OwnFile:
 
 
 def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
-    """Reads and checks a file of ours.
+    """Read and check a trial or candidate file.
 
     Args:
         source: its path, or its bytes.
-        name: of the file in messages, when `source` is bytes.
-        kind: the format that it must state.
+        name: name of the file in messages, if `source` is bytes.
+        kind: the required format, `TRIAL` or `CANDIDATE`.
 
     Raises:
-        GroundedError: if it can't be read, is damaged, or is something else.
+        GroundedError: if it can't be read, is damaged, or has another format.
     """
     if not isinstance(source, bytes):
         name, source = str(source), read_file(Path(source), FILE_LIMIT)
@@ -266,7 +266,7 @@ def _read(source: bytes, name: str, kind: str) -> OwnFile:
 def _sorted(
     batch: Messages, channels: dict[int, Channel], name: str
 ) -> Iterator[tuple[str, Messages]]:
-    """A batch's messages by topic."""
+    """Yield the messages of a batch by topic."""
     for identity in batch.channel_ids():
         if identity not in channels:
             raise DamagedFile(
@@ -288,7 +288,15 @@ def _type(channel: Channel, schemas: dict[int, Schema], name: str) -> Struct:
 def stated(
     kind: str, dt: float, states: Units, inputs: Units, meta: Meta, **more: str
 ) -> dict[str, str]:
-    """The metadata record of a file: what each states, what its kind adds, and the caller's own.
+    """Return the metadata record of a file.
+
+    Args:
+        kind: the format, `TRIAL` or `CANDIDATE`.
+        dt: control interval [s].
+        states: name -> unit, in array order.
+        inputs: name -> unit, in array order.
+        meta: the caller's own entries.
+        **more: the entries that only this format has.
 
     Raises:
         GroundedError: if an entry of `meta` is reserved.
@@ -302,5 +310,5 @@ def stated(
 
 
 def with_units(names: tuple[str, ...], units: Units | None) -> dict[str, str]:
-    """Name -> unit for each name, "1" where none is known."""
+    """Return name -> unit for each name, "1" where the unit is not known."""
     return {name: (units or {}).get(name, "1") for name in names}

@@ -1,15 +1,15 @@
-"""The store: a folder of files that only grows; a file's identity is the hash of its content.
+"""The store: an append-only folder of files that are identified by the hash of their contents.
 
-A file is named  t0007-3f9a0c2d51b8e644.mcap : its number in the order of arrival, and the first
-16 hex digits of the SHA-256 of its bytes. Names are all there is: the folder can be copied to
-another machine, and its order goes with it. (Two files with one number, from two folders that
-were joined, are ordered by their hashes.) The hash is computed again at every read.
+A file is named like t0007-3f9a0c2d51b8e644.mcap: its number in order of arrival, and the first 16
+hex digits of the SHA-256 of its bytes. There is no other record, so copying the folder keeps the
+order. (Two files with the same number, from two folders that were merged, are ordered by their
+hashes.) The hash is checked at every read.
 
-A file is copied to a temporary name in the same folder, synced, renamed, and the folder synced;
-only then is it acknowledged. A lock keeps other processes out. What a killed process leaves
-behind is a temporary file, which the next one removes.
+A file is copied to a temporary name in the same folder, synced and renamed, and the folder is
+synced, before it is acknowledged. A lock keeps other processes out. A killed process may leave a
+temporary file, which the next process removes.
 
-What is kept as JSON (notes, diagnoses, results of studies) is told in `documents.py`.
+`documents.py` handles JSON files (notes, diagnoses, results of studies).
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ try:
 except ImportError:
     raise GroundedError(
         "trials can be stored on Linux and macOS only: the store locks its folder with fcntl, "
-        "which Windows lacks. Use WSL; grounded.policy, which drives a robot, works here as well"
+        "which Windows lacks. Use WSL; grounded.policy, which drives a robot, also works here"
     ) from None
 
-DIGITS = 16  # hex digits of the hash in a name
+DIGITS = 16  # hex digits of the hash in a file name
 _NAME = re.compile(r"^([a-z]+)(\d{4,})-([0-9a-f]{16})(\.\w+)$")
 _BLOCK = 2**20
 _TEMPORARY = re.compile(r"-[0-9a-f]{16}\.tmp$")
-OLD_S = 3600.0  # of a temporary file that nobody writes any more
+OLD_S = 3600.0  # [s] age at which a temporary file counts as abandoned
 
 
 @dataclass(frozen=True)
@@ -62,15 +62,15 @@ class Stored(_Named):
 
 @dataclass(frozen=True)
 class Added(_Named):
-    """What became of a file that was given to the store."""
+    """The result of adding a file to the store."""
 
     sha256: str
-    known: bool  # it was there already
+    known: bool  # it was already in the store
 
 
 @dataclass(frozen=True)
 class Damaged:
-    """A stored file whose content is not what it was, or a file that does not belong there."""
+    """A stored file that is damaged, and the reason."""
 
     path: Path
     reason: str
@@ -81,17 +81,17 @@ class Store:
 
     def __init__(self, folder: str | Path, prefix: str = "t") -> None:
         self.folder, self.prefix = Path(folder), prefix
-        self._seen: dict[str, Stored | None] = {}  # what a name says
-        self._listed: tuple[list[str], tuple[Stored, ...]] = ([], ())  # names, and their files
+        self._seen: dict[str, Stored | None] = {}  # parsed file names
+        self._listed: tuple[list[str], tuple[Stored, ...]] = ([], ())  # the last listing
 
     def list(self) -> tuple[Stored, ...]:
-        """The files in the order of their arrival; nothing is read but the folder.
+        """Return the files in order of arrival; reads only the folder, no file.
 
         Raises:
             GroundedError: if the folder can't be read.
         """
         try:
-            names = os.listdir(self.folder)  # noqa: PTH208 (many times quicker)
+            names = os.listdir(self.folder)  # noqa: PTH208 (many times faster)
         except FileNotFoundError:
             return ()
         except OSError as error:
@@ -108,11 +108,13 @@ class Store:
         return self._listed[1]
 
     def digests(self) -> set[str]:
-        """The hashes of all files, as their names have them."""
+        """Return the hashes in the names of all files."""
         return {entry.digest for entry in self.list()}
 
     def find(self, key: str) -> Stored:
-        """The file whose short name, name, or hash (from 4 digits on) is `key`.
+        """Return the file whose short name or name is `key`, or whose hash starts with it.
+
+        A part of a hash needs at least 4 digits.
 
         Raises:
             GroundedError: if there is none, or more than one.
@@ -127,13 +129,13 @@ class Store:
             last = f"the last is {entries[-1].id}" if entries else "it is empty"
             raise GroundedError(f"{self.folder} has no file '{key}'; {last}")
         names = ", ".join(s.path.name for s in hits)
-        raise GroundedError(f"'{key}' may be any of {names}; give more of the hash")
+        raise GroundedError(f"'{key}' matches {names}; give more digits of the hash")
 
     def read(self, key: str | Stored) -> bytes:
-        """The content of a file, checked against its hash.
+        """Return the contents of a file, checked against its hash.
 
         Raises:
-            GroundedError: if it is not there, can't be read, or has changed.
+            GroundedError: if it does not exist, can't be read, or was changed.
         """
         entry = key if isinstance(key, Stored) else self.find(key)
         try:
@@ -143,7 +145,7 @@ class Store:
             raise GroundedError(f"{entry.path} can't be read: {error.strerror}") from None
         if hashlib.sha256(data).hexdigest()[:DIGITS] != entry.digest:
             raise GroundedError(
-                f"{entry.path} is damaged: its content does not have the hash in its name; "
+                f"{entry.path} is damaged: its contents do not match the hash in its name; "
                 "restore it from a backup, or ingest the original log again to replace it"
             )
         return data
@@ -151,18 +153,18 @@ class Store:
     def add(
         self, source: str | Path | bytes, suffix: str = ".mcap", *, again: bool = False
     ) -> Added:
-        """Takes a copy of a file, or of bytes; the same content is kept once, unless `again`.
+        """Add a copy of a file, or bytes; equal contents are stored once, unless `again`.
+
+        On return, the contents are synced to disk. If the stored file with this hash is damaged, it
+        is replaced by the copy; the damaged file is kept as `NAME.damaged`.
 
         Args:
             source: the file, or its bytes.
-            suffix: of its name in the store.
-            again: the same content is another file: a run that repeated itself to the last bit.
-
-        When it returns, the content is on the disk. A stored file that was damaged is replaced by
-        its good copy; the damaged one is kept as `NAME.damaged`.
+            suffix: suffix of its name in the store.
+            again: store equal contents as a new file, for a run that repeats another bit by bit.
 
         Raises:
-            GroundedError: if the source can't be read or the folder not be written.
+            GroundedError: if the source can't be read or the folder can't be written.
         """
         with self.locked():
             temporary = self.folder / f".{self.prefix}-{os.getpid()}.tmp"
@@ -179,10 +181,12 @@ class Store:
     def adding(
         self, source: str | Path | bytes, suffix: str = ".mcap", *, again: bool = False
     ) -> Iterator[Added]:
-        """`add`, but what it added is taken back if what is done with it fails.
+        """Add a file as `add` does, and remove it again if the `with` body raises.
+
+        It is not removed if another file was added after it, so that numbers have no gaps.
 
         Args:
-            source: see `add`. What came meanwhile keeps it there: numbers have no gaps.
+            source: see `add`.
             suffix: see `add`.
             again: see `add`.
 
@@ -200,7 +204,7 @@ class Store:
             raise
 
     def verify(self) -> tuple[Damaged, ...]:
-        """Reads every file; returns those that changed, and names that do not belong here.
+        """Read every file, and return the damaged ones.
 
         Raises:
             GroundedError: if the folder can't be read.
@@ -228,13 +232,13 @@ class Store:
         return Added(path, digest, known=False)
 
     def _sweep(self) -> None:
-        """Removes what killed processes left; the lock says that none is at work."""
+        """Remove temporary files of killed processes; the lock excludes running ones."""
         for path in self.folder.glob(f".{self.prefix}-*.tmp"):
             path.unlink(missing_ok=True)
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keeps other processes from adding a file meanwhile.
+        """Lock the store, so that no other process adds a file meanwhile.
 
         Raises:
             GroundedError: if the folder can't be written.
@@ -251,23 +255,23 @@ class Store:
                 raise self._unwritable(error) from None
             yield
         finally:
-            with suppress(OSError):  # nothing was written through it
+            with suppress(OSError):  # nothing was written to it
                 os.close(descriptor)
 
     def _unwritable(self, error: OSError) -> GroundedError:
         return GroundedError(
-            f"{self.folder} can't be written: {error.strerror}; the file is not stored. Make room, "
-            "or give yourself the right to write there, and add it again"
+            f"{self.folder} can't be written: {error.strerror}; the file is not stored. Free disk "
+            "space, or get write permission, and add it again"
         )
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Writes a file that is complete or not there: temporary name, sync, rename, sync the folder.
+    """Write a file atomically: temporary name, sync, rename, sync of the folder.
 
     Raises:
         GroundedError: if it can't be written.
     """
-    # not by the process's number: two containers may each have a process of the same
+    # not named by process id: processes in two containers may have the same id
     temporary = path.with_name(f".{path.name}-{os.urandom(8).hex()}.tmp")
     try:
         _sweep_old(path.parent)
@@ -276,8 +280,8 @@ def write_atomically(path: Path, data: bytes) -> None:
         sync_folder(path.parent)
     except FileNotFoundError:
         raise GroundedError(
-            f"{path} can't be written: the folder {path.parent} does not exist; make it, or name "
-            "another place"
+            f"{path} can't be written: the folder {path.parent} does not exist; create it, or name "
+            "another folder"
         ) from None
     except OSError as error:
         raise GroundedError(f"{path} can't be written: {error.strerror}") from None
@@ -286,7 +290,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def _sweep_old(folder: Path) -> None:
-    """Removes the temporary files of processes that were killed, an hour after their last write."""
+    """Remove temporary files of killed processes, `OLD_S` after their last write."""
     with os.scandir(folder) as entries:
         names = [e.name for e in entries if e.name[0] == "." and _TEMPORARY.search(e.name)]
     for path in (folder / name for name in names):
@@ -296,13 +300,13 @@ def _sweep_old(folder: Path) -> None:
 
 
 def _remove(path: Path) -> None:
-    """Removes a temporary file; one that can't be removed now is swept by the next process."""
+    """Remove a temporary file; if that fails, a later process removes it."""
     with suppress(OSError):
         path.unlink(missing_ok=True)
 
 
 def sync_folder(folder: Path) -> None:
-    """Makes the names in a folder durable."""
+    """Sync a folder, so that the names in it are durable."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -311,7 +315,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def _copy(source: str | Path | bytes, target: Path, mode: int = 0o444) -> str:
-    """Copies to a new file, on the disk when it returns; the SHA-256 of what was copied."""
+    """Copy to a new file and sync it; return the SHA-256 of the contents."""
     hasher = hashlib.sha256()
     descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     with os.fdopen(descriptor, "wb") as out:
@@ -337,7 +341,7 @@ def _blocks(source: str | Path | bytes) -> Iterator[bytes]:
 
 
 def hash_file(path: Path) -> str:
-    """The SHA-256 of a file, read piece by piece.
+    """Return the SHA-256 of a file, read in blocks.
 
     Raises:
         GroundedError: if it can't be read.

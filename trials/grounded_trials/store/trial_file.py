@@ -1,4 +1,4 @@
-"""A trial as a file: written whole or while it runs, read back exactly.
+"""Writes trial files, at once or while the trial runs, and reads them back exactly.
 
 The format is described in this folder's `__init__`.
 """
@@ -21,11 +21,11 @@ from grounded.trial import Trial
 from grounded_trials.store.own_files import TRIAL, Meta, Units, read_own, stated, with_units
 from grounded_trials.store.store import write_atomically
 
-FLUSH_NS = 10**9  # at most this much trial time is lost when the robot's battery is
+FLUSH_NS = 10**9  # [ns] of trial time between flushes: the most that a power failure loses
 
 
 class TrialWriter:
-    """Writes a trial while it runs; what was appended up to a second ago survives a crash.
+    """Writes a trial while it runs; data older than a second survive a crash.
 
     Args:
         target: a path (an existing file is refused) or a writable binary stream.
@@ -34,10 +34,10 @@ class TrialWriter:
         inputs: name -> unit, in array order.
         meta: further entries of the metadata record.
         candidate: the candidate that is run, "" for none.
-        policy: the bytes of its file.
-        start_inputs: (m,) held before t = 0; None: zero.
-        start_ns: absolute time of t = 0 [ns], for display; where it is negative (simulation time),
-            stamps count from 0, since MCAP's have no sign.
+        policy: the bytes of the candidate's file.
+        start_inputs: inputs held before t = 0, (m,); None: zero.
+        start_ns: absolute time of t = 0 [ns], for display. If it is negative (simulation time),
+            stamps count from 0, since those of MCAP are unsigned.
 
     Raises:
         GroundedError: if the file can't be written or an entry of `meta` is reserved.
@@ -86,12 +86,12 @@ class TrialWriter:
         self._log.flush()
 
     def append(self, t: float, state: Array, input: Array | None) -> None:
-        """Adds the state (n,) at t seconds after the start, and the input (m,) sent then.
+        """Add the state (n,) at `t` seconds after the start, and the input (m,) sent at that time.
 
-        The last state of a trial has no input.
+        The last state of a trial has the input None.
 
         Raises:
-            GroundedError: if the shapes do not fit, or the file can't be written.
+            GroundedError: if a shape is wrong, or the file can't be written.
         """
         data = self._encode_state(_row(state, self._n))
         sent = None if input is None else self._encode_input(_row(input, self._m))
@@ -99,7 +99,7 @@ class TrialWriter:
             self._add(max(self._start_ns, 0) + round(t * 1e9), data, sent)
 
     def extend(self, trial: Trial) -> None:
-        """Adds a whole trial, as `append` does step by step."""
+        """Add a whole trial, as repeated calls of `append`."""
         from grounded_trials.formats.mcap_writer import encode_doubles
 
         states, inputs = encode_doubles(trial.states), encode_doubles(trial.inputs)
@@ -116,10 +116,10 @@ class TrialWriter:
             self._flushed = time
 
     def close(self) -> None:
-        """Ends the file; a second call does nothing.
+        """Finish the file; a second call does nothing.
 
         Raises:
-            GroundedError: if it can't be written, as on a full disk.
+            GroundedError: if it can't be written, for example on a full disk.
         """
         if not self._closed:
             self._closed = True
@@ -134,8 +134,8 @@ class TrialWriter:
             yield
         except OSError as error:
             raise GroundedError(
-                f"the trial can't be written: {error.strerror}; what is in the file already can be "
-                "saved with `recover`"
+                f"the trial can't be written: {error.strerror}; `recover` restores what the file "
+                "already holds"
             ) from None
 
     def __enter__(self) -> TrialWriter:
@@ -154,12 +154,12 @@ class _About(TypedDict, total=False):
 def trial_bytes(
     trial: Trial, meta: Meta, policy: bytes | None = None, **about: Unpack[_About]
 ) -> bytes:
-    """A trial as the bytes of a file; equal arguments give equal bytes.
+    """Return a trial as the bytes of a file; equal arguments give equal bytes.
 
     Args:
         trial: states (T+1, n) and inputs (T, m).
         meta: entries of the metadata record besides the reserved ones.
-        policy: the bytes of the candidate's file that was run.
+        policy: the bytes of the file of the candidate that was run.
         **about: `state_units` and `input_units` (name -> unit; "1" where missing), and `start_ns`,
             the absolute time of t = 0 [ns].
 
@@ -185,7 +185,7 @@ def trial_bytes(
 def write_trial(
     path: str | Path, trial: Trial, meta: Meta, policy: bytes | None = None, **about: Unpack[_About]
 ) -> None:
-    """Writes a whole trial as `trial_bytes` has it; the file appears complete or not at all.
+    """Write a whole trial atomically; for the arguments see `trial_bytes`.
 
     Raises:
         GroundedError: if the file can't be written or an entry of `meta` is reserved.
@@ -196,14 +196,19 @@ def write_trial(
 def read_trial(
     source: str | Path | bytes, name: str = "trial"
 ) -> tuple[Trial, dict[str, str], bytes | None]:
-    """Reads a trial back: (trial, metadata, the bytes of the policy's file or None).
+    """Read a trial file.
 
-    `trial.id` is the SHA-256 of the file. `name` stands for the file in messages when `source` is
-    its bytes.
+    Args:
+        source: the file's path, or its bytes.
+        name: name of the file in messages, if `source` is bytes.
+
+    Returns:
+        The trial, whose `id` is the SHA-256 of the file; its metadata; the bytes of the file of
+        the candidate that was run, or None.
 
     Raises:
-        GroundedError: for a file that is damaged, not a trial of ours, or whose samples do not lie
-            on its time grid.
+        GroundedError: if the file is damaged, is not a trial file of grounded's, or has samples off
+            its time grid.
     """
     own = read_own(source, name, TRIAL)
     states, inputs = own.names("states"), own.names("inputs")
@@ -213,7 +218,7 @@ def read_trial(
         raise GroundedError(
             f"{own.name}: the trial has no states; it ended before its first sample"
         )
-    if len(u) == len(x):  # stopped between the last input and the state that it would have led to
+    if len(u) == len(x):  # interrupted after the last input, before the resulting state
         u = u[:-1]
     if len(u) != len(x) - 1:
         raise GroundedError(f"{own.name}: {len(x)} states need {len(x) - 1} inputs, found {len(u)}")
@@ -246,6 +251,6 @@ def _create(path: Path) -> IO[bytes]:
     try:
         return path.open("xb")
     except FileExistsError:
-        raise GroundedError(f"{path} exists already; a trial is never overwritten") from None
+        raise GroundedError(f"{path} exists already: trials are never overwritten") from None
     except OSError as error:
         raise GroundedError(f"{path} can't be written: {error.strerror}") from None

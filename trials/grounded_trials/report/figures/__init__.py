@@ -1,5 +1,5 @@
-"""What a report draws: figures of `grounded.figures`, from findings, before it is known how.
+"""The figures of a report, as values of `grounded.figures` that page and pictures draw.
 
-Read `runs.py` first (over time, and the list of all), then `paths.py` and `gap.py`; `png.py` makes
-pictures of them.
+Read `runs.py` first (figures over time, and the list of all), then `paths.py` and `gap.py`;
+`png.py` draws figures with matplotlib.
 """

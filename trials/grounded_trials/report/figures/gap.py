@@ -1,8 +1,8 @@
-"""The gap in time, and what is left of it.
+"""Figures of the gap between model and reality: forecasts, residuals, autocorrelation.
 
-The model set on the real state every second and then left alone; what it lacks over the variable
-that tells most of it, with what the diagnosed model adds drawn through it; whether the rest is
-noise.
+Forecasts restart the model from the measured state every second. Residuals are drawn over the
+variable that explains most of them, with the contribution of the diagnosed model as a line. The
+autocorrelation shows whether the remaining residual is noise.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ from grounded_trials.report.findings import Findings, Run
 from grounded_trials.report.forecast import forecast
 from grounded_trials.wording import labelled, per_second, percent, shown
 
-SPAN_S = 30.0  # of a long log that is drawn: the part with the largest errors
-LOGS = 2  # that are drawn; the table has all
-CHANNELS = 4  # whose residuals are drawn
-POINTS = 1500  # of a residual
+SPAN_S = 30.0  # [s] of a long log that are drawn, where the errors are largest
+LOGS = 2  # number of logs drawn; the table has all
+CHANNELS = 4  # number of states whose residuals are drawn
+POINTS = 1500  # points of a residual
 BINS = 24
-LAGS_S, LAGS = 1.0, 60  # of the autocorrelation: a second, at most so many steps
-LEAST_STEPS = 30  # of a trial whose residual is drawn
+LAGS_S, LAGS = 1.0, 60  # largest lag of the autocorrelation, in [s] and in steps
+LEAST_STEPS = 30  # shortest trial whose residual is drawn
 
 
 def forecast_figures(findings: Findings) -> list[Figure]:
-    """One for a run that the diagnosis didn't see, or else the best; one for the longest logs."""
+    """Return forecasts of a run unknown to the diagnosis, else of the best; and of long logs."""
     found, ahead = [], f"{findings.ahead_s:.3g} s"
     run = _unseen(findings) or findings.lately
     if run is not None:
-        title = f"The model, set right every {ahead}, {run.label}"
+        title = f"Predictions restarted every {ahead}, {run.label}"
         found.append(_figure(findings, "forecast", title, run.trial))
     longest = sorted(findings.logs, key=lambda log: -log.trial.finite_steps)[:LOGS]
     for log in longest:
-        title = f"The model, set right every {ahead}, data {log.trial.id}"
+        title = f"Predictions restarted every {ahead}, data {log.trial.id}"
         found.append(_figure(findings, f"data-{log.trial.id}", title, log.trial))
     return [figure for figure in found if figure is not None]
 
 
 def _unseen(findings: Findings) -> Run | None:
-    """The latest run that the diagnosis was not made from."""
+    """Return the latest run that the diagnosis did not use."""
     made = findings.diagnosis.made if findings.diagnosis is not None else None
     seen = set(made.trials) if made is not None else None
     fresh = [r for r in findings.runs if seen is not None and r.trial.id not in seen]
@@ -78,19 +78,19 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
         panels.append(panel)
     caption = (
         f"Every {findings.ahead_s:.3g} s the model starts from the measured state and gets the "
-        "inputs that were sent: where the lines part, the model is wrong."
+        "inputs that were sent: where the lines differ, the model is wrong."
     )
     diagnosis = findings.diagnosis
     if diagnosis is not None and diagnosis.made is not None and better is not None:
-        saw = "saw this trial too" if trial.id in diagnosis.made.trials else "never saw this trial"
+        saw = "used this trial" if trial.id in diagnosis.made.trials else "did not use this trial"
         caption += f" The last diagnosis, {made_from(diagnosis)}, {saw}."
     if trial.steps < steps:
-        caption += f" Drawn is its worst part, from {begin:g} s on."
+        caption += f" Only its worst part, from {begin:g} s on, is drawn."
     return Figure(name, title, caption, tuple(panels), legend(panels))
 
 
 def _worst_part(findings: Findings, trial: Trial) -> tuple[Trial, float]:
-    """The SPAN_S of a long trial with the largest forecast errors, and when it begins [s]."""
+    """Return the SPAN_S of a long trial with the largest forecast errors, and its start [s]."""
     whole = trial.finite_steps
     span = round(SPAN_S / trial.dt)
     if whole <= span:
@@ -115,7 +115,7 @@ def _part(trial: Trial, first: int, last: int) -> Trial:
 
 
 def residual_figures(findings: Findings) -> list[Figure]:
-    """What the model lacks over what explains it best, and whether the rest is white noise."""
+    """Return the figures of the residual and of its autocorrelation."""
     run = findings.lately
     data: list[tuple[Trial, Array, Array | None]] = [
         (r.trial, r.residual, r.explained) for r in ([run] if run is not None else [])
@@ -134,14 +134,14 @@ def residual_figures(findings: Findings) -> list[Figure]:
     if explained is not None and better is not None:
         caption += f" The line is what the model {better.name} adds."
     same = (
-        f"Of what the model misses of {name} from one measured state to the next. A sensor's noise "
-        "is in two such steps, with opposite signs: alone it takes the first lag to -0.5, where "
-        "all of it is noise. Beyond the first, white noise stays within the band."
+        f"Residuals of {name} from one measured state to the next. A sensor's noise enters two "
+        "consecutive residuals with opposite signs: if they are noise only, the first lag is -0.5. "
+        "At higher lags, white noise stays within the band."
     )
     if findings.diagnosis is not None and findings.diagnosis.where.whiteness:
         same += (
-            ' The test in "Is there a pattern in the rest?" is made of other residuals: those of '
-            "the filter that allows for the sensors' noise, over all trials of the diagnosis."
+            ' The test in "Is there a pattern in the rest?" uses other residuals: those of the '
+            "filter that accounts for sensor noise, over all trials of the diagnosis."
         )
     return [
         Figure("residual", "What the model lacks", caption, tuple(over), legend(over)),
@@ -153,7 +153,7 @@ def residual_figures(findings: Findings) -> list[Figure]:
 
 
 def _channels(findings: Findings, states: Array, residual: Array) -> list[int]:
-    """The states that the diagnosis blames, or else those with the largest residual."""
+    """Return the states that the diagnosis blames, then those with the largest residuals."""
     names, diagnosis = findings.task.model.state_names, findings.diagnosis
     found = diagnosis.where.channels if diagnosis is not None else ()
     blamed = [c.name for c in found if c.share > 0]
@@ -167,7 +167,7 @@ def _channels(findings: Findings, states: Array, residual: Array) -> list[int]:
 def _over(
     findings: Findings, trial: Trial, state: int, residual: Array, explained: Array | None
 ) -> Panel:
-    """A state's residual over the state or input whose bins differ most in it."""
+    """Draw a state's residual over the state or input that explains most of its variance."""
     model, steps = findings.task.model, len(residual)
     units = [*model.states.items(), *model.inputs.items()]
     values = np.hstack([trial.states[:steps], trial.inputs[:steps]])
@@ -177,7 +177,7 @@ def _over(
     x = values[:, k]
     some = np.linspace(0, steps - 1, min(steps, POINTS)).astype(int)
     curves = [
-        Curve(x[some], rate[some], "model", f"lacking in the {findings.plain}", style="points")
+        Curve(x[some], rate[some], "model", f"missing in the {findings.plain}", style="points")
     ]
     better = findings.better
     if explained is not None and better is not None:
@@ -202,7 +202,7 @@ def _edges(x: Array) -> Array:
 
 
 def _told(x: Array, y: Array) -> float:
-    """The share of y's variance that its means in bins of x hold."""
+    """Return the share of y's variance that is explained by its means in bins of x."""
     edges, total = _edges(x), float(np.var(y))
     if len(edges) < 3 or not total > 0:
         return 0.0
@@ -213,9 +213,10 @@ def _told(x: Array, y: Array) -> float:
 
 
 def _binned(x: Array, y: Array) -> tuple[Array, Array]:
-    """Means of x and y in bins of x: equally full ones where x is often, equally wide ones beyond.
+    """Return means of x and y in bins of x.
 
-    So a line through them goes from the least x to the largest.
+    Edges of equally full bins and of equally wide bins are combined, so that a line through the
+    means covers the whole range of x.
     """
     edges = np.union1d(_edges(x), np.linspace(x.min(), x.max(), _bins(x) + 1))
     which = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, max(len(edges) - 2, 0))
@@ -226,7 +227,7 @@ def _binned(x: Array, y: Array) -> tuple[Array, Array]:
 def _autocorrelation(
     findings: Findings, trial: Trial, state: int, residual: Array, explained: Array | None
 ) -> Panel:
-    """Of a state's residual, of the model alone and as diagnosed."""
+    """Draw the autocorrelation of a state's residual, without and with the diagnosed effects."""
     most = min(LAGS, len(residual) // 3, max(5, round(LAGS_S / trial.dt)))
     lags = range(1, most + 1)
     shown_ = [(residual, "model", findings.plain)]
@@ -235,14 +236,14 @@ def _autocorrelation(
     curves, note = [], ""
     if explained is not None:
         left = float(np.std(explained[:, state]) / (np.std(residual[:, state]) or 1.0))
-        note = f"{percent(left)} of its size is left"
+        note = f"{percent(left)} of the residual is left"
     note += "; " * bool(note) + "sensor noise alone: −0.5 at the first lag"
     for values, role, name in shown_:
         y = values[:, state] - values[:, state].mean()
         power = float(y @ y) or 1.0
         found = np.array([float(y[lag:] @ y[:-lag]) / power for lag in lags])
         curves.append(
-            Curve(np.array(lags) * float(trial.dt), found, role, f"left of the {name}", 2.0)
+            Curve(np.array(lags) * float(trial.dt), found, role, f"residual of the {name}", 2.0)
         )
     bound = 1.96 / np.sqrt(len(residual))
     band = Band(-bound, bound, "other", "white noise stays inside, 95 %")

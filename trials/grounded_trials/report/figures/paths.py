@@ -1,6 +1,6 @@
-"""Where the runs went: paths in the plane, the error as their colour, deviations enlarged.
+"""Figures of paths: the runs in the plane, the error as a colour, deviations enlarged.
 
-A mechanism without a place on a map is seen from the side: the path of its tip, and itself.
+A mechanism without a position in the plane is drawn from the side, with the path of its tip.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from grounded_trials.report.findings import Findings, Log, Run, compared
 from grounded_trials.report.scene import Scene, scene_of
 from grounded_trials.wording import labelled
 
-OTHERS = 60  # runs that are drawn behind the compared ones
-LOGS = 4  # that are drawn where there is no run
+OTHERS = 60  # largest number of runs drawn behind the compared ones
+LOGS = 4  # largest number of logs drawn if there is no run
 LOG_ROLES = ("best", "model", "accepted", "limit")
-SEEN = 5.0  # the least factor that shows more than the paths themselves
-MOSTLY = 0.5  # of a path: one of which more lies beyond is left out
-FAR = 0.4  # of the desired path's size: enlarged deviations beyond it are not drawn
+SEEN = 5.0  # smallest factor at which enlarged deviations are drawn
+MOSTLY = 0.5  # a path with a larger share beyond FAR is left out
+FAR = 0.4  # limit of enlarged deviations, as a fraction of the desired path's size
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Two axes, and where states (T, n) lie between them (T, 2)."""
+    """Two axes, and a function that maps states (T, n) to points (T, 2)."""
 
     names: tuple[str, str]
     place: Callable[[Array], Array]
@@ -38,12 +38,12 @@ class View:
 
     @property
     def title(self) -> str:
-        """What it shows."""
+        """The title of its panel."""
         return "{1} over {0}".format(*self.names) if self.body is None else "From the side"
 
 
 def _views(findings: Findings, scene: Scene) -> list[View]:
-    """From above and from the side; of what has no position, its body or its phase plane."""
+    """Return the views from above and from the side; without a position, of body or phase plane."""
     body = body_in(findings)
     if not scene.spatial and is_mechanism(body):
         names = labelled("x", body.unit), labelled("z, up", body.unit)
@@ -53,14 +53,14 @@ def _views(findings: Findings, scene: Scene) -> list[View]:
 
 
 def _plane(scene: Scene, axis: int) -> View:
-    """Another axis over the first one."""
+    """Return the view of an axis over the first one."""
     x, y = (labelled(scene.names[i], scene.units[i]) for i in (0, axis))
     equal = axis == 1 and scene.spatial and scene.units[0] == scene.units[1]
     return View((x, y), lambda states: states[:, [scene.axes[0], scene.axes[axis]]], equal)
 
 
 def path_figure(findings: Findings) -> Figure | None:
-    """The paths, the error along the best one, and the deviations enlarged."""
+    """Return the figure of the paths, the enlarged deviations and the error along the best path."""
     scene = scene_of(findings.task.model)
     views = _views(findings, scene)
     logs = not findings.runs and bool(findings.logs) and not scene.volume
@@ -69,22 +69,22 @@ def path_figure(findings: Findings) -> Figure | None:
     body, caption = views[0].body, []
     if logs:
         panels = [_of_logs(findings, view) for view in views]
-        caption.append("Data that ran no candidate.")
+        caption.append("Data of logs that ran no candidate.")
     else:
         panels = [_seen_in(findings, view) for view in views]
         if views[0].equal and findings.runs:
             panels += _enlarged(findings, views[0]) + _shaded(findings, views[0])
         if body is not None:
             caption.append(
-                "Moving: real in black or white, predicted for the same trial in pink, desired "
-                f"dashed. The curves are paths of {body.watched}."
+                "Moving parts: real in black or white, predicted for the same trial in pink, "
+                f"desired dashed. The curves are paths of {body.watched}."
             )
     if body is None and not scene.spatial:
-        caption.append(f"No plane among the roles: {listed(scene.names)}.")
+        caption.append(f"No role gives a position: phase plane of {listed(scene.names)}.")
     if body is not None and not body.unit:
         caption.append(
-            "How long its links are is not known (a parameter l, or l1, l2 ... in m says it): "
-            "they are drawn alike."
+            "The lengths of its links are unknown (name parameters l, or l1, l2 ... in m): they "
+            "are drawn with equal length."
         )
     if any(crash(run) for run in findings.runs):
         caption.append("A cross marks where a run ended early.")
@@ -92,7 +92,7 @@ def path_figure(findings: Findings) -> Figure | None:
 
 
 def _of_logs(findings: Findings, view: View) -> Panel:
-    """Where the robot went in the logs, while no candidate has been run."""
+    """Draw the paths in the logs, for a workspace without runs."""
     curves = []
     for k, log in enumerate(findings.logs[-LOGS:]):
         states, dt, name = log.trial.states, log.trial.dt, log.trial.id
@@ -103,7 +103,7 @@ def _of_logs(findings: Findings, view: View) -> Panel:
 def _path(
     view: View, states: Array, dt: float, role: str, name: str, trial: str, style: str
 ) -> Curve:
-    """One path with the times of its points, and the body that moves along it."""
+    """Return a path with the times of its points, and the body that moves along it."""
     width = 0.8 if role == "other" else WIDTHS.get(role, 1.5)
     moved = None if view.body is None else motion(view.body, states, dt)
     times: Array = np.arange(len(states), dtype=np.float64) * dt
@@ -112,12 +112,12 @@ def _path(
 
 
 def name_of(role: str, run: Run) -> str:
-    """Of a compared run in a legend."""
+    """Return the name of a compared run in a legend."""
     return f"{'model’s policy' if role == 'model' else 'best so far'}, {run.label}"
 
 
 def named_paths(findings: Findings) -> list[tuple[str, str, Array]]:
-    """(role, name, states) of what is compared, first what lies behind."""
+    """Return (role, name, states) of the compared paths, in drawing order."""
     found = [(role, name_of(role, run), run.trial.states) for role, run in compared(findings)]
     waiting = findings.standing.outstanding
     if not found and waiting is not None:
@@ -126,14 +126,14 @@ def named_paths(findings: Findings) -> list[tuple[str, str, Array]]:
 
 
 def crash(run: Run | Log) -> int | None:
-    """The step after which a run has no more data; None where it went to its end."""
+    """Return the step after which a run has no data, None if it is complete."""
     last = run.trial.finite_steps
     short = isinstance(run, Run) and (not np.isfinite(run.utility) or last < run.trial.steps)
     return last if short else None
 
 
 def _seen_in(findings: Findings, view: View) -> Panel:
-    """Every run's path by name, the compared ones before the others, and what was predicted."""
+    """Draw every run's path, the compared ones on top, and the predictions as ghosts."""
     dt = findings.task.dt
     shown = compared(findings)  # means of several runs have no id
     ids = {run.trial.id for _, run in shown}
@@ -166,7 +166,7 @@ def _crash_mark(run: Run, view: View, dt: float) -> list[Dot]:
 
 
 def _enlarged(findings: Findings, view: View) -> list[Panel]:
-    """The compared paths as many times as far from the desired one, where one can't see it."""
+    """Draw the compared paths with enlarged deviations, if these are too small to see."""
     desired = view.place(findings.task.target)
     if not np.isfinite(desired).all():
         return []
@@ -179,19 +179,19 @@ def _enlarged(findings: Findings, view: View) -> list[Panel]:
         path = near + factor * (view.place(states) - near)
         off = np.abs(path - near).max(axis=1) > FAR * np.ptp(desired, axis=0).max()
         if off.mean() > MOSTLY:
-            note = f"{name.partition(',')[0]} lies outside"
+            note = f"{name.partition(',')[0]} is outside"
             continue
         path[off] = np.nan
         cut |= bool(off.any())
         width = WIDTHS.get(role, 1.5)
         curves.append(Curve(path[:, 0], path[:, 1], role, name, width))
-    title = f"Deviations {factor:g} times as large"
+    title = f"Deviations {factor:g} times enlarged"
     title += ", where they fit" * cut
     return [Panel(title, *view.names, tuple(curves), equal=True, note=note, kind="path")]
 
 
 def _shaded(findings: Findings, view: View) -> list[Panel]:
-    """The best path, its distance from where it should have been as its colour."""
+    """Draw the best path, coloured by its distance from the desired position."""
     (_, run), body = compared(findings)[-1], body_in(findings)
     states, target = run.trial.states, findings.task.target
     desired = body.path(target)
@@ -203,5 +203,5 @@ def _shaded(findings: Findings, view: View) -> list[Panel]:
     (x, y), (a, b) = view.place(states).T, view.place(target).T
     path = Curve(x, y, "other", "", 1.0, times, far, name)
     wanted = Curve(a, b, "desired", "desired", 1.0)
-    title = f"How far {body.watched.partition(',')[0]} is off, {run.label}"
+    title = f"Error of {body.watched.partition(',')[0]}, {run.label}"
     return [Panel(title, *view.names, (path, wanted), equal=True, kind="path")]

@@ -1,4 +1,4 @@
-"""Figures as pictures, drawn by matplotlib: the page's panels, on white."""
+"""Draws the page's figures as PNG files with matplotlib, on white."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from grounded.figures.figure import (
 )
 
 WIDE, HIGH, SQUARE = 4.8, 2.7, 4.4  # [inch] of a panel
-HEAD, ROW = 0.5, 0.27  # [inch] of bars: their title, a bar
-POSES = 6  # of a body that moves
+HEAD, ROW = 0.5, 0.27  # [inch] of a title above bars, and of a bar
+POSES = 6  # drawn poses of a moving body
 DPI = 200
 MARKERS = {"disc": "o", "ring": "o", "cross": "x", "dash": "_"}
-TITLE = 52  # letters of a panel's title in a line
-OTHERS = 3  # single trials that a legend names
+TITLE = 52  # characters per line of a panel's title
+OTHERS = 3  # largest number of single trials named in a legend
 STYLE: Any = {
     "font.size": 9.0, "axes.titlesize": 9.5, "axes.titleweight": "bold",
     "axes.titlelocation": "left", "axes.grid": True, "axes.axisbelow": True,
@@ -41,7 +41,7 @@ STYLE: Any = {
 
 
 def png(figure: Figure) -> bytes:
-    """The PNG file of a figure: its title, its legend, its panels.
+    """Return the PNG file of a figure: its title, its panels, its legend.
 
     Raises:
         GroundedError: if matplotlib is not installed.
@@ -81,7 +81,7 @@ def _height(panel: Panel | Bars) -> float:
 
 
 def _keys(figure: Figure) -> list[Key]:
-    """The legend without a line for each of many trials."""
+    """Return the legend; many single trials become one entry."""
     single = [key for key in figure.key if key.trial]
     if len(single) <= OTHERS:
         return list(figure.key)
@@ -90,7 +90,7 @@ def _keys(figure: Figure) -> list[Key]:
 
 
 def _bars(axes: Any, panel: Bars, most: int) -> None:
-    """Bars as thick as those of their row's panel that has `most`."""
+    """Draw bars as thick as those of the panel with the `most` bars in the same row."""
     rows = range(len(panel.bars))
     drawn = axes.barh(rows, panel.values, color=[_colour(bar.role) for bar in panel.bars])
     axes.bar_label(drawn, [bar.text for bar in panel.bars], padding=3)

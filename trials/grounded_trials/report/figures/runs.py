@@ -1,4 +1,4 @@
-"""The figures over time: states, tracking error, inputs, bias; and the list of all figures."""
+"""Figures over time: states, tracking error, inputs, bias; and the list of all figures."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from grounded_trials.report.scene import scene_of
 from grounded_trials.wording import figure, labelled, per_second, shown
 from grounded_trials.workspace.off_target import tracked, tracking_error
 
-ITERATIONS = 5
+ITERATIONS = 5  # largest number of iterations whose bias is drawn
 
 
 def all_figures(findings: Findings) -> list[Figure]:
-    """All figures of a report, in reading order; those without content are left out."""
+    """Return all figures of a report in reading order, without empty ones."""
     runs = (path_figure, state_figure, error_figure, input_figure, bias_figure)
     made = [search_figure(findings.standing, findings.optimum), *(draw(findings) for draw in runs)]
     if findings.diagnosis is not None:
@@ -47,7 +47,7 @@ def all_figures(findings: Findings) -> list[Figure]:
 
 
 def _distance(findings: Findings, axes: list[int]) -> Panel:
-    """How far the position was from where it should have been at that time."""
+    """Draw the distance of the position from the desired one at the same time."""
     task = findings.task
     curves = []
     for role, run in compared(findings):
@@ -58,7 +58,7 @@ def _distance(findings: Findings, axes: list[int]) -> Panel:
 
 
 def state_figure(findings: Findings) -> Figure | None:
-    """Each state over time, beside its target and prediction."""
+    """Return the figure of each state over time, with its target and prediction."""
     task = findings.task
     if len(named_paths(findings)) < 2:
         return None
@@ -74,7 +74,7 @@ def state_figure(findings: Findings) -> Figure | None:
 
 
 def error_figure(findings: Findings) -> Figure | None:
-    """Distance to the target, and to what was predicted for the same run."""
+    """Return the figure of the errors from the target, and from the run's own prediction."""
     task = findings.task
     shown, panels = compared(findings), []
     if not shown:
@@ -92,12 +92,12 @@ def error_figure(findings: Findings) -> Figure | None:
         gap, words = prediction_error(task, run)[:, i], f"real − predicted, {run.label}"
         curves.append(_over_time(gap, task.dt, "predicted", words, 1.0))
         panels.append(_timed(f"{name} − target", unit, curves, spare=50.0))
-    caption = "How far each run was from its target, and from what the model had predicted for it."
+    caption = "Error of each run from its target, and from the model's prediction for that run."
     return Figure("error", "Tracking error", caption, tuple(panels), legend(panels))
 
 
 def input_figure(findings: Findings) -> Figure | None:
-    """Each input over time against its limits."""
+    """Return the figure of each input over time, with its limits."""
     task, shown, panels = findings.task, compared(findings), []
     if not shown:
         return None
@@ -111,7 +111,7 @@ def input_figure(findings: Findings) -> Figure | None:
 
 
 def bias_figure(findings: Findings) -> Figure | None:
-    """What the crude model lacks along the run, by iteration."""
+    """Return the figure of the crude model's bias along the run, by iteration."""
     task = findings.task
     runs = selection(findings.improvements, ITERATIONS)
     if not runs:
@@ -126,13 +126,13 @@ def bias_figure(findings: Findings) -> Figure | None:
         best = findings.best
         if best is not None and best.explained is not None and findings.better is not None:
             rest = best.explained[:, i] / task.dt
-            words = f"left of the last, model {findings.better.name}"
+            words = f"last iteration, model {findings.better.name}"
             curves.append(_over_time(rest, task.dt, "predicted", words))
         panels.append(_timed(name, per_second(unit), curves))
     caption = (
         f"What must be added to the rate of change of the {findings.plain} for it to replay the "
-        "trial. A curve that keeps its shape over the iterations is a property of the system, not "
-        "of a run."
+        "trial. A curve with the same shape in all iterations is a property of the system, not of "
+        "a run."
     )
     return Figure("bias", "Bias of the model", caption, tuple(panels), legend(panels))
 
@@ -143,13 +143,13 @@ def _over_time(values: Array, dt: float, role: str, name: str, width: float = 1.
 
 
 def _held(values: Array, dt: float, role: str, name: str) -> Curve:
-    """Commands as they are sent: each is held for a step, the last one too."""
+    """Return a curve of commands with zero-order hold, including the last step."""
     curve = _over_time(np.append(values, values[-1:]), dt, role, name)
     return replace(curve, style="steps")
 
 
 def _crashes(findings: Findings, state: int) -> list[Dot]:
-    """A cross where a compared run ended early."""
+    """Return crosses where compared runs ended early."""
     dots = []
     for role, run in compared(findings):
         last = crash(run)
@@ -167,9 +167,9 @@ def _timed(
     spare: float = 3.0,
     marks: Sequence[Dot] = (),
 ) -> Panel:
-    """A panel over time; a first run that went astray is cut off rather than flatten the others.
+    """Return a panel over time, scaled so that a diverging first run does not flatten the others.
 
-    A note says so then, and how far the run went.
+    If that run is cut off, a note states the values that it reaches.
     """
     calm = [c.y for c in curves if c.role != "model"] + [np.array(limits)]
     wild = [c.y for c in curves if c.role == "model"]
@@ -189,7 +189,7 @@ def _timed(
 
 
 def _cut_off(values: list[Array], low: float, high: float) -> str:
-    """How far values go that lie outside the picture, "" where all are inside."""
+    """Return a note with the extreme values outside the picture, "" if all are inside."""
     finite = [v[np.isfinite(v)] for v in values]
     ends = [float(e) for v in finite if len(v) for e in (v.min(), v.max())]
     out = sorted({e for e in ends if not low <= e <= high})

@@ -2,6 +2,6 @@
 
 Read `page.py` first, then `diagnosed.py`, its section on the diagnosis, and `tables.py`, its parts.
 `page.html` is the template, `page.js` draws the figures with Plotly.
-`plotly-basic.min.js` is Plotly's own smallest bundle, unchanged (npm: plotly.js-basic-dist-min
-4.1.1, MIT): a quarter of the one that the Python package brings; a page opens in half a second.
+`plotly-basic.min.js` is Plotly's smallest bundle, unchanged (npm: plotly.js-basic-dist-min 4.1.1,
+MIT). It is a quarter of the size of the bundle in the Python package, so that pages open fast.
 """

@@ -4,11 +4,11 @@
   const { panels, colours } = JSON.parse(document.getElementById("data").textContent);
   const night = matchMedia("(prefers-color-scheme: dark)");
   const plots = all(".plot");
-  const hidden = new Map(); // of a figure: the names that its legend has switched off
-  let light = false; // while it is printed
+  const hidden = new Map(); // for each figure, the names switched off in its legend
+  let light = false; // true while printing
   let time = 0;
 
-  // Values: typed arrays from their bytes, colours from their roles.
+  // Values: decode typed arrays, replace roles by colours.
   const array = ({ dtype, bdata, from, step }) => {
     const bytes = Uint8Array.from(atob(bdata), (c) => c.charCodeAt(0));
     if (dtype === "u2") {
@@ -36,7 +36,7 @@
     return Object.fromEntries(Object.entries(value).map(([key, item]) => [key, coloured(item)]));
   };
 
-  // Drawing: each panel when it first comes into view.
+  // Drawing: each panel is drawn when it first comes into view.
   const known = (plot) => {
     const panel = panels[plot.dataset.panel];
     if (!panel.ready) {
@@ -50,7 +50,7 @@
   const looks = (plot) => {
     const { data, layout, kind } = known(plot);
     const gone = off(plot);
-    const shown = data.filter((trace) => trace.meta.style !== "ghost"); // those move marks alone
+    const shown = data.filter((trace) => trace.meta.style !== "ghost"); // ghosts only move marks
     const traces = coloured(shown).map((trace) => {
       const name = trace.name || trace.meta.trial;
       return gone.has(name) || gone.has(trace.meta.trial) ? { ...trace, visible: false } : trace;
@@ -83,7 +83,7 @@
     const { kind } = panels[plot.dataset.panel];
     const placed = () => {
       marks(plot);
-      for (const button of all(".modebar-btn", plot)) button.tabIndex = -1; // a plot has keys
+      for (const button of all(".modebar-btn", plot)) button.tabIndex = -1; // plots have keyboard shortcuts
     };
     plot.on("plotly_afterplot", placed);
     plot.on("plotly_relayout", (change) => zoomedTo(plot, kind, change));
@@ -95,7 +95,7 @@
     plot.addEventListener("keydown", (event) => keyed(plot, event));
     placed();
   };
-  const waiting = []; // one panel a frame, so that the page can be scrolled meanwhile
+  const waiting = []; // one panel per frame, so that the page remains responsive
   const next = () => {
     const plot = waiting.shift();
     if (plot && !plot.drawn) draw(plot);
@@ -107,7 +107,7 @@
     if (idle && waiting.length) requestAnimationFrame(next);
   }, { rootMargin: "300px" });
 
-  // Zoom: the panels over a run's time share it; keys do what the mouse does.
+  // Zoom: panels over time share their range; keys do what the mouse does.
   const zoomedTo = (plot, kind, change) => {
     if (!Object.keys(change).some((key) => /^[xy]axis/.test(key))) return;
     plot.zoomed = true;
@@ -137,7 +137,7 @@
     Plotly.relayout(plot, { "xaxis.range": [...to] });
   };
 
-  // The cursor: one time in all panels, as a line or as marks on the paths.
+  // The cursor: one time in all panels, drawn as a line or as marks on the paths.
   const over = (plot, name, kind) => {
     let mark = plot.querySelector(`:scope > .over[data-name="${name}"]`);
     if (!mark) {
@@ -158,7 +158,7 @@
     mark.style.top = `${yaxis._offset + top}px`;
     if (y === undefined) mark.style.height = `${yaxis._length}px`;
   };
-  const between = (t) => { // the two samples around the time, and where it lies between them
+  const between = (t) => { // returns a linear interpolator at the cursor's time
     if (!t || !t.length || time > t[t.length - 1] + 1e-9) return null;
     let low = 0, high = t.length - 1;
     while (high - low > 1) {
@@ -172,7 +172,7 @@
     const now = between(t), place = now && [now(x), now(y)];
     return place && place.every(Number.isFinite) ? place : null;
   };
-  // A mechanism seen from the side: its parts' lines, turned and moved to where they are now.
+  // A mechanism seen from the side: the lines of its parts in their pose at the cursor's time.
   const SVG = "http://www.w3.org/2000/svg";
   const body = (plot, name, motion) => {
     const { xaxis, yaxis } = plot._fullLayout, now = motion && between(motion.t);
@@ -262,7 +262,7 @@
     });
   }
 
-  // Legends: a button hides and shows what it names, in all panels of its figure.
+  // Legends: a button hides and shows its curves in all panels of its figure.
   for (const chip of all(".chip")) {
     chip.addEventListener("click", () => {
       const figure = chip.closest(".figure");
@@ -301,7 +301,7 @@
     });
   }
 
-  // Print: everything, light, at the width of half a sheet.
+  // Print: everything, in light colours, at the width of half a sheet.
   addEventListener("beforeprint", () => {
     light = true;
     for (const part of all("details")) part.open = true;
@@ -319,7 +319,7 @@
   });
   night.addEventListener("change", () => { for (const plot of plots) if (plot.drawn) draw(plot); });
 
-  // Watching: a small picture beside the page has the revision as its width; another one reloads.
+  // Watching: the width of a small picture beside the page is the revision; reload if it changes.
   const mine = +document.documentElement.dataset.watched;
   if (mine) {
     const kept = JSON.parse(sessionStorage.getItem("kept") || "{}");
@@ -335,7 +335,7 @@
     }, 1000);
   }
   for (const plot of plots) seen.observe(plot);
-  // The others later, one at a time: a page that is saved or scrolled fast is whole.
+  // Draw the others later, one at a time, so that a page that is saved or scrolled is complete.
   const others = [...plots];
   const rest = () => {
     const plot = others.shift();

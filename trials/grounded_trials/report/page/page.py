@@ -1,8 +1,8 @@
-"""report.html: one page with everything, that needs no network and runs no script but its own.
+"""report.html: one self-contained page that needs no network and runs only its own scripts.
 
-What a name or a file says is text, never markup: the template escapes it, and a content security
-policy allows only the two scripts whose hashes the page states. The figures are in the page as
-data; `page.js` draws each with Plotly when it comes into view.
+Names and texts from files are never markup: the template escapes them, and a content security
+policy allows only the two scripts whose hashes the page states. The page holds the figures as data;
+`page.js` draws each with Plotly when it comes into view.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ from grounded_trials.wording import count, figure, glued, rendered
 from grounded_trials.workspace.next_step import DIAGNOSE
 from grounded_trials.workspace.proposing import not_counted
 
-OPEN = 12  # candidates whose table is open
+OPEN = 12  # largest number of candidates whose table is shown unfolded
 
 
 def page(findings: Findings, watched: int = 0) -> str:
-    """The whole document.
+    """Return the HTML of the report.
 
     Args:
-        findings: what is shown.
-        watched: the revision that the page is of, where `report --watch` keeps it current.
+        findings: the contents.
+        watched: the page's revision for `report --watch`; 0: the page does not reload.
 
     Raises:
         GroundedError: if Jinja2 is not installed.
@@ -75,7 +75,7 @@ def page(findings: Findings, watched: int = 0) -> str:
         panels.append(_data(panel))
         return len(panels) - 1
 
-    def data() -> str:  # asked for after every panel has its number
+    def data() -> str:  # called after all panels have been numbered
         text = json.dumps({"panels": panels, "colours": palette()}, allow_nan=False)
         return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
@@ -99,11 +99,11 @@ def page(findings: Findings, watched: int = 0) -> str:
 
 
 def _unbroken(text: str) -> Any:
-    """Markup in which a browser breaks no quantity: neither 0.05 kg nor 1e-05; `x` is code."""
+    """Return markup in which no quantity (0.05 kg, 1e-05) is broken; text in ` becomes code."""
     from markupsafe import Markup, escape
 
     parts = str(text).split("`")
-    if len(parts) % 2 == 0:  # one that is not closed
+    if len(parts) % 2 == 0:  # an unmatched backtick
         parts = [str(text)]
     for k, part in enumerate(parts):
         if k % 2:
@@ -133,7 +133,7 @@ def _data(panel: Panel | Bars) -> dict[str, Any]:
 
 
 def _motion(motion: Motion | None) -> dict[str, Any] | None:
-    """What moves as the script draws it; of each part, eight numbers over time."""
+    """Return a motion as data for the script: eight numbers over time for each part."""
     if motion is None:
         return None
     rows = motion.poses.reshape(*motion.poses.shape[:2], 8)
@@ -149,7 +149,7 @@ def _motion(motion: Motion | None) -> dict[str, Any] | None:
 
 
 def _plain(value: Any) -> Any:
-    """Arrays packed, numbers of NumPy as Python's."""
+    """Pack arrays, and convert NumPy numbers to Python's, in nested data."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -160,21 +160,21 @@ def _plain(value: Any) -> Any:
 
 
 def _height(panel: Panel | Bars) -> int:
-    """Of a panel in the page [px]."""
+    """Return the height of a panel in the page [px]."""
     if isinstance(panel, Bars):
         return 30 + 26 * max(len(panel.bars), 1)
     return 420 if panel.kind == "path" else 240
 
 
 def _roles() -> str:
-    """Colours of the roles for the legends, light and dark; print is light."""
+    """Return the style of the roles' colours, light and dark; print uses light."""
     light = "".join(f".{role}{{--c:{pair[0]}}}" for role, pair in palette().items())
     dark = "".join(f".{role}{{--c:{pair[1]}}}" for role, pair in palette().items())
     return f"{light}@media screen and (prefers-color-scheme: dark){{{dark}}}"
 
 
 def _sections(findings: Findings) -> list[tuple[str, list[Block]]]:
-    """Titles and parts, in reading order."""
+    """Return the sections (title, parts) in reading order."""
     paths = drawn(path_figure(findings), wide=True)
     return [
         ("Paths", [Block("run"), *paths] if paths and findings.runs else paths),
@@ -197,18 +197,18 @@ def _about(findings: Findings) -> str:
 
 
 def _heading(findings: Findings) -> str:
-    """What the rows below it show: an improvement is only what is better in all of them."""
+    """Return the heading above `_improved`; "What improved" only if no row got worse."""
     runs, tried = compared(findings), [one for one in findings.history if one.trials]
     if len(runs) < 2:
         alone = len(tried) < 2 or findings.first is None
-        return "What the runs gave" if alone else "Nothing improved on the first run"
+        return "Results" if alone else "Nothing improved on the first run"
     rows = improvements_in(findings)
     worse = any(one.after > one.before and not one.is_same for one in rows)
     return "What the runs changed" if worse else "What improved"
 
 
 def _improved(findings: Findings) -> list[tuple[str, str]]:
-    """What the first trial missed by, and the best one does: in the units of the states."""
+    """Return rows (value, text) of the errors and utility of the first and the best trial."""
     from grounded.search.certainty import owed_to_start
 
     rows = [(one.text, one.what) for one in improvements_in(findings)]
@@ -218,12 +218,12 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
         gain = ""
         if -math.inf < first.utility < 0 and best.utility <= 0:
             share = 1 - best.utility / first.utility
-            gain = f": {100 * share:.1f} % of the first cost is gone"
+            gain = f": cost reduced by {100 * share:.1f} %"
             tried = {one.candidate.id: one for one in findings.history}
             two = tried[first.candidate.id], tried[best.candidate.id]
             if start := owed_to_start(*two, findings.history):
                 part = -100 * start / first.utility
-                gain += f", {part:.1f} % by where the runs began, as the model sees it"
+                gain += f", {part:.1f} % due to different start states, as the model predicts"
         moved = f"{figure(first.utility)} → {figure(best.utility)}"
         rows.append((moved, f"utility, the model’s own policy to {best.candidate.id}{gain}"))
     elif best is not None:
@@ -246,13 +246,13 @@ def _tiles(findings: Findings) -> list[str]:
         (findings.left_logs, len(findings.logs), "logs"),
     ):
         if left:
-            found.append(f"{left} of {left + shown} {kind} are not drawn: there are too many")
+            found.append(f"{left} of {left + shown} {kind} are not drawn (too many)")
     early = [run.trial.id for run in findings.runs if crash(run) is not None]
     return [*found, f"ended early: {', '.join(early)}"] if early else found
 
 
 def _why(findings: Findings) -> dict[str, Any]:
-    """The verdict, the lines that measure it, and the credit."""
+    """Return the verdict, the lines that quantify it, and the credit figure; {} if undiagnosed."""
     diagnosis = findings.diagnosis
     if diagnosis is None:
         return {}
@@ -273,7 +273,7 @@ def _why(findings: Findings) -> dict[str, Any]:
 def _utility(findings: Findings) -> list[Block]:
     if not findings.history:
         logs = count(len(findings.logs) + findings.left_logs, "log")
-        return [Block("text", f"No candidate was proposed yet; {logs} of data.")]
+        return [Block("text", f"No candidate has been proposed yet; {logs} of data.")]
     from grounded.search.certainty import last_improvement
 
     sure = last_improvement(findings.history)

@@ -1,6 +1,6 @@
-"""The page's parts as values: tables, figures, sentences, commands; a template lays them out.
+"""The parts of the page as values: tables, figures, sentences, commands.
 
-The template escapes every text: names come from strangers' files too.
+The template lays them out, and escapes every text, since names may come from untrusted files.
 """
 
 from __future__ import annotations
@@ -25,20 +25,21 @@ from grounded_trials.report.forecast import forecast_error
 from grounded_trials.wording import figure, legend, percent, rendered, shown, with_unit
 from grounded_trials.workspace.next_step import Since
 
-WIDEST = 1e6  # an interval so many times its value, or so wide, says nothing
+WIDEST = 1e6  # an interval wider than this times max(|value|, 1) counts as unknown
 UNKNOWN = "–, not determined by these trials"
 
 
 @dataclass(frozen=True)
 class Block:
-    """A part of a section; `kind` says how it looks.
+    """A part of a section; `kind` selects its layout.
 
     text, soft, heading    a sentence
     command                a command to copy; `name` is its id
     verdict                `lines`, one below the other
-    table                  `name`, `header` (text columns end with a blank), `rows`; `strong` ones
-    figure                 `figure`; wide: two panels a row
-    folded                 `blocks` under the title `text`; open where `wide`
+    table                  `name`, `header` (text columns end with a blank), `rows`; `strong` rows
+                           are bold
+    figure                 `figure`; with `wide` two panels per row
+    folded                 `blocks` under the title `text`; open if `wide`
     run                    the slider that moves along the paths
     """
 
@@ -55,7 +56,7 @@ class Block:
 
 
 def drawn(figure: Figure | None, wide: bool = False, title: bool = False) -> list[Block]:
-    """A figure, under its own title where asked; nothing for None."""
+    """Return a figure's blocks, with its title as a heading if `title`; [] for None."""
     if figure is None:
         return []
     heading = [Block("heading", figure.title)] if title else []
@@ -65,12 +66,12 @@ def drawn(figure: Figure | None, wide: bool = False, title: bool = False) -> lis
 def table(
     name: str, header: Sequence[str], rows: Sequence[Sequence[str]], strong: Iterable[int] = ()
 ) -> Block:
-    """A table that can be copied."""
+    """Return a table that can be copied."""
     return Block("table", name=name, header=header, rows=rows, strong=frozenset(strong))
 
 
 def candidate_table(findings: Findings) -> list[Block]:
-    """The candidates with their trials; of many not all, and how many are left out."""
+    """Return the candidates with their trials; of many, a part and the number left out."""
     rows, best = [], findings.standing.incumbent
     kept, left = few(findings.history, MOST)
     for tried in kept:
@@ -90,7 +91,7 @@ def candidate_table(findings: Findings) -> list[Block]:
         rows.append(cells)
     strong = {k for k, t in enumerate(kept) if best and t.candidate is best.candidate}
     made = table("candidates", list(rows[0]), [list(cells.values()) for cells in rows], strong)
-    words = f"{left} candidates between them are left out; this shows all:"
+    words = f"{left} candidates are left out; this command shows all:"
     more = [
         Block("text", words),
         Block("command", rendered(NextCommand("status"), findings.folder), "c-status"),
@@ -100,7 +101,7 @@ def candidate_table(findings: Findings) -> list[Block]:
 
 
 def error_table(findings: Findings) -> list[Block]:
-    """Rms by state: off the target, off the prediction, and the bias."""
+    """Return by state the rms errors from target and prediction, and the rms bias."""
     task, runs = findings.task, [run for _, run in compared(findings)]
     if findings.best is None:
         return []
@@ -112,7 +113,10 @@ def error_table(findings: Findings) -> list[Block]:
 
 
 def forecast_table(findings: Findings) -> list[Block]:
-    """Rms error so far ahead (`ahead_s`) in the best run and every log: not the ruler's."""
+    """Return the rms prediction error at the horizon `ahead_s` in the best run and every log.
+
+    Unlike the errors of the diagnosis, these are not held out.
+    """
     run = findings.lately
     trials = ([run.trial] if run is not None else []) + [log.trial for log in findings.logs]
     if not trials:
@@ -123,13 +127,13 @@ def forecast_table(findings: Findings) -> list[Block]:
     names = [f"{t.id or t.candidate}, {words}" for t in trials for words, _ in planners]
     ahead = findings.ahead_s
     columns = [forecast_error(planner, t, ahead) for t in trials for _, planner in planners]
-    title = Block("heading", f"What the model, set right every {ahead:.3g} s, misses by then, rms")
+    title = Block("heading", f"Prediction error {ahead:.3g} s ahead, rms")
     rows = by_state(findings.task.model, columns)
     return [title, table("forecasts", ("state", "unit", *names), rows)]
 
 
 def effect_table(diagnosis: Diagnosis, since: Since) -> Block:
-    """The ranked effects with their parameters and 95 % intervals."""
+    """Return the ranked effects with their parameters and 95 % intervals."""
     rows = [
         (
             r.effect + " (adopted since)" * (r.effect in since.adopted),
@@ -154,7 +158,7 @@ def _params(ranked: Ranked) -> str:
 
 
 def _interval(v: Estimate) -> str:
-    """A value and its 95 % interval as the diagnosis has it; a dash where there is none."""
+    """Return a value and its 95 % interval as text; `UNKNOWN` if the interval is too wide."""
     if v.interval is None:
         return figure(v.value)
     low, high = v.interval
@@ -163,7 +167,7 @@ def _interval(v: Estimate) -> str:
 
 
 def leftover_table(diagnosis: Diagnosis) -> list[Block]:
-    """What a flexible model finds that no known effect explains; nothing where it finds none."""
+    """Return the residuals that a flexible model finds and no known effect explains."""
     rows = [
         (
             left.channel,
@@ -183,7 +187,7 @@ def leftover_table(diagnosis: Diagnosis) -> list[Block]:
 
 
 def parameter_table(findings: Findings) -> list[Block]:
-    """The model's parameters: in model.py, now, and as the diagnosis has them."""
+    """Return the model's parameters: in model.py, current, and as diagnosed."""
     estimated = _estimated(findings.diagnosis)
     rows = []
     for name, param in findings.task.model.params.items():
@@ -199,7 +203,7 @@ def parameter_table(findings: Findings) -> list[Block]:
 
 
 def _estimated(diagnosis: Diagnosis | None) -> dict[str, Estimate]:
-    """What a diagnosis makes of parameters: calibrated, or blamed by name as an effect."""
+    """Return the parameters that a diagnosis calibrated, or claimed as an effect."""
     if diagnosis is None:
         return {}
     found = dict(diagnosis.parameters)
@@ -212,7 +216,7 @@ def _estimated(diagnosis: Diagnosis | None) -> dict[str, Estimate]:
 
 
 def channel_table(findings: Findings) -> Block:
-    """States and inputs with units, weights, limits and latency."""
+    """Return states and inputs with units, weights, limits and latency."""
     task, reward, rows = findings.task, findings.task.reward, []
     assert task.latency is not None
     for i, (name, unit) in enumerate(task.model.states.items()):

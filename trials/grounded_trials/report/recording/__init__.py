@@ -1,4 +1,4 @@
-"""The workspace as a Rerun recording, one .rrd file. Only this room imports rerun.
+"""Writes the workspace as a Rerun recording, one .rrd file. Only this package imports rerun.
 
-Read `recording.py` first (what is recorded, and how), then `layout.py` (the viewer's views).
+Read `recording.py` first (the recorded entities), then `layout.py` (the views of the viewer).
 """

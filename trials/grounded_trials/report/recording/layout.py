@@ -1,4 +1,4 @@
-"""The recording's blueprint: which views the viewer opens with, and where they look from."""
+"""The recording's blueprint: the views that the viewer opens, and their camera positions."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from grounded_trials.report.findings import Findings
 from grounded_trials.report.scene import Scene
 from grounded_trials.wording import labelled, per_second
 
-FAR = 1.1  # times the size of what is seen
-ASIDE = 1.5  # the same of a mechanism: its parts have a width
+FAR = 1.1  # distance of the camera, times the size of the contents
+ASIDE = 1.5  # the same for a mechanism, whose parts have a width
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +31,14 @@ class Space:
 
     @property
     def title(self) -> str:
-        """What the first view shows."""
+        """The title of the first view."""
         if is_mechanism(self.body):
             return "Real and predicted, from the side"
         axes = [labelled(*one) for one in zip(self.scene.names, self.scene.units, strict=True)]
         return "Paths: " + " over ".join(reversed(axes)) if len(axes) == 2 else "Paths"
 
     def view(self, contents: Sequence[str], name: str) -> Any:
-        """A view of some entities; from above y points up, from the side z does."""
+        """Return a view of some entities; y points up from above, z from the side."""
         import rerun.blueprint as rrb
 
         (centre, extent), up = self._bounds, (0, 0, 1)
@@ -63,7 +63,7 @@ class Space:
 
     @cached_property
     def _bounds(self) -> tuple[Array, float]:
-        """The middle and the size of all that is drawn, without runs that went astray."""
+        """Centre and size of target, best and first run; others may diverge and are left out."""
         findings = self.findings
         shown = [findings.task.target]
         shown += [run.trial.states for run in (findings.best, findings.first) if run is not None]
@@ -75,13 +75,13 @@ class Space:
         return (low + high) / 2, float((high - low).max() or 1.0)
 
 
-TRIALS = 60  # that get a tab of their own
+TRIALS = 60  # largest number of trials with a tab of their own
 NAMES = {"state": "states", "input": "inputs", "bias": "bias"}
 FIRST = 4  # states in the overview; all of them have a tab
 
 
 def blueprint(findings: Findings, space: Space) -> Any:
-    """Overview, effects on and off, states, inputs, bias, and a tab for each trial."""
+    """Return the views: overview, effects on and off, states, inputs, bias, one tab per trial."""
     import rerun.blueprint as rrb
 
     model = findings.task.model
@@ -132,7 +132,7 @@ def _overview(findings: Findings, space: Space) -> Any:
 
 
 def _effects(findings: Findings, space: Space) -> list[Any]:
-    """The best run beside the model set on it again and again: without effects, and with them."""
+    """Return views of the best run and the model's forecasts, without effects and with them."""
     import rerun.blueprint as rrb
 
     better = findings.better
@@ -160,7 +160,7 @@ def _trials(findings: Findings, space: Space) -> list[Any]:
     for run in findings.runs[-TRIALS:]:
         names = dict(NAMES)
         if run.explained is not None:
-            names["explained"] = "bias that is left after the diagnosis"
+            names["explained"] = "bias of the model as diagnosed"
         about = f"{run.label}, utility {run.utility:.4g}"
         shown.append((f"/trials/{run.trial.id}", about, names, ["path", "predicted/**", "body/**"]))
     for log in findings.logs[-TRIALS:]:

@@ -1,17 +1,17 @@
-"""The recording: a workspace for the Rerun viewer, one .rrd file.
+"""Writes a workspace for the Rerun viewer, as one .rrd file.
 
     /paths/...                desired, the model's own policy, the best so far and its prediction
-    /state/x/...              the same over time, a plot a state;  /input/u/...  with their limits
-    /bias/x/...               what the crude model lacks along the run [unit/s], by iteration
-    /ahead/...                the best run, and the model set on it every second: effects off, on
-    /trials/t0007/...         everything of one trial: path, prediction, body, state, input, bias
-    /data/t0003/...           the same of a log that ran no candidate
-    /verdict                  why the model was wrong, what each cause is worth, what to run next
-    /utilities, /summary      by iteration, and in words (Markdown)
+    /state/x/...              the same over time, one plot per state;  /input/u/...  with limits
+    /bias/x/...               bias of the crude model along the run [unit/s], by iteration
+    /ahead/...                the best run, and forecasts restarted every second: effects off, on
+    /trials/t0007/...         all of one trial: path, prediction, body, state, input, bias
+    /data/t0003/...           the same for a log that ran no candidate
+    /verdict                  why the model was wrong, the share of each cause, what to run next
+    /utilities, /summary      utility by iteration, and a summary in Markdown
 
-One timeline, `time`, in seconds since the start of a trial. Numbers go in by whole columns, names
-and colours once. A file is derived from trials: it may be deleted, and files of single trials of
-one workspace merge into one recording (`rerun rrd merge`), for their identity is the same.
+There is one timeline, `time`, in seconds since the start of a trial. Numbers are logged as whole
+columns, names and colours once. The file is derived from trials and may be deleted. All recordings
+of one workspace have the same id, so that they can be merged (`rerun rrd merge`).
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ from grounded_trials.workspace.off_target import tracked
 COLOURS = {role: rgb(dark) for role, (_, dark) in PAGE.items()}
 COLOURS |= {"desired": (170, 170, 170), "other": (110, 110, 110), "model_policy": COLOURS["model"]}
 SERIES = [COLOURS[role] for role in ("best", "limit", "accepted", "step2", "predicted", "model")]
-ITERATIONS = 4  # of the bias, in one plot
-FINE = 600  # steps; the bias of longer trials is averaged over a few steps, or files get large
-BAR = 24  # letters of a credit of 100 %
+ITERATIONS = 4  # largest number of iterations whose bias is drawn
+FINE = 600  # steps above which the bias of a trial is averaged, to keep files small
+BAR = 24  # characters of a bar of 100 % credit
 Colour = tuple[int, int, int]
-FRAMES = 600  # poses of a body in an animation
-VERTICES = 1000  # of a path in space
+FRAMES = 600  # largest number of poses of a body in an animation
+VERTICES = 1000  # largest number of points of a path in space
 
 
 def write_recording(findings: Findings, path: Path) -> None:
-    """Writes the .rrd file of a workspace.
+    """Write the .rrd file of a workspace.
 
     Raises:
         GroundedError: if it can't be written, or rerun is not installed.
@@ -76,7 +76,7 @@ def write_recording(findings: Findings, path: Path) -> None:
 
 
 class _Recorder:
-    """Findings on their way into a stream: first what is recorded, then how."""
+    """Records findings into a stream: methods for the contents first, then for single entities."""
 
     def __init__(self, stream: Any, findings: Findings, body: Body) -> None:
         self.stream, self.findings, self.body = stream, findings, body
@@ -105,7 +105,7 @@ class _Recorder:
             self.signals(f"data/{one.trial.id}", one.trial, one.residual)
 
     def paths(self) -> None:
-        """The paths that one wants to see first, with a body on each that was really run."""
+        """Record the paths of the overview, with a body on each path that was run."""
         task, first, best = self.task, self.findings.first, self.findings.best
         if np.isfinite(self.body.path(task.target)).all():
             self.path("paths/desired", task.target, "desired", 2.0)
@@ -121,7 +121,7 @@ class _Recorder:
                 self.moving(f"paths/{role}", run.trial, role)
 
     def over_time(self) -> None:
-        """States and inputs over time, a plot each: target and limits beside what was run."""
+        """Record states and inputs over time, one plot each, with target, prediction and limits."""
         task, best, known = self.task, self.findings.best, tracked(self.task)
         for i, name in enumerate(task.model.state_names):
             if i in known:
@@ -138,7 +138,7 @@ class _Recorder:
                     self.line(f"input/{name}/{bound}", span, whole, "limit", width=1)
 
     def runs(self, at: str, kind: str, column: int) -> None:
-        """One quantity along the model's policy and along the best so far."""
+        """Record one quantity along the model's policy and along the best run so far."""
         words = {"model_policy": "the model's policy", "best": "best so far"}
         for role, run in self.compared.items():
             if run is not None:
@@ -147,7 +147,7 @@ class _Recorder:
                 self.line(f"{at}/{role}", values, self.dt, role, name, width)
 
     def biases(self) -> None:
-        """What the crude model lacks, by iteration; what the diagnosed effects leave of it."""
+        """Record the crude model's bias by iteration, and that of the model with effects."""
         best, better = self.findings.best, self.findings.better
         shown = selection(self.findings.improvements, ITERATIONS)
         for number, run in enumerate(shown):
@@ -158,7 +158,7 @@ class _Recorder:
             self.rates(f"left, {better.name}", best.explained, "limit")
 
     def forecasts(self) -> None:
-        """The best run beside the model without effects, and with them, set on it every second."""
+        """Record the best run, and its forecasts by the model without effects and with them."""
         run = self.findings.best or self.findings.latest
         if run is None or self.findings.better is None:
             return
@@ -185,10 +185,10 @@ class _Recorder:
             self.line(at, rates[:, i], dt, colour, key, 1.0)
 
     def trial(self, run: Run) -> None:
-        """Everything of one trial, under its own name."""
+        """Record all of one trial under its own name."""
         at, colour = f"trials/{run.trial.id}", "accepted" if run.accepted else "other"
         if self.task.utility(run.trial) == -np.inf:
-            colour = "limit"  # it crashed
+            colour = "limit"  # crashed
         for role, chosen in self.compared.items():
             if chosen is not None and run.candidate is chosen.candidate:
                 colour = role
@@ -199,14 +199,14 @@ class _Recorder:
             self.columns(f"{at}/explained", *rate(run.explained, self.dt), self.per_second)
 
     def signals(self, at: str, trial: Trial, residual: Array) -> None:
-        """States, inputs and bias, each as one entity with named columns."""
+        """Record states, inputs and bias, each as one entity with named columns."""
         model = self.task.model
         self.columns(f"{at}/state", trial.states, self.dt, model.states)
         self.columns(f"{at}/input", trial.inputs, self.dt, model.inputs)
         self.columns(f"{at}/bias", *rate(residual, self.dt), self.per_second)
 
     def ghost(self, at: str, run: Run) -> None:
-        """The run as it was predicted, with a body of its own that moves beside the real one."""
+        """Record the predicted run, with a body that moves alongside the real one."""
         states, inputs = run.candidate.predicted_states, run.candidate.predicted_inputs
         names = (run.trial.state_names, run.trial.input_names)
         if np.isfinite(states).all():
@@ -217,7 +217,7 @@ class _Recorder:
     def moving(
         self, at: str, trial: Trial, colour: str, path: str = "", width: float = 2.0
     ) -> None:
-        """A path that was run, and the body that moves and turns along it."""
+        """Record the path of a run, and the body that moves and turns along it."""
         import rerun as rr
 
         self.path(at + path, trial.states, colour, width)
@@ -236,7 +236,7 @@ class _Recorder:
             self.stream.send_columns(entity, times, pose)
 
     def path(self, at: str, states: Array, colour: str, width: float) -> None:
-        """A path in space, all of it at once."""
+        """Record a path in space as one static line."""
         import rerun as rr
 
         points = self.body.path(states)
@@ -250,7 +250,7 @@ class _Recorder:
     def line(
         self, at: str, values: Array, dt: float, colour: str, name: str = "", width: float = 1.5
     ) -> None:
-        """One curve over time, named by default after its colour; only what is finite."""
+        """Record the finite values of a curve over time, named by default after its colour."""
         import rerun as rr
 
         style = rr.SeriesLines(colors=COLOURS[colour], names=name or colour, widths=width)
@@ -260,7 +260,7 @@ class _Recorder:
         self.stream.send_columns(at, times, rr.Scalars.columns(scalars=values[keep]))
 
     def columns(self, at: str, values: Array, dt: float, units: Mapping[str, str]) -> None:
-        """All columns of an array as one entity; `units` by the names of the columns."""
+        """Record the columns of an array as one entity; `units` by the names of the columns."""
         import rerun as rr
 
         steps, width = values.shape
@@ -273,7 +273,7 @@ class _Recorder:
 
 
 def rate(residual: Array, dt: float) -> tuple[Array, float]:
-    """What a model lacks per second (T, n), and its interval: means of a few steps for large T."""
+    """Return a residual per second (T, n) and its interval [s]; averaged over steps for large T."""
     step = -(-len(residual) // FINE)
     if step <= 1:
         return residual / dt, dt
@@ -282,7 +282,7 @@ def rate(residual: Array, dt: float) -> tuple[Array, float]:
 
 
 def verdict(findings: Findings) -> str:
-    """What the diagnosis says in three lines, each cause's share, and what to run next."""
+    """Return the diagnosis in a few lines, each cause's share, and the next command (Markdown)."""
     diagnosis, lines = findings.diagnosis, []
     if diagnosis is None:
         lines.append("not diagnosed yet\n")
@@ -291,7 +291,7 @@ def verdict(findings: Findings) -> str:
             f"{line}\n" for line in told(diagnosis, findings.task, findings.since, findings.settled)
         ]
         if diagnosis.credit:
-            lines += ["| credit | | of what predictions gain |", "|---|---|---|"]
+            lines += ["| credit | | of the improvement of predictions |", "|---|---|---|"]
         for one in diagnosis.credit:
             bar = "█" * max(1, round(BAR * one.share)) if one.share > 0 else ""
             lines.append(f"| {one.of} | {percent(one.share)} | {bar} |")
@@ -300,7 +300,7 @@ def verdict(findings: Findings) -> str:
 
 
 def summary(findings: Findings) -> str:
-    """What was learnt, and what is left out."""
+    """Return a summary of the workspace and of what is left out (Markdown)."""
     task, best, first = findings.task, findings.best, findings.first
     left = findings.left_runs + findings.left_logs
     lines = [
@@ -317,7 +317,7 @@ def summary(findings: Findings) -> str:
         known.append(f"{best.utility:.4g} best so far ({best.candidate.id})")
     if findings.optimum is not None:
         known.append(f"{findings.optimum:.4g} at the optimum")
-    lines.append(f"utility {', '.join(known)}" if known else "no candidate was run yet")
+    lines.append(f"utility {', '.join(known)}" if known else "no candidate has been run yet")
     lines += ["", "grey: desired; orange: model's policy; blue: best so far; pink: its prediction"]
     lines += ["", f"**{findings.standing.outcome}**: {findings.standing.sentence}", ""]
     lines += [f"**left out**: {one.file}: {one.reason}\n" for one in findings.lost]
@@ -325,7 +325,7 @@ def summary(findings: Findings) -> str:
 
 
 def drawn(part: Part, colour: Colour, ghost: bool = False) -> Any:
-    """The archetype of a part, in one colour; a ghost, what was only predicted, as its edges."""
+    """Return the archetype of a part in one colour; ghosts (predictions) as wireframes."""
     import rerun as rr
 
     modes, size = rr.components.FillMode, part.size

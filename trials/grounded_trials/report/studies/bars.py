@@ -1,4 +1,4 @@
-"""The studies whose picture is bars: a number a row, one below the other."""
+"""Draws the studies whose picture is bars, one number per row."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from grounded.experiments.jobs import improvement
 from grounded.experiments.nondeterminism import NondeterminismResult
 from grounded.figures.figure import Bar, Bars, Figure, Key
 
-LEVEL = 2  # of SHARES: what the picture of the baselines counts trials to
-PAPER_SPREAD = 50.0  # [cm] the largest that the paper saw
+LEVEL = 2  # index of SHARES: the share of the gap to close in the picture of the baselines
+PAPER_SPREAD = 50.0  # [cm] largest distance reported in the paper
 KINDS = {
     "parametric": "parametric error",
     "structural": "structural error",
@@ -28,7 +28,7 @@ QUANTITIES = (("Position", "mm", 1e3), ("Heading", "mrad", 1e3), ("Speed", "m/s"
 
 
 def footnote9_figure(result: Footnote9Result) -> Figure:
-    """Shares of the optimum for each b: the model's policy, one iteration, policy gradient."""
+    """Draw shares of the optimum for each b: the model's policy, one iteration, policy gradient."""
     kinds = {"model": "model-based", "best": "one iteration", "other": "policy gradient"}
     bars = []
     for row in result.rows:
@@ -41,7 +41,7 @@ def footnote9_figure(result: Footnote9Result) -> Figure:
 
 
 def nondeterminism_figure(result: NondeterminismResult) -> Figure:
-    """The largest distance between end-points, by scatter and sequence, on one scale."""
+    """Draw the largest distance between end points, by scatter and sequence, on one scale."""
     roles = ("other", "best", "model")
     bars, keys = [], []
     for i, level in enumerate(sorted({s.level for s in result.spreads})):
@@ -52,19 +52,19 @@ def nondeterminism_figure(result: NondeterminismResult) -> Figure:
                 cm = 100 * s.largest
                 bars.append(Bar(f"{s.sequence}, x{level:g}", cm, f"{cm:.1f} cm", role))
     bars.append(Bar("the paper’s car, at most", PAPER_SPREAD, f"{PAPER_SPREAD:.0f} cm", "desired"))
-    panel = Bars(f"Largest distance between end-points, {result.runs} runs of 2 s", tuple(bars))
-    return Figure("nondeterminism", "The same inputs, again and again", "", (panel,), tuple(keys))
+    panel = Bars(f"Largest distance between end points, {result.runs} runs of 2 s", tuple(bars))
+    return Figure("nondeterminism", "Repeated runs with the same inputs", "", (panel,), tuple(keys))
 
 
 def baselines_figure(result: BaselinesResult) -> Figure:
-    """Real trials that each method needs, a panel a manoeuvre and error; long bars are cut."""
+    """Draw the real trials that each method needs, one panel per manoeuvre and kind of error."""
     panels = []
     for manoeuvre, kind in dict.fromkeys((line.manoeuvre, line.kind) for line in result.lines):
         own = [li for li in result.lines if (li.manoeuvre, li.kind) == (manoeuvre, kind)]
         methods = dict.fromkeys(line.method for line in own)
         bars = tuple(_method([line for line in own if line.method == m]) for m in methods)
         panels.append(Bars(f"{manoeuvre}, {KINDS.get(kind, kind)}", bars))
-    key = _discs(best="this tool", other="other methods", model="most seeds never get there")
+    key = _discs(best="this tool", other="other methods", model="not reached by most seeds")
     title = f"Real trials to close {SHARES[LEVEL]:.0%} of the gap, median; bars end at {BUDGET}"
     return Figure("baselines", title, "", tuple(panels), key)
 
@@ -74,13 +74,13 @@ def _method(lines: Sequence[Line]) -> Bar:
     median, name = float(np.median(counts)), lines[0].method
     if not np.isfinite(median):
         end = float(np.median([line.final for line in lines]))
-        return Bar(name, float(BUDGET), f"never: ends at {end:.1%}", "model")
+        return Bar(name, float(BUDGET), f"not reached: ends at {end:.1%}", "model")
     role = "best" if name == "grounded" else "other"
     return Bar(name, min(median, BUDGET), f"{median:g}", role)
 
 
 def fit_car_figure(result: FitCarResult) -> Figure:
-    """By parameter: whether intervals hold, what the fit adds, and whether its std is honest."""
+    """Draw by parameter: coverage of the intervals, rms error, and calibration of the std."""
     held, gained, honest = [], [], []
     count = len(result.runs)
     for name, share in result.coverage.items():
@@ -96,23 +96,23 @@ def fit_car_figure(result: FitCarResult) -> Figure:
         gained.append(Bar(name, ratio, f"{ratio:.1%}: {text}"))
         honest.append(Bar(name, z, f"{z:.2f}"))
     panels = (
-        Bars("Cars whose 95 % interval holds the true value", tuple(held)),
-        Bars("Rms error of the fit, as a share of the first value’s", tuple(gained)),
-        Bars("Error of each fit in its own stated standard deviations, rms", tuple(honest)),
+        Bars("Cars whose 95 % interval contains the true value", tuple(held)),
+        Bars("Rms error of the fit, relative to that of the initial value", tuple(gained)),
+        Bars("Rms error of the fits in their own standard deviations", tuple(honest)),
     )
     title = f"Parameters from {result.minutes:g} minutes of driving, {count} cars"
     return Figure("fit-car", title, "", panels)
 
 
 def estimated_figure(result: EstimatedResult) -> Figure:
-    """Improvement on estimated beside true states, and the errors of the estimates."""
+    """Draw the improvement with estimated and with true states, and the estimation errors."""
     names = list(dict.fromkeys(run.manoeuvre for run in result.runs))
     bars = [bar for name in names for bar in _gains(result, name)]
-    panels = [Bars("Share of the model’s cost that is gone", tuple(bars))]
+    panels = [Bars("Reduction of the model’s cost", tuple(bars))]
     for i, (what, unit, factor) in enumerate(QUANTITIES):
         rows = [bar for name in names for bar in _errors(result, name, i, unit, factor)]
         if rows:
-            panels.append(Bars(f"{what}: error of the estimates, rms", tuple(rows)))
+            panels.append(Bars(f"{what}: rms estimation error", tuple(rows)))
     others = "optimum, and the paper’s car"
     key = _discs(best="on estimated states", accepted="on true states", other=others)
     title = f"The closed loop on estimated states, markers ±{1e3 * CAMERA:g} mm"
@@ -132,7 +132,7 @@ def _gains(result: EstimatedResult, name: str) -> list[Bar]:
 
 
 def _errors(result: EstimatedResult, name: str, which: int, unit: str, factor: float) -> list[Bar]:
-    """The rms error of one quantity, live and smoothed, over the runs that were filmed."""
+    """Return the rms estimation errors of one quantity, live and smoothed, of the camera runs."""
     runs = [run for run in result.of(name, "camera") if run.live]
     bars = []
     for words in ("live filter", "smoother") if runs else ():
@@ -143,5 +143,5 @@ def _errors(result: EstimatedResult, name: str, which: int, unit: str, factor: f
 
 
 def _discs(**names: str) -> tuple[Key, ...]:
-    """A legend of discs: role = its name."""
+    """Return a legend of discs, given as role = name."""
     return tuple(Key(role, name, "disc") for role, name in names.items())

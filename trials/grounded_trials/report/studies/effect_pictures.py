@@ -1,12 +1,12 @@
-"""A picture of each family's signature, for docs/effects.md.
+"""Draws a picture of each effect family's signature, for docs/effects.md.
 
-Made by `python -m grounded_trials.report.studies.effect_pictures docs`.
+Run `python -m grounded_trials.report.studies.effect_pictures docs` to update them.
 
-A car (for a joint's effects a pendulum, for a medium's a boat) is driven by the same commands in
-the model (grey) and in the model with one effect (orange); shown is the state that the effect
-changes most, in units of its own range: one that moves fast (speed, steering angle, heading rate)
-where it changes those, else a position. Strengths are chosen so that the change is seen: about a
-quarter of the range.
+The model (grey) and the model with one effect (orange) get the same commands. The model is a car,
+for effects of a joint a pendulum, for those of a medium a boat. The picture shows the state that
+changes most relative to its range: a dynamic one (speed, steering angle, heading rate) if it
+changes at all, else a position. The strength is chosen for a change of about a quarter of the
+range.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ from grounded.trial import Trial
 DT, STEPS = 0.05, 160
 WIDE, HIGH, GAP, TOP = 170, 84, 14, 18  # of a panel [px]
 ROW = 4  # panels side by side
-SEEN = 0.25  # of a state's range
+SEEN = 0.25  # desired change, as a fraction of a state's range
 
-Drawn = tuple[str, Array, Array]  # a state's name, and it without and with an effect (T + 1,)
+Drawn = tuple[str, Array, Array]  # a state's name, its values without and with effect (T + 1,)
 
 
 def _sailing(s: Any, a: Any, p: Any) -> dict[str, Any]:
@@ -70,7 +70,7 @@ boat = Model(
 
 
 def commands() -> Array:
-    """Steering and throttle, lively and of both signs, with steps."""
+    """Return steering and throttle (STEPS, 2), of both signs and with steps."""
     t = np.arange(STEPS) * DT
     steering = 0.5 * np.sin(2.0 * t) * np.where(t > 4, 1.0, np.sign(np.sin(2.0 * t)))
     throttle = 0.45 + 0.3 * np.sign(np.sin(1.3 * t))
@@ -78,7 +78,7 @@ def commands() -> Array:
 
 
 def run(model: Model, base: Model, inputs: Array) -> Array:
-    """States of the base model's names under the commands, (T + 1, n)."""
+    """Simulate a model under the commands; return the states of the base model, (T + 1, n)."""
     start = np.full(base.n, 0.1)
     still = Trial(np.tile(start, (2, 1)), inputs[:1], DT, base.state_names, base.input_names)
     x = start if model.n == base.n else np.hstack([start, memory_start(model, base, still)])
@@ -89,7 +89,7 @@ def run(model: Model, base: Model, inputs: Array) -> Array:
 
 
 def settings(effect: Effect) -> list[dict[str, float]]:
-    """Values to try: strengths that double at the middle of the grid, or the grid itself."""
+    """Return parameter values to try: doubling strengths at mid-grid, or the grid itself."""
     linear = [q for q in effect.free if not q.grid]
     scanned = {q.name: np.sort(q.grid) for q in effect.free if q.grid}
     if not linear:
@@ -101,7 +101,7 @@ def settings(effect: Effect) -> list[dict[str, float]]:
 
 
 def signature(effect: Effect, inputs: Array, plain: Array) -> Drawn:
-    """The state that changes most."""
+    """Return the state that changes most, at the strength with a change closest to `SEEN`."""
     size, model = np.maximum(np.ptp(plain, axis=0), 1e-9), effect.site.model
     fast = [model.state_names.index(name) for name in places.dynamic(model)]
     found = []
@@ -118,7 +118,7 @@ def signature(effect: Effect, inputs: Array, plain: Array) -> Drawn:
 
 
 def strip(named: Mapping[str, Drawn]) -> str:
-    """Small plots in rows, as one SVG."""
+    """Return small plots in rows as one SVG."""
     step, body = TOP + HIGH + GAP, []
     for i, (title, (state, *curves)) in enumerate(named.items()):
         x, y = (i % ROW) * (WIDE + GAP), (i // ROW) * step
@@ -138,7 +138,7 @@ def strip(named: Mapping[str, Drawn]) -> str:
 
 
 def kind_of(effect: Effect) -> str:
-    """The section of docs/effects.md."""
+    """Return the section of docs/effects.md that an effect belongs to."""
     kinds = {InputFamily: "input", MemoryFamily: "memory", LossFamily: "joint", RateFamily: "rate"}
     kinds |= {MediumFamily: "rate", ParamFamily: "param"}
     name = next((k for cls, k in kinds.items() if isinstance(effect.family, cls)), "sensor")
@@ -146,7 +146,7 @@ def kind_of(effect: Effect) -> str:
 
 
 def drawn_of(model: Model, scales: Scales) -> list[Effect]:
-    """All that applies to the car; of the pendulum what acts on its joint, of the boat a medium."""
+    """Return the effects to draw: all for the car, joint effects for the pendulum, else medium."""
     if model is car:
         return list(Library().candidates(model, scales))
     library = Library()
@@ -157,7 +157,7 @@ def drawn_of(model: Model, scales: Scales) -> list[Effect]:
 
 
 def draw_all(folder: Path) -> list[Path]:
-    """Writes effects-KIND.svg for every kind; returns their paths."""
+    """Write effects-KIND.svg for every kind; return their paths."""
     inputs, swings = commands(), 2.0 * commands()[:, :1]
     strips: dict[str, dict[str, Drawn]] = {}
     for model, u in ((car, inputs), (pendulum, swings), (boat, inputs)):
@@ -167,7 +167,7 @@ def draw_all(folder: Path) -> list[Path]:
             named = strips.setdefault(kind_of(effect), {})
             drawn = signature(effect, u, plain)
             before = named.get(effect.family.name)
-            if before is None or _change(drawn) > _change(before):  # the target where it shows
+            if before is None or _change(drawn) > _change(before):  # the target that shows it best
                 named[effect.family.name] = drawn
     paths = []
     for kind, named in strips.items():
@@ -177,7 +177,7 @@ def draw_all(folder: Path) -> list[Path]:
 
 
 def _change(drawn: Drawn) -> float:
-    """How far apart the lines are, in units of the first one's range; at most SEEN counts."""
+    """Return the largest distance of the lines relative to the first one's range, 0 if over 2."""
     _, plain, changed = drawn
     far = float(np.abs(changed - plain).max() / max(float(np.ptp(plain)), 1e-9))
     return far if far < 2 else 0.0

@@ -1,7 +1,7 @@
-"""The picture of each of the paper's studies, drawn as the page draws its figures.
+"""Draws the picture of each of the paper's studies, in the style of the report's figures.
 
-Here are those with curves: the aircraft's paths (Figure 1), the car's (Figures 4 and 5), Theorem 1
-over epsilon, and the line search over the scatter; `bars.py` has the others.
+This module draws those with curves: the aircraft's paths (Figure 1), the car's (Figures 4 and 5),
+Theorem 1 over epsilon, and the line search over the scatter. `bars.py` draws the others.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ from grounded_trials.store.store import write_atomically
 FIRST, LAST, DESIRED = "the model’s controller", "after learning", "desired"
 PAPER_FIGURE = {"turn": 4, "circle": 5, "figure8": 5}
 RULE_ROLES = ("model", "step2", "accepted", "best", "other", "predicted", "desired")
-SMALLEST = 1e-300  # instead of the logarithm of nothing
+SMALLEST = 1e-300  # lower bound of arguments of the logarithm
 
 
 def flight_figure(result: FlightResult) -> Figure:
-    """Figure 1: North-East (also enlarged) and altitude over time; utilities."""
+    """Draw Figure 1: North over East (also enlarged), altitude over time, and utilities."""
     shown = result.representative
     after = f"after {len(shown.utilities) - 1} iterations"
     paths = [
@@ -64,7 +64,7 @@ def flight_figure(result: FlightResult) -> Figure:
     factor = enlarging(paths[0][2], paths[2][2])
     panels = (
         _plane("Figure 1: North over East", paths, 1.0),
-        _plane(f"The same, deviations {factor:g} times as large", paths, factor),
+        _plane(f"The same, deviations {factor:g} times enlarged", paths, factor),
         Panel("Figure 1: altitude above the start", "time [s]", "m", tuple(height)),
         _utilities(result),
     )
@@ -78,7 +78,7 @@ def flight_figure(result: FlightResult) -> Figure:
 
 
 def _plane(title: str, paths: list[tuple[str, str, Array]], factor: float) -> Panel:
-    """Paths from above, each `factor` times as far from the desired one as it was."""
+    """Draw paths from above, with deviations from the desired one enlarged by `factor`."""
     desired = paths[-1][2]
     curves = []
     for role, name, path in paths:
@@ -89,7 +89,7 @@ def _plane(title: str, paths: list[tuple[str, str, Array]], factor: float) -> Pa
 
 
 def _utilities(result: FlightResult) -> Panel:
-    """Utility by iteration, a line a run, above the optimum with the true parameters."""
+    """Draw utility by iteration, one line per run, and the optimum with the true parameters."""
     curves = []
     for run in sorted(result.flown, key=lambda run: run is result.representative):
         x, y = np.arange(len(run.utilities), dtype=np.float64), np.array(run.utilities)
@@ -101,9 +101,9 @@ def _utilities(result: FlightResult) -> Panel:
 
 
 def car_figure(result: CarResult) -> Figure:
-    """Figure 4, the turn through its iterations; Figure 5, circle and figure-8; improvements.
+    """Draw Figure 4 (the turn by iteration), Figure 5 (circle and figure-8) and improvements.
 
-    Paths are those of the first seed, with scatter where that was run.
+    Paths are those of the first seed, with scatter if that was run.
     """
     names = list(dict.fromkeys(run.manoeuvre for run in result.runs))
     shown = [(result.of(name, True) or result.of(name, False))[0] for name in names]
@@ -116,7 +116,7 @@ def car_figure(result: CarResult) -> Figure:
 
 
 def _manoeuvre(run: CarRun, stages: bool) -> Panel:
-    """The path of the first and the last iteration, and those between."""
+    """Draw the paths of the first and last iteration, and with `stages` those between."""
     every = [p for name, p in run.paths.items() if name != "target"]
     roles = ["model", *STEPS, *["other"] * len(every)][: len(every)]
     roles[-1] = "best" if len(every) > 1 else "model"
@@ -134,7 +134,7 @@ def _manoeuvre(run: CarRun, stages: bool) -> Panel:
 
 
 def _improvements(result: CarResult, names: Sequence[str]) -> Bars:
-    """Share of the cost that is gone, beside the paper's."""
+    """Draw the reduction of the cost, with that of the paper."""
     bars = []
     for name in names:
         for noisy, words in ((False, "quiet"), (True, "with scatter")):
@@ -143,11 +143,11 @@ def _improvements(result: CarResult, names: Sequence[str]) -> Bars:
                 mean, _ = mean_se(gains)
                 bars.append(Bar(f"{name}, {words}", mean, f"{mean:.1%}"))
         bars.append(Bar(f"{name}, the paper’s car", PAPER[name], f"{PAPER[name]:.0%}", "other"))
-    return Bars("Share of the model’s cost that is gone", tuple(bars))
+    return Bars("Reduction of the model’s cost", tuple(bars))
 
 
 def theorem1_figure(result: Theorem1Result) -> Figure:
-    """Gradient error and squared gradient over epsilon, log-log, with the theorem's slopes."""
+    """Draw gradient error and squared gradient over epsilon, log-log, with the theorem's slopes."""
     slopes = result.slopes()
     panels = (
         _trend(
@@ -169,8 +169,8 @@ def theorem1_figure(result: Theorem1Result) -> Figure:
     key = (
         Key("best", "median of the seeds"),
         Key("best", "each seed", "ring"),
-        Key("desired", "the slope of the theorem’s bound, through it"),
-        Key("model", "the theorem’s bound, at its lowest"),
+        Key("desired", "the slope of the theorem’s bound, through the median"),
+        Key("model", "the theorem’s bound, smallest of the seeds"),
     )
     return Figure("theorem1", "Theorem 1: a model wrong by epsilon", "", panels, key)
 
@@ -183,7 +183,7 @@ def _trend(
     theory: int,
     bound: Callable[[Theorem1Row], float] | None = None,
 ) -> Panel:
-    """A quantity (its title, its axis) by epsilon: a ring a seed, the median, the bound's slope."""
+    """Draw a quantity (title, axis) by epsilon: a ring per seed, the median, the bound's slope."""
     rows = result.rows
     dots = tuple(
         Dot(_log(r.epsilon), _log(value(r)), "best", f"seed {r.seed}: {value(r):.3g}", "ring")
@@ -208,7 +208,7 @@ def _log(value: float) -> float:
 
 
 def noise_figure(result: NoiseResult) -> Figure:
-    """Share of the gap closed by each rule over the scatter: the median seed and the worst."""
+    """Draw the share of the gap closed by each rule over the scatter: median and worst seed."""
     panels = []
     for name in dict.fromkeys(o.manoeuvre for o in result.outcomes):
         own = [o for o in result.outcomes if o.manoeuvre == name]
@@ -220,7 +220,7 @@ def noise_figure(result: NoiseResult) -> Figure:
 
 
 def _shares(outcomes: Sequence[Outcome], title: str, of: Callable[[Array], Any]) -> Panel:
-    """A curve a rule."""
+    """Draw one curve per rule."""
     curves, dots = [], []
     for k, rule in enumerate(dict.fromkeys(o.rule for o in outcomes)):
         closed: dict[float, list[float]] = {}
@@ -231,7 +231,7 @@ def _shares(outcomes: Sequence[Outcome], title: str, of: Callable[[Array], Any])
         curves.append(Curve(np.array([*shares]), np.array([*shares.values()]), role, rule))
         for level, share in shares.items():
             dots.append(Dot(level, share, role, f"{rule}, scatter x{level:g}: {share:.1f} %"))
-    return Panel(title, "scatter, times the car’s own", "%", tuple(curves), tuple(dots))
+    return Panel(title, "scatter, relative to the car’s", "%", tuple(curves), tuple(dots))
 
 
 PICTURES: dict[str, Callable[[Any], Figure]] = {
@@ -248,20 +248,20 @@ PICTURES: dict[str, Callable[[Any], Figure]] = {
 
 
 def draw_study(name: str, result: Any, path: Path) -> None:
-    """Writes the picture of a study's result as a PNG file.
+    """Write the picture of a study's result as a PNG file.
 
     Args:
-        name: of the study, as in `grounded experiment NAME`.
-        result: what its function returned.
-        path: of the file; its folder is made.
+        name: name of the study, as in `grounded experiment NAME`.
+        result: the study's result.
+        path: path of the file; its folder is created if needed.
 
     Raises:
         GroundedError: if the name is unknown or the file can't be written.
     """
     if name not in PICTURES:
-        raise GroundedError(f"no picture of '{name}', only of {', '.join(PICTURES)}")
+        raise GroundedError(f"there is no picture of '{name}', only of {', '.join(PICTURES)}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise GroundedError(f"{path.parent} can't be made: {error.strerror}") from None
+        raise GroundedError(f"{path.parent} can't be created: {error.strerror}") from None
     write_atomically(path, png(PICTURES[name](result)))
