@@ -171,10 +171,10 @@ class RulerRow(Document):
     floor_at_most: `noise_floor` is an upper bound and the noise may be far less. No trial was
         repeated and the innovations are not white, so part of them is the model's error.
     runs_away: by column ("crude" ...), the channels whose prediction diverges far beyond the
-        measured range, as in open loop for an unstable plant. The error is meaningless.
+        measured range, as in open loop for an unstable plant. Its error is meaningless.
     floor_unsure: standard deviation of the logarithm of a floor from few or short repeats.
-    drowned: noise alone takes some state beyond its measured range within this horizon, so open-loop
-        errors are meaningless in all channels.
+    drowned: noise alone takes some state beyond its measured range within this horizon, so
+        open-loop errors are meaningless in all channels.
     """
 
     horizon_s: float
