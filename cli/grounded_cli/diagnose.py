@@ -1,4 +1,4 @@
-"""grounded diagnose: where the model is wrong, which effect makes it so, how far it shrinks."""
+"""grounded diagnose: where the model is wrong, which effect causes it, how far the gap shrinks."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from grounded.result import listed
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, parallel
 from grounded_cli.terminal import (
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
     from grounded.engine import Engine
     from grounded.instruments.finding import Finding
 
+LEAST_SHARE = 0.005  # of the gap: a channel below it is not listed
+CHANNELS, REGIONS = 2, 3  # named in a line, in the details
+
 
 @click.command("diagnose")
 @click.option(
@@ -39,19 +43,24 @@ if TYPE_CHECKING:
     "--max-effects",
     type=click.IntRange(1, 6),
     metavar="K",
-    help="Blame at most K effects at once, 1 to 6 (default: 3, more where they leave a gap).",
+    help="Claim at most K effects, 1 to 6 (default: 3, more if they leave a gap).",
 )
-@click.option("--without", multiple=True, metavar="F1,F2,...", help="Families not to blame.")
+@click.option("--without", multiple=True, metavar="F1,F2,...", help="Families to exclude.")
 @click.option(
     "--compare",
     nargs=2,
     metavar="A B",
     shell_complete=complete.trials,
-    help="Two groups of trials, T1,T2 T3,T4: what changed between them.",
+    help="Two groups of trials, T1,T2 T3,T4: report what changed.",
 )
-@click.option("--probe", is_flag=True, help="Write the most instructive next trial, tie or not.")
+@click.option(
+    "--probe", is_flag=True, help="Write the most informative next trial, even without a tie."
+)
 @parallel
-@click.option("--instruments", is_flag=True, help="Judge the sensors alone; takes some seconds.")
+@click.option("--instruments", is_flag=True, help="Check the sensors only; takes some seconds.")
+@click.option(
+    "--details", is_flag=True, help="Also rival effects, whole trials, look-alikes, utilities."
+)
 @in_workspace
 @as_json
 def command(
@@ -62,13 +71,14 @@ def command(
     probe: bool,
     engine: Engine,
     instruments: bool,
+    details: bool,
     json_: bool,
 ) -> None:
     """Explain the sim-to-real gap from the stored trials; keeps reports/diagnosis.json.
 
-    The verdict is one effect, several, none (what is left is noise, or can't be told from it) or
-    unknown (a gap that no known effect explains). Where two effects tie, a probe candidate that
-    would tell them apart is written.
+    The verdict is one effect, several, none (the rest is noise, or cannot be told from it) or
+    unknown (a gap that no known effect explains). If two effects tie, a probe is written: a
+    candidate whose trial would tell them apart.
     """
     workspace = open_workspace()
     from grounded.errors import GroundedError
@@ -77,13 +87,13 @@ def command(
     chosen = names_in(trials)
     if trials is not None and not chosen:
         raise GroundedError(
-            "--trials names no trial: expected some, like t0001,t0002; leave it out to take all"
+            "--trials names no trial: expected some, like t0001,t0002; omit it to use all"
         )
     first, second = map(names_in, compare or ("", ""))
     if compare and (chosen or not (first and second) or {*first} & {*second}):
         raise GroundedError(
             "--compare takes two groups of different trials, like --compare t0001,t0002 "
-            "t0003,t0004, instead of --trials"
+            "t0003,t0004, and no --trials"
         )
     if instruments:
         findings = workspace.preflight(chosen)
@@ -108,7 +118,8 @@ def command(
         show_json(found.to_json())
     else:
         params = workspace.base_model.params
-        _tell(found, {name: param.value for name, param in params.items()})
+        nominal = {name: param.value for name, param in params.items()}
+        _show(found, nominal, details=details)
         show("\n" + field("next trial", found.next_trial))
         if found.probe:
             from grounded_cli.propose import show_extent
@@ -118,7 +129,8 @@ def command(
         show(f"\n{next_line(found.then)}")
 
 
-def _tell(found: Diagnosis, before: dict[str, float]) -> None:
+def _show(found: Diagnosis, nominal: dict[str, float], *, details: bool) -> None:
+    """Print a diagnosis: what a person needs to decide, or with `details` everything."""
     from grounded.diagnosis.tables import error_table
     from grounded_trials.report.diagnosis_words import (
         agreement_lines,
@@ -131,25 +143,26 @@ def _tell(found: Diagnosis, before: dict[str, float]) -> None:
     _instruments(found.preflight)
     for text in found.unknowable:
         if text not in found.sentence:
-            show(field("unknown", text))
+            show(field("limits", text))
     if not found.no_cause:
         if found.prediction_error:
-            show("\n" + table(*error_table(found)))
+            show("\n" + table(*error_table(found, whole_trials=details)))
             _note(f"open loop, {_held_out(found)}")
-        _effects(found)
-    _places(found)
-    for title, text in error_lines(found, before):
-        show(field(title, text))
-    for text in in_vain(found):
-        show(field("dropped", text))
-    if found.correction is not None:
+        _effects(found, details=details)
+    _places(found, details=details)
+    if details:
+        for title, text in error_lines(found, nominal):
+            show(field(title, text))
+        for text in in_vain(found):
+            show(field("dropped", text))
+    if found.correction is not None and (details or found.correction.adoptable):
         show(field("correction", correction_line(found.correction)))
     for title, text in agreement_lines(found):
         show(field(title, text))
 
 
 def _held_out(found: Diagnosis) -> str:
-    """How the errors were measured, and how far ahead they tell something."""
+    """Say how the errors were held out and what the noise floor is from."""
     from grounded.diagnosis.error_report import furthest
 
     row = found.prediction_error[0]
@@ -160,21 +173,21 @@ def _held_out(found: Diagnosis) -> str:
     noise = {
         "repeats": "the scatter of repeats",
         "alike": "the scatter of trials whose commands agree to 2 %",
-        "short horizon": "one step's noise, carried on",
+        "short horizon": "extrapolated from one-step errors",
     }
     if row.floor_at_most:
         noise["short horizon"] = (
-            "at most what one step leaves, carried on (it isn't white: part of it is the model's "
-            "error; repeat a trial)"
+            "an upper bound, extrapolated from one-step errors that are not white (part of them is "
+            "model error; repeat a trial to know)"
         )
-    told = f"{by.get(row.held_out, 'not held out')}; noise: {noise.get(row.floor_from, 'unknown')}"
-    told_of = furthest(found.prediction_error)
-    if told_of and any(one.drowned for one in found.prediction_error if not one.whole_trial):
-        told += (
-            f"; farther ahead than {told_of.horizon_s:.3g} s noise alone grows beyond all that was "
-            "measured (a robot that falls without its feedback, say): whole trials tell little"
+    text = f"{by.get(row.held_out, 'not held out')}; noise: {noise.get(row.floor_from, 'unknown')}"
+    last = furthest(found.prediction_error)
+    if last and any(one.drowned for one in found.prediction_error if not one.whole_trial):
+        text += (
+            f"; beyond {last.horizon_s:.3g} s noise alone grows past everything measured (as for a "
+            "robot that falls without feedback), so errors of whole trials say little"
         )
-    return told
+    return text
 
 
 def _instruments(findings: Sequence[Finding]) -> None:
@@ -185,22 +198,22 @@ def _instruments(findings: Sequence[Finding]) -> None:
 
 
 def _unheld(alone: Sequence[str], odd: bool) -> None:
-    """What the instruments can't know: of a sensor that no other one can be held against."""
+    """Name the sensors that have no other sensor to be checked against."""
     if alone:
         of = "its" if len(alone) == 1 else "their"
-        text = f"{', '.join(alone)}: no other sensor to hold against, so {of} sign, unit and delay"
-        show(field("unchecked", f"{text} are not known"))
+        text = f"{', '.join(alone)}: no other sensor to compare with, so {of} sign, unit and delay"
+        show(field("unchecked", f"{text} were not checked"))
     if not odd:
-        show("the sensors show nothing odd" + " by themselves" * bool(alone))
+        show("no fault found in the sensors" + " by themselves" * bool(alone))
 
 
 def _note(text: str) -> None:
-    """What a table's columns mean."""
+    """Print what the columns of a table mean."""
     show("\n".join(lines(text, "  ", "  ")))
 
 
 def _verdict(found: Diagnosis) -> str:
-    """The kind, then a cause or a sentence a line: they say different things."""
+    """Return the kind of verdict, then a line per cause and sentence."""
     from grounded_trials.report.diagnosis_words import verdict_lines
 
     causes, others = verdict_lines(found)
@@ -210,41 +223,53 @@ def _verdict(found: Diagnosis) -> str:
     return "\n".join(shown)
 
 
-def _places(found: Diagnosis) -> None:
+def _places(found: Diagnosis, *, details: bool) -> None:
+    """Print where the gap lies: a line, or with `details` a table of channels and regions."""
+    where = found.where
+    channels = [c for c in where.channels if c.share >= LEAST_SHARE]  # NaN: the gap is noise
+    regions = [
+        f"{percent(one.share)} of the gap in {percent(one.occupancy)} of the time, where {one.told}"
+        for one in where.regions[: REGIONS if details else 1]
+    ]
+    if not channels:
+        return
+    if not details:
+        parts = [f"{percent(c.share)} of the gap in {c.name}" for c in channels[:CHANNELS]]
+        return show("\n" + field("where", "; ".join([listed(parts), *regions])))
+    rows = [(c.name, percent(c.share), with_unit(number(c.rms, 3), c.unit)) for c in channels]
+    show("\n" + table(rows, ("where", "share of the gap", "rms")))
     from grounded.diagnosis.error_report import furthest
 
-    where = found.where
-    channels = [
-        (c.name, percent(c.share), with_unit(number(c.rms, 3), c.unit))
-        for c in where.channels
-        if c.share >= 0.005  # NaN: the gap is noise
-    ]
-    if channels:
-        show("\n" + table(channels, ("where", "share of the gap", "rms")))
-        row = furthest(found.prediction_error)
-        ahead = f" {row.horizon_s:.3g} s ahead" if row else ""
-        _note(
-            "share: of the squared errors of single steps, in units of the noise, that causes and "
-            f"leftover make; rms: of the model as it was{ahead}"
-        )
-    for region in where.regions[:3]:
-        share, time = percent(region.share), percent(region.occupancy)
-        show(field("", f"{region.told}: {share} of the gap in {time} of the time"))
+    row = furthest(found.prediction_error)
+    ahead = f" {row.horizon_s:.3g} s ahead" if row else ""
+    _note(
+        "share: of the squared one-step errors beyond the noise; rms: of the predictions of the "
+        f"model before this diagnosis{ahead}"
+    )
+    for text in regions:
+        show(field("", text))
 
 
-def _effects(found: Diagnosis) -> None:
+def _effects(found: Diagnosis, *, details: bool) -> None:
+    """Print the claimed effects and what ties with them, or with `details` all rivals."""
     from grounded.diagnosis.tables import effect_table
     from grounded.diagnosis.verdict import told_apart
 
-    if found.ranking:
-        show("\n" + table(*effect_table(found)))
+    rows, header = effect_table(found, rivals=details)
+    if rows:
+        show("\n" + table(rows, header))
         _note(
-            "credit: what predictions lose without it, of what they gain in all; evidence: of "
-            "what is claimed or tied, what is lost without it beside the other causes; of the "
-            "rest, what it gains alone; +-: one standard deviation, if the equations are right"
+            "credit: share of the improvement lost without it; evidence: log-likelihood lost "
+            "without it" + "; of rivals, gained by it alone" * details + "; +-: one standard "
+            "deviation" + _if_right(found)
         )
     for group in found.indistinguishable:
-        if group in found.equivalent:
-            show(field("same", told_apart(group, found.equivalent)))
-        else:
-            show(field("tied", f"the data can't tell apart: {', '.join(group)}"))
+        if (text := told_apart(group, found.equivalent)) not in found.sentence:
+            show(field("tied", text))
+
+
+def _if_right(found: Diagnosis) -> str:
+    """Say what standard deviations leave out: errors of the equations themselves."""
+    if found.leftover:
+        return ", but a gap remains, so true values may be further off"
+    return ", if the equations are right"

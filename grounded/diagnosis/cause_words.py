@@ -1,4 +1,4 @@
-"""What each cause is in words: an effect with its numbers, and effects of one kind together."""
+"""Causes in words: each effect with its values, effects of one kind in one clause."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from grounded.result import listed, number, percent, with_unit
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.effects import Effect
 
-AS_STRONG = 0.2  # of what is modelled: a turned input that is so near to it has the wrong sign
-TURNED = ": turn its sign in model.py, or if only the log counts so, with {log} scale = -1"
-MOST_DIGITS = 6  # of a value, however sure it is
-FEW = 3  # causes that are told one by one
-TOLD = 4  # clauses of more: of one kind together, the smallest are counted
+AS_STRONG = 0.2  # a gain this close to -1 is a wrong sign and nothing else
+TURNED = ": flip its sign in model.py, or, if only the log has it so, set {log} scale = -1"
+MOST_DIGITS = 6  # significant digits of a value
+FEW = 3  # up to so many causes get a clause each
+TOLD = 4  # clauses otherwise: one per kind of effect, the smallest causes only counted
 
 
 def give_or_take(estimate: Estimate) -> str:
-    """A value with its +-, as precise as that is: `1.5763 +- 0.0012 N/V`."""
+    """Format a value with as many digits as its +- supports: `1.5763 +- 0.0012 N/V`."""
     value, std = estimate.value, estimate.std
     if not (0 < std < math.inf and math.isfinite(value)):
         return quantity(estimate)
@@ -38,9 +38,9 @@ GREEK = (
 
 
 def called(model: Model, name: str) -> str:
-    """A state or an input in a sentence: `the speed v`, `the state delta`, `the throttle`.
+    """Name a state or input in a sentence: `the speed v`, `the state delta`, `the throttle`.
 
-    Symbols get a word before them: what is short, Greek, or not letters alone.
+    Symbols (short names, Greek letters, names with digits) get a noun in front.
     """
     from grounded.effects import places
 
@@ -58,7 +58,7 @@ def called(model: Model, name: str) -> str:
 
 
 def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
-    """The family's sentence with names and numbers filled in; starts with a small letter."""
+    """Fill names and values into the sentence of an effect's family; starts in lower case."""
     from grounded.effects import ParamFamily
 
     model, targets = effect.site.model, effect.site.targets
@@ -82,7 +82,7 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
 
     told = set(_told(params))
 
-    def kept(found: re.Match[str]) -> str:  # of quantities that are estimated and not about zero
+    def kept(found: re.Match[str]) -> str:  # parts whose quantities are estimated and not zero
         parts = found[1].split(" & ")
         known = [p for p in parts if {*re.findall(r"\{(\w)[%}]", p)} <= told]
         return listed(known or (parts[1:] and parts[:1]))
@@ -111,7 +111,7 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
 
 
 def _turned(effect: Effect, params: Mapping[str, Estimate]) -> str:
-    """The sentence of a gain whose sign is the other one; "" where it isn't."""
+    """Return the sentence for a gain of the opposite sign; "" if the sign is right."""
     from grounded.effects import InputFamily
 
     text, size = effect.family.turned, -1 - params["g"].value if "g" in params else 0.0
@@ -119,7 +119,7 @@ def _turned(effect: Effect, params: Mapping[str, Estimate]) -> str:
         return ""
     if abs(size - 1) < AS_STRONG:
         return text + TURNED * isinstance(effect.family, InputFamily)
-    return f"{text} (by {number(100 * size)} % of what is modelled)"
+    return f"{text} (with {number(100 * size)} % of the modelled strength)"
 
 
 def clauses(
@@ -129,16 +129,16 @@ def clauses(
     effects: Mapping[str, Effect],
     values: Mapping[str, Mapping[str, Estimate]],
 ) -> tuple[str, ...]:
-    """What the first sentence of a verdict tells, largest first, each with its share.
+    """Return the clauses of the verdict's first sentence, each with its share, largest first.
 
-    More than a FEW causes are told by kind: the friction of every joint in one clause.
+    More than FEW causes are grouped by kind: the friction of every joint in one clause.
 
     Args:
-        names: of the causes, largest first.
-        causes: a clause each (`meaning`, what parameters moved).
-        shares: of what predictions gain.
-        effects: by name, those of the causes that are effects.
-        values: the estimates of each effect, by its name.
+        names: names of the causes, largest first.
+        causes: one clause per cause.
+        shares: the share of the improvement due to each cause, 0 to 1.
+        effects: the causes that are effects, by name.
+        values: the estimates of each effect, by name.
     """
     if len(names) < 2:
         return tuple(causes)
@@ -163,12 +163,12 @@ def clauses(
 
 
 def with_share(clause: str, share: float) -> str:
-    """A clause and what it is worth of all that predictions gain."""
+    """Append a cause's share of the improvement to its clause."""
     return f"{clause} ({percent(share)} of the improvement)"
 
 
 def _beside(effect: Effect, params: Mapping[str, Estimate]) -> str:
-    """What an effect adds to the sentence of another one of its family: `the base 0.45 N m`."""
+    """Return what an effect adds to the clause of another of its family: `the base 0.45 N m`."""
     driven, _, source = effect.site.target.partition("<-")
     targets = [driven] if source else effect.site.targets
     who = listed(called(effect.site.model, n) for n in targets)
@@ -177,10 +177,10 @@ def _beside(effect: Effect, params: Mapping[str, Estimate]) -> str:
 
 
 def _told(params: Mapping[str, Estimate]) -> list[str]:
-    """The quantities that are not about zero."""
+    """Return the quantities that differ from zero by more than their standard deviation."""
     return [n for n, e in params.items() if e.value != 0 and not abs(e.value) <= e.std]
 
 
 def quantity(estimate: Estimate) -> str:
-    """A value with its unit; pure numbers as they are."""
+    """Format a value with its unit."""
     return with_unit(number(estimate.value), estimate.unit)

@@ -230,7 +230,7 @@ def runaway(rows: Sequence[RulerRow]) -> str:
     names = () if whole is None else whole.runs_away.get("with_effects", ())
     if not names:
         return ""
-    return f"Predictions of whole trials run away, open loop, in {', '.join(names)}."
+    return f"Open-loop predictions of whole trials diverge for {', '.join(names)}."
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,9 +281,8 @@ class Remainder(Document):
         if not self.above and math.isfinite(self.size):
             [off, _] = beside_noise(errors, self.floor, unit, at_most=self.floor_at_most)
             return (
-                f"the rate of {name} lacks {number(self.size)} {self.unit} rms{where}: unlike "
-                f"noise, it is systematic, but {name} is off by {off} {ahead}, which may all be "
-                "noise"
+                f"the rate of {name} lacks {number(self.size)} {self.unit} rms{where}; it lasts, "
+                f"although the {off} that {name} is off {ahead} may be noise alone"
             )
         [off, noise] = beside_noise(errors, self.floor, unit, at_most=self.floor_at_most)
         return f"{name} is still off by {off} {ahead}{noise}{where}"
@@ -310,7 +309,7 @@ def beside_noise(errors: Sequence[float], floor: float, unit: str, *, at_most: b
     if not 0 < floor < math.inf:
         return [*measured_alike(errors, unit), ""]
     if at_most and errors[0] <= ABOVE * floor:
-        bound = " (noise: at most that; repeat a trial to measure it)"
+        bound = " (noise: at most that; only repeated trials can show)"
         return [*measured_alike(errors, unit), bound]
     *told, noise = measured_alike([*errors, floor], unit)
     return [*told, f" (noise: {'at most ' * at_most}{noise})"]

@@ -1,4 +1,4 @@
-"""What the ruler's rows say in words: what predictions gain and lose, what is left of it."""
+"""Held-out prediction errors in words: what improves, what gets worse, what remains."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from grounded.result import listed, measured_alike, number
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Agreement
 
-NAMED = 3  # channels that a sentence names at most
-MATTERS = 0.05  # of the crude model's error: a rest below it is told as its share
-HALF, MORE = 0.5, 0.2  # of the error that is gone: less a second ahead, so much more by the end
-SHOWS = 0.1  # of the error: a channel that improves by less is not named
-COUNTS = 0.03  # likewise, where nothing else in the same row gains as much
+NAMED = 3  # channels named in one sentence
+MATTERS = 0.05  # share of the crude model's error below which a remaining error is given as a share
+HALF, MORE = 0.5, 0.2  # improvements: below HALF 1 s ahead and MORE of it over whole trials
+SHOWS = 0.1  # relative change below which a channel is not named
+COUNTS = 0.03  # relative change below which a loss is not compared with gains elsewhere
 
 
 def improvement(rows: Sequence[RulerRow]) -> str:
-    """What predictions gain: `1 s ahead predictions miss v by 0.08 m/s instead of 0.31`.
+    """Return a sentence: `Predictions 1 s ahead miss v by 0.08 m/s instead of 0.31 m/s`.
 
-    Of whole trials, where they gain nothing a second ahead, or much more.
+    Whole trials are used if predictions 1 s ahead gain nothing, or whole trials gain much more.
     """
     first = telling(rows)
     shown = [row for row in rows if row is first or row.whole_trial]
@@ -37,9 +37,9 @@ def improvement(rows: Sequence[RulerRow]) -> str:
 
 
 def telling(rows: Sequence[RulerRow]) -> RulerRow | None:
-    """The row that a sentence is about: the longest horizon, or whole trials of a slow plant.
+    """Return the row to report: the longest horizon, or whole trials if the plant is slow.
 
-    A second ahead, what heats up over an hour misses little whatever the model lacks.
+    A heating process, for example, moves so little within 1 s that any model predicts it well.
     """
     ahead = furthest(rows)
     whole = next((row for row in rows if row.whole_trial), None)
@@ -49,7 +49,7 @@ def telling(rows: Sequence[RulerRow]) -> RulerRow | None:
 
 
 def _gains(row: RulerRow) -> dict[str, float]:
-    """The share of each channel's error that is gone, where predictions do not run away."""
+    """Return the share of each channel's error that is gone, without diverging predictions."""
     told = {n: e for n, e in row.crude.items() if row.tells(n, "crude", "with_effects")}
     return {n: 1 - row.with_effects[n] / e for n, e in told.items() if e > 0}
 
@@ -60,28 +60,27 @@ def _most(row: RulerRow) -> float:
 
 def _ahead(row: RulerRow) -> str:
     if row.whole_trial:
-        return "Whole trials"
-    held = "" if row.held_out != "no" else ", not held out"
-    return f"{number(row.horizon_s)} s ahead{held} predictions"
+        return "Predictions of whole trials"
+    held = "" if row.held_out != "no" else " (not held out)"
+    return f"Predictions {number(row.horizon_s)} s ahead{held}"
 
 
 def worsened(rows: Sequence[RulerRow]) -> str:
-    """What predictions lose in the channel that loses most, "" where none loses over SHOWS."""
+    """Return a sentence on the channel that gets worst; "" if none gets worse by SHOWS."""
     ratio, row, name = _lost_most(rows)
     if row is None or not (ratio > 1 + SHOWS or outweighed(rows)):
         return ""
     unit = row.unit_by_channel[name]
     now, then = measured_alike([row.with_effects[name], row.crude[name]], unit)
-    text = f"{_ahead(row)} miss {name} by {now} instead of {then}: that is worse"
+    text = f"{_ahead(row)} get worse for {name}: {now} instead of {then}"
     if not row.tells(name, "with_effects"):  # how far says nothing
         (then,) = measured_alike([row.crude[name]], unit)
-        ahead = "Predictions of whole trials" if row.whole_trial else _ahead(row)
-        text = f"{ahead} run away in {name}, which the crude model misses by {then}"
-    return f"{text}." if outweighed(rows) else f"{text}, though over all states they gain."
+        text = f"{_ahead(row)} diverge for {name}, which the crude model misses by {then}"
+    return f"{text}." if outweighed(rows) else f"{text}, but they improve over all states."
 
 
 def outweighed(rows: Sequence[RulerRow]) -> bool:
-    """Whether those predictions lose more in what gets worse than they gain in other states."""
+    """Check whether the states that get worse lose more than the other states gain."""
     ratio, row, _ = _lost_most(rows)
     if row is None or not ratio > 1 + COUNTS:
         return False
@@ -93,7 +92,7 @@ def outweighed(rows: Sequence[RulerRow]) -> bool:
 
 
 def _lost_most(rows: Sequence[RulerRow]) -> tuple[float, RulerRow | None, str]:
-    """By what factor errors grow in the channel that loses most, where and in which."""
+    """Return (factor, row, channel) of the channel whose error grows most."""
     losses = [
         (row.with_effects[name] / max(error, row.noise_floor.get(name, 0.0)), row, name)
         for row in rows
@@ -107,16 +106,17 @@ def _lost_most(rows: Sequence[RulerRow]) -> tuple[float, RulerRow | None, str]:
 def contested(
     rows: Sequence[RulerRow], agreement: Sequence[Agreement], effects: Sequence[str]
 ) -> bool:
-    """Whether what is claimed is better not adopted: predictions get worse somewhere with it.
+    """Check whether adopting the claimed effects is unwise.
 
-    By more than they gain there, or while the trials differ in its values.
+    It is if predictions lose more than they gain, or get worse somewhere while the trials disagree
+    about the effects' values.
     """
     differ = {one.effect for one in agreement if not one.agrees} & set(effects)
     return bool(effects) and (outweighed(rows) or bool(differ and worsened(rows)))
 
 
 def floor(row: RulerRow | None) -> str:
-    """What predictions miss by, and noise alone, of the channel that misses most."""
+    """Return `: 1 s ahead it misses v by 0.1 m/s (noise: 0.05 m/s)` for the worst channel."""
     if row is None:
         return ""
     if not (name := most_off(row)):
@@ -126,31 +126,31 @@ def floor(row: RulerRow | None) -> str:
 
 
 def explained(rows: Sequence[RulerRow]) -> str:
-    """That the model explains the data, and how far: down to the noise, or as far as that is known.
+    """Return a sentence that the model explains the data, down to the noise if that is known.
 
-    For what leaves nothing above the noise (`rest`).
+    To be used if `rest` finds nothing above the noise.
     """
     row = furthest(rows)
     name = "" if row is None else most_off(row)
     known = row is None or row.noise_floor.get(name, math.nan) > 0
     if doubt := in_doubt(rows):
-        return f"The model explains the data as far as their noise is known: {doubt}."
+        return f"The model explains the data as far as the noise is known: {doubt}."
     return f"The model explains the data{' down to the noise' * known}{floor(row)}."
 
 
 def in_doubt(rows: Sequence[RulerRow]) -> str:
-    """What is off by more than noise, but not by more than the doubt in that; "": nothing."""
+    """Return a clause on an error above the noise but within the noise's uncertainty; or ""."""
     times, _, name, row = max(_ratios(rows), key=lambda one: one[0], default=(0.0, 0.0, "", None))
     if row is None or not doubt_of(0.0) < times <= doubt_of(row.floor_unsure):
         return ""
     values = [row.with_effects[name], row.noise_floor[name]]
     error, noise = measured_alike(values, row.unit_by_channel[name])
-    few = f"which so few repeats tell only to a factor of {doubt_of(row.floor_unsure):.2g}"
+    few = f"known only to a factor of {doubt_of(row.floor_unsure):.2g} from so few repeats"
     return f"{_when(row)} {name} is off by {error}, {times:.2g} times its noise of {noise}, {few}"
 
 
 def _ratios(rows: Sequence[RulerRow]) -> list[tuple[float, float, str, RulerRow]]:
-    """How many times its noise a state is off, its share of the first error, its name, where."""
+    """Return (error / noise, error / crude error, state, row) of every state and horizon."""
     return [
         (
             row.with_effects[name] / noise,
@@ -167,20 +167,20 @@ def _ratios(rows: Sequence[RulerRow]) -> list[tuple[float, float, str, RulerRow]
 
 
 def most_off(row: RulerRow) -> str:
-    """The state that is off by most, beside its noise; "" where none was measured."""
+    """Return the state with the largest error relative to its noise; "" if none was measured."""
     known = {n: e for n, e in row.with_effects.items() if e == e}
     off = {n: e / max(row.noise_floor.get(n, math.nan), 1e-300) for n, e in known.items()}
     return max(off, key=lambda n: off[n], default="")
 
 
 def open_noise(rows: Sequence[RulerRow]) -> str:
-    """The state whose error may be noise or not, for want of repeats; "" where that is known."""
+    """Return the state whose error may be noise, for lack of repeats; "" if that is known."""
     row = furthest([row for row in rows if row.floor_at_most])
     return "" if row is None or rest(rows) else most_off(row)
 
 
 def rest(rows: Sequence[RulerRow]) -> str:
-    """What is left above the noise where no leftover is stated, and why none is; "": nothing."""
+    """Return a clause on an error above the noise that is too small to explain; or ""."""
     found = [one for one in _ratios(rows) if one[0] > doubt_of(one[3].floor_unsure)]
     if not found:
         return ""
@@ -189,9 +189,9 @@ def rest(rows: Sequence[RulerRow]) -> str:
     least = "at least " * rows[0].floor_at_most
     text = f"the state {name} is still off by {least}{times:.2g} times the noise {when}"
     if share < MATTERS:
-        of = f"{100 * share:.1g} % of what the crude model missed"
-        return f"{text}, which is {of}: too little to look for a cause"
-    beside = f"beside how far {name} moves or how much trials differ"
+        of = f"{100 * share:.1g} % of the crude model's error"
+        return f"{text}, but that is only {of}: too little to look for a cause"
+    beside = f"compared with how far {name} moves or how much the trials differ"
     return f"{text}: too little to look for a cause, {beside}"
 
 
@@ -200,7 +200,7 @@ def _when(row: RulerRow) -> str:
 
 
 def _told(row: RulerRow, name: str, *columns: str) -> list[str]:
-    """A state's errors in these columns and the noise beside the first, in one unit."""
+    """Return a state's errors in these columns, then the noise as text, in one unit."""
     errors = [getattr(row, column)[name] for column in columns]
     noise, unit = row.noise_floor.get(name, math.nan), row.unit_by_channel[name]
     return beside_noise(errors, noise, unit, at_most=row.floor_at_most)

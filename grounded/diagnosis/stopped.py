@@ -1,4 +1,4 @@
-"""Parameters that ended where they may go no further, though the data ask for more."""
+"""Parameters that stopped at a bound or at the edge of their prior."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from grounded.result import listed
 
 ENDED = {  # by `Estimate.stopped`
     "": (),
-    "bound": ("at its bound: the data ask for more",),
-    "prior": ("as far as its std lets it go: the data ask for more",),
+    "bound": ("at its bound, the data ask for more",),
+    "prior": ("at the limit of its std, the data ask for more",),
 }
 
-AT_BOUNDS = (  # said of the next trial where all that moved are there
-    "None helps before this: parameters ended at their bounds and the data ask for more. Where one "
-    "may lie beyond, widen its bounds in the model file; else another, which the model has as a "
-    "constant, may be off: give it bounds. Then diagnose again."
+AT_BOUNDS = (  # advice on the next trial if every parameter that moved is there
+    "None helps yet: parameters stopped at their bounds and the data ask for more. Widen the "
+    "bounds in the model file if the true value may lie beyond; otherwise a parameter that the "
+    "model holds constant may be off, so give it bounds. Then diagnose again."
 )
 
 
 def wider(known: Mapping[str, Estimate]) -> str:
-    """What to do about those whose prior stopped them, a sentence; "" where it stopped none.
+    """Return advice on the parameters that their prior stopped; "" if there are none.
 
     Args:
         known: the calibrated values, by parameter.
@@ -30,9 +30,9 @@ def wider(known: Mapping[str, Estimate]) -> str:
     if not names:
         return ""
     one = len(names) == 1
-    its, it, each = ("its", "it", "it is") if one else ("their", "them", "they are")
+    its, each = ("its", "it is") if one else ("their", "they are")
     return (
-        f"{listed(names)} went as far as {its} std {'lets' if one else 'let'} {it}, and the data "
-        f"ask for more: if {each} known less well than that, widen {its} std in the model file, or "
-        "give bounds instead, and diagnose again; else adopt what is claimed."
+        f"{listed(names)} moved as far as {its} std allows, and the data ask for more: if {each} "
+        f"known less well than that, widen {its} std in the model file, or give bounds instead, "
+        "and diagnose again; otherwise adopt the claimed effects."
     )

@@ -1,4 +1,4 @@
-"""A diagnosis in rows and lines, the same in the terminal, on the page and in a notebook."""
+"""A diagnosis in rows and lines, shared by terminal, page and notebook."""
 
 from __future__ import annotations
 
@@ -15,11 +15,16 @@ if TYPE_CHECKING:
     from grounded.instruments.finding import Finding
 
 Cells = tuple[str, ...]
-EFFECTS = 8  # rows of them
+EFFECTS = 8  # rows of the table of effects
 
 
-def error_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
-    """(rows, header): held-out prediction errors a second ahead and over whole trials, in units."""
+def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[list[Cells], Cells]:
+    """Return (rows, header) of the held-out prediction errors, in the units of the states.
+
+    Args:
+        diagnosis: the result.
+        whole_trials: whether to add the errors over whole trials to those a horizon ahead.
+    """
     ahead = [row for row in [furthest(diagnosis.prediction_error)] if row]
     whole = [row for row in diagnosis.prediction_error if row.whole_trial]
     columns = {
@@ -37,11 +42,11 @@ def error_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
         if not any(getattr(row, key) for row in ahead):
             del columns[key]
     rows: list[Cells] = []
-    for row in (*ahead, *whole):
+    for row in (*ahead, *(whole if whole_trials or not ahead else ())):
         when = "whole trial" if row.whole_trial else f"{row.horizon_s:.3g} s ahead"
         for name, unit in row.unit_by_channel.items():
             if math.isnan(row.crude.get(name, math.nan)):
-                continue  # never measured
+                continue  # the state has no sensor
             figures = (_cell(row, key, name) for key in columns)
             rows.append((f"{name}, {when}", *figures, shown(unit)))
     return rows, ("error (rms)", *columns.values(), "unit")
@@ -50,28 +55,34 @@ def error_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
 def _cell(row: RulerRow, column: str, name: str) -> str:
     value = getattr(row, column).get(name, math.nan)
     if not row.tells(name, column):
-        return "runs away"
+        return "diverges"
     return figure(value, 3) if math.isfinite(value) else "-"
 
 
 def credit_of(diagnosis: Diagnosis, effect: str) -> str:
-    """What predictions lose without a cause, in percent of what they gain; "" if it has none."""
+    """Return the share of the improvement that is lost without a cause, in percent; or ""."""
     return next((percent(c.share) for c in diagnosis.credit if c.of == effect), "")
 
 
 def instrument_lines(findings: Iterable[Finding]) -> list[str]:
-    """Each finding with its signal, whether it was corrected, and what does so in the logs, too."""
+    """Return a line per sensor finding: the signal, the finding, and how to correct it for good."""
     lines = []
     for one in findings:
         done = "; corrected here" * (one.corrected and one.kind != "smoothed")
-        more = f", for good by {one.log} in its table of [log]" * bool(one.log)
+        more = f"; to correct it for good, set {one.log} in its table of [log]" * bool(one.log)
         more += f"; {one.advice}" * bool(one.advice)
         lines.append(f"{one.signal}: {one.finding}{done}{more}")
     return lines
 
 
-def effect_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
-    """(rows, header): what is claimed, and what else was weighed, likeliest first."""
+def effect_table(diagnosis: Diagnosis, *, rivals: bool = True) -> tuple[list[Cells], Cells]:
+    """Return (rows, header) of the effects that were compared, the claimed ones first.
+
+    Args:
+        diagnosis: the result.
+        rivals: whether to list effects that are neither claimed nor tied with a claimed one.
+    """
+    tied = {name for group in diagnosis.indistinguishable for name in group}
     rows: list[Cells] = [
         (
             ("* " if r.claimed else "  ") + r.effect,
@@ -80,6 +91,7 @@ def effect_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
             _values(r),
         )
         for r in diagnosis.ranking[:EFFECTS]
+        if rivals or r.claimed or r.effect in tied
     ]
     if rows and (share := credit_of(diagnosis, "calibration")):
         rows.insert(0, ("  (calibration)", share, "", "the model's own parameters"))
@@ -87,7 +99,7 @@ def effect_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
 
 
 def _values(row: Ranked) -> str:
-    """The quantities of an effect, each with its standard deviation and unit."""
+    """Format the quantities of an effect with their standard deviations and units."""
     return ", ".join(
         with_unit(f"{name} = {figure(e.value, 3)}{_spread(e.std)}", e.unit)
         for name, e in row.params.items()
@@ -101,11 +113,11 @@ def _spread(std: float) -> str:
 
 
 def as_html(diagnosis: Diagnosis, everything: str) -> str:
-    """What a notebook shows: the verdict, the sensors, errors and effects; the rest folded.
+    """Return HTML for a notebook: verdict, sensors, errors and effects; the rest is folded.
 
     Args:
-        diagnosis: of which nothing is drawn here (`.plot()`).
-        everything: its document as HTML.
+        diagnosis: the result; `.plot()` draws it.
+        everything: the whole document as HTML.
     """
     said = "".join(f"<p>{escape(line)}</p>" for line in diagnosis.verdict.lines)
     parts = [f"<b>{escape(diagnosis.kind)}</b>{said}"]

@@ -1,9 +1,10 @@
-"""What was seen once: likely effects of too few trials for predictions of others to bear them out.
+"""Effects that are likely but unconfirmed: too few trials show them to test them on held-out data.
 
-Or of one motion that the trials repeat (`validation.motions`). They are never causes. Each is told
-with the trial, the time and the region that show it, where a further trial would have to go. What
-most trials show as likely, and none predicts better by, is a fault of the likelihood: it is marked
-in the table, so that nobody asks why its nats make no cause; what ties is told as tied.
+The same holds for an effect that shows in one repeated motion only (`validation.motions`). They are
+never claimed. Each is reported with the trial, the time and the region that show it, which is
+where a further trial should go. An effect that is likely in most trials and yet improves no
+held-out prediction points to a flaw of the likelihood: it is marked in the table, so that its
+evidence is not taken for a cause.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 MENTIONED = 2
-FAR_OFF = 2.0  # times the room of the target and the best run: a run beyond it is lost
-SURE = 2.0  # standard deviations that one of its numbers is from zero
+FAR_OFF = 2.0  # times the range of the target and the best run: a run beyond it has failed
+SURE = 2.0  # standard deviations by which one of its values differs from zero
 
 
 def unconfirmed(
     claims: Claims, doubtful: Sequence[Doubtful], groups: Sequence[Sequence[str]] = ()
 ) -> tuple[Unconfirmed, ...]:
-    """The likeliest effects that a decision dropped, that few trials show; no tied ones."""
+    """Return the likeliest effects that were dropped and that few trials show, without ties."""
     if claims.known.no_cause:
         return ()
     tied = {name for group in groups for name in group}
@@ -56,7 +57,7 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
     i = one.fit.hypothesis.names.index(one.name)
     params, begin = claims.estimates(one.fit)[i], data.time[0, run]
     if not any(abs(e.value) > SURE * e.std for e in params.values()):
-        return None  # no size is known that it would have
+        return None  # its size is unknown
     return Unconfirmed(
         one.name,
         meaning(one.fit.hypothesis.effects[i], params),
@@ -72,16 +73,16 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
 
 
 def marked(ranking: Sequence[Ranked], likely: Collection[str]) -> tuple[Ranked, ...]:
-    """The ranking, with a mark on what is likely and yet predicts held-out trials no better."""
+    """Mark effects that are likely and yet do not improve held-out predictions."""
     return tuple(replace(r, no_better=r.effect in likely and not r.claimed) for r in ranking)
 
 
 def unrepeatable(task: Task, trials: Sequence[Trial]) -> dict[str, str]:
-    """The trials that can't or should not be run again, and why: logs, and runs that crashed.
+    """Return the trials that cannot or should not be repeated, with the reason.
 
-    Only a candidate's run can be repeated. One crashed that ended early, left [safety], or went far
-    from all others: where a state with a target strays from it by FAR_OFF times the range that the
-    target and the best run have.
+    Only the run of a candidate can be repeated, and only if it did not fail. A run has failed if
+    it ended early, left [safety], or strayed from the target by more than FAR_OFF times the range
+    of the target and the best run.
     """
     assert task.safety_low is not None and task.safety_high is not None
     ran = [trial for trial in trials if trial.candidate]
@@ -97,21 +98,19 @@ def unrepeatable(task: Task, trials: Sequence[Trial]) -> dict[str, str]:
 
 
 def another_look(task: Task | None, trials: Sequence[Trial], left: str, when: str = "") -> str:
-    """What to run for a leftover: a repeat where there is none yet, else something new.
-
-    A candidate with feedback sends other inputs each time: it is the candidate that is run again.
+    """Return what to run to investigate a leftover: first a repeat, then a new motion.
 
     Args:
-        task: that candidates were run for; None for bare trials.
-        trials: that were diagnosed.
-        left: the channel that is off without a cause.
-        when: the region that holds most of that, "" where none does.
+        task: the task of the candidates; None for bare trials.
+        trials: the trials that were diagnosed.
+        left: the channel whose error has no known cause.
+        when: the region that holds most of it; "" if none does.
     """
     runs = Counter(trial.candidate or trial.inputs.tobytes() for trial in trials)
     if max(runs.values(), default=0) > 1:
-        where = f"goes more often where {when}" if when else f"moves {left} in another way"
-        return f"Run a trial that {where}, for the leftover in {left}: repeats are there already."
-    why = f"to see whether the leftover in {left} repeats"
+        where = f"spends more time where {when}" if when else f"moves {left} in another way"
+        return f"Run a trial that {where}, to investigate the gap in {left}."
+    why = f"to see whether the gap in {left} repeats"
     ran = [trial for trial in trials if trial.candidate] if task else []
     best = max(ran, key=task.utility, default=None) if task else None
     if task is None or best is None or math.isinf(task.utility(best)):
@@ -130,7 +129,7 @@ def _far(task: Task, trial: Trial, best: Trial | None) -> bool:
 
 
 def _stretch(more: Array) -> Any:
-    """From which step to which most is done (Kadane's largest sum of neighbours)."""
+    """Return the interval of steps with the largest sum (Kadane's algorithm)."""
     total = np.concatenate([[0.0], np.cumsum(more)])
     least = np.minimum.accumulate(total)
     end = int((total - least).argmax())

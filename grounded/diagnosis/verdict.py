@@ -1,4 +1,4 @@
-"""What a diagnosis says in words: the verdict, each effect in it, what to run next."""
+"""The verdict of a diagnosis in words, and what to run next."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from grounded.result import listed
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.validation.claims import Claims
 
-LOG, LOST = "is a log that no candidate made", "was lost"  # why a trial can't be run again
-MOST_EFFECTS, FURTHER = 6, 2  # that may be blamed at once; so many more are looked for next
-NAMED = 3  # parameters, channels and leftovers that a sentence names at most
+LOG, LOST = "is a log that no candidate made", "failed"  # why a trial can't be repeated
+MOST_EFFECTS, FURTHER = 6, 2  # most effects blamed at once; how many more the next search allows
+NAMED = 3  # parameters, channels or leftovers named in one sentence
 
 
 def verdict(
@@ -36,27 +36,29 @@ def verdict(
     one_motion: bool = False,
     given: Mapping[str, Sequence[str]] | None = None,
 ) -> Verdict:
-    """One effect, several, none or unknown, and why: what, by how much, what is left.
+    """Return the verdict (effect, several, none or unknown) with its sentences.
 
     Args:
-        claims: what is blamed.
-        ranking: the claimed effects first.
-        groups: what ties.
-        remainder: what no effect explains.
-        rows: the ruler's.
-        credit: what each cause is worth, largest first.
-        seen: what only one trial shows.
-        same: of the groups, what is one thing in the model.
-        most: effects that were looked for at once; 0: any number.
-        one_motion: that all trials repeat.
-        given: by parameter, those held with which alone it is known (`Identifiable.given`).
+        claims: the causes that are claimed.
+        ranking: all effects that were compared, the claimed ones first.
+        groups: effects that the data cannot tell apart.
+        remainder: errors that no effect explains.
+        rows: held-out prediction errors, a row per horizon.
+        credit: the share of the improvement due to each cause, largest first.
+        seen: effects that only one trial shows.
+        same: those of `groups` that are equivalent in this model.
+        most: the largest number of effects that was looked for; 0 for no limit.
+        one_motion: whether all trials repeat one motion.
+        given: by parameter, the parameters that it is only known relative to
+            (`Identifiable.given`).
     """
     from grounded.effects import like_a_load
 
     rare = [one for one in seen if not one.repeats] + [one for one in seen if one.repeats][:1]
     once = [sentence([one.sentence()]) for one in rare]
     left = remainder[0].sentence() if remainder else ""
-    left += f"; {len(remainder) - 1} more" if len(remainder) > 1 else ""
+    others = len(remainder) - 1
+    left += f"; {others} more state{'s' * (others > 1)}" if others > 0 else ""
     claimed = [row for row in ranking if row.claimed]
     row = furthest(rows)
     if claims.known.no_cause:
@@ -65,9 +67,9 @@ def verdict(
         if remainder:
             return _said("unknown", f"A gap remains that no known effect explains: {left}.", *once)
         if above := rest(rows):
-            text = f"The model explains what these trials can show: {above}."
+            text = f"The model explains what these trials show: {above}."
         elif row is not None and row.floor_at_most:
-            what = "No known effect explains what is left, and it is no white noise"
+            what = "A gap remains that is neither white noise nor any known effect"
             return _said("unknown", f"{what}{floor(row)}.", *once)
         else:
             text = explained(rows)
@@ -87,10 +89,10 @@ def verdict(
     words += [one.sentence() for one in claims.one_clock[:1]]
     more = 0
     if remainder and len(claims.names) == most:
-        words.append(f"More is left: {left}; beyond {most} effects nothing was looked for.")
+        words.append(f"A gap remains: {left}; no more than {most} effects were looked for.")
         more = min(most + FURTHER, MOST_EFFECTS) * any(one.above for one in remainder)
     elif remainder:
-        words.append(f"Something is left that no known effect explains: {left}.")
+        words.append(f"A gap remains that no known effect explains: {left}.")
     elif above := rest(rows):
         words.append(sentence([above]))
     if one_motion and (remainder or seen):
@@ -105,20 +107,20 @@ def verdict(
 
 
 def with_faults(said: Verdict, findings: Iterable[Finding]) -> Verdict:
-    """The verdict with what is wrong with the log itself, which is put right nowhere but here."""
+    """Add the faults of the log that this diagnosis corrected, but the stored trials still have."""
     odd = in_the_log(findings)
     if not odd:
         return said
     told = "; ".join(f"{one.signal} {one.finding}" for one in odd)
-    sentences = (*said.lines, f"Put right here, but not in the trials: {told}.")
+    sentences = (*said.lines, f"Corrected here, but not in the stored trials: {told}.")
     return replace(said, sentences=sentences, sentence=" ".join(sentences))
 
 
 LOAD = (
-    "Gains of several joints at once are what a load does, or a link's mass that is off: give the "
-    "model a parameter for it before you adopt them."
+    "Several joints with a wrong gain suggest a load or a wrong link mass: give the model a "
+    "parameter for it before you adopt them."
 )
-ONE_MOTION = "All trials repeat one motion: numbers that fit it need not hold in another."
+ONE_MOTION = "All trials repeat one motion, so these values may not hold for another one."
 
 
 def _said(kind: Kind, *words: str) -> Verdict:
@@ -132,7 +134,7 @@ def _causes(
     credit: Sequence[Credit],
     given: Mapping[str, Sequence[str]],
 ) -> tuple[str, ...]:
-    """A clause a cause, largest first."""
+    """Return one clause per cause, the largest first."""
     effects = {e.name: e for e in claims.best.hypothesis.effects}
     values = {row.effect: row.params for row in ranking}
     found = []
@@ -142,30 +144,30 @@ def _causes(
         else:
             text = f"the model's own parameters are off: {_moved(claims)}"
             held = dict.fromkeys(other for n in _off(claims)[:NAMED] for other in given.get(n, ()))
-            text += f", with {listed(held)} as written" * bool(held)
+            text += f", given {listed(held)} as in the model" * bool(held)
         found.append(text)
     return tuple(found)
 
 
 def _off(claims: Claims) -> list[str]:
-    """The parameters that have to differ, most important first."""
+    """Return the parameters that are off, the most important first."""
     return [claims.data.model.param_names[one.index] for one in claims.moved]
 
 
 def at_bounds(claims: Claims) -> bool:
-    """Whether parameters have to differ, and all of them by more than they may."""
+    """Check whether parameters are off and all of them stopped at a bound."""
     known = claims.parameters()
     return all_at_bounds(claims.data.model.params, {n: known[n].value for n in _off(claims)})
 
 
 def _moved(claims: Claims) -> str:
-    """`L should be 0.1662 +- 0.0011 m (+11 %)` of the parameters that have to differ."""
+    """Return `L should be 0.1662 +- 0.0011 m (+11 %)` for the parameters that are off."""
     params, known = claims.data.model.params, claims.parameters()
     named, texts = _off(claims), []
     for name in named[:NAMED]:
         old = params[name].value
         change = 100 * (known[name].value - old) / abs(old) if old else 0.0
-        beside = [f"{change:+.{0 if abs(change) >= 1 else 1}f}%"] * bool(old)
+        beside = [f"{change:+.{0 if abs(change) >= 1 else 1}f} %"] * bool(old)
         beside += ENDED[known[name].stopped]
         part = f" ({', '.join(beside)})" * bool(beside)
         texts.append(f"{name} should be {give_or_take(known[name])}{part}")
@@ -185,26 +187,26 @@ def next_trial(
     further: bool = False,
     ended: bool = False,
 ) -> str:
-    """A sentence; `excitation.probe` makes the trial itself.
+    """Return a sentence on the next trial; `excitation.probe` designs the trial itself.
 
     Args:
-        claims: what is blamed.
-        look: what to run for what is off without a cause, "" where nothing is.
-        groups: what ties.
-        seen: what only one trial shows.
-        same: of the groups, what is one thing in the model.
-        unrepeatable: the trials that can't or should not be run again, and why.
-        worse: predictions get worse with what is claimed (`Diagnosis.contested`).
-        adopted: the effects whose numbers are parameters of the model.
-        further: more effects are to be looked for first (`Verdict.look_for`).
-        ended: all parameters that moved are at their bounds (`at_bounds`).
+        claims: the causes that are claimed.
+        look: what to run because of a gap without a cause; "" if there is none.
+        groups: effects that the data cannot tell apart.
+        seen: effects that only one trial shows.
+        same: those of `groups` that are equivalent in this model.
+        unrepeatable: trials that cannot or should not be repeated, with the reason.
+        worse: whether predictions get worse with the claimed causes (`Diagnosis.contested`).
+        adopted: adopted effects, whose values are parameters of the model.
+        further: whether more effects should be looked for first (`Verdict.look_for`).
+        ended: whether all parameters that moved stopped at their bounds (`at_bounds`).
     """
     from grounded.effects import like_a_load, places
 
     if claims.known.no_cause:
         return "Run two or more trials in which every input changes."
     if groups and groups[0] in same:
-        return f"{told_apart(groups[0], same)}: no trial tells them apart, either will do."
+        return f"None helps: {told_apart(groups[0], same)}, so adopt either."
     if groups:
         made = f"A trial made for it may tell {tied(groups[0])}."
         turns = bool(places.plane(claims.data.model))
@@ -212,31 +214,31 @@ def next_trial(
     if seen:
         one = seen[0]
         if one.repeats:
-            return f"Run a trial that moves differently: those that show {one.effect} move alike."
+            return f"Run a different motion: all trials that show {one.effect} move alike."
         why = (unrepeatable or {}).get(one.trial)
         if why is None:
-            return f"Repeat trial {one.trial}: hardly another one shows {one.effect}."
+            return f"Repeat trial {one.trial}: few others show {one.effect}."
         there = "" if one.region is None else f" that goes where {one.region.told}"
         better = f"run a gentler one{there}" if why == LOST else f"record another one{there}"
-        return f"Hardly a trial but {one.trial} shows {one.effect}, and that one {why}: {better}."
+        return f"Only {one.trial} clearly shows {one.effect}, and it {why}: {better}."
     if not claims.names and look:
         return look
     if not claims.names and not claims.blamed:
-        return "Nothing is tied and nothing to adopt."
+        return "None is needed: nothing is tied and nothing needs adopting."
     if worse:
-        return f"Nothing is tied, but predictions get worse with {_it(claims)}: {REPEAT}."
+        return f"Predictions get worse with {_it(claims)}: {REPEAT}."
     if further:
-        return "None is needed yet: nothing is tied, and more effects have to be looked for first."
+        return "None is needed yet: look for more effects first."
     if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names):
-        return "Nothing is tied: give the model a parameter for a load, then diagnose again."
+        return "None is needed yet: give the model a parameter for a load and diagnose again."
     if ended:
         return AT_BOUNDS
     if _own_numbers(claims, adopted):
         return "None is needed to tell causes apart: fit the model's parameters."
-    return "None is needed to tell causes apart: adopt what is claimed."
+    return "None is needed to tell causes apart: adopt the claimed effects."
 
 
-REPEAT = "run another trial and diagnose again before you adopt anything"
+REPEAT = "run another trial and diagnose again before adopting anything"
 
 
 def _it(claims: Claims) -> str:
@@ -244,7 +246,7 @@ def _it(claims: Claims) -> str:
 
 
 def _own_numbers(claims: Claims, adopted: Collection[str]) -> bool:
-    """Whether all that is blamed is parameters that the model had before anything was adopted."""
+    """Check whether only parameters of the original model are blamed, none of adopted effects."""
     from grounded.effects import ParamFamily, param_name
 
     effects, theirs = claims.best.hypothesis.effects, tuple(param_name(n, "") for n in adopted)
@@ -281,25 +283,30 @@ STRAIGHT = {  # where nothing has a heading or drives a curve
 
 
 def sentence(clauses: Iterable[str]) -> str:
-    """Clauses as one sentence: first word capital (never a name: `called` puts a word before)."""
+    """Join clauses to a sentence (`called` keeps names from being its first word)."""
     text = "; ".join(clauses)
     return f"{text[:1].upper()}{text[1:]}."
 
 
 def told_apart(group: Sequence[str], same: Sequence[Sequence[str]]) -> str:
-    """What is said of a tie: that these data can't break it, or that no data can."""
+    """Return a clause: these data cannot tell the group apart, or no data can."""
     if group in same:
-        return f"{listed(group)} are one thing in this model"
+        return f"{listed(group)} are equivalent in this model"
     return f"The data can't tell {tied(group)}"
 
 
 def tied(group: Sequence[str]) -> str:
-    """`A from B or C`."""
+    """Return `A from B or C`."""
     return f"{group[0]} from {' or '.join(group[1:])}"
 
 
 def distinguishing(group: Sequence[str], *, turns: bool = True) -> list[str]:
-    """What to do in a trial that tells a group apart, in sentences; turns: there is a heading."""
+    """Return sentences on how to excite the robot so that a trial tells a group apart.
+
+    Args:
+        group: names of effects.
+        turns: whether the model has a heading.
+    """
     found = []
     for name in group:
         family, _, target = name.partition(":")

@@ -160,7 +160,7 @@ def test_repeats_say_what_is_waited_for(tmp_path):
         (["diagnose", "--without", "delay,delai"], "did you mean 'delay'"),
         (["diagnose", "--trials", ""], "--trials names no trial: expected some, like t0001"),
         (["fit", "--params", ","], "--params names no parameter: expected some, like a1,L"),
-        (["diagnose", "--trials", " , "], "leave it out to take all"),
+        (["diagnose", "--trials", " , "], "omit it to use all"),
         (["recover", "trials"], "is a folder"),
         (["recover", "model.py"], "look for another copy of the recording"),
         (["ingest", "nofile.mcap"], "nofile.mcap does not exist"),

@@ -80,9 +80,39 @@ def test_evidence_that_is_not_known_is_a_dash(capsys):
     from grounded_cli.diagnose import _effects
 
     row = Ranked("parameter:m", claimed=True)
-    _effects(Diagnosis(Verdict("several", ("parameter:m",)), ranking=(row,)))
+    _effects(Diagnosis(Verdict("several", ("parameter:m",)), ranking=(row,)), details=True)
     told = capsys.readouterr().out
     assert "parameter:m" in told and "nan" not in told
+
+
+def test_a_diagnosis_lists_rivals_and_whole_trials_only_in_its_details(capsys):
+    from grounded.diagnosis.report import Ranked
+    from grounded_cli.diagnose import _show
+
+    claimed, tied, rival = "delay:u", "first_order_lag:u", "offset:v"
+    ranking = (Ranked(claimed, claimed=True), Ranked(tied), Ranked(rival))
+    found = Diagnosis(
+        Verdict("effect", (claimed,)),
+        ranking=ranking,
+        indistinguishable=((claimed, tied),),
+        prediction_error=(_row(1.0), _row(8.0, whole_trial=True)),
+    )
+    for details in (False, True):
+        _show(found, {}, details=details)
+        out = capsys.readouterr().out
+        assert claimed in out and tied in out and "v, 1 s ahead" in out
+        assert (rival in out) == ("v, whole trial" in out) == details
+
+
+def _row(horizon_s, **more):
+    return RulerRow(
+        horizon_s,
+        unit_by_channel={"v": "m/s"},
+        crude={"v": 0.3},
+        with_effects={"v": 0.1},
+        noise_floor={"v": 0.1},
+        **more,
+    )
 
 
 def test_a_long_command_says_its_stage_in_a_log_too_now_and_then(capsys, monkeypatch):
@@ -103,4 +133,4 @@ def test_errors_of_what_falls_over_by_itself_are_said_to_tell_little_farther_ahe
     fallen = Diagnosis(
         Verdict("none"), prediction_error=(*rows[:2], replace(rows[2], drowned=True))
     )
-    assert "farther ahead than 0.5 s" in _held_out(fallen)
+    assert "beyond 0.5 s" in _held_out(fallen)

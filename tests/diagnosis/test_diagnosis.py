@@ -239,11 +239,11 @@ def test_sentences_are_english():
     assert said("offset:w", c=0.1) == "The state w drifts by 0.1 1/s."
     assert said("input_gain:throttle", g=-0.2) == "The throttle acts 20 % weaker than modelled."
     assert said("input_gain:throttle", g=-1.5) == (
-        "The throttle acts the other way round (by 50 % of what is modelled)."
+        "The throttle acts the other way round (with 50 % of the modelled strength)."
     )
     assert said("input_gain:throttle", g=-2.1) == (
-        "The throttle acts the other way round: turn its sign in model.py, or if only the log "
-        "counts so, with [log] scale = -1."
+        "The throttle acts the other way round: flip its sign in model.py, or, if only the log "
+        "has it so, set [log] scale = -1."
     )
     assert said("rate_gain:v", g=-2.0) == "The speed v changes the other way round."
     assert said("input_fade:throttle", k=-0.05) == "The throttle gets 5 % stronger every second."
@@ -327,7 +327,7 @@ def test_leftovers_that_are_not_named_are_counted():
     off = tuple(Remainder(name, 0.1, "m/s", 9.0, None) for name in "abcd")
     said = {k: verdict(claims, (), (), off[:k], (), ()).sentence for k in (1, 3)}
     assert said[1].endswith("a is off by 0.1 m/s rms.")
-    assert said[3].endswith("a is off by 0.1 m/s rms; 2 more.")
+    assert said[3].endswith("a is off by 0.1 m/s rms; 2 more states.")
     assert verdict(claims, (), (), off[:1], (), ()).kind == "unknown"
     assert verdict(claims, (), (), (), (errors(0.1),), ()).kind == "none"
 

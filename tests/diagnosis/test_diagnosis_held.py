@@ -55,7 +55,7 @@ def test_a_gain_follows_the_mass_that_is_held(found):
     off = TRUE["k"] - found.parameters["k"].value
     assert abs(off) > 5 * found.parameters["k"].std  # with m as written
     assert abs(off) < 2 * by["k"].prior * by["k"].left  # with all free
-    assert "with m as written" in found.sentence
+    assert "given m as in the model" in found.sentence
 
 
 def test_table_and_document_say_it(found):
@@ -76,13 +76,13 @@ def test_a_value_that_its_std_stopped_is_told_with_what_to_widen():
     said = diagnose(sure, trials, DiagnosisOptions(library=Library(())))
     assert said.parameters["k"].value == pytest.approx(1.15)
     assert {n for n, e in said.parameters.items() if e.stopped == "prior"} == {"k"}
-    assert "k should be 1.15" in said.sentence and "as far as its std" in said.sentence
+    assert "k should be 1.15" in said.sentence and "at the limit of its std" in said.sentence
     assert "widen its std" in said.sentence
     again = type(said).from_json(said.to_json())
     assert again.parameters["k"].stopped == "prior"
     beside = replace(again, verdict=replace(again.verdict, effects=("delay:u",)))
     text = dict(error_lines(beside, {"k": 1.0, "b": 0.5}))["parameters"]
-    assert "N/V (as far as its std" in text and text.count("std") == 1
+    assert "N/V (at the limit of its std" in text and text.count("std") == 1
 
 
 def test_a_line_names_no_twenty_parameters():

@@ -46,13 +46,13 @@ def test_what_got_worse_is_said_of_the_channel_that_lost_most():
     short = row({"x": 0.2, "v": 0.5}, {"x": 0.1, "v": 0.6})
     whole = row({"x": 2.12, "v": 0.5}, {"x": 3.79, "v": 0.3}, whole_trial=True, horizon_s=60.0)
     said = worsened((short, whole))
-    assert "x" in said.split() and "3.8 m" in said and "2.1 m" in said
+    assert holds(said, "worse for x", "3.8 m", "2.1 m")
     assert "0.60 m/s" in worsened((short,))
     assert outweighed((short, whole)) and not outweighed((short,))
-    assert said.endswith("that is worse.") and not worsened((short,)).endswith("that is worse.")
+    assert "improve" not in said and "improve over all" in worsened((short,))
     wild = replace(whole, with_effects={"x": 6e5, "v": 0.3}, runs_away={"with_effects": ("x",)})
     said = worsened((short, wild))
-    assert "run away in x" in said and "2.1 m" in said and "0,000" not in said  # no distance
+    assert "diverge for x" in said and "2.1 m" in said and "0,000" not in said  # no distance
 
 
 def test_where_noise_alone_leaves_all_that_was_measured_nothing_is_told_of_a_horizon():
@@ -78,8 +78,8 @@ def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt
     assert contested((short,), (unlike,), ("delay:u",))
     claims = _claiming(Library().effect("coulomb_friction:v", cart_task().model))
     said = {worse: next_trial(claims, "", (), worse=worse) for worse in (False, True)}
-    assert said[False].endswith("adopt what is claimed.")
-    assert "worse" in said[True] and not said[True].endswith("adopt what is claimed.")
+    assert said[False].endswith("adopt the claimed effects.")
+    assert "worse" in said[True] and not said[True].endswith("adopt the claimed effects.")
     assert "adopt" not in next_trial(claims, "", (), further=True)
 
 
@@ -100,8 +100,8 @@ def test_numbers_of_the_model_are_fitted_those_of_adopted_effects_adopted():
         return next_trial(claims, "", (), adopted=("viscous_friction:v",))
 
     assert "fit" in said("mass") and "adopt" not in said("mass")
-    assert said(*names).endswith("adopt what is claimed.") and said(names[1]).endswith(
-        "adopt what is claimed."
+    assert said(*names).endswith("adopt the claimed effects.") and said(names[1]).endswith(
+        "adopt the claimed effects."
     )
     one = _claiming(Library().effect("parameter:mass", cart_task().model))
     assert next_trial(one, "", ()) == said("mass")
@@ -118,7 +118,7 @@ def test_predictions_that_run_away_are_compared_with_nothing():
     assert worsened((second, replace(whole, with_effects={"x": 9e5, "v": 0.4}))) == ""
     assert "x" in runaway((second, whole)) and not runaway((second,))
     table, _ = error_table(SimpleNamespace(prediction_error=(second, whole)))
-    assert next(cells[1:-1] for cells in table if "whole" in cells[0]) == ("runs away",) * 3
+    assert next(cells[1:-1] for cells in table if "whole" in cells[0]) == ("diverges",) * 3
     assert holds(rest((second, replace(whole, runs_away={}))), "x", "1e+02 times", "whole trials")
 
 
@@ -137,7 +137,7 @@ def test_nothing_is_said_where_nothing_lost_or_only_within_the_noise():
     assert worsened(()) == ""
     assert worsened((row({"x": 0.2}, {"x": 0.205}),)) == ""
     slight = row({"x": 0.2, "v": 0.5}, {"x": 0.21, "v": 0.5})  # nothing gains as much
-    assert outweighed((slight,)) and worsened((slight,)).endswith("that is worse.")
+    assert outweighed((slight,)) and holds(worsened((slight,)), "worse", "21 cm", "20 cm")
     paid = row({"x": 0.2, "v": 0.5}, {"x": 0.21, "v": 0.4})
     assert not outweighed((paid,)) and worsened((paid,)) == ""
     assert worsened((row({"x": 0.02}, {"x": 0.04}, {"x": 0.05}),)) == ""
@@ -179,7 +179,7 @@ def test_a_leftover_within_the_noise_is_stated_by_what_tells_it_from_noise():
     within = replace(left, error=0.0041, floor=0.004, horizon_s=1.0, error_unit="m/s")
     for one in (within, replace(within, floor_at_most=True)):
         said = one.sentence()
-        assert holds(said, "0.031 m/s^2", "|w| > 0.66 rad/s", "may all be noise")
+        assert holds(said, "0.031 m/s^2", "|w| > 0.66 rad/s", "may be noise")
         assert "at most that" not in said
     above = replace(within, error=0.041).sentence()
     assert holds(above, "0.041 m/s", "noise: 0.0040 m/s") and "may all be" not in above
@@ -264,7 +264,7 @@ def test_repeats_are_asked_for_where_there_are_none_as_they_can_be_made():
 
     single = [ran(1, "c0001"), ran(2, "c0002")]
     best = max(single, key=task.utility).candidate
-    assert holds(another_look(task, single, "x"), f"Run {best} twice more", "leftover in x")
+    assert holds(another_look(task, single, "x"), f"Run {best} twice more", "gap in x")
     twice = another_look(task, [*single, ran(3, "c0002")], "x", "|v| > 1")
     assert "twice" not in twice and holds(twice, "x", "|v| > 1")
     by_hand = another_look(task, [ran(1, ""), ran(2, "")], "x")

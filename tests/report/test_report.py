@@ -90,10 +90,12 @@ def test_text_says_how_utilities_are_predicted_and_what_acts_alike(cart):
 def test_half_a_number_is_never_shown(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     params = {f"k{i}": {"value": 0.123456, "std": 0.01, "unit": "m/s"} for i in range(4)}
-    entry = {"effect": "patch:v", "params": params, "evidence": 9.0, "gap_after": 1.0}
+    entry = {"effect": "patch:v", "params": params, "evidence": 9.0, "claimed": True}
     document = DIAGNOSIS | {"ranking": [entry]}
     write_document(folder / "reports" / "diagnosis.json", document)
-    (shown,) = re.findall(r"patch:v +9\.0 +(k0 .*?)\n\S", grounded("-C", folder, "report").out, re.S)
+    (shown,) = re.findall(
+        r"patch:v +9\.0 +(k0 .*?)\n\S", grounded("-C", folder, "report").out, re.S
+    )
     values = [re.sub(r"\s+", " ", one).strip() for one in shown.split(",")]
     assert values == [f"k{i} = 0.123 +- 0.010 m/s" for i in range(4)]
 
@@ -298,7 +300,7 @@ def test_text_says_what_was_calibrated(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     out = " ".join(grounded("-C", folder, "report").out.split())
     assert "mass 1.00 -> 1.40 kg" in out
-    assert re.search(r"\brms; .*\butilities\b.* 1\.50\)", out)
+    assert re.search(r"\brms; .*\butilities\b.* 1\.50\b", out)
     assert "scatter" not in out
     one = DIAGNOSIS["utility_prediction"] | {"trials": 1, "spread": 0.0}
     document = DIAGNOSIS | {"utility_prediction": one}
@@ -312,8 +314,7 @@ def test_at_most_three_parameters_are_named_the_most_changed_first():
     found = Diagnosis.from_json(DIAGNOSIS | {"parameters": table})
     text = calibrated_sentence(found, dict.fromkeys(table, 1.0))
     assert text == (
-        "calibrated beside them: p5 1.00 -> 1.50 m, p4 1.00 -> 1.40 m, p3 1.00 -> 1.30 m "
-        "(and 2 more)"
+        "calibrated as well: p5 1.00 -> 1.50 m, p4 1.00 -> 1.40 m, p3 1.00 -> 1.30 m (and 2 more)"
     )
 
 

@@ -56,7 +56,7 @@ def test_causes_gain_and_what_is_left(diagnosis):
 
 
 def test_what_became_worse_is_not_kept_back(diagnosis):
-    worse = "Whole trials miss x by 3.8 m instead of 2.1 m: that is worse."
+    worse = "worse for x: 3.8 m instead of 2.1 m."
     (row,) = diagnosis.prediction_error
     whole = replace(row, whole_trial=True, crude={"x": 2.1}, with_effects={"x": 3.8})
     found = replace(diagnosis, prediction_error=(row, whole))

@@ -42,8 +42,8 @@ class OneClock:
         commands = "the commands" if self.whole else f"the commands of {_and(self.inputs)}"
         sensors = "all sensors" if self.whole else f"the sensors of {_and(self.states)}"
         return (
-            f"No log can distinguish a delay of {commands} from one of {sensors}: plans are the "
-            "same for both, but with late sensors a log shows where the robot was that long ago."
+            f"A delay of {commands} cannot be told from one of {sensors} in a log; plans are the "
+            "same for both."
         )
 
 

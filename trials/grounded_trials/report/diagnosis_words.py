@@ -1,9 +1,4 @@
-"""What a diagnosis says of the error itself, as sentences for terminal and page.
-
-explained      what the effects take away on held-out trials
-unexplained    what they leave above the noise
-noise          what no model predicts
-"""
+"""A diagnosis in sentences for terminal and page, beyond its verdict."""
 
 from __future__ import annotations
 
@@ -17,17 +12,17 @@ from grounded.diagnosis.stopped import ENDED
 from grounded.result import listed
 from grounded_trials.wording import changed, count, figure, percent, ranges, with_unit
 
-MOST = 3  # parameters that are named
+MOST = 3  # parameters named in one sentence
 
 
 def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple[str, str]]:
-    """(title, text): what was calibrated or held, how utilities are predicted, what acts alike.
+    """Return (title, text) of the details: calibrated parameters, utility, look-alikes.
 
-    Nothing where no cause could be named: with too little data, what was fitted is not a finding.
+    Empty if there were too few data to name a cause: what was fitted then is not a finding.
 
     Args:
-        diagnosis: what was found.
-        before: the values of the model's parameters before it.
+        diagnosis: the result.
+        before: values of the model's parameters before it.
     """
     if diagnosis.no_cause:
         return []
@@ -40,7 +35,7 @@ def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple
         found.append(("utility", text))
     for effect in dict.fromkeys(one.effect for one in diagnosis.lookalikes):
         like = [
-            f"{one.like} {'makes ' * (k == 0)}{percent(one.share)}"
+            f"{one.like} {'could make ' * (k == 0)}{percent(one.share)}"
             for k, one in enumerate(o for o in diagnosis.lookalikes if o.effect == effect)
         ]
         found.append(("alike", f"{', '.join(like)} of the signal of {effect}"))
@@ -48,33 +43,33 @@ def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple
 
 
 def made_from(diagnosis: Diagnosis) -> str:
-    """`made from 6 trials, t0001 to t0006`."""
+    """Return `made from 6 trials, t0001 to t0006`."""
     names = diagnosis.made.trials if diagnosis.made is not None else ()
     number = count(len(names) or diagnosis.trials, "trial")
     return f"made from {number}{f', {ranges(names)}' * bool(names)}"
 
 
 def correction_line(correction: Correction) -> str:
-    """What a correction does, and that it is none of the causes."""
+    """Describe a correction, which is not a cause."""
     over = listed(correction.over)
-    gain = f"takes away {percent(correction.held_out_gain)} of the held-out squared error"
+    gain = f"removes {percent(correction.held_out_gain)} of the held-out squared error"
     if not correction.adoptable:
-        return f"a curve of {correction.channel} over {over} predicts held-out trials no better"
-    return f"correction:{correction.channel}, a curve over {over}, {gain}; it is no cause"
+        return f"a curve of {correction.channel} over {over} does not improve held-out predictions"
+    return f"correction:{correction.channel}, a curve over {over}, {gain}; it explains no cause"
 
 
 def in_vain(diagnosis: Diagnosis) -> list[str]:
-    """Which effects are likely by their evidence and yet no causes, a sentence each."""
+    """Return a sentence for each effect that is likely but improves no held-out prediction."""
     return [
-        f"{row.effect} is likely by itself, by {figure(row.evidence, 3)} nats, but held-out trials "
-        "are predicted no better with it"
+        f"{row.effect} alone is likely ({figure(row.evidence, 3)} nats), but it does not improve "
+        "held-out predictions"
         for row in diagnosis.ranking
         if row.no_better
     ]
 
 
 def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """What changed between two groups of trials, or the values that trials do not share."""
+    """Return what changed between two groups of trials, or where trials disagree."""
     if diagnosis.changed is not None:
         rows = [
             (
@@ -84,22 +79,23 @@ def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
             )
             for one in diagnosis.changed
         ]
-        rows = rows or [("changed", "nothing that these trials show")]
+        rows = rows or [("changed", "nothing that these trials could show")]
         same = [
             f"{one.effect}: {one.quantity}, by {figure(one.second.value - one.first.value, 2)} "
             f"+- {figure(math.hypot(one.first.std, one.second.std), 2)}"
             for one in diagnosis.unchanged
         ]
-        return [*rows, ("unchanged", f"within its +-: {'; '.join(same)}")] if same else rows
+        return [*rows, ("unchanged", f"within +-: {'; '.join(same)}")] if same else rows
     found = []
     for one in diagnosis.agreement:
         if not one.agrees:
             values = [v for v in diagnosis.per_trial if v.effect == one.effect]
             values = [v for v in values if v.quantity == one.quantity]
             low, high = (f(values, key=lambda v: v.value) for f in (min, max))
+            highest = with_unit(figure(high.value, 3), one.estimate.unit)
             text = (
-                f"not in {one.quantity} of {one.effect}: {figure(low.value, 3)} in {low.trial}, "
-                f"{with_unit(figure(high.value, 3), one.estimate.unit)} in {high.trial}"
+                f"trials disagree on {one.quantity} of {one.effect}: {figure(low.value, 3)} in "
+                f"{low.trial}, {highest} in {high.trial}"
             )
             found.append(("agreement", text + f"; it {one.goes_with}" * bool(one.goes_with)))
     return found
@@ -111,18 +107,18 @@ def _with_spread(estimate: Estimate) -> str:
 
 
 def gap_sentence(gap: Gap) -> str:
-    """The gap before and after, and what it is measured in."""
+    """Return the gap before and after, with its unit."""
     held = "held out" if gap.held_out else "not held out, too few trials"
-    low = ", below 1: predictions miss less than that" * (gap.after < gap.floor)
+    low = "; below 1, so errors are smaller than that" * (gap.after < gap.floor)
     return (
-        f"{figure(gap.before, 3)} before, {figure(gap.after, 3)} after, in units of what the noise "
-        f"that this diagnosis estimates makes of predictions {gap.horizon_s:g} s ahead "
-        f"({held}){low}; figures of two diagnoses don't compare"
+        f"{figure(gap.before, 3)} before, {figure(gap.after, 3)} after, {held}, in units of the "
+        f"error that the estimated noise alone causes {gap.horizon_s:g} s ahead{low}; not "
+        "comparable between two diagnoses"
     )
 
 
 def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> str:
-    """The model's own parameters that were fitted beside the effects, most changed first."""
+    """List the model parameters that were calibrated together with the effects."""
     if all(name.startswith("parameter:") for name in diagnosis.effects):
         return ""
     made = diagnosis.made
@@ -135,11 +131,11 @@ def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> st
             moved.append((-change, changed(name, old, e.value, e.unit) + more))
     named = ", ".join(text for _, text in sorted(moved)[:MOST])
     others = len(moved) - MOST
-    return f"calibrated beside them: {named}{f' (and {others} more)' * (others > 0)}" * bool(moved)
+    return f"calibrated as well: {named}{f' (and {others} more)' * (others > 0)}" * bool(moved)
 
 
 def held_sentence(diagnosis: Diagnosis) -> str:
-    """What calibrated parameters depend on that these trials don't tell, and how much."""
+    """Say which calibrated parameters depend on others that these trials cannot identify."""
     said, held = [], dict[str, list[float]]()
     for one in (one for one in diagnosis.identifiable if one.given):
         e = diagnosis.parameters.get(one.parameter)
@@ -149,23 +145,23 @@ def held_sentence(diagnosis: Diagnosis) -> str:
             held.setdefault(name, []).append(by)
         parts = [f"{by:+.2g} % for 1 % more {name}" for name, by in one.given.items()]
         free = with_unit(f"+- {figure(one.prior * one.left, 2)}", e.unit)
-        said.append(f"{one.parameter} {listed(parts)} ({free} with all free)")
+        said.append(f"{one.parameter} {listed(parts)} ({free} if all are free)")
     if len(said) > MOST:
         said = [
             f"{len(some)} values {min(some):+.2g} to {max(some):+.2g} % for 1 % more {name}"
             for name, some in held.items()
         ]
-    told = f"{listed(held)} as written, which these trials don't tell: {', '.join(said)}"
+    told = f"{listed(held)} as in the model, not identifiable here: {', '.join(said)}"
     return told * bool(said)
 
 
 def utility_sentence(diagnosis: Diagnosis) -> str:
-    """How well utilities of whole trials are predicted; "" where none was."""
+    """Say how well the utilities of whole trials are predicted; "" if none was."""
     found = diagnosis.utility_prediction
     if found is None or not found.trials:
         return ""
     without, better = (
-        f"by {figure(value, 3)}" if math.isfinite(value) else "beyond all measure"
+        f"by {figure(value, 3)}" if math.isfinite(value) else "without bound (it diverges)"
         for value in (found.before, found.after)
     )
     whole = count(found.trials, "whole trial")
@@ -176,11 +172,11 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
     if found.trials < 2:
         return f"{text} (rms)"
     spread = figure(found.spread, 3)
-    return f"{text} (rms; from policy to policy the utilities themselves differ by {spread})"
+    return f"{text} (rms; the utilities themselves vary by {spread} between policies)"
 
 
 def verdict_lines(diagnosis: Diagnosis) -> tuple[list[str], list[str]]:
-    """A verdict's causes, where they are several, with their shares; then its sentences."""
+    """Return the causes with their shares if there are several, then the other sentences."""
     causes, told = diagnosis.verdict.causes, list(diagnosis.verdict.lines)
     if len(causes) < 2:
         return [], told

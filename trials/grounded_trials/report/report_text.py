@@ -160,9 +160,9 @@ def _diagnosis(findings: Findings, table: Table) -> str:
     for title, text in error_lines(diagnosis, before):
         lines += _wrapped(f"{title}: {text}", "  ")
     if diagnosis.prediction_error and not diagnosis.no_cause:
-        lines += ["", table(*error_table(diagnosis))]
+        lines += ["", table(*error_table(diagnosis, whole_trials=False))]
     if diagnosis.ranking and not diagnosis.no_cause:
-        lines += ["", table(*effect_table(diagnosis))]
+        lines += ["", table(*effect_table(diagnosis, rivals=False))]
     return "\n".join(lines)
 
 
