@@ -1,12 +1,12 @@
-"""The blind challenge: cases whose answer is sealed, and the marks of a diagnosis.
+"""The blind challenge: generated cases with sealed labels, and the scoring of diagnoses.
 
     for case in make("single", 200, seed): write its trials; seal its label elsewhere
     judge(label, diagnosis, oracle(...)), summary(marks)
 
-Read `cases` first (what a case is and how it is drawn), then `systems` (what is driven), `draws`
-(the effects, in the library and not), `truth` (the simulated real system), `mechanism` (the same in
-MuJoCo), `score` (oracle and marks). Nothing in `grounded.diagnosis` imports this folder: the
-diagnosis can't reach the truth.
+Read `cases` first (what a case is and how it is drawn), then `systems` (the simulated systems),
+`draws` (effects, from the library and outside it), `truth` (the simulated real system), `mechanism`
+(the same in MuJoCo), `score` (oracle and marks). Nothing in `grounded.diagnosis` imports this
+folder, so that a diagnosis can't reach the truth.
 """
 
 from __future__ import annotations

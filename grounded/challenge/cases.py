@@ -1,8 +1,8 @@
-"""Blind cases: a crude model, real trials, and a label that is sealed apart.
+"""Blind cases: a crude model, simulated real trials, and a label that is sealed separately.
 
-A case is data; the command line writes it as a workspace of MCAP trials. Everything about it
-follows from one seed: the system, the task, rates, noise, number of trials, the effect and its size
-from barely visible to large.
+A case is data; the command line writes it as a workspace of MCAP trials. One seed determines
+everything: the system, the task, rates, noise, number of trials, the effect and its size, from
+barely visible to large.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ NOISE_KINDS = ("white", "coloured", "heavy")
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One case. `model` is what the user has; `label` is what is sealed."""
+    """One case. `model` is the crude model that the user has; `label` is sealed."""
 
     name: str
     system: str
     model: Model
     trials: tuple[Trial, ...]
-    fresh: tuple[Trial, ...]  # further trials of the same truth, for judging predictions
+    fresh: tuple[Trial, ...]  # further trials of the same system, for scoring predictions
     dt: float
     target: Array  # (T + 1, n)
     start: Array
@@ -59,14 +59,15 @@ def make(
     param_error: float | None = None,
     noise: str | None = None,
 ) -> Iterator[Case]:
-    """Cases of a kind, one by one.
+    """Yield cases of a kind, one by one.
 
     Args:
         kind: single, double, none or withheld.
-        count: how many.
-        seed: everything follows from it.
-        only: one system instead of all.
-        groups: of systems (`systems.GROUPS`); "own" is half of the cases where there are others.
+        count: number of cases.
+        seed: determines everything.
+        only: name of one system instead of all.
+        groups: groups of systems (`systems.GROUPS`); "own" makes half of the cases if there are
+            others.
         param_error: relative errors of the model's parameters (uniform), instead of a random third
             of the cases with 5 %.
         noise: "white", "coloured" or "heavy", instead of mostly white (of all three for "none").
@@ -75,7 +76,7 @@ def make(
         GroundedError: for an unknown kind or system, or mechanisms without MuJoCo.
     """
     if kind not in KINDS:
-        raise GroundedError(f"a challenge is one of {', '.join(KINDS)}; got '{kind}'")
+        raise GroundedError(f"kinds of challenge: {', '.join(KINDS)}; got '{kind}'")
     if only is not None and only not in systems.SYSTEMS:
         raise GroundedError(f"systems of the challenge: {', '.join(systems.SYSTEMS)}; got '{only}'")
     share = _shares(groups)
@@ -93,7 +94,7 @@ def make(
 
 
 def _shares(groups: Sequence[str]) -> dict[str, float]:
-    """How often each system is drawn.
+    """Return the probability of each system.
 
     Raises:
         GroundedError: for an unknown group, or none.
@@ -110,13 +111,13 @@ def _shares(groups: Sequence[str]) -> dict[str, float]:
 
 
 def sealed(label: Mapping[str, Any]) -> str:
-    """The hash under which a label is announced before it is opened."""
+    """Return the hash under which a label is published before it is opened."""
     return hashlib.sha256(json.dumps(label, sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
 class _Setting:
-    """What is drawn for a case beside its effect."""
+    """Random settings of a case other than its effect."""
 
     dt: float
     steps: int
@@ -136,7 +137,7 @@ def _case(
     param_error: float | None,
     noise: str | None,
 ) -> Case | None:
-    """A case; None where a mechanism lost its way, as nobody would keep such runs."""
+    """Draw a case; None if a mechanism left its target, since nobody would keep such runs."""
     dt = 1.0 / float(rng.choice(system.rates))
     duration = float(rng.uniform(*system.duration))
     drawn = NOISE_KINDS[index % 3] if kind == "none" else rng.choice(NOISE_KINDS, p=[0.8, 0.1, 0.1])
@@ -189,11 +190,11 @@ def _with_errors(model: Model, error: float, rng: np.random.Generator) -> Model:
     return model.with_values({n: p.value * float(f) for (n, p), f in names if p.uncertain})
 
 
-LOST = 2.0  # [rad or m] from the target
+LOST = 2.0  # distance from the target [rad or m]
 
 
 def _lost(model: Model, trial: Trial, plan: Plan) -> bool:
-    """Whether a position went far from its target."""
+    """Check whether a position went far from its target."""
     error = model.difference(trial.states, plan[2])[:, : model.n // 2]
     return not np.abs(error).max() < LOST
 
@@ -204,7 +205,7 @@ Plan = tuple[Array, Array, Array, Array]  # inputs (T, m), start (n,), target (T
 def _plans(
     system: systems.SystemUnderTest, crude: Model, setting: _Setting, rng: np.random.Generator
 ) -> list[Plan]:
-    """A manoeuvre for each trial (or one for all, inputs varied a little), and two fresh ones."""
+    """Draw a manoeuvre for each trial (or one for all, inputs slightly varied), and two more."""
     t = np.arange(setting.steps) * setting.dt
     found: list[Plan] = []
     for i in range(setting.trials + 2):
@@ -292,7 +293,7 @@ INSIDE = {"joint_friction": "friction", "added_inertia": "armature", "first_orde
 def _built(
     system: systems.SystemUnderTest, truth: Truth, more: Mapping[str, float] | None = None
 ) -> Truth:
-    """The same in MuJoCo, where the system has a double there; what its joints do, they do."""
+    """Build the system in MuJoCo if it has a model there, with the effects of its joints inside."""
     if system.built is None:
         return truth
     true = dict(zip(truth.model.param_names, map(float, truth.model.values), strict=True))

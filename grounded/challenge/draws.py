@@ -1,11 +1,11 @@
-"""What a blind case's effect is and how large: drawn by family, from barely visible to large.
+"""Random effects of blind cases and their sizes, from barely visible to large.
 
-`draw_effect` draws from the library. `draw_withheld` draws what is NOT in the library, and the
-diagnosis must meet without a name for it:
+`draw_effect` draws from the library. `draw_withheld` draws an effect that is NOT in the library, so
+that the diagnosis has no name for it:
 
 resonance     the actuator rings: u_eff'' = w^2 (u - u_eff) - 2 zeta w u_eff'
 dropouts      commands get lost for 0.1 to 0.4 s; the last one is held
-fault         from half of the trial on an actuator gives less
+fault         from about the middle of the trial on, an actuator is weaker
 crosstalk     one input leaks, squared, into another
 quantised     commands arrive in coarse steps
 gusts         pushes of half a second at random times
@@ -32,14 +32,14 @@ from grounded.model import Model
 JOINT = (
     "joint_friction", "added_inertia", "parameter", "first_order_lag", "delay", "dead_zone",
 )  # fmt: skip
-DRIVE = {"delay": 0.12, "first_order_lag": 0.3}  # [s] of a mechanism, times the size
-SMALLEST, LARGEST = 0.04, 0.35  # of the signals an effect acts on
+DRIVE = {"delay": 0.12, "first_order_lag": 0.3}  # [s] for a mechanism, times the relative size
+SMALLEST, LARGEST = 0.04, 0.35  # size relative to the signals an effect acts on
 
 
 def draw_effect(
     model: Model, scales: Scales, rng: np.random.Generator, families: Sequence[str] = ()
 ) -> Effect:
-    """A family at random (of `families`, if any are named), then one of its targets."""
+    """Draw a family (from `families`, if any are given), then one of its targets."""
     by_family: dict[str, list[Effect]] = {}
     for effect in Library().candidates(model, scales):
         if not families or effect.family.name in families:
@@ -55,16 +55,16 @@ def values_of(
     visited: Array,
     mechanism: bool = False,
 ) -> dict[str, float]:
-    """A size from barely visible to large, as a part of the signals it acts on.
+    """Draw the values of an effect, from barely visible to large relative to the signals.
 
-    Of sizes from 2 to 4 % four in ten stayed below 3 nats, of larger ones one in seven.
+    Of effects of 2 to 4 %, four in ten stayed below 3 nats; of larger ones, one in seven.
 
     Args:
-        effect: which.
+        effect: the effect.
         scales: sizes of the signals.
-        rng: draws.
-        visited: (N, n) states of the manoeuvres: a place that differs is one that is visited.
-        mechanism: whether it is one, whose loop a late drive shakes sooner.
+        rng: random generator.
+        visited: states of the manoeuvres (N, n), so that a patch is at a visited place.
+        mechanism: whether the system is a mechanism, whose loop tolerates less delay.
     """
     size = float(np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST))))
     sign = float(rng.choice([-1, 1]))
@@ -87,7 +87,7 @@ def values_of(
 
 
 def _rate_scale(scales: Scales, name: str) -> float:
-    """A typical rate of a state: its spread over two seconds."""
+    """Return a typical rate of a state, its spread over two seconds."""
     return float(scales.spread(name)) / 2.0
 
 
@@ -152,14 +152,14 @@ def _value(
     if family == "periodic" and quantity == "omega":
         return 2 * np.pi * float(np.exp(rng.uniform(np.log(0.3), np.log(2.0))))
     if family == "patch" and quantity == "c":
-        return 4 * sign * size * _rate_scale(scales, target)  # it acts for a moment only
+        return 4 * sign * size * _rate_scale(scales, target)  # it acts only briefly
     if family == "patch":
-        return 0.12 * max(effect.free[-1].grid) / 0.16  # of the radius; the place is drawn apart
+        return 0.12 * max(effect.free[-1].grid) / 0.16  # radius; the place is drawn separately
     return sign * size * _rate_scale(scales, target)
 
 
 def _joint(quantity: str, size: float, scales: Scales, tau: str, w: str) -> float:
-    """Parts of the largest input: dry friction, viscous friction, what accelerates in 0.2 s."""
+    """Return friction or inertia of a joint as a part of the largest input (0.2 s to speed)."""
     if quantity == "k":
         return size
     over = {"b": scales.peak(w), "J": scales.peak(w) / 0.2}.get(quantity, 1.0)
@@ -171,7 +171,7 @@ Rate = Callable[[Any, Any, float, Mapping[str, Any]], Mapping[str, float]]
 
 @dataclass(frozen=True, eq=False)
 class Withheld:
-    """One withheld effect at work."""
+    """A withheld effect."""
 
     name: str
     target: str
@@ -190,16 +190,17 @@ def draw_withheld(
     duration: float,
     mechanism: bool = False,
 ) -> Withheld:
-    """A random withheld effect for a model.
+    """Draw a withheld effect for a model.
 
     Args:
-        rng: randomness.
+        rng: random generator.
         model: the system.
         peak: typical size of each input (m,).
         driven: the state that gusts and hysteresis act on.
         rate: typical size of that state's rate.
         duration: of a trial [s].
-        mechanism: whether it is one: what would push its states hangs or pulls at it instead.
+        mechanism: whether the system is a mechanism, which gets a spring or a hanging mass instead
+            of gusts and hysteresis.
     """
     makers = [_resonance, _dropouts, _fault, _quantised, _crosstalk]
     kind = int(rng.integers(0, len(makers) + 2))
@@ -222,11 +223,11 @@ def _attached(rng: np.random.Generator, driven: str) -> Withheld:
     return Withheld(name, driven, {name: size}, joint={name: size})
 
 
-_Made = tuple[dict[str, float], Actuator]  # what is sealed, what acts
+_Made = tuple[dict[str, float], Actuator]  # sealed parameters, and the actuator
 
 
 def _on(j: int, delivered: Callable[[Array, dict[str, Any], float, float], float]) -> Actuator:
-    """An actuator that changes input j alone."""
+    """Return an actuator that changes input j alone."""
 
     def act(u: Array, own: dict[str, Any], t: float, dt: float) -> Array:
         out = u.copy()

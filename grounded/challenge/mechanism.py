@@ -1,9 +1,9 @@
-"""Mechanisms in MuJoCo, in the place of the real system.
+"""Mechanisms in MuJoCo that act as the real system.
 
-The simulator is foreign to the diagnosis: its own joints, contacts of dry friction and integrator.
-What a crude model in `grounded.models` lacks stands in the simulator's own terms: `frictionloss`,
-`damping`, `armature`, the filter of an actuator, masses; or it is a thing that no family describes,
-a spring at a joint or a pendulum that hangs from the tip.
+The simulator shares nothing with the diagnosis: it has its own joints, dry friction and integrator.
+What a crude model in `grounded.models` lacks is given in the simulator's own terms: `frictionloss`,
+`damping`, `armature`, the filter of an actuator, masses. Withheld effects are things that no family
+describes: a spring at a joint, or a pendulum that hangs from the tip.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from grounded.errors import needs
 from grounded.frozen import Array
 
-STEP = 1e-4  # [s] of the simulator, at most: it shows the motion a part of a step early
+STEP = 1e-4  # longest step of the simulator [s], since its positions are early by a part of it
 
 CART = """
 <mujoco model="cart-pole">
@@ -67,7 +67,7 @@ HUNG = """<body name="hung" pos="{at}"><joint name="swing" axis="0 1 0" damping=
 
 
 def _filter(lag: float) -> str:
-    """An actuator's first-order lag [s]."""
+    """Return the XML attributes of an actuator's first-order lag [s]."""
     return f'dyntype="filterexact" dynprm="{lag}"' if lag else ""
 
 
@@ -82,7 +82,7 @@ def cart_xml(
     hung: float = 0.0,
     true: Mapping[str, float] | None = None,
 ) -> str:
-    """The cart-pole; `true` are M, m, l, b of `grounded.models.cart_pole` where they differ."""
+    """Return the cart-pole; `true`: differing M, m, l, b of `grounded.models.cart_pole`."""
     p = {"M": 1.0, "m": 0.3, "l": 0.5, "b": 0.0} | dict(true or {})
     return CART.format(
         timestep=timestep,
@@ -111,7 +111,7 @@ def arm_xml(
     hung: float = 0.0,
     true: Mapping[str, float] | None = None,
 ) -> str:
-    """The two-link arm; `true` are m2, b1, b2 of `grounded.models.arm` where they differ."""
+    """Return the two-link arm; `true`: differing m2, b1, b2 of `grounded.models.arm`."""
     a1, a2 = np.broadcast_to(armature, 2)
     return ARM.format(
         payload=payload,
@@ -131,13 +131,13 @@ def arm_xml(
 
 
 def cart_built(part: Mapping[str, Mapping[str, float]], **more: Any) -> str:
-    """The cart-pole with what a case gives its joint: by kind, then by input or parameter."""
+    """Return the cart-pole with the effects of a case, {kind: {input or parameter: size}}."""
     at = {kind: values.get("force", 0.0) for kind, values in part.items() if kind != "true"}
     return cart_xml(integrator="implicitfast", true=part["true"], **at, **more)
 
 
 def arm_built(part: Mapping[str, Mapping[str, float]], **more: Any) -> str:
-    """The same of the arm."""
+    """Return the arm with the effects of a case, {kind: {input or parameter: size}}."""
     two = {k: (v.get("tau1", 0.0), v.get("tau2", 0.0)) for k, v in part.items() if k != "true"}
     f1, f2 = two["friction"]
     true = dict(part["true"])
@@ -149,9 +149,10 @@ def arm_built(part: Mapping[str, Mapping[str, float]], **more: Any) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Mechanism:
-    """A mechanism and what its crude model lacks: {kind: {input: size}}, "true" parameters, more.
+    """A mechanism with what its crude model lacks.
 
-    `built` writes its XML; the kinds are friction, armature and lag.
+    `built` writes its XML. `part` is {kind: {input: size}} with kinds friction, armature and lag,
+    and the "true" parameters.
     """
 
     built: Callable[..., str]
@@ -159,13 +160,13 @@ class Mechanism:
     more: Mapping[str, float] = field(default_factory=dict)  # spring, hung
 
     def plant(self, fine: float) -> Plant:
-        """It at rest, advanced by `fine` seconds at a time."""
+        """Return the mechanism at rest, which advances by `fine` seconds at a time."""
         count = int(np.ceil(fine / STEP))
         return Plant(self.built(self.part, timestep=fine / count, **self.more), count)
 
 
 class Plant:
-    """MuJoCo under way: it keeps its actuators, its warm start and what hangs from it."""
+    """A running MuJoCo simulation, with the state of actuators, warm start and hanging mass."""
 
     def __init__(self, xml: str, steps: int) -> None:
         self.mj, self.steps = simulator(), steps
@@ -174,10 +175,10 @@ class Plant:
         self.started = False
 
     def advance(self, x: Array, u: Array) -> Array:
-        """The state (n,), positions then velocities, after the steps with inputs (m,)."""
+        """Return the state (n,), positions then velocities, after the steps with inputs u (m,)."""
         data, half = self.data, len(x) // 2
         data.qpos[:half], data.qvel[:half], data.ctrl[:] = x[:half], x[half:], u
-        if not self.started and self.model.na:  # actuators have settled
+        if not self.started and self.model.na:  # actuators start settled
             data.act[self.model.actuator_actadr[self.filtered]] = u[self.filtered]
         self.started = True
         for _ in range(self.steps):
@@ -186,12 +187,12 @@ class Plant:
 
     @cached_property
     def filtered(self) -> Any:
-        """The actuators that have a state."""
+        """Indices of the actuators that have a state."""
         return np.flatnonzero(self.model.actuator_actadr >= 0)
 
 
 def simulator() -> Any:
-    """MuJoCo.
+    """Import MuJoCo.
 
     Raises:
         GroundedError: if it is not installed, with what to install.

@@ -1,17 +1,17 @@
-"""Judging diagnoses against opened labels, and against an oracle that knows the effect.
+"""Scoring of diagnoses against opened labels, and against an oracle that knows the effects.
 
-The oracle fits the true effects (values free, noise and parameters as in a diagnosis) and nothing
-else: a case counts as detectable where its evidence exceeds 3 nats, as distinguishable where it is
-also 3 nats ahead of the likeliest others that the diagnosis ranked, fitted in the same way. What a
-diagnosis predicts, held out and in units, is compared with what the oracle predicts.
+The oracle fits only the true effects (values free, noise and parameters as in a diagnosis). A case
+counts as detectable if the evidence of the true effects exceeds 3 nats, and as distinguishable if
+it is also 3 nats above that of the likeliest other effects in the diagnosis' ranking, fitted in the
+same way. Held-out prediction errors of the diagnosis are compared with those of the oracle.
 
-Parameters that are off in a case beside its effect are rightly named with it: of the others the
-effect has to be first, whether they are calibrated all at once or named one by one.
+If a case has wrong parameters beside its effect, naming these is correct, too: the effect must be
+first among the other names, whether the parameters are calibrated together or named one by one.
 
-Besides a first name that is wrong there are a second one that nothing makes (`false_second`), the
-right family at the wrong place (`wrong_place`), names that predict worse than the model without
-them (`worse`), and how much of the error in units is gone (`units_shrinkage`). `summary` gives each
-share with its count and Wilson's 95 % interval.
+Other marks are a further name without a true effect (`false_second`), the right family at the wrong
+target (`wrong_place`), names that predict worse than the model without them (`worse`), and the
+reduction of the error in units (`units_shrinkage`). `summary` gives each share with its count and
+Wilson's 95 % interval.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from grounded.utility import Reward
 
 Marks = Sequence[Mapping[str, Any]]
 DETECTABLE = 3.0  # nats
-WORSE = 1.01  # ratio of errors in units from which names predict worse than none
-WITHIN, LEAVES = 1.15, 1.3  # of the oracle's error; of the noise, from which a claim misleads
+WORSE = 1.01  # ratio of errors from which the named effects predict worse than none
+WITHIN, LEAVES = 1.15, 1.3  # ratio to the oracle's error; gap from which a false claim misleads
 RIVALS = 2
-LATE = {"delay": "sensor_delay", "lag": "sensor_lag"}  # what instruments find, as effects
+LATE = {"delay": "sensor_delay", "lag": "sensor_lag"}  # findings of the instruments as effects
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,18 @@ def oracle(
     label: Mapping[str, Any],
     ranking: Sequence[Mapping[str, Any]] = (),
 ) -> Oracle | None:
-    """What knowing the label would give; None where the library has no such effect.
+    """Fit the true effects of a case.
 
     Args:
-        model: the crude one.
-        trials: the case's.
-        latency: of its inputs (m,) [s].
-        label: opened.
-        ranking: a diagnosis', whose likeliest others are fitted too where one effect is true.
+        model: the crude model.
+        trials: the trials of the case.
+        latency: modelled delay of its inputs (m,) [s].
+        label: the opened label.
+        ranking: the ranking of a diagnosis. If one effect is true, its likeliest others are fitted
+            too.
+
+    Returns:
+        The oracle; None if the label has no effect of the library.
     """
     if not label["effects"]:
         return None
@@ -92,7 +96,7 @@ def oracle(
     search.nulls()
 
     def fitted(which: Sequence[int]) -> float:
-        """The best score of a set of the true effects."""
+        """Return the best score of a set of effects."""
         h = Hypothesis()
         for i in which:
             h = h.plus(effects[i], values[i])
@@ -128,7 +132,7 @@ def oracle(
 
 
 def _plain(search: HypothesisSearch) -> list[Any]:
-    """Fits without effects under white noise with exact parameters."""
+    """Return the fits without effects under white noise and with exact parameters."""
     return [
         f
         for (structure, spread, names), f in search.fits.items()
@@ -139,15 +143,15 @@ def _plain(search: HypothesisSearch) -> list[Any]:
 def judge(
     label: Mapping[str, Any], diagnosis: Mapping[str, Any], known: Oracle | None
 ) -> dict[str, Any]:
-    """One case's marks."""
+    """Return the marks of one case."""
     truth = [e["effect"] for e in label["effects"]]
     mended = [f for f in diagnosis.get("preflight", ()) if f["corrected"] and f["kind"] in LATE]
     sensors = [f"{LATE[f['kind']]}:{f['signal']}" for f in mended]  # found before any physics
     off = [f"parameter:{name}" for name in diagnosis["verdict"].get("parameters", ())]
     named = list(dict.fromkeys([*sensors, *diagnosis["verdict"]["effects"], *off]))
     listed = [r["effect"] for r in diagnosis["ranking"]]
-    order = sensors + listed if named else []  # the likeliest of what nobody claims is no name
-    if label["param_error"] and _physical(named, label):  # rightly named beside it, too
+    order = sensors + listed if named else []  # without a claim, the ranking names nothing
+    if label["param_error"] and _physical(named, label):  # wrong parameters are true names, too
         order = [name for name in order if name in truth or not name.startswith("parameter:")]
     group = set(order[:1])
     for g in diagnosis["indistinguishable"]:
@@ -186,17 +190,17 @@ def judge(
 
 
 def _physical(named: Sequence[str], label: Mapping[str, Any]) -> list[str]:
-    """The names without parameters, where those are off too."""
+    """Return the names, without parameters if those are off in the case."""
     return [n for n in named if not (label["param_error"] and n.startswith("parameter:"))]
 
 
 def _spare(truth: Sequence[str], named: Sequence[str], label: Mapping[str, Any]) -> int:
-    """How many names are claimed beside the true ones, or beside one that stands for each."""
+    """Return the number of names in excess of the true effects."""
     return len(set(_physical(named, label)) | (set(truth) & set(named))) - len(truth)
 
 
 def _matched(truth: Sequence[str], named: Sequence[str], ties: Sequence[Sequence[str]]) -> bool:
-    """Whether each true effect is named, or tied with a name that stands for no other."""
+    """Check that each true effect is named, or tied with a name of its own."""
     free = [name for name in named if name not in truth]
     for effect in (effect for effect in truth if effect not in named):
         place = next((g[0] for g in ties if effect in g[:3] and g[0] in free), None)
@@ -207,27 +211,27 @@ def _matched(truth: Sequence[str], named: Sequence[str], ties: Sequence[Sequence
 
 
 def _misplaced(truth: Sequence[str], order: Sequence[str]) -> bool:
-    """Whether the first name is a true family, at another place."""
+    """Check whether the first name has a true family but the wrong target."""
     if not truth or not order or order[0] in truth:
         return False
     return order[0].partition(":")[0] in {name.partition(":")[0] for name in truth}
 
 
 def _row(diagnosis: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The ruler's row of the longest horizon that is not the whole trial."""
+    """Return the row of prediction errors at the longest horizon but the whole trial."""
     rows = [row for row in diagnosis.get("prediction_error", ()) if not row["whole_trial"]]
     return rows[-1] if rows else {}
 
 
 def _without(diagnosis: Mapping[str, Any]) -> Mapping[str, float]:
-    """Errors without what is named: calibrated, unless it is parameters that are named."""
+    """Return the errors without the named effects: calibrated ones, unless only parameters are."""
     row, named = _row(diagnosis), diagnosis["verdict"]["effects"]
     effects = any(not name.startswith("parameter:") for name in named)
     return dict((effects and row.get("calibrated")) or row.get("crude", {}))
 
 
 def _ratio(diagnosis: Mapping[str, Any], other: Mapping[str, float]) -> float:
-    """Held-out errors of a diagnosis in units over others, the geometric mean over channels."""
+    """Return the ratio of a diagnosis' held-out errors to others, geometric mean of channels."""
     own = _row(diagnosis).get("with_effects", {})
     pairs = [(own[n], other[n]) for n in own if n in other]
     logs = [np.log(a / b) for a, b in pairs if a is not None and b is not None and a > 0 and b > 0]
@@ -235,7 +239,7 @@ def _ratio(diagnosis: Mapping[str, Any], other: Mapping[str, float]) -> float:
 
 
 def _values(label: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str, Any]:
-    """Errors and interval coverage of the true effects' values, where they were claimed."""
+    """Return errors and interval coverage of the values of true effects that were claimed."""
     covered, errors = [], []
     rows = {r["effect"]: r for r in diagnosis["ranking"] if r["claimed"]}
     for entry in label["effects"]:
@@ -252,7 +256,7 @@ def _values(label: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str,
 
 
 def summary(marks: Marks) -> dict[str, Any]:
-    """Figures of a set of judged cases, by kind."""
+    """Return summary figures of a set of marked cases, by kind."""
     found: dict[str, Any] = {}
     for kind in sorted({m["kind"] for m in marks}):
         some = [m for m in marks if m["kind"] == kind]
@@ -291,7 +295,7 @@ def _double(some: Marks) -> dict[str, Any]:
 
 
 def _of_effects(some: Marks) -> dict[str, Any]:
-    """Of cases with effects: names to spare, intervals, predictions beside the oracle's."""
+    """Return figures for cases with effects: false names, coverage, predictions over oracle's."""
     gaps = [m["gap_ratio"] for m in some if m.get("detectable")]
     units = [m["units_ratio"] for m in some if np.isfinite(m.get("units_ratio", np.nan))]
     return {
@@ -334,7 +338,7 @@ def _part(marks: Marks, key: str) -> dict[str, Any]:
 
 
 def share(said: Iterable[bool]) -> dict[str, Any]:
-    """How many of how many, their share and its 95 % interval (Wilson 1927)."""
+    """Return count, total, share and its 95 % interval (Wilson 1927)."""
     each = list(said)
     n, k, z = len(each), sum(each), 1.96
     if not n:
@@ -346,7 +350,7 @@ def share(said: Iterable[bool]) -> dict[str, Any]:
 
 
 def task_of(case: Case) -> Task:
-    """The task that a case's owner has: his model, his latency, his limits."""
+    """Return the task of a case as its user has it: crude model, latency, limits."""
     n, m = case.model.n, case.model.m
     return Task(
         model=case.model,

@@ -1,7 +1,8 @@
-"""The systems of the blind challenge: what is driven, how, and how noisy it is.
+"""The systems of the blind challenge: models, noise levels and random manoeuvres.
 
-A manoeuvre is a random sequence of inputs, its run in the crude model is the target, and a
-time-varying linear-quadratic regulator about it is the policy: closed-loop data, as real ones are.
+A manoeuvre is a random sequence of inputs. Its rollout in the crude model is the target, and a
+time-varying linear-quadratic regulator about it is the policy, so that the data are closed-loop, as
+on real robots.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ from grounded.model import Model
 class SystemUnderTest:
     """A system: its model, limits, noise at level 1, random manoeuvres.
 
-    `manoeuvre(rng, times, model)` gives inputs (T, m) and the start state (n,). `driven` is the
-    state that withheld effects act on, `grows` says what process noise scales with (`Disturbance`),
-    `built` writes the XML of its double in MuJoCo.
+    `manoeuvre(rng, times, model)` returns inputs (T, m) and the start state (n,). `driven` is the
+    state that withheld effects act on, `grows` is what process noise scales with (`Disturbance`),
+    `built` writes the XML of its MuJoCo model.
     """
 
     name: str
@@ -41,14 +42,14 @@ class SystemUnderTest:
     latency: tuple[float, ...] = ()
     driven: str = "v"
     duration: tuple[float, float] = (5.0, 10.0)  # [s]
-    settled: bool = False  # the first inputs were held before the start
+    settled: bool = False  # whether the first inputs were held before the start
     grows: tuple[str, float] | None = None
-    bend: float = 0.05  # of the limits: how trials of one task differ
+    bend: float = 0.05  # difference between trials of one task, as a fraction of the limits
     built: Callable[..., str] | None = None
 
 
 def wave(rng: np.random.Generator, t: Any, count: int, low: float, high: float) -> Array:
-    """A sum of sines of random frequency [Hz] and phase, peak about 1."""
+    """Return a sum of sines of random frequency [Hz] and phase, with a peak of about 1."""
     total = np.zeros_like(t)
     for _ in range(count):
         f = rng.uniform(low, high)
@@ -57,7 +58,7 @@ def wave(rng: np.random.Generator, t: Any, count: int, low: float, high: float) 
 
 
 def steps(rng: np.random.Generator, t: Array, low: float, high: float, every: float) -> Array:
-    """Levels held for a random time around `every` seconds."""
+    """Return random levels, each held for a random time around `every` seconds."""
     out, at = np.empty_like(t), 0.0
     while at < t[-1] + 1:
         out[t >= at - 1e-9] = rng.uniform(low, high)
@@ -105,7 +106,7 @@ def _fly(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array
 
 
 def car() -> SystemUnderTest:
-    """The RC car of section 5.2 (20 to 50 Hz, overhead camera)."""
+    """Return the RC car of section 5.2 (20 to 50 Hz, overhead camera)."""
     from grounded.models.car import model
 
     process = {"delta": 0.01, "v": 0.03, "x": 0.004, "y": 0.004, "psi": 0.01, "psi_rate": 0.1}
@@ -126,7 +127,7 @@ def car() -> SystemUnderTest:
 
 
 def pendulum() -> SystemUnderTest:
-    """A torque-driven pendulum with an encoder."""
+    """Return a torque-driven pendulum with an encoder."""
     from grounded.models.pendulum import model
 
     return SystemUnderTest(
@@ -145,7 +146,7 @@ def pendulum() -> SystemUnderTest:
 
 
 def aircraft() -> SystemUnderTest:
-    """The small aircraft of section 5.1 (50 Hz)."""
+    """Return the small aircraft of section 5.1 (50 Hz)."""
     from grounded.models.aircraft import model
 
     process = {"u": 0.05, "v": 0.05, "w": 0.05, "p": 0.05, "q": 0.05, "r": 0.03}
@@ -178,7 +179,7 @@ def _crawl(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Arr
 
 
 def buggy() -> SystemUnderTest:
-    """A car with a kink between driving and braking, in noise that grows with its speed."""
+    """Return a car with a kink between driving and braking and noise that grows with speed."""
     from grounded.models.buggy import model
 
     return SystemUnderTest(
@@ -205,7 +206,7 @@ def _hoist(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Arr
 
 
 def lift() -> SystemUnderTest:
-    """An axis with kinks in its drive and its friction, in noise that grows with its speed."""
+    """Return an axis with kinks in drive and friction and noise that grows with speed."""
     from grounded.models.lift import model
 
     return SystemUnderTest(
@@ -226,7 +227,7 @@ def lift() -> SystemUnderTest:
 
 
 def _reach(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array]:
-    """Torques that lead the crude model along waves about hanging, by its inverse dynamics."""
+    """Return torques that move the crude model along waves about hanging, by inverse dynamics."""
     dt = float(t[1] - t[0])
     reach = rng.uniform(0.3, 1.1, 2)
     path = np.column_stack([r * wave(rng, t, 2, 0.15, 0.7) for r in reach])
@@ -244,7 +245,7 @@ def _reach(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Arr
 
 
 def _accelerations(model: Model, x: Array) -> tuple[Array, Array]:
-    """Of the joints: without torques (2,), and by each torque (2, 2)."""
+    """Return the joints' accelerations without torques (2,), and per unit of each torque (2, 2)."""
     assert model.derivative is not None
     p = Named("parameter", model.param_names, list(model.values))
     s, found = Named("state", model.state_names, list(x)), []
@@ -255,7 +256,7 @@ def _accelerations(model: Model, x: Array) -> tuple[Array, Array]:
 
 
 def arm() -> SystemUnderTest:
-    """A two-link arm with encoders; the real one is MuJoCo's."""
+    """Return a two-link arm with encoders, whose real system is simulated by MuJoCo."""
     from grounded.models.arm import model
 
     return SystemUnderTest(
@@ -287,7 +288,7 @@ def _shove(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Arr
 
 
 def cart_pole() -> SystemUnderTest:
-    """A cart whose pole hangs and swings; the real one is MuJoCo's."""
+    """Return a cart with a hanging pole, whose real system is simulated by MuJoCo."""
     from grounded.models.cart_pole import model
 
     return SystemUnderTest(
@@ -312,7 +313,7 @@ def cart_pole() -> SystemUnderTest:
 def regulator(
     system: SystemUnderTest, model: Model, u: Array, start: Array, dt: float
 ) -> tuple[Array, Array]:
-    """The target (T + 1, n) in the crude model and the gains (T, m, n) of a regulator about it."""
+    """Return the target (T + 1, n) in the crude model and the gains (T, m, n) of a regulator."""
     T, n = len(u), model.n
     x = np.empty((T + 1, n))
     x[0] = start
@@ -336,7 +337,7 @@ def regulator(
 SYSTEMS: dict[str, Callable[[], SystemUnderTest]] = {
     made.__name__: made for made in (car, pendulum, aircraft, buggy, lift, arm, cart_pole)
 }
-GROUPS: dict[str, dict[str, float]] = {  # systems, and how often each is drawn
+GROUPS: dict[str, dict[str, float]] = {  # systems, and the probability of each
     "own": {"car": 0.6, "pendulum": 0.2, "aircraft": 0.2},
     "kinked": {"buggy": 0.6, "lift": 0.4},
     "mujoco": {"arm": 0.6, "cart_pole": 0.4},

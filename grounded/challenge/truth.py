@@ -1,9 +1,9 @@
-"""A simulated real system for the blind challenge, written apart from the diagnosis.
+"""The simulated real system of the blind challenge, implemented independently of the diagnosis.
 
 The diagnosis predicts with one step of the crude model, Strang splitting and a linear filter. The
-truth is integrated at several times the control rate with the added rates inside the derivative,
-actuators advanced at that fine rate, noise of its own kinds, and a controller that sees the noisy
-log. What they share is the equation of an effect, no numerics.
+truth is integrated at several times the control rate, with added rates inside the derivative,
+actuators advanced at that fine rate, other kinds of noise, and a controller that sees the noisy
+log. They share the equation of an effect, but no numerics.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.trial import Trial
 
-FINE = 6  # integration steps a control step
-TINY = 1e-6  # [s] over which a moving medium's own rate is taken
-NUDGE = 1e-2  # of an input's unit: the difference by which its own part of a rate is known
+FINE = 6  # integration steps per control step
+TINY = 1e-6  # step for the rate in a moving medium [s]
+NUDGE = 1e-2  # finite-difference step for the slope of a rate, in an input's unit
 
-# What is outside the library acts on received inputs: f(u (m,), state of its own, t, dt) -> u
+# A withheld actuator acts on received inputs: f(u (m,), its own state, t, dt) -> u
 Actuator = Callable[[Array, dict[str, Any], float, float], Array]
 
 
@@ -61,7 +61,7 @@ class Disturbance:
 class Truth:
     """The real system: a model with true parameters, effects, disturbances, withheld parts.
 
-    A mechanism takes the place of the model's derivative, and of the effects that it has itself.
+    A mechanism replaces the model's derivative, and the effects that are built into it.
     """
 
     model: Model
@@ -81,7 +81,7 @@ class Truth:
         steps: int,
         dt: float,
     ) -> Trial:
-        """One real trial: controller(t, logged state) -> command."""
+        """Simulate one real trial; controller(t, logged state) -> command."""
         return _Run(self, rng, start, held, dt).trial(controller, steps)
 
 
@@ -126,7 +126,7 @@ class _Run:
         return Trial(states, np.array(inputs), self.dt, *names, start_inputs=self.held)
 
     def settle(self) -> None:
-        """What was held before went through the effects on inputs, too, and their memories."""
+        """Initialise memories of effects on inputs as settled at the held inputs."""
         u, names = self.held.copy(), self.truth.model.input_names
         for index, (effect, values) in enumerate(self.truth.effects):
             for target in effect.site.targets:
@@ -140,7 +140,7 @@ class _Run:
         self.queues = [[u[j]] * (int(whole) + 1) for j, (whole, _) in enumerate(self.late)]
 
     def received(self, u: Array, t: float) -> Array:
-        """What the actuators deliver over a fine step."""
+        """Return what the actuators deliver over a fine step."""
         model, out = self.truth.model, u.copy()
         for index, (effect, values) in enumerate(self.truth.effects):
             family = effect.family
@@ -156,7 +156,7 @@ class _Run:
                     out[j], self.memory[key] = family.advance(out[j], z, values, self.fine)
         for actuator in self.truth.actuators:
             out = actuator(out, self.own_state, t, self.fine)
-        for j, queue in enumerate(self.queues):  # the mean of what arrives within a fine step
+        for j, queue in enumerate(self.queues):  # mean of the delayed input over a fine step
             part = self.late[j][1]
             queue.append(out[j])
             out[j] = (1 - part) * queue[1] + part * queue[0]
@@ -164,7 +164,7 @@ class _Run:
         return out
 
     def rates(self, x: Array, u: Array, t: float) -> Array:
-        """ds/dt of the real system over ground: of one in a medium, as that moves and it turns."""
+        """Return ds/dt of the real system over ground, in a moving medium if there is one."""
         s = Named("state", self.names, list(x))
         for effect, values in self.truth.effects:
             if isinstance(effect.family, MediumFamily):
@@ -178,7 +178,7 @@ class _Run:
         return self.through_the_medium(x, u, t)
 
     def through_the_medium(self, x: Array, u: Array, t: float) -> Array:
-        """ds/dt with all other effects inside."""
+        """Return ds/dt of states through the medium, with all other effects."""
         model = self.truth.model
         s, a = Named("state", self.names, list(x)), Named("input", model.input_names, list(u))
         assert model.derivative is not None
@@ -203,7 +203,7 @@ class _Run:
         return np.array([total[n] for n in self.names])
 
     def advance(self, u: Array, t: float) -> None:
-        """One fine step, by the midpoint rule or the foreign simulator."""
+        """Take one fine step, by the midpoint rule or by MuJoCo."""
         received = self.last = self.received(u, t)
         if self.plant is not None:
             self.x = self.plant.advance(self.x, received)
@@ -212,14 +212,14 @@ class _Run:
         self.x = self.x + self.fine * self.rates(half, received, t + 0.5 * self.fine)
 
     def tie(self, t: float) -> None:
-        """A heading rate that the model only carries along is, in truth, the heading's rate."""
+        """Set heading rates that the model only carries along to the heading's true rate."""
         if self.tied:
             rates = self.rates(self.x, self.last, t)
             for heading, rate in self.tied:
                 self.x[rate] = rates[heading]
 
     def disturb(self) -> None:
-        """Process noise over a control step."""
+        """Add process noise over a control step."""
         noise, dt = self.truth.disturbance, self.dt
         scale = np.array([noise.process.get(n, 0.0) for n in self.names])
         if noise.grows is not None:
@@ -240,7 +240,7 @@ class _Run:
         return self.rng.standard_normal(count)
 
     def measure(self) -> Array:
-        """The log of this moment."""
+        """Return the logged state at this moment."""
         noise = self.truth.disturbance
         y = self.x.copy()
         for effect, values in self.truth.effects:
@@ -259,7 +259,7 @@ class _Run:
         return np.asarray(y + scale * v)
 
     def _old(self, i: int, delay: float) -> float:
-        """State i as it was `delay` seconds ago; before t = 0 it stood still."""
+        """Return state i of `delay` seconds ago; it was constant before t = 0."""
         back = delay / self.fine
         k, part = int(back), back - int(back)
         last = len(self.past) - 1
@@ -267,7 +267,7 @@ class _Run:
         return float((1 - part) * new + part * old)
 
     def _filtered(self, i: int, tau: float) -> float:
-        """State i through a first-order filter at the fine rate, settled at the start."""
+        """Return state i through a first-order filter at the fine rate, settled at the start."""
         part, found = 1 - np.exp(-self.fine / tau), self.past[0][i]
         for x in self.past[1:]:
             found = found + part * (x[i] - found)
@@ -275,5 +275,5 @@ class _Run:
 
 
 def _with(inputs: Named, name: str, value: Any) -> Named:
-    """Inputs with another value of one."""
+    """Return the inputs with another value of one."""
     return Named("input", tuple(inputs), [value if n == name else inputs[n] for n in inputs])

@@ -1,12 +1,12 @@
-"""The sim-to-real gap: where it lies, which effect makes it, how far it shrinks.
+"""Diagnosis of the sim-to-real gap: where it is, which effects cause it, how far it can shrink.
 
-Read `diagnose` first; its docstring lists the stages. `report` is what comes out.
+Read `diagnose` first; its docstring lists the stages. `report` holds the result.
 
-    likelihood/    how likely trials are under a hypothesis and its noise
-    hypotheses/    which effect: made, fitted, weighed against each other
-    validation/    what held-out predictions say of it, in units; what is claimed
-    excitation     the trial that would tell what these data can't, one of `patterns`
+    likelihood/    likelihood of the trials under a hypothesis and its noise
+    hypotheses/    search for the effects: hypotheses are made, fitted and compared
+    validation/    held-out prediction errors in units, and the decision what is claimed
+    excitation     the next trial, which would separate tied effects, from `patterns`
     verdict        the result in words
-    tables         in rows, for terminal, page and notebook
+    tables         the result in rows, for terminal, page and notebook
     pictures       the result in figures
 """

@@ -1,20 +1,22 @@
-"""START HERE: the sim-to-real gap, diagnosed. Trials and a crude model in, a verdict out.
+"""START HERE: diagnose the sim-to-real gap, from trials and a crude model to a verdict.
 
-sound_trials      the instruments, from their signals alone: corrected first  (instruments)
-limits            what can't be known from these data; which parameters they identify
-attribution       which effects, by evidence       (search, hypotheses, scan, refine, noise, fitted)
+The stages and their modules:
+
+sound_trials      check and correct the sensors, from their signals alone       (instruments)
+limits            what the data can't determine; which parameters they identify
+attribution       search for effects by evidence   (search, hypotheses, scan, refine, noise, fitted)
 ruler             held-out prediction errors in the channels' units
-decide            evidence proposes, the ruler decides; what each cause is worth
-measured          what the ruler says of the decision: table, noise floor, credit, what is left
-claims            what is claimed, what ties, what is nearly the same    (lookalike)
-correction        a curve that predicts what is left, where it passes a test of its own
-leftover          what no effect explains
-agreement         whether the trials agree; what changed between two groups of them
-prediction_error  where the gap lies: channels, times, regions
-split             what the error is made of: explained, unexplained, irreducible
-unconfirmed       what was seen once, and where
-verdict           all of it in sentences; `writer` puts all together, `report` is it as data
-excitation        what to run next, where two explanations tie
+decide            choose the claim by the ruler, among hypotheses proposed by evidence
+measured          table of errors, noise floor, credit of each cause, leftover
+claims            claimed effects with intervals, ties and look-alikes           (lookalike)
+leftover          structure that no effect explains
+correction        a curve that predicts the leftover, if it passes its own test
+agreement         agreement of the trials; changes between two groups of them
+prediction_error  where the gap is, by channel, time and region
+split             explained, unexplained and irreducible parts of the error
+unconfirmed       effects that only few trials show, and where
+verdict           the result in sentences; `writer` assembles the `report`
+excitation        the next trial, to separate two explanations that tie
 """
 
 from __future__ import annotations
@@ -57,18 +59,20 @@ from grounded.trial import Trial, scattered
 
 @dataclass(frozen=True)
 class DiagnosisOptions:
-    """How to diagnose.
+    """Options of a diagnosis.
 
     Args:
         library: the families that may be blamed.
-        max_effects: at most so many at once; None: 3, and more where those leave more than noise.
-        horizon: how far ahead predictions are judged [s].
-        hidden: states that no sensor has: the memory of effects that were adopted.
-        but: effects that are not blamed, by name: adopted ones, whose numbers are parameters now.
-        delays: those that were adopted [s], by the names of their effects, which the task's latency
-            holds: they may have to be longer or shorter.
-        origin: the task before anything was adopted: what matters is measured by what its model
-            misses, in the second diagnosis as in the first.
+        max_effects: largest number of effects at once; None: 3, or more while the errors are above
+            the noise.
+        horizon: how far ahead the gap is measured [s].
+        hidden: names of states without a sensor, such as the memory of adopted effects.
+        but: names of effects that are not blamed, such as adopted ones, whose values are now
+            parameters of the model.
+        delays: adopted delays [s], {effect: delay}. They are part of the task's latency, and may
+            turn out longer or shorter.
+        origin: the task before anything was adopted. Improvements are measured relative to the
+            errors of its model, so that later diagnoses use the same scale as the first.
     """
 
     library: Library = field(default_factory=Library)
@@ -90,19 +94,23 @@ def diagnose(
     engine: Engine | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
-    """Where the gap between model and trials lies, which effect makes it, how far it shrinks.
+    """Find where the gap between model and trials is, and which effects cause it.
 
     Args:
-        subject: the task (its latency counts as modelled) or the bare model.
-        trials: real runs on one time grid, whatever policy they ran.
+        subject: the task (its latency counts as modelled) or a model.
+        trials: real runs with one time step, under any policy.
         options: library, number of effects, horizon.
-        compare: a second group of trials; all are diagnosed, and what changed is `changed`.
-        engine: workers that fit hypotheses; the same comes out on any number.
-        progress: told of the stage, the share done and the time left, for a display.
+        compare: a second group of trials. Both groups are diagnosed together, and `changed` lists
+            the values that differ between them.
+        engine: workers that fit hypotheses; the result does not depend on their number.
+        progress: called with the stage, the fraction done and the time left, for a display.
+
+    Returns:
+        The diagnosis, with its verdict, ranking of effects and prediction errors.
 
     Raises:
-        Interrupted: on Ctrl-C, with the best hypothesis so far and what it predicts.
-        GroundedError: for trials that don't fit the model, or with nothing in them.
+        Interrupted: on Ctrl-C, with the best hypothesis so far and its prediction errors.
+        GroundedError: if the trials don't fit the model, or hold no data.
     """
     given: Any = trials
     loose = (
@@ -120,7 +128,7 @@ def diagnose(
     if model.n + model.m > MOST_NAMES:
         raise GroundedError(
             f"model '{model.name}' has {model.n} states and {model.m} inputs; a diagnosis takes at "
-            f"most {MOST_NAMES} of both together, each may be blamed for each: diagnose a model of "
+            f"most {MOST_NAMES} of both together, since each may affect each: diagnose a model of "
             "the part where the gap is"
         )
     latency = subject.latency if isinstance(subject, Task) else None
@@ -163,7 +171,7 @@ def diagnose(
         search, best = attribute(
             data, candidates, max_effects=options.max_effects, tick=tick, joints=joints
         )
-    many = len(best.hypothesis.effects)  # of all joints, beside which one more was looked for
+    many = len(best.hypothesis.effects)  # may exceed the usual number if it has all joints
     most = options.max_effects or (many + 1 if many > USUAL_EFFECTS else USUAL_EFFECTS)
     used = [trial for trial in trials if trial.known_steps >= 2]
     task = subject if isinstance(subject, Task) else None
@@ -193,7 +201,7 @@ def diagnose(
                 uncertain,
             )
             if written and not writer.worth_more_than(written):
-                written.most = most  # one more was looked for
+                written.most = most  # one more was sought
                 break
             written = writer
             if options.max_effects or not (most < MOST_EFFECTS and writer.unfinished):
@@ -214,11 +222,11 @@ def diagnose(
 
 
 def _again(effect: Effect, known: float, data: Data) -> Effect:
-    """An adopted delay as a change of it: no command arrives before it was sent."""
+    """Return an adopted delay as a change of it, bounded so that the total is not negative."""
     late = data.latency[[data.model.input_names.index(name) for name in effect.site.targets]]
     return delay_again(effect, known, float(late.min()))
 
 
-MOST_NAMES = 50  # of 36 and 12 come 1,649 effects, of 20 and 100 as many; each is filtered
-USUAL = 160  # stages of a diagnosis, and hypotheses that are refined together
-FIRST_LOOK = 6  # iterations of the fit by whose noise the parameters are found identifiable
+MOST_NAMES = 50  # 36 states and 12 inputs already give 1,649 effects, each of which is filtered
+USUAL = 160  # typical number of progress ticks: stages, and blocks of hypotheses refined
+FIRST_LOOK = 6  # iterations of the fit whose noise decides which parameters are identifiable

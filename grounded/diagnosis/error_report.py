@@ -1,4 +1,4 @@
-"""What a diagnosis says of errors: where the gap lies, what predictions miss, what is left."""
+"""Errors in a diagnosis: where the gap is, prediction errors by horizon, and the leftover."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 
 from grounded.result import Document, measured_alike, number, with_unit
 
-ABOVE = 1.3  # times the noise floor: what is left is stated
-SURE = 3.0  # standard deviations of the floor: it is compared in each channel, at each horizon
-BRIEF: dict[str, Any] = {"brief": True}  # a field whose key is left out where there is nothing
+ABOVE = 1.3  # times the noise floor, above which a leftover is stated
+SURE = 3.0  # the same in standard deviations of the floor, since many channels are compared
+BRIEF: dict[str, Any] = {"brief": True}  # marks a field whose key is omitted if it is empty
 
 
 @dataclass(frozen=True, eq=False)
 class ChannelShare(Document):
-    """A state's part of the gap, the rms of its prediction error and of its noise alone."""
+    """A state's share of the gap, the rms of its prediction error and of its noise alone."""
 
     name: str
-    share: float  # 0 to 1; NaN where the gap is no more than noise
+    share: float  # 0 to 1; NaN if the gap is no more than noise
     rms: float
     unit: str = ""
     noise: float = math.nan
@@ -27,7 +27,7 @@ class ChannelShare(Document):
 
 @dataclass(frozen=True, eq=False)
 class TimeShare(Document):
-    """A time's part of the gap, from `start` to `end` [s] of a trial."""
+    """Share of the gap from `start` to `end` [s] of a trial."""
 
     start: float = field(metadata={"key": "from"})
     end: float = field(metadata={"key": "to"})
@@ -36,7 +36,7 @@ class TimeShare(Document):
 
 @dataclass(frozen=True, eq=False)
 class Region(Document):
-    """A region's part of the gap (`v > 0.5`), and of the time."""
+    """A region (`v > 0.5`), with its share of the gap and of the time."""
 
     when: str
     share: float = math.nan
@@ -45,7 +45,7 @@ class Region(Document):
 
     @property
     def told(self) -> str:
-        """With its unit: `v > 0.5 m/s`."""
+        """The region with its unit: `v > 0.5 m/s`."""
         return with_unit(self.when, self.unit)
 
 
@@ -60,7 +60,7 @@ class Parts(Document):
 
 @dataclass(frozen=True, eq=False)
 class ChannelParts(Document):
-    """The same of one state, and the rms error of the bare model."""
+    """The three parts for one state, and the rms error of the crude model."""
 
     name: str
     unit: str = ""
@@ -72,11 +72,11 @@ class ChannelParts(Document):
 
 @dataclass(frozen=True, eq=False)
 class Split(Document):
-    """What the error a while ahead is made of: of all states in units of their noise, and of each.
+    """The parts of the prediction error at one horizon: all states relative to noise, and each.
 
-    The irreducible part comes from "repeats" of a candidate, trials "alike", or the "noise"; of
-    a noise of which only a bound is known it is "at most" so large. NaN: the noise is not known.
-    `irreducible_unsure`: standard deviation of the logarithm of a noise from few repeats.
+    The irreducible part comes from "repeats" of a candidate, trials "alike", or the "noise"; "at
+    most" means that only an upper bound of the noise is known. NaN: the noise is not known.
+    `irreducible_unsure`: standard deviation of the logarithm of the noise, from few repeats.
     """
 
     horizon_s: float
@@ -86,20 +86,20 @@ class Split(Document):
     irreducible_unsure: float = field(metadata=BRIEF, default=0.0)
 
     def may_be_noise(self, parts: Parts | ChannelParts) -> bool:
-        """Whether what is unexplained is no more than the doubt in what noise leaves."""
+        """Check whether the unexplained part is within the uncertainty of the noise."""
         left, bound = parts.unexplained + parts.irreducible, self.irreducible_from == "at most"
         return not bound and left <= doubt_of(self.irreducible_unsure) ** 2 * parts.irreducible
 
 
 @dataclass(frozen=True, eq=False)
 class Where(Document):
-    """Where the gap lies, and what is left of it: the largest shares first.
+    """Where the gap is, largest shares first.
 
-    Where nothing is named or left, no channel has a share and no time or region is given.
+    Without a claim or a leftover, no channel has a share and no time or region is given.
 
     split: by horizon (one_step, horizon, whole_run).
-    whiteness: by state, the chance that white noise leaves what is left of it (a p-value).
-    tempering: what a nat of evidence is worth, by the correlation and the size of what is left.
+    whiteness: by state, the p-value of white innovations.
+    tempering: factor on evidence, below 1 if the innovations are correlated or too large.
     """
 
     channels: tuple[ChannelShare, ...] = ()
@@ -127,9 +127,9 @@ class RunChange(Change):
 
 @dataclass(frozen=True, eq=False)
 class Gap(Document):
-    """The prediction error in units of the noise that one diagnosis estimates, before and after.
+    """The prediction error relative to the noise that one diagnosis estimates, before and after.
 
-    Figures of two diagnoses don't compare; verdicts rest on `prediction_error`, not on these.
+    It can't be compared between diagnoses; verdicts are based on `prediction_error` instead.
     """
 
     horizon_s: float = math.nan
@@ -142,7 +142,7 @@ class Gap(Document):
 
     @property
     def measured(self) -> bool:
-        """Whether the document has a gap at all."""
+        """Whether the document contains a gap."""
         return self != Gap()
 
 
@@ -154,27 +154,27 @@ class UtilityPrediction(Document):
     unit: str = field(metadata=BRIEF, default="")
     before: float = math.nan  # NaN: the predicted run diverged
     after: float = math.nan
-    spread: float = field(metadata=BRIEF, default=math.nan)  # standard deviation of the real ones
+    spread: float = field(metadata=BRIEF, default=math.nan)  # std of the real utilities
     mean: float = field(metadata=BRIEF, default=math.nan)
-    feedback: bool = False  # trials had one, the predictions lack it
+    feedback: bool = False  # the trials had feedback, which the predictions lack
 
 
 @dataclass(frozen=True, eq=False)
 class RulerRow(Document):
     """Rms errors of held-out open-loop predictions over one horizon, by channel in its unit.
 
-    held_out: by "trials", by "pieces" of one long log, or "no" where there is too little.
-    outset: of the model before anything was adopted; empty where nothing was.
-    calibrated: with the model's own parameters fitted; empty where none may move.
+    held_out: by "trials", by "pieces" of one long log, or "no" if there are too few data.
+    outset: errors of the model before anything was adopted; empty if nothing was.
+    calibrated: errors with the model's own parameters fitted; empty if all are constants.
     floor_from: "repeats" of a candidate, trials whose commands are "alike", or the "short horizon",
-        whose noise is carried on.
-    floor_at_most: the noise is no more than `noise_floor` and may be far less: nothing was
-        repeated, and what one step leaves isn't white, so part of it is the model's error.
-    runs_away: by column ("crude" ...), the channels whose prediction leaves all that was measured
-        far behind, as open-loop ones of an unstable plant do: how far says nothing.
-    floor_unsure: standard deviation of the logarithm of the scatter of few or short repeats.
-    drowned: noise alone takes a state beyond all that was measured of it by then: of no channel is
-        anything to be told so far ahead, open loop.
+        whose noise is propagated by the model.
+    floor_at_most: `noise_floor` is an upper bound and the noise may be far less. No trial was
+        repeated and the innovations are not white, so part of them is the model's error.
+    runs_away: by column ("crude" ...), the channels whose prediction diverges far beyond the
+        measured range, as in open loop for an unstable plant. Its error is meaningless.
+    floor_unsure: standard deviation of the logarithm of a floor from few or short repeats.
+    drowned: noise alone takes some state beyond its measured range within this horizon, so
+        open-loop errors are meaningless in all channels.
     """
 
     horizon_s: float
@@ -193,20 +193,20 @@ class RulerRow(Document):
     drowned: bool = field(metadata=BRIEF, default=False)
 
     def tells(self, name: str, *columns: str) -> bool:
-        """Whether the errors of a channel in these columns mean something: none runs away."""
+        """Check that the errors of a channel are meaningful: none of these columns runs away."""
         return not any(name in self.runs_away.get(column, ()) for column in columns)
 
 
 def gain(rows: Sequence[RulerRow], before: str, after: str) -> float:
-    """What the errors of one column are less than another's, over channels and horizons.
+    """Return the log gain of one column of errors over another, over channels and horizons.
 
     Args:
-        rows: of the ruler.
+        rows: rows of the table of prediction errors.
         before: "outset", "crude", "calibrated" or "with_effects".
         after: likewise.
 
     Returns:
-        The sum of the logarithms; 0 where nothing can be told.
+        The sum of the log ratios; 0 without meaningful errors.
     """
     ratios = [
         math.log(was / now)
@@ -219,13 +219,13 @@ def gain(rows: Sequence[RulerRow], before: str, after: str) -> float:
 
 
 def furthest(rows: Sequence[RulerRow]) -> RulerRow | None:
-    """The longest horizon at which noise leaves something to be told, or else the shortest."""
+    """Return the longest horizon that is not drowned in noise, or else the shortest."""
     ahead = [row for row in rows if not row.whole_trial]
     return next((row for row in reversed(ahead) if not row.drowned), ahead[0] if ahead else None)
 
 
 def runaway(rows: Sequence[RulerRow]) -> str:
-    """Of whole trials, whose predictions run away whatever is claimed; "" where none does."""
+    """Return a sentence on predictions of whole trials that run away despite the claim, or ""."""
     whole = next((row for row in rows if row.whole_trial), None)
     names = () if whole is None else whole.runs_away.get("with_effects", ())
     if not names:
@@ -235,10 +235,10 @@ def runaway(rows: Sequence[RulerRow]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Credit(Document):
-    """What an effect, or the "calibration", is worth: what predictions lose without it.
+    """Credit of an effect, or of "calibration": the loss of prediction accuracy without it.
 
-    share: of what predictions gain in all, by the logarithm of their errors, over channels and
-    horizons; without_it: rms by channel, 1 s ahead, all the rest fitted again.
+    share: of the total gain in log error, over channels and horizons; without_it: rms error by
+    channel, 1 s ahead, with all the rest fitted again.
     """
 
     of: str
@@ -250,16 +250,16 @@ class Credit(Document):
 class Remainder(Document):
     """A leftover that no known effect explains.
 
-    size: rms of the rate that a state lacks, where a flexible model finds one [unit of the state
-    per second]; error: rms of predictions `horizon_s` ahead, which noise alone leaves at `floor`,
-    or at less (`floor_at_most`).
+    size: rms of the rate that the model of a state lacks, if a flexible regression finds one [unit
+    of the state per second]; error: rms error of predictions `horizon_s` ahead; floor: the same
+    from noise alone, or an upper bound of it (`floor_at_most`).
     """
 
     channel: str
     size: float = math.nan
     unit: str = ""
     evidence: float = math.nan  # [nats]
-    region: Region | None = None  # that holds most of it
+    region: Region | None = None  # the region with most of it
     error: float = math.nan
     floor: float = math.nan
     horizon_s: float = math.nan
@@ -268,11 +268,11 @@ class Remainder(Document):
 
     @property
     def above(self) -> bool:
-        """Whether it is more than noise may be: a mere bound tells nothing below it."""
+        """Whether the error is clearly above the floor."""
         return not (self.floor > 0 and self.error <= ABOVE * self.floor)
 
     def sentence(self) -> str:
-        """One clause."""
+        """Return it as one clause."""
         where = "" if self.region is None else f", mostly where {self.region.told}"
         if not math.isfinite(self.error):
             return f"{self.channel} is off by {number(self.size)} {self.unit} rms{where}"
@@ -289,22 +289,22 @@ class Remainder(Document):
 
 
 def doubt_of(unsure: float) -> float:
-    """The factor within which noise is known: by how much an error exceeds it without a cause.
+    """Return the factor by which errors may exceed the noise floor and still be noise.
 
     Args:
-        unsure: standard deviation of its logarithm, `RulerRow.floor_unsure`.
+        unsure: standard deviation of the floor's logarithm, `RulerRow.floor_unsure`.
     """
     return max(ABOVE, math.exp(SURE * unsure))
 
 
 def beside_noise(errors: Sequence[float], floor: float, unit: str, *, at_most: bool) -> list[str]:
-    """Errors as text in one unit, then `" (noise: 0.1 rad)"`; a mere bound is told as one.
+    """Return errors as text in one unit, then the noise as `" (noise: 0.1 rad)"`.
 
     Args:
-        errors: the first is the one that noise is told beside.
-        floor: what noise alone leaves; none is told of what is not known.
-        unit: of all of them.
-        at_most: `floor` is a bound.
+        errors: the first one is compared with the noise.
+        floor: the error from noise alone; if it is not known, the last text is empty.
+        unit: unit of all of them.
+        at_most: `floor` is an upper bound.
     """
     if not 0 < floor < math.inf:
         return [*measured_alike(errors, unit), ""]

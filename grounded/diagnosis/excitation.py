@@ -1,27 +1,30 @@
-"""What to run next: the probe that tells two explanations apart best.
+"""Design of the next trial: the probe that best separates two tied explanations.
 
 Two hypotheses A and B tie on the trials so far. Each of a set of probes (the base policy with a
-staircase, steps, doublets, a sweep of frequencies or a slow ramp added to one input) is run in the
-model with A; then B, its values and all calibrated parameters free to adapt, tries to explain that
-run through the same filter and noise. What it fails to explain is the evidence of the probe:
+staircase, doublets, a pulse, a frequency sweep or a slow ramp added to one input) is simulated in
+the model with A. Then B is fitted to that run with the same noise, its values and all calibrated
+parameters free. What it can't explain is the expected evidence of the probe:
 
     E[log p(y | A) - log p(y | B)] = 1/2 |whitened innovations of B on A's run|^2
 
-The trials so far measure how far that can be believed: their own commands would have told the two
-apart by some nats, and have by few; whatever a probe is expected to tell is scaled alike.
+This number is calibrated on the trials so far. The same computation with their commands predicts
+some nats of difference between A and B, and the actual difference is known. The ratio scales the
+expected evidence of every probe.
 
-Where nothing ties, the probe teaches most about the values that are claimed or calibrated: from
-the information F of the trials so far and J of its run, filtered alike, the expected gain is
+Without a tie, the probe is chosen for the information on the claimed and calibrated values
+(D-optimal). With the Fisher information F of the trials so far and J of the probe's run, the
+expected gain is
 
     1/2 log det(F + J) / det F
 
-What it promises is what the diagnosis after it will state: that asks the trials, each left out, and
-does not believe a number that one trial alone tells (`intervals.foretold`). So where one run would
-hardly be believed, the promise is that of two. Where predictions miss by more than the noise, so
-will those of a new motion, and it tells less by that. Nothing measures in the probe's run what
-nothing has measured in the trials.
+The predicted `+-` is the one that the next diagnosis will state. That includes a jackknife over
+trials, which does not trust a value determined by one trial alone (`intervals.foretold`). So if a
+second run would reduce it much further, the prediction is for two runs. If predictions miss by more
+than the noise, those of a new motion will, too, and J is reduced accordingly. States that no trial
+measured are not measured in the probe's run, either.
 
-The probe stays inside the inputs' limits, and both hypotheses' runs inside the task's safety.
+The probe stays inside the limits of the inputs, and the runs of both hypotheses inside the task's
+safety limits.
 """
 
 from __future__ import annotations
@@ -51,22 +54,22 @@ from grounded.policy import Policy
 from grounded.task import Task
 from grounded.trial import Trial
 
-NOTHING = 0.1  # nats: less is nothing that a trial could tell
-REPLAYED = 4  # trials whose commands show what they should have told
-ADAPTED = 12  # iterations in which a rival adapts to a run
-TWICE = 0.8  # of what one run leaves of a value's error: if two leave less, two are asked for
-SETTLED = 4  # iterations
-TEACHES = 0.1  # of a value's standard deviation: a probe that takes off less teaches too little
-LITTLE = 1e-6  # of a value's own information, and of its size
+NOTHING = 0.1  # nats below which no trial can separate two effects
+REPLAYED = 4  # most recent trials whose commands are used to calibrate the expected evidence
+ADAPTED = 12  # iterations in which a rival is fitted to a run
+TWICE = 0.8  # two runs are asked for if they leave less than this part of what one leaves of `+-`
+SETTLED = 4  # iterations in which the track of an unmeasured state is found
+TEACHES = 0.1  # smallest relative reduction of a value's `+-` for which a probe is advised
+LITTLE = 1e-6  # fraction of a value's information, and of its size, that counts as zero
 
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """A runnable policy, the evidence it is expected to bring [nats], and what it does.
+    """A policy to run, the evidence expected of it [nats], and a sentence that describes it.
 
-    `about`: the two effects that it tells apart, or the value that it teaches most of.
-    `little`: that is too little to be worth a trial. `std`: of that value, in its unit, as a
-    diagnosis will state it after `runs` runs.
+    `about`: the two effects that it separates, or the value whose `+-` it reduces most.
+    `little`: whether that is too little to be worth a trial. `std`: the standard deviation of that
+    value, in its unit, as a diagnosis will state it after `runs` runs.
     """
 
     policy: Policy
@@ -80,7 +83,7 @@ class Probe:
 
 @dataclass(frozen=True, eq=False)
 class _Noise:
-    """The noise of a diagnosis; nothing disturbs or measures `hidden` states, adopted memories."""
+    """The noise of a diagnosis; `hidden` states (adopted memories) have neither kind of noise."""
 
     model: NoiseModel
     hidden: tuple[str, ...]
@@ -106,16 +109,17 @@ def probe(
     trials: Sequence[Trial],
     library: Library | None = None,
 ) -> Probe | None:
-    """The best probe for the first group that the data can't tell apart, or else for all values.
-
-    None where neither ties nor values are, or none is safe.
+    """Find the best probe for the first indistinguishable group, or else for all values.
 
     Args:
         task: limits, start, safety, latency.
-        policy: what the probe is added to, usually the best policy so far.
-        diagnosis: names the group and the hypotheses' values.
-        trials: the trials it was made from (for the sizes of signals).
-        library: where the effects come from.
+        policy: the policy that the probe is added to, usually the best so far.
+        diagnosis: names the group and the values of the hypotheses.
+        trials: the trials it was made from.
+        library: source of the effects.
+
+    Returns:
+        The probe; None if there are neither ties nor values, or no probe is safe.
     """
     open_ = [g for g in diagnosis.indistinguishable if g not in diagnosis.equivalent]
     ties = [g for g in open_ if all(diagnosis.values(n) for n in g[:2])]
@@ -148,15 +152,15 @@ def probe(
         return None
     expected, chosen, words = best
     if expected < NOTHING:
-        same = f"no probe tells {group[0]} from {group[1]}: with other values of the rest"
-        text = f"{same} they do the same"
+        same = f"no probe can distinguish {group[0]} from {group[1]}: with the other values"
+        text = f"{same} refitted they are equivalent"
         return Probe(chosen, expected, (group[0], group[1]), text, little=True)
     gain = f"{expected:,.{int(expected < 100)}f} nats"
-    tells = f"{words}: expected to tell {group[0]} from {group[1]} by {gain}"
+    tells = f"{words}: expected to distinguish {group[0]} from {group[1]} by {gain}"
     if little := expected < TIE:
         tells = (
-            f"no candidate inside the limits tells enough, not even {tells}, of {TIE:g} that are "
-            "needed: record larger inputs or another manoeuvre"
+            f"no candidate inside the limits is informative enough, not even {tells} "
+            f"({TIE:g} needed); record larger inputs or another manoeuvre"
         )
     return Probe(chosen, expected, (group[0], group[1]), tells, little)
 
@@ -164,7 +168,7 @@ def probe(
 def _teaching(
     task: Task, policy: Policy, diagnosis: Diagnosis, trials: Sequence[Trial], library: Library
 ) -> Probe | None:
-    """The probe from which most is learnt about claimed and calibrated values."""
+    """Find the probe that gives most information on claimed and calibrated values."""
     known, task = _calibrated(task, diagnosis)
     scales, h = _scales(task, trials), Hypothesis()
     spreads: dict[str, tuple[float, str]] = {}  # by column: standard deviation, unit
@@ -188,7 +192,7 @@ def _teaching(
     if groups.shape[1:] != (len(std), len(std)) or not np.isfinite(groups).all():
         return None
     F = groups.sum(axis=0)
-    own = np.maximum(np.diag(F), 1 / np.maximum(std, LITTLE) ** 2)  # or what is known beforehand
+    own = np.maximum(np.diag(F), 1 / np.maximum(std, LITTLE) ** 2)  # or that of the priors
     unit_of = 1 / np.sqrt(own)
     groups, prior = groups * np.outer(unit_of, unit_of), np.diag(1 - np.diag(F) / own + LITTLE)
     F = groups.sum(axis=0) + prior
@@ -209,7 +213,7 @@ def _teaching(
         return None
     gain, chosen, words, J = best
     before = foretold(groups, prior)
-    wider = np.median((std / (before * unit_of))[std > 0])  # than where the model is right
+    wider = np.median((std / (before * unit_of))[std > 0])  # than if the model were right
     J = J / max(_misfit(diagnosis) / wider, 1.0) ** 2
     once, twice = (foretold(np.concatenate([groups, *[J] * n]), prior) / before for n in (1, 2))
     k = int(np.argmin(np.where(std > 0, twice, np.inf)))
@@ -220,10 +224,10 @@ def _teaching(
     now = float(std[k]) * sizes.get(name, 1.0)
     then = now * float(shrunk)
     little = False
-    tells = f"would tell {name} to +- {then:.2g}{unit} (now +- {now:.2g}{unit})"
+    tells = f"would determine {name} to +- {then:.2g}{unit} (now +- {now:.2g}{unit})"
     sentence = f"{words}{', run twice,' if again else ':'} {tells}"
     if diagnosis.motions == 1 < len(trials) and words != BASE:
-        sentence = f"{words}: would show if {name}, told by one motion so far, holds in another"
+        sentence = f"{words}: would show whether {name}, so far from one motion, holds in another"
     elif shrunk > 1 - TEACHES:
         sentence = f"no candidate inside the limits teaches much, not even {sentence}"
         little = True
@@ -231,7 +235,7 @@ def _teaching(
 
 
 def _misfit(diagnosis: Diagnosis) -> float:
-    """How many times more than noise predictions miss: what another motion tells is as far off."""
+    """Return the largest ratio of prediction errors to the noise, at least 1."""
     left = [one.error / one.floor for one in diagnosis.leftover if one.floor > 0]
     return float(max(1.0, diagnosis.where.tempering**-0.5, *left))
 
@@ -239,9 +243,9 @@ def _misfit(diagnosis: Diagnosis) -> float:
 def _information(
     task: Task, runs: Sequence[Trial], h: Hypothesis, noise: _Noise, unseen: Array | None = None
 ) -> Array:
-    """Fisher information on a hypothesis' values that each of the runs holds, or would (S, C, C).
+    """Return the Fisher information of each run on a hypothesis' values, (S, C, C).
 
-    `unseen`: states (n,) that nothing will measure in predicted runs.
+    `unseen`: mask (n,) of states that will not be measured in predicted runs.
     """
     data = noise.data(task, runs)
     track, iterations = data.y.copy(), 1
@@ -249,7 +253,7 @@ def _information(
         hidden = [replace(run, states=np.where(unseen, np.nan, run.states)) for run in runs]
         data = noise.data(task, hidden)
     elif not data.told.all():
-        iterations = SETTLED  # a state that nothing measured has no track yet
+        iterations = SETTLED  # an unmeasured state has no track yet
     start = [(h, noise.model, track)]
     fits = refine(Predictor(data), start, iterations=iterations, fixed_noise=True)
     by = np.zeros((len(runs), *(fits[0].gram.shape[1:] if fits else (0, 0))))
@@ -259,14 +263,14 @@ def _information(
 
 
 def _inputs_of(model: Model, names: Sequence[str]) -> list[int]:
-    """Inputs that the tied effects act on; all of them where they act on states."""
+    """Return the indices of the inputs that tied effects act on; all if they act on states."""
     targets = {t for name in names for t in name.partition(":")[2].split("+")}
     own = [j for j, n in enumerate(model.input_names) if n in targets]
     return own or list(range(model.m))
 
 
 def _calibrated(task: Task, diagnosis: Diagnosis) -> tuple[dict[str, Estimate], Task]:
-    """The parameters that were calibrated, and the task with their values."""
+    """Return the calibrated parameters, and the task with their values."""
     known = {n: e for n, e in diagnosis.parameters.items() if n in task.model.params}
     values = {n: e.value for n, e in known.items() if np.isfinite(e.value)}
     return known, task.with_model(task.model.with_values(values))
@@ -279,7 +283,7 @@ def _rivals(
     library: Library,
     pair: Sequence[str],
 ) -> tuple[Task, Hypothesis, Hypothesis]:
-    """The calibrated task, and two hypotheses in which whatever was calibrated may still move."""
+    """Return the calibrated task and two hypotheses, calibrated parameters free in both."""
     known, task = _calibrated(task, diagnosis)
     scales, h = _scales(task, trials), Hypothesis()
     names = [name for name in diagnosis.joining if not name.startswith("parameter:")]
@@ -288,7 +292,7 @@ def _rivals(
         h = replace(h, shift=np.zeros(task.model.system.k), spread=1.0)
     one = other = h
     for name in (n for n in names if n != pair[1]):
-        rival = pair[1] if name == pair[0] else name  # it acts where the other one does
+        rival = pair[1] if name == pair[0] else name  # in the other's place in the order
         first, second = (_effect(library, n, task, diagnosis, scales) for n in (name, rival))
         one = one.plus(first, diagnosis.values(name))
         other = other.plus(second, diagnosis.values(rival))
@@ -298,7 +302,7 @@ def _rivals(
 def _effect(
     library: Library, name: str, task: Task, diagnosis: Diagnosis, scales: Scales
 ) -> Effect:
-    """The effect as the diagnosis had it: a delay that was adopted is one that changes."""
+    """Return the effect as the diagnosis had it: for an adopted delay, its change."""
     effect, adopted = library.effect(name, task.model, scales), diagnosis.made or Made()
     if name not in adopted.effects or effect.family.name != "delay":
         return effect
@@ -308,7 +312,7 @@ def _effect(
 
 
 def _adapted(task: Task, runs: list[Trial], h: Hypothesis, noise: _Noise) -> Hypothesis:
-    """A hypothesis with the values that explain runs best: as the trials left it."""
+    """Return a hypothesis with the values fitted to some runs."""
     data = noise.data(task, runs)
     start = [(h, noise.model, data.y.copy())]
     fits = refine(Predictor(data), start, iterations=ADAPTED, fixed_noise=True)
@@ -323,9 +327,9 @@ def _scales(task: Task, trials: Sequence[Trial]) -> Scales:
 
 
 def _run(task: Task, h: Hypothesis, policy: Policy, like: Trial | None = None) -> Trial | None:
-    """A run of the policy in the model with a hypothesis, without noise; None if it diverges.
+    """Simulate the policy in the model with a hypothesis, without noise; None if it diverges.
 
-    With `like` the commands and the start of that trial take the policy's place.
+    If `like` is given, its start and its commands are used instead of the policy.
     """
     model = _wrapped(task, h)
     assert task.latency is not None
@@ -354,7 +358,7 @@ def _run(task: Task, h: Hypothesis, policy: Policy, like: Trial | None = None) -
 
 
 def _wrapped(task: Task, h: Hypothesis) -> Model:
-    """The model with a hypothesis' shifts and effects in it."""
+    """Return the model with a hypothesis' shifts and effects."""
     model = task.model
     if h.shift is not None:
         moved = model.values + h.shift
@@ -376,7 +380,7 @@ def _safe(task: Task, run: Trial | None) -> bool:
 
 
 def _evidence(task: Task, run: Trial, true: Hypothesis, rival: Hypothesis, noise: _Noise) -> float:
-    """What the rival, its values free, fails to explain of a run [nats]."""
+    """Return what the rival, its values fitted, can't explain of a run [nats]."""
     data = noise.data(task, [run])
     predictor = Predictor(data)
     rss = []

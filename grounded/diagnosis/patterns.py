@@ -1,4 +1,4 @@
-"""The probes that are tried: a policy with steps, ramps, doublets or a sweep added to an input."""
+"""The probes that are tried: a policy with ramps, steps, doublets or a sweep added to an input."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
 
-BASE = "the base policy once more"
+BASE = "the base policy again"
 SIZES = (0.15, 0.35)  # of the input's range
 
 
 def probes(policy: Policy, model: Model, inputs: Sequence[int]) -> Iterator[tuple[str, Policy]]:
-    """The base policy itself, then with each pattern added to each input."""
+    """Yield the base policy, then the policy with each pattern added to each input, described."""
     yield BASE, policy
     t = np.arange(policy.horizon, dtype=float) * policy.dt
     for j in inputs:
@@ -36,7 +36,7 @@ def probes(policy: Policy, model: Model, inputs: Sequence[int]) -> Iterator[tupl
 
 
 def patterns(t: Any) -> list[tuple[str, Array]]:
-    """Shapes of unit size over the times t (H,)."""
+    """Return the shapes, of unit size, over the times t (H,), with their names."""
     T = float(t[-1]) + 1e-9
     phase = t / T
     stairs = np.round(4 * np.sin(2 * np.pi * phase)) / 4
@@ -47,6 +47,6 @@ def patterns(t: Any) -> list[tuple[str, Array]]:
         ("a slow ramp up", phase),
         ("a staircase", stairs),
         ("doublets", doublets),
-        ("a sweep of frequencies", sweep),
-        ("a pulse to the lower side", -((phase > 0.4) & (phase < 0.7)).astype(float)),
+        ("a frequency sweep", sweep),
+        ("a negative pulse", -((phase > 0.4) & (phase < 0.7)).astype(float)),
     ]

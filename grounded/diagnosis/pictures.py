@@ -1,4 +1,4 @@
-"""What a diagnosis shows: predictions before and after it, the credit, where the gap lies."""
+"""Figures of a diagnosis: predictions before and after, the credit, where the gap is."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from grounded.diagnosis.report import Diagnosis
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
 from grounded.result import measured, measured_alike, number, percent, shown
 
-MOST = 12
-APART = 0.01  # of errors: curves that differ by less lie on each other
-SHOWS = 1.02  # times the error without a cause, from which on bars show its worth
-CREDIT_S = 1.0  # how far ahead an effect's worth is measured
+MOST = 12  # bars
+APART = 0.01  # relative difference of errors below which curves coincide
+SHOWS = 1.02  # ratio of errors without and with a cause from which bars show its worth
+CREDIT_S = 1.0  # horizon at which an effect's worth is measured [s]
 MODELS = {  # keys of a prediction error: role, name
     "outset": ("limit", "model.py"),
     "crude": ("model", "model"),
@@ -26,13 +26,13 @@ MODELS = {  # keys of a prediction error: role, name
 
 
 def models(error: RulerRow) -> dict[str, tuple[str, str]]:
-    """`MODELS`, with the noise called a bound where it is one."""
+    """Return `MODELS`, with the noise labelled as a bound if it is one."""
     bound = {"noise_floor": ("other", "noise, at most")}
     return MODELS | bound if error.floor_at_most else MODELS
 
 
 def _told_apart(errors: Sequence[RulerRow]) -> dict[str, tuple[str, str]]:
-    """`models`, those whose errors are the same everywhere as one: `model = as diagnosed`."""
+    """Return `models`, merging those with the same errors everywhere: `model = as diagnosed`."""
     found: dict[str, tuple[str, str]] = {}
     for key, (role, name) in models(errors[0]).items():
         alike = (other for other in found if all(_same(e, key, other) for e in errors))
@@ -44,14 +44,14 @@ def _told_apart(errors: Sequence[RulerRow]) -> dict[str, tuple[str, str]]:
 
 
 def _same(error: RulerRow, one: str, other: str) -> bool:
-    """Whether two columns can't be told apart in a picture."""
+    """Check whether two columns coincide in a figure."""
     a, b = getattr(error, one), getattr(error, other)
     known = [n for n in a if n in b and math.isfinite(a[n]) and math.isfinite(b[n])]
     return bool(known) and all(math.isclose(a[n], b[n], rel_tol=APART) for n in known)
 
 
 def gap_figures(diagnosis: Diagnosis) -> list[Figure]:
-    """The diagnosis in figures, what matters first; nothing where no cause is known."""
+    """Return the figures of a diagnosis, most important first; none if no cause can be named."""
     if diagnosis.no_cause:
         return []
     found = (accuracy_figure(diagnosis), credit_figure(diagnosis, 6), where_figure(diagnosis))
@@ -59,7 +59,7 @@ def gap_figures(diagnosis: Diagnosis) -> list[Figure]:
 
 
 def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
-    """How far predictions are off without the diagnosis and with it, in each state's unit."""
+    """Return the prediction errors without and with the diagnosis, in each state's unit."""
     errors = diagnosis.prediction_error
     if not errors:
         panels: list[Panel | Bars] = [_shrinkage(diagnosis)] if diagnosis.gap.measured else []
@@ -69,7 +69,7 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
         held = errors[0].held_out != "no"
     if not panels:
         return None
-    where = "on data that was held out" if held else "on the data that it was made from"
+    where = "on held-out data" if held else "on the data used for the diagnosis"
     least = "" if any(e.floor_at_most for e in errors) else " No model gets below the noise."
     caption = f"Rms error of predictions, {where}.{least}"
     key = tuple(sorted(legend(panels), key=lambda one: one.role == "other"))
@@ -77,7 +77,7 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
 
 
 def _over_horizons(errors: Sequence[RulerRow]) -> list[Panel | Bars]:
-    """A panel a state: its error by how far ahead is predicted."""
+    """Return one panel per state: its error over the horizon."""
     units = errors[0].unit_by_channel
     panels: list[Panel | Bars] = []
     ahead = np.array([error.horizon_s for error in errors])
@@ -88,7 +88,7 @@ def _over_horizons(errors: Sequence[RulerRow]) -> list[Panel | Bars]:
             if np.isfinite(values).any():
                 curves.append(Curve(ahead, np.array(values, float), role, name, 2.0))
         if curves:
-            curves.sort(key=lambda curve: curve.role != "other")  # noise lies behind
+            curves.sort(key=lambda curve: curve.role != "other")  # noise is drawn behind
             unit = shown(unit)
             label = f"{channel} [{unit}]" if unit else channel
             panels.append(Panel(label, "predicted ahead [s]", unit, tuple(curves), log=True))
@@ -109,24 +109,24 @@ def _by_channel(error: RulerRow) -> list[Panel | Bars]:
 
 
 def _in_unit(bars: Sequence[tuple[str, float, str]], unit: str) -> tuple[Bar, ...]:
-    """Bars of (name, error, role) whose texts have one unit."""
+    """Return bars of (name, error, role) whose texts share one unit."""
     texts = measured_alike([value for _, value, _ in bars], unit)
     return tuple(Bar(n, v, text, role) for (n, v, role), text in zip(bars, texts, strict=True))
 
 
 def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
-    """How much of the improvement each effect, and calibration, deserves.
+    """Return the share of the improvement due to each effect and to calibration.
 
     Args:
-        diagnosis: what was found.
-        channels: so many states show by how much predictions are off without each, in their unit;
-            first those that predictions improved most.
+        diagnosis: the diagnosis.
+        channels: number of states for which errors without each cause are drawn, in their unit;
+            those with the largest improvement first.
     """
     credit, known = diagnosis.credit, _second_ahead(diagnosis)
     if not credit:
         return None
     bars = tuple(Bar(c.of, c.share, percent(c.share)) for c in credit[:MOST])
-    panels = [Bars("Share of what predictions gain", bars)]
+    panels = [Bars("Share of the improvement in predictions", bars)]
     for name in _improved(known)[:channels] if known else ():
         panels += worth_of([name], name, diagnosis)
     return Figure("credit", "What each is worth", "", tuple(panels))
@@ -135,18 +135,18 @@ def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
 def worth_figure(
     diagnosis: Diagnosis, groups: Sequence[tuple[Sequence[str], str]]
 ) -> Figure | None:
-    """What predictions lose without each cause: of some states, and where these don't show it.
+    """Return the prediction errors without each cause, for some states.
 
-    A cause is claimed for the mean over all states and horizons. Where predictions of the given
-    states lose nothing without it, the one that loses most is drawn too; one that shows in none
-    a second ahead is named.
+    A cause is claimed for the mean over all states and horizons. If predictions of the given states
+    lose nothing without it, the state that loses most is drawn, too. A cause that shows in no state
+    a second ahead is named in the caption.
 
     Args:
-        diagnosis: what was found.
-        groups: names of states in one unit, and what they are called together.
+        diagnosis: the diagnosis.
+        groups: names of states with one unit, and a label for them together.
 
     Returns:
-        The figure, None where no error a second ahead is known.
+        The figure, or None if no error a second ahead is known.
     """
     error, drawn, hidden = _second_ahead(diagnosis), list(groups), []
     if error is None:
@@ -162,17 +162,17 @@ def worth_figure(
     panels = [panel for names, what in drawn for panel in worth_of(names, what, diagnosis)]
     known = [_loss(c, error, names) for c in diagnosis.credit[:MOST] for names, _ in drawn]
     caption = (
-        "A cause is claimed for the mean over all states and horizons; where predictions of one "
-        "state are better without it, its bar is the shorter one."
+        "A cause is claimed for the mean over all states and horizons. If predictions of one state "
+        "are better without it, its bar is shorter."
     ) * any(0 < loss < 1 for loss in known)
     caption += (
-        f" No state shows 1 s ahead what {', '.join(hidden)} is worth: other horizons do."
+        f" The improvement by {', '.join(hidden)} shows at other horizons, in no state 1 s ahead."
     ) * bool(hidden)
     return Figure("credit", "", caption.strip(), tuple(panels)) if panels else None
 
 
 def _loss(credit: Credit, error: RulerRow, names: Sequence[str]) -> float:
-    """How many times as far off states are without a cause; 0 where that is not known."""
+    """Return the ratio of errors without and with a cause, 0 if it is not known."""
     if not set(names) <= set(credit.without_it) & set(error.with_effects):
         return 0.0
     without, whole = (
@@ -182,15 +182,15 @@ def _loss(credit: Credit, error: RulerRow, names: Sequence[str]) -> float:
 
 
 def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars]:
-    """How far states together are mispredicted a second ahead without each cause, and with all.
+    """Return the combined error of some states a second ahead, without each cause and with all.
 
     Args:
-        names: of states in one unit, such as a position's.
-        what: they are called.
-        diagnosis: what was found.
+        names: names of states with one unit, such as those of a position.
+        what: their label.
+        diagnosis: the diagnosis.
 
     Returns:
-        One panel, none where an error is not known.
+        One panel, or none if an error is not known.
     """
     error = _second_ahead(diagnosis)
     if error is None or not set(names) <= set(error.crude):
@@ -202,7 +202,7 @@ def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars
     rows += [(models(error)["noise_floor"], error.noise_floor)]
     found = [(look, math.hypot(*(v[n] for n in names))) for look, v in rows if set(names) <= set(v)]
     bars = _in_unit([(n, v, role) for (role, n), v in found if math.isfinite(v)], unit)
-    if not bars:  # of a state that was never measured
+    if not bars:  # the state was never measured
         return []
     title = what.removeprefix("the ").capitalize() if len(names) > 1 else what
     return [Bars(f"{title}: error {error.horizon_s:g} s ahead", bars)]
@@ -215,7 +215,7 @@ def _second_ahead(diagnosis: Diagnosis) -> RulerRow | None:
 
 
 def _improved(error: RulerRow) -> list[str]:
-    """The states by how much better they are predicted, most first."""
+    """Return the states by how much better they are predicted, best first."""
     gain = {
         name: error.crude[name] / max(after, 1e-300)
         for name, after in error.with_effects.items()
@@ -225,7 +225,7 @@ def _improved(error: RulerRow) -> list[str]:
 
 
 def where_figure(diagnosis: Diagnosis) -> Figure | None:
-    """Shares of the gap by channel, time and region, and the evidence for each effect."""
+    """Return the shares of the gap by channel, time and region, and the evidence for effects."""
     where = diagnosis.where
     by_channel = [
         (c.name, c.share, f", {measured(c.rms, c.unit)}")
@@ -248,25 +248,26 @@ def where_figure(diagnosis: Diagnosis) -> Figure | None:
     if not panels:
         return None
     caption = (
-        "Evidence is the gain in log-likelihood less its price. Blue: what it loses without a "
-        "claimed effect, from 3 nats on. Grey: what an effect would gain alone, in their place."
+        "Evidence is the gain in log-likelihood less a price for parameters. Blue: the loss "
+        "without a claimed effect, 3 nats or more. Grey: the gain of another effect alone, in "
+        "place of the claimed ones."
     )
     if by_channel:
-        more = f"Beside a channel's share: by how much the model misses it{_ahead(diagnosis)}."
+        more = f"Beside a channel's share: the model's prediction error{_ahead(diagnosis)}."
         caption = f"{caption} {more}"
     located = by_channel or by_time or by_region
-    title = "Where the gap lies" if located else "What was weighed"
+    title = "Where the gap is" if located else "Effects compared"
     return Figure("gap", title, caption, tuple(panels))
 
 
 def _ahead(diagnosis: Diagnosis) -> str:
-    """How far ahead errors by channel are measured."""
+    """Return the horizon at which errors by channel are measured, as text."""
     row = furthest(diagnosis.prediction_error)
     return f" {row.horizon_s:.3g} s ahead, rms" if row else ", rms"
 
 
 def _shares(shares: Sequence[tuple[str, float, str]], role: str) -> tuple[Bar, ...]:
-    """Bars of (label, share, what else is said of it)."""
+    """Return bars of (label, share, note)."""
     return tuple(
         Bar(label, share, f"{percent(share)}{note}", role) for label, share, note in shares[:MOST]
     )

@@ -1,7 +1,7 @@
-"""What a diagnosis says: one tree of frozen values, and the JSON document that it is kept as.
+"""The result of a diagnosis: a tree of frozen values, which is also its JSON document.
 
-Command, page, pictures, recording and notebook all take a `Diagnosis`; `to_json` gives the document
-of `diagnose --json` and `from_json` reads it back, an older one too.
+Command, page, pictures, recording and notebook all take a `Diagnosis`. `to_json` gives the document
+of `diagnose --json`; `from_json` reads it back, including older versions.
 """
 
 from __future__ import annotations
@@ -36,12 +36,13 @@ Kind = Literal["effect", "several", "none", "unknown"]
 
 @dataclass(frozen=True, eq=False)
 class Verdict(Document):
-    """The answer: its kind, the effects that it claims, and why.
+    """The verdict: its kind, the effects that it claims, and sentences that explain them.
 
-    `sentences` is a line each, `sentence` their join; the first is made of `clauses`, which tell
-    many `causes` (a clause each, in the order of `Diagnosis.credit`) by kind. `parameters` are the
-    model's own that it calls off, beside effects or alone. `look_for` is how many effects to look
-    for before any is adopted, where as many as were looked for leave more than noise; else 0.
+    `sentences` has one entry per line, `sentence` joins them. The first sentence is made of
+    `clauses`, which describe the `causes` (a clause each, in the order of `Diagnosis.credit`), or
+    groups of them if there are many. `parameters` are those of the model that are off, with or
+    without effects. `look_for` is the number of effects to search for before any is adopted, if the
+    usual number leaves more than noise; else 0.
     """
 
     kind: str  # one of `Kind`
@@ -55,7 +56,7 @@ class Verdict(Document):
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """The sentences; of an older document, all of them as one."""
+        """The sentences; in older documents, all of them as one."""
         return self.sentences or (self.sentence or self.kind,)
 
 
@@ -67,10 +68,10 @@ class Estimate(Document):
     std: float = math.nan
     interval: tuple[float, float] | None = field(metadata=BRIEF, default=None)
     unit: str = ""
-    stopped: str = field(metadata=BRIEF, default="")  # what kept it from going on (`Param`)
+    stopped: str = field(metadata=BRIEF, default="")  # the bound that it reached (`Param`)
 
     def moved(self, by: float) -> Estimate:
-        """The same of a quantity that is so much larger."""
+        """Return the estimate shifted by a constant."""
         ends = None if self.interval is None else (self.interval[0] + by, self.interval[1] + by)
         return Estimate(self.value + by, self.std, ends, self.unit)
 
@@ -81,16 +82,16 @@ class Ranked(Document):
 
     effect: str
     params: Mapping[str, Estimate] = field(default_factory=dict)
-    fixed: Mapping[str, float] = field(default_factory=dict)  # quantities that are no parameters
+    fixed: Mapping[str, float] = field(default_factory=dict)  # constants, which are not fitted
     evidence: float = math.nan
     gap_after: float = math.nan
-    shrinkage: float = math.nan  # the share of the gap that it closes
+    shrinkage: float = math.nan  # share of the gap that it closes
     claimed: bool = False
-    no_better: bool = False  # likely by evidence, but held-out trials are predicted no better
+    no_better: bool = False  # likely by evidence, but predicts held-out trials no better
 
     @property
     def values(self) -> dict[str, float]:
-        """All its quantities, as `grounded.effects.wrap` wants them."""
+        """All its quantities, as `grounded.effects.wrap` takes them."""
         return {name: e.value for name, e in self.params.items()} | dict(self.fixed)
 
 
@@ -105,10 +106,11 @@ class Likeness(Document):
 
 @dataclass(frozen=True, eq=False)
 class Unconfirmed(Document):
-    """A likely effect that few trials show, most of all `trial` from `start` to `end` [s].
+    """A likely effect that few trials show, mostly `trial` from `start` to `end` [s].
 
-    seen: how many trials hold most of what it does, of how many; region: where it does. repeats:
-    they all make one motion, or nearly one: nothing tells it from whatever else repeats with that.
+    seen: number of trials that hold most of its action, and of all trials. region: where it acts.
+    repeats: these trials all make nearly the same motion, so it can't be distinguished from
+    anything else that repeats with the motion.
     """
 
     effect: str
@@ -123,7 +125,7 @@ class Unconfirmed(Document):
     repeats: bool = False
 
     def sentence(self) -> str:
-        """One clause."""
+        """Return it as one clause."""
         few, all_ = self.seen
         if self.repeats:
             made = f"{few} of {all_}" if few < all_ else f"all {all_}"
@@ -139,11 +141,12 @@ class Unconfirmed(Document):
 
 @dataclass(frozen=True, eq=False)
 class Identifiable(Document):
-    """How well the trials tell one uncertain parameter, all others free.
+    """How well the trials identify one uncertain parameter, with all others free.
 
-    left: of its prior standard deviation `prior`, 0 to 1. given: those that were held at their
-    values though the trials don't tell them, by how many percent it is off for each percent that
-    one of them is (1: only the ratio is known). Its `+-` holds with them as they are.
+    left: remaining fraction of its prior standard deviation `prior`, 0 to 1. given: {parameter:
+    slope} for parameters that were held though the trials don't identify them; the slope is by how
+    many per cent this one is off for each per cent of error of the other (1: only the ratio is
+    known). Its `+-` assumes that they are exact.
     """
 
     parameter: str
@@ -155,17 +158,17 @@ class Identifiable(Document):
 
 @dataclass(frozen=True, eq=False)
 class NoiseLevels(Document):
-    """The noise as it was estimated: a standard deviation for each state."""
+    """The estimated noise: standard deviations by state."""
 
     process: Mapping[str, float] = field(default_factory=dict)
     measurement: Mapping[str, float] = field(default_factory=dict)
-    correlation_s: float = math.nan  # of process noise; NaN where it is white
+    correlation_s: float = math.nan  # of process noise; NaN if it is white
     outliers: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class TrialValue(Document):
-    """What one trial alone says of a claimed value, all others as they are."""
+    """A claimed value as estimated from one trial alone, all other values held."""
 
     trial: str
     effect: str
@@ -177,9 +180,10 @@ class TrialValue(Document):
 
 @dataclass(frozen=True, eq=False)
 class Agreement(Document):
-    """Whether the trials share a value: the chance of such differences if they do.
+    """Whether the trials agree on a value; `chance` is the p-value of their differences.
 
-    `estimate` is the shared value; its `std` is what trials differ by beyond their own uncertainty.
+    `estimate` is the common value; its `std` is the scatter of the trials beyond their own
+    uncertainty.
     """
 
     effect: str
@@ -192,19 +196,19 @@ class Agreement(Document):
 
 @dataclass(frozen=True, eq=False)
 class Changed(Document):
-    """A value in each of two groups of trials, and the evidence [nats] that it differs."""
+    """A value in each of two groups of trials, and the evidence that it differs [nats]."""
 
     effect: str
     quantity: str = ""
     first: Estimate = field(default_factory=lambda: Estimate(math.nan))
     second: Estimate = field(default_factory=lambda: Estimate(math.nan))
     evidence: float = math.nan
-    chance: float = math.nan  # of such a difference where there is none
+    chance: float = math.nan  # p-value of the difference
 
 
 @dataclass(frozen=True, eq=False)
 class Curve(Document):
-    """The shape of a leftover: a rate `value` with its `std` at places `at` of one variable."""
+    """The shape of a leftover: a rate `value` with its `std` at points `at` of one variable."""
 
     effect: str  # its name for `adopt`
     over: str
@@ -216,10 +220,10 @@ class Curve(Document):
 
 @dataclass(frozen=True, eq=False)
 class Correction(Document):
-    """A curve that predicts what no effect explains. It is no cause.
+    """A curve that predicts what no effect explains. It does not count as a cause.
 
-    `held_out_gain` is the share of the squared error that goes on held-out trials; `adoptable`:
-    that is more than its scatter from trial to trial.
+    `held_out_gain` is the share of the squared error that it removes on held-out trials;
+    `adoptable`: whether that exceeds its scatter from trial to trial.
     """
 
     channel: str
@@ -232,15 +236,15 @@ class Correction(Document):
 
 @dataclass(frozen=True, eq=False)
 class Made(Document):
-    """What a diagnosis was made from: stored trials, and the model of that day."""
+    """What a diagnosis was made from: stored trials, and the model at that time."""
 
     trials: tuple[str, ...] = ()
     adopted: tuple[Mapping[str, Any], ...] = ()  # {"name": "dead_zone:throttle", "c": 0.146}
-    params: Mapping[str, float] | None = field(metadata=BRIEF, default=None)  # of [model]
-    nominal: Mapping[str, float] = field(default_factory=dict)  # the values of all parameters
-    named: tuple[str, ...] = ()  # the trials that were asked for, where not all that there are
+    params: Mapping[str, float] | None = field(metadata=BRIEF, default=None)  # [model] params
+    nominal: Mapping[str, float] = field(default_factory=dict)  # values of all parameters
+    named: tuple[str, ...] = ()  # trials named by the user, if not all were used
     compared: tuple[str, ...] = ()  # the second group
-    without: tuple[str, ...] = ()  # families that were not to be blamed
+    without: tuple[str, ...] = ()  # families that were excluded
 
     def __post_init__(self) -> None:
         if not all("name" in effect for effect in self.adopted):
@@ -254,40 +258,40 @@ class Made(Document):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis(Document):
-    """All that a diagnosis found, as `diagnose --json` has it."""
+    """The result of a diagnosis, as in `diagnose --json`."""
 
     verdict: Verdict
     where: Where = field(default_factory=Where)
-    ranking: tuple[Ranked, ...] = ()  # what is claimed first, then what lost
-    indistinguishable: tuple[tuple[str, ...], ...] = ()
-    equivalent: tuple[tuple[str, ...], ...] = ()  # in any trial
-    lookalikes: tuple[Likeness, ...] = ()  # that hardly differ from a claimed effect
+    ranking: tuple[Ranked, ...] = ()  # claimed effects first, then rejected ones
+    indistinguishable: tuple[tuple[str, ...], ...] = ()  # groups that these trials can't separate
+    equivalent: tuple[tuple[str, ...], ...] = ()  # groups that no trial can separate
+    lookalikes: tuple[Likeness, ...] = ()  # effects with nearly the signal of a claimed one
     acting: tuple[str, ...] = ()  # the claimed effects in the order in which they act
     gap: Gap = field(default_factory=Gap)
-    utility_prediction: UtilityPrediction | None = None  # where the subject was a task
+    utility_prediction: UtilityPrediction | None = None  # if the subject was a task
     whole_run: Mapping[str, RunChange] = field(default_factory=dict)
     leftover: tuple[Remainder, ...] = ()
-    unconfirmed: tuple[Unconfirmed, ...] = ()  # no named causes
-    correction: Correction | None = None  # where something is left
+    unconfirmed: tuple[Unconfirmed, ...] = ()  # likely effects that are not claimed
+    correction: Correction | None = None  # if there is a leftover
     next_trial: str = ""
-    unknowable: tuple[str, ...] = ()  # what the trials are too few or too quiet for
+    unknowable: tuple[str, ...] = ()  # what these trials can't identify
     noise: NoiseLevels = field(default_factory=NoiseLevels)
     parameters: Mapping[str, Estimate] = field(default_factory=dict)  # calibrated beside effects
     identifiable: tuple[Identifiable, ...] = ()  # each uncertain parameter
     prediction_error: tuple[RulerRow, ...] = ()  # by horizon, the whole trial last
     credit: tuple[Credit, ...] = ()  # largest first
-    preflight: tuple[Finding, ...] = ()  # of the instruments, before any physics
+    preflight: tuple[Finding, ...] = ()  # of the sensors, before any physics
     per_trial: tuple[TrialValue, ...] = ()
     agreement: tuple[Agreement, ...] = ()  # of the trials in each of these values
-    changed: tuple[Changed, ...] | None = field(metadata=BRIEF, default=None)  # of two groups
-    unchanged: tuple[Changed, ...] = field(metadata=BRIEF, default=())  # alike in both groups
+    changed: tuple[Changed, ...] | None = field(metadata=BRIEF, default=None)  # between two groups
+    unchanged: tuple[Changed, ...] = field(metadata=BRIEF, default=())  # between two groups
     trials: int = 0
-    motions: int = field(metadata=BRIEF, default=0)  # that differ, among the trials
+    motions: int = field(metadata=BRIEF, default=0)  # number of different motions in the trials
     steps: int = 0
     candidates: int = 0
     made: Made | None = field(metadata=BRIEF | {"key": "diagnosed"}, default=None)  # in a workspace
-    probe: str = field(metadata=BRIEF, default="")  # the candidate that tells what ties apart
-    then: NextCommand | None = field(metadata={"key": ""}, default=None)  # what to type next
+    probe: str = field(metadata=BRIEF, default="")  # candidate that separates tied explanations
+    then: NextCommand | None = field(metadata={"key": ""}, default=None)  # next command
 
     def __repr__(self) -> str:
         named = ", ".join(self.effects) or "no effect"
@@ -295,26 +299,26 @@ class Diagnosis(Document):
         return f"Diagnosis({self.kind}: {named}; gap {gap}; {self.trials} trials)"
 
     def figures(self) -> Sequence[Figure]:
-        """Predictions before and after, the credit, where the gap lies."""
+        """Return figures: predictions before and after, the credit, where the gap is."""
         from grounded.diagnosis.pictures import gap_figures
 
         return gap_figures(self)
 
     @property
     def kind(self) -> str:
-        """Of the verdict: one effect, several, none or unknown."""
+        """Kind of the verdict: "effect", "several", "none" or "unknown"."""
         return self.verdict.kind
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Those that the verdict claims."""
+        """Names of the claimed effects."""
         return self.verdict.effects
 
     @property
     def joining(self) -> dict[str, dict[str, float]]:
-        """The claimed effects' quantities, in the order in which they act: for `Search.adopt`.
+        """Quantities of the claimed effects, in the order in which they act, for `Search.adopt`.
 
-        Beside `known_parameters`: what is one of these is not among them.
+        Parameters in `known_parameters` are not repeated here.
         """
         known = self.known_parameters
         own = {n for n in self.effects if n.removeprefix("parameter:") not in known}
@@ -327,20 +331,20 @@ class Diagnosis(Document):
 
     @property
     def contested(self) -> bool:
-        """Whether what it claims is better not adopted: predictions get worse with it."""
+        """Whether the claim should not be adopted, because some predictions get worse with it."""
         return contested(self.prediction_error, self.agreement, self.effects)
 
     @property
     def no_cause(self) -> bool:
-        """Whether too little is known to name any cause: its figures mean nothing then."""
+        """Whether the data are insufficient to name any cause; figures are meaningless then."""
         return self.kind == "unknown" and any(text in self.sentence for text in self.unknowable)
 
     def ranked(self, effect: str) -> Ranked | None:
-        """The row of an effect, None where it was not weighed."""
+        """Return the row of an effect, or None if it is not in the ranking."""
         return next((row for row in self.ranking if row.effect == effect), None)
 
     def values(self, effect: str) -> dict[str, float]:
-        """An effect's quantities, fixed ones included; none where it was not weighed."""
+        """Return an effect's quantities, constants included; empty if it is not known."""
         for curve in self.correction.curves if self.correction is not None else ():
             if effect == curve.effect:
                 return dict(curve.quantities)
@@ -354,26 +358,26 @@ class Diagnosis(Document):
 
     @property
     def late_sensors(self) -> dict[str, dict[str, float]]:
-        """The filters and delays of sensors that were found and corrected, as effects by name.
+        """Filters and delays of sensors that were found and corrected, as effects by name.
 
-        The physics was judged without them; what a controller feeds back comes through them.
+        The diagnosis is made without them, but a controller's feedback passes through them.
         """
         return late_effects(self.preflight)
 
     @property
     def known_parameters(self) -> dict[str, Estimate]:
-        """The calibrated parameters that the trials identify: what may be adopted."""
+        """The calibrated parameters that the trials identify, which may be adopted."""
         lost = {i.parameter for i in self.identifiable if i.verdict == "not identifiable"}
         return {name: e for name, e in self.parameters.items() if name not in lost}
 
     def open(
         self, adopted: Iterable[Mapping[str, Any]], params: Mapping[str, float] | None = None
     ) -> tuple[str, ...]:
-        """The claimed effects that the model with these adopted ones lacks as it did then.
+        """Return the claimed effects that have not been adopted or changed since the diagnosis.
 
         Args:
-            adopted: effects, as [model] effects has them.
-            params: the model's parameters, as [model] params has them.
+            adopted: effects, as in [model] effects.
+            params: the model's parameters, as in [model] params.
         """
         made = self.made or Made()
         now, then = _numbers(adopted, params), _numbers(made.adopted, made.params)
@@ -383,9 +387,9 @@ class Diagnosis(Document):
 def _numbers(
     effects: Iterable[Mapping[str, Any]], params: Mapping[str, float] | None
 ) -> dict[str, Any]:
-    """What a model has, by the names of effects: their own, and `parameter:NAME` of every number.
+    """Return all numbers of a model: effects by name, and every number as `parameter:NAME`.
 
-    A number of an effect is a parameter too: that of `viscous_friction:vz` is called
+    Numbers of an effect are parameters, too: that of `viscous_friction:vz` is called
     `viscous_friction_vz_k`.
     """
     from grounded.effects import param_name

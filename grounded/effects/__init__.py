@@ -1,12 +1,12 @@
-"""Unmodelled effects: what a model may lack, one family of physics a file.
+"""Unmodelled effects that a model may lack, one file per kind of physics.
 
-Read `family` first (what an effect is), then any of the families: `actuator`, `joint`, `friction`,
-`rate`, `geometry`, `medium`, `sensor`. `places` says where in a model they can act. `registry` has
-the `Library` of all families: what of it applies to a model, and the way from a name to its effect.
-`wrap` adds an effect to a model, which is then a plain model again, inside what it has got already;
-`order` says which of several is wrapped first; `sensed` keeps late logs apart from the true values
-that move. A new family is a value in one of these files, or comes from a package of your own
-by the entry point group `grounded.effects`.
+Read `family` first, which defines an effect, then any of the kinds: `actuator`, `joint`,
+`friction`, `rate`, `geometry`, `medium`, `sensor`. `places` finds where in a model effects can act.
+`registry` has the `Library` of all families: it lists the effects that apply to a model and builds
+an effect from its name. `wrap` adds an effect to a model and returns a plain model again. `order`
+says in which order several effects are wrapped; `sensed` handles delayed logs beside true values. A
+new family is a value in one of these files, or comes from your own package by the entry point
+group `grounded.effects`.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""What an actuator makes of its commands: at once (bias, dead zone ...), or with a memory (delay).
+"""Effects of actuators: static maps of a command (bias, dead zone, ...) and dynamic ones (delay).
 
     u_eff     = effect(u, t)             static maps of one input; t is the time in the trial
-    u_eff, z+ = advance(u, z, dt)        maps with a memory z
+    u_eff, z+ = advance(u, z, dt)        dynamic maps with a memory z
 
-The command u is held over a step of dt (a zero-order hold), so the u_eff of a map with memory is
-the MEAN of what the actuator delivers over the step, and fractions of a step matter:
+The command u is held over a step of dt (zero-order hold). The u_eff of a dynamic map is the MEAN of
+what the actuator delivers over the step, so fractions of a step matter:
 
     delay      d = dt (i + f):        u_eff = (1 - f) u[t-i] + f u[t-i-1]
     lag        z' = (u - z) / tau:    z+ = u + (z - u) e,  e = exp(-dt / tau)
@@ -34,34 +34,34 @@ from grounded.effects.family import (
 )
 from grounded.model import Model
 
-LONGEST_DELAY = 0.5  # [s] that a scan considers, where steps are not longer than usual
-NEARBY = (0.05, 0.15, 0.4, 0.8, 1.3, 2.0)  # steps by which an adopted delay may be off
-LONGEST_LAG = 2.0  # [s] the same
-ONE_SIDED = 0.05  # of an input's peak: what it reached the other way is no second side
+LONGEST_DELAY = 0.5  # longest delay of a scan [s]; four steps if these are longer
+NEARBY = (0.05, 0.15, 0.4, 0.8, 1.3, 2.0)  # scanned changes of an adopted delay, in steps
+LONGEST_LAG = 2.0  # longest time constant of a scan [s]; 40 steps if these are longer
+ONE_SIDED = 0.05  # fraction of an input's peak below which the weaker side counts as not used
 
 
 def _threshold(site: Site) -> tuple[Quantity, ...]:
-    """A threshold below which something differs: scanned, the small ones closely."""
+    """Return a threshold, scanned more finely at small values."""
     peak = max(site.scales.peak(name) for name in site.targets)
     grid = tuple(float(v) for v in np.linspace(0.15, 0.87, 20) ** 2 * peak)
     return (Quantity("c", site.unit(site.target), grid, 0.0, peak, places=8),)
 
 
 def _limit(site: Site) -> tuple[Quantity, ...]:
-    """A limit above which the input is cut: scanned from the peak downwards."""
+    """Return a limit of an input, scanned from the peak downwards."""
     peak = site.scales.peak(site.target)
     grid = tuple(float(v) for v in np.linspace(0.95, 0.3, 12) * peak)
     return (Quantity("c", site.unit(site.target), grid, 0.0, 1.5 * peak, start=2 * peak, places=6),)
 
 
 def _one_or_all(model: Model) -> list[str]:
-    """Each input, and all at once: a delay in the radio or the camera shifts every command."""
+    """Return each input, and all together: a delay of radio or camera shifts every command."""
     names = model.input_names
     return [*names, "+".join(names)] if len(names) > 1 else list(names)
 
 
 def _one_or_alike(model: Model) -> list[str]:
-    """Each input, those of one unit together, and each two of them: drives of one make."""
+    """Return each input, all of one unit together, and pairs of these: drives of one kind."""
     found = list(model.input_names)
     for unit in dict.fromkeys(model.inputs.values()):
         alike = [n for n in model.input_names if model.inputs[n] == unit]
@@ -71,7 +71,7 @@ def _one_or_alike(model: Model) -> list[str]:
 
 
 def _curve(site: Site) -> tuple[Quantity, ...]:
-    """Sides differ only where both were seen: of one side alone `a` is a gain, which has a name."""
+    """Return the quantities of `input_curve`; `a` is held if the log has only one side."""
     scales, name = site.scales, site.target
     peak = scales.peak(name)
     weaker = min(scales.high.get(name, 1.0), -scales.low.get(name, -1.0))
@@ -81,7 +81,7 @@ def _curve(site: Site) -> tuple[Quantity, ...]:
 
 
 def _end_to_end(name: str, value: float) -> float:
-    """By how much one end's gain exceeds the other's: a and b are of the gain half way."""
+    """Return by how much one end's gain exceeds the other's; a and b are relative to the mean."""
     half = value if name == "a" else 0.5 * value
     return (1 + half) / (1 - half) - 1
 
@@ -157,7 +157,7 @@ input_curve = InputFamily(
 
 
 def _fade(site: Site) -> tuple[Quantity, ...]:
-    """Nothing is left at the end at most, and a gain more than doubles in no trial."""
+    """Return the fade rate, bounded so that a gain neither vanishes nor doubles within a trial."""
     most = 1.0 / max(site.scales.duration, 1e-3)
     return (Quantity("k", "1/s", high=most, absurd=most),)
 
@@ -184,12 +184,12 @@ def _delay(site: Site) -> tuple[Quantity, ...]:
 
 
 def delay_again(effect: Effect, known: float, room: float) -> Effect:
-    """A delay that the model has already, as an effect that makes it longer or shorter.
+    """Return an effect that lengthens or shortens a delay that the model already has.
 
     Args:
-        effect: a delay, at its site.
-        known: what the model has of it [s].
-        room: by how much it may be shorter at most [s].
+        effect: the delay at its site.
+        known: the delay that the model has [s].
+        room: the most by which it may be shortened [s].
     """
     dt, (d,) = effect.site.scales.dt, effect.quantities
     less = min(known, room)
@@ -235,9 +235,9 @@ def _advance_lag(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tupl
 
 
 def along_lag(u: Any, z: Any, c: Any, dt: float) -> Any:
-    """What a first-order lag makes of signals u (S, T), from z (S,) on.
+    """Return the output (S, T) of a first-order lag of signals u (S, T), starting at z (S,).
 
-    1 / (1 - e B) = (1 + e B) (1 + e^2 B^2) (1 + e^4 B^4) ..., B a step back.
+    With B the shift by one step, 1 / (1 - e B) = (1 + e B) (1 + e^2 B^2) (1 + e^4 B^4) ...
     """
     e, back = float(np.exp(-dt / max(c["tau"], 1e-6))), 1
     path = np.concatenate([z[:, None], (1 - e) * u[:, :-1]], axis=1)
@@ -249,14 +249,14 @@ def along_lag(u: Any, z: Any, c: Any, dt: float) -> Any:
 
 def _advance_rate(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tuple[Any, ...]]:
     most = np.maximum(c["r"] * dt, LEAST_LIMIT)
-    part = np.minimum(np.maximum((u - z[0]) / most, -1.0), 1.0)  # of the step, on the ramp
+    part = np.minimum(np.maximum((u - z[0]) / most, -1.0), 1.0)  # fraction of the step on the ramp
     return z[0] + most * part * (1 - 0.5 * np.abs(part)), (z[0] + most * part,)
 
 
 def _along_rate(u: Any, z: Any, c: Any, dt: float) -> Any:
     most, path = max(c["r"] * dt, 1e-12), np.empty(u.shape)
     for row, commands, now in zip(path, u.tolist(), z.tolist(), strict=True):
-        at = []  # plain numbers: of few signals NumPy's calls take longer
+        at = []  # plain Python numbers, faster than NumPy calls for few signals
         for command in commands:
             at.append(now)
             missing = command - now
@@ -271,7 +271,7 @@ def _advance_backlash(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any,
 
 
 def _along_backlash(u: Any, z: Any, c: Any, dt: float) -> Any:
-    """One clip after another is a clip: of twice as many steps each time."""
+    """Return the output of a backlash by doubling: successive clips combine to one clip."""
     half, back = 0.5 * c["b"], 1
     low, high = (u[:, :-1] + side for side in (-half, half))
     while back < low.shape[1]:

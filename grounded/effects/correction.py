@@ -1,10 +1,10 @@
-"""`correction`, a smooth curve added to a state's rate: no cause, and never offered as one.
+"""`correction`, a smooth curve added to a state's rate. It is never a candidate for a cause.
 
     s' = model + sum_k w_k g_k(r) / sum_k g_k(r)   (s<-r)
 
-with bells g_k at KNOTS places from lo to hi, flat beyond them. A diagnosis fits it to what no
-effect explains (`grounded.diagnosis.hypotheses.correction`); adopted, it is part of the model
-like any effect.
+with Gaussian bells g_k at KNOTS points from lo to hi, constant beyond them. A diagnosis fits it to
+what no effect explains (`grounded.diagnosis.hypotheses.correction`). Once adopted, it is part of
+the model like any effect.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import numpy as np
 from grounded.effects.family import Quantity, RateFamily, Site, Values, per
 
 KNOTS = 7
-WIDTH = 0.7  # of the distance between knots
+WIDTH = 0.7  # standard deviation of a bell, in distances between knots
 
 
 def bells(r: Any, lo: Any, hi: Any) -> list[Any]:
-    """The KNOTS shares of each weight at r; they sum to 1."""
+    """Return the KNOTS normalised basis functions at r, which sum to 1."""
     apart = (hi - lo) / (KNOTS - 1)
     inside = np.minimum(np.maximum(r, lo), hi)
     found = [

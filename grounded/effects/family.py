@@ -1,31 +1,31 @@
-"""What an effect is: a small change of ANY model, with a few quantities to be estimated.
+"""Definition of an effect: a small change of ANY model, with a few quantities to be estimated.
 
-An effect's name is `family:target`. A family says where it acts and writes one equation in plain
-NumPy; the same equation is traced into the adopted model, evaluated on whole trials by the
-diagnosis, and listed in docs/effects.md.
+An effect's name is `family:target`. A family defines its targets and one equation in plain NumPy.
+The same equation is traced into the adopted model, evaluated on whole trials by the diagnosis, and
+listed in docs/effects.md.
 
-    InputFamily     u_eff = effect(u, t, c)                 what the actuator makes of a command
-    MemoryFamily    u_eff, z+ = advance(u, z, c, dt)        the same, with a memory z
-    LossFamily      u_eff = u - loss(w, u, c)               what a driven motion takes off an input
+    InputFamily     u_eff = effect(u, t, c)                 static map of a command
+    MemoryFamily    u_eff, z+ = advance(u, z, c, dt)        dynamic map of a command, with memory z
+    LossFamily      u_eff = u - loss(w, u, c)               loss of an input to the motion it drives
     RateFamily      ds/dt = model + rate(s, a, own, t, c)   added to the rates of states
-    MediumFamily    f seen from axes that move with (c)     what it floats or flies in moves itself
-    SensorFamily    y = measure(s, c),  s = recover(y, c)   what is logged of a state
-    ParamFamily     p + c                                   the model's own parameter is wrong
+    MediumFamily    f in axes that move with (c)            the surrounding water or air moves
+    SensorFamily    y = measure(s, c),  s = recover(y, c)   logged value of a state
+    ParamFamily     p + c                                   shift of the model's own parameter
 
-c are the effect's quantities by name. A quantity without a scan grid is absent at zero and the
-equation is (to first order) linear in it; one with a grid is scanned first, then refined. A fixed
-quantity is a constant that the data's scale chose (the width of a smoothed sign); where the effect
-is large, the data may set it themselves.
+c are the effect's quantities by name. A quantity without a scan grid vanishes at zero, and the
+equation is (to first order) linear in it. One with a grid is scanned first, then refined. A fixed
+quantity is a constant chosen by the scale of the data (the width of a smoothed sign). If the effect
+is large, it may be fitted, too.
 
-Several effects act in one order, for prediction, probes and adopted models alike:
+Several effects act in one order, the same for predictions, probes and adopted models:
 
     command -> input effects as claimed -> transport delays -> losses -> model -> sensor effects
 
-A transport delay commutes with all that does not depend on time, so it may as well act last; there
-a fraction of a step blends two samples of what is delivered, not two commands that a nonlinear
-effect has yet to see. Of two effects the one that is wrapped LAST acts FIRST on a command, so
-wrapping goes from the model outwards: parameters, losses, limits of rates, rates, a medium, sensors
-(late ones last, delays before filters), inputs (`order`).
+A transport delay commutes with everything time-invariant, so it can act last. There, a fraction of
+a step interpolates two samples of what is delivered, not two commands that still pass through a
+nonlinear effect. Of two effects, the one wrapped LAST acts FIRST on a command. So wrapping goes
+from the model outwards: parameters, losses, limits of rates, rates, a medium, sensors (delayed ones
+last, delays before filters), inputs (`order`).
 """
 
 from __future__ import annotations
@@ -52,15 +52,15 @@ class Quantity:
         name: short name, `c`.
         unit: SI unit.
         grid: values to scan; empty for a linear coefficient.
-        low: lower bound that an estimate keeps.
-        high: upper bound, likewise.
-        fixed: a constant of the effect, not estimated; its value is `start`.
-        start: value at which the effect is absent (or, fixed, the value itself).
-        places: how many independent values the grid looks at, for the price of looking.
-        tunable: a constant that data may set (above zero) where they show the effect well.
-        tuned: it was.
-        absurd: a size beyond which it is no finding but a sign of other units, or of other logs.
-        known: what the model has of it already; the value is what it has to have more, or less.
+        low: lower bound of an estimate.
+        high: upper bound of an estimate.
+        fixed: whether it is a constant of the effect, not estimated; its value is `start`.
+        start: value at which the effect vanishes (if fixed: the value itself).
+        places: number of independent values in the grid, for the price of the search.
+        tunable: whether it is a constant (above zero) that is fitted if the effect is large.
+        tuned: whether that was done.
+        absurd: size above which it is not claimed, as it indicates wrong units or mixed-up logs.
+        known: the value that the model already has; the estimate is a change of it. 0: none.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Scales:
-    """Typical sizes of the signals: what a grid or a smoothing width is measured in.
+    """Typical sizes of the signals, which set grids and smoothing widths.
 
     Args:
         low: smallest value of each state and input, by name.
@@ -96,23 +96,23 @@ class Scales:
     duration: float = 10.0
 
     def peak(self, name: str) -> float:
-        """Largest absolute value, 1 where nothing is known."""
+        """Return the largest absolute value of a signal, 1 if it is unknown or zero."""
         value = max(abs(self.low.get(name, -1.0)), abs(self.high.get(name, 1.0)))
         return value if value > 0 else 1.0
 
     def moves(self, name: str) -> bool:
-        """Whether its size is known, and not zero."""
+        """Check whether the size of a signal is known and not zero."""
         return max(abs(self.low.get(name, 0.0)), abs(self.high.get(name, 0.0))) > 0
 
     def spread(self, name: str) -> float:
-        """High minus low, never zero."""
+        """Return high minus low, never zero."""
         value = self.high.get(name, 1.0) - self.low.get(name, -1.0)
         return value if value > 1e-12 else 1.0
 
 
 @dataclass(frozen=True)
 class Site:
-    """Where an effect is built: the model, the targets, the sizes of its signals."""
+    """Where an effect acts: the model, the targets, the sizes of the signals."""
 
     model: Model
     targets: tuple[str, ...]
@@ -120,31 +120,32 @@ class Site:
 
     @property
     def target(self) -> str:
-        """The first target, for effects that have one."""
+        """The first target, for effects with a single one."""
         return self.targets[0]
 
     def unit(self, name: str) -> str:
-        """Unit of a state or an input."""
+        """Return the unit of a state or an input."""
         return self.model.states.get(name) or self.model.inputs.get(name) or "1"
 
 
 def per(unit: str, by: str = "s") -> str:
-    """A unit divided by another, readable: m/s by s is m/s^2."""
+    """Return a unit divided by another in readable form: m/s by s is m/s^2."""
     if unit == "1":
         return f"1/{by}"
     return f"{unit}^2" if unit.endswith(f"/{by}") else f"{unit}/{by}"
 
 
 def coupled(site: Site) -> tuple[str, str]:
-    """The two sides of `v<-delta`: what is driven, and what drives it."""
+    """Return the two sides of a target `v<-delta`: the driven signal and its source."""
     target, _, source = site.target.partition("<-")
     return target, source
 
 
 def width(site: Site, speed: str) -> Quantity:
-    """Over which speed a dry friction builds up: a constant, a hundredth of the largest.
+    """Return the speed over which a dry friction builds up: a hundredth of the largest speed.
 
-    Data may make it up to three tenths: wider, it would be a viscous one under another name.
+    It may be fitted, up to three tenths of the largest speed; a wider one would be a viscous
+    friction.
     """
     peak, unit = site.scales.peak(speed), site.unit(speed)
     return Quantity(
@@ -153,12 +154,12 @@ def width(site: Site, speed: str) -> Quantity:
 
 
 def two_axes(unit: str) -> tuple[Quantity, ...]:
-    """What acts along both axes of a plane."""
+    """Return the quantities of an effect with a component along each axis of a plane."""
     return (Quantity("a", unit), Quantity("b", unit))
 
 
 def speed_limit(site: Site, unit: str) -> tuple[Quantity, ...]:
-    """A speed r that is not exceeded: scanned from half the fastest that a step could show."""
+    """Return a speed limit r, scanned downwards from half the fastest that a step could show."""
     spread = site.scales.spread(site.target)
     fastest = spread / site.scales.dt
     grid = tuple(float(v) for v in np.geomspace(0.5 * fastest, 0.1 * spread, 12))
@@ -167,23 +168,23 @@ def speed_limit(site: Site, unit: str) -> tuple[Quantity, ...]:
 
 @dataclass(frozen=True)
 class Family:
-    """A family of effects: what it is called, where it applies, what it estimates.
+    """A family of effects: its name, where it applies, what it estimates.
 
     Args:
-        name: `dead_zone`.
+        name: such as `dead_zone`.
         equation: one line of maths for docs and messages.
-        sentence: what it means in the workshop. {target} and quantities are filled in; {s} is a
-            verb's ending, {g%} a percentage, {g%stronger|weaker} one with its direction,
-            {k>by|less, by} words by the sign of a quantity that then stands without it; what
-            stands in [] is left out where a quantity {b} in it is a constant, or zero; of parts
-            with & between them, one at least is told.
-        targets: all targets of a model to which it can apply, joined by "+".
+        sentence: its meaning in plain words. {target} and quantities are filled in. {s} is a
+            verb's ending, {g%} a percentage, {g%stronger|weaker} a percentage with its direction.
+            {k>by|less, by} chooses words by the sign of a quantity, whose absolute value is then
+            shown. Text in [] is left out if a quantity {b} in it is a constant or zero; of parts
+            separated by &, at least one is shown.
+        targets: all targets of a model to which it can apply; several signals are joined by "+".
         quantities: the numbers to estimate at a site.
-        lookalikes: families that the same data may explain.
-        vague: nats that a family pays for naming no mechanism, so that a tie goes to one that does.
-        turned: of a gain, the sentence where 1 + g is below zero.
-        loose: it names no mechanism, but fits what repeats with a motion, whatever the cause.
-        ratio: what a percentage {g%} tells of the quantity g of some value.
+        lookalikes: families that may explain the same data.
+        vague: price in nats of naming no mechanism, so that a family that does wins a tie.
+        turned: the sentence of a gain for 1 + g below zero.
+        loose: whether it names no mechanism and fits anything that repeats with a motion.
+        ratio: converts a quantity (name, value) to the ratio shown as {g%}.
     """
 
     name: str
@@ -198,15 +199,15 @@ class Family:
     ratio: Callable[[str, float], float] = lambda name, value: value
 
     def at(self, site: Site) -> Effect:
-        """The effect of this family there, with the quantities that it estimates there."""
+        """Return the effect of this family at a site, with its quantities there."""
         return Effect(self, site, self.quantities(site))
 
 
 @dataclass(frozen=True)
 class InputFamily(Family):
-    """effect(u, t, c) -> what the actuator receives of a command u at time t.
+    """effect(u, t, c) -> the input that the actuator receives for a command u at time t.
 
-    `linear`: a command that is delayed by a part of a step, its mean over each, may come first.
+    `linear`: the effect commutes with a delay by a fraction of a step (a mean of two commands).
     """
 
     effect: Callable[[Any, Any, Any], Any] = lambda u, t, c: u
@@ -218,10 +219,10 @@ class InputFamily(Family):
 class MemoryFamily(Family):
     """advance(u, z, c, dt) -> (mean input over the step, next memory); z has `depth` entries.
 
-    `depth(values, dt)`: how many memory states the effect needs, all starting at the input that
-    was held before t = 0. `transport`: a pure delay, which acts after all others. `along(u, z, c,
-    dt)`: where `depth` is one, z before each step of the commands u (S, T) that begin at z (S,).
-    `linear`: as of an `InputFamily`.
+    `depth(values, dt)`: number of memory states, all starting at the input held before t = 0.
+    `transport`: a pure delay, which acts after all others. `along(u, z, c, dt)`: for a depth of
+    one, z before each step of the commands u (S, T), starting at z (S,). `linear`: as in
+    `InputFamily`.
     """
 
     advance: Callable[[Any, tuple[Any, ...], Any, Any], tuple[Any, tuple[Any, ...]]] = (
@@ -235,12 +236,12 @@ class MemoryFamily(Family):
 
 @dataclass(frozen=True)
 class LossFamily(Family):
-    """What the motion w takes off the input u that drives it, at a target `u<-w` (`joint`).
+    """Loss of the input u to the motion w that it drives, at a target `u<-w` (`joint`).
 
-    loss(w, free, gain, u, c, dt): its mean over a step that begins at the speed w and would end at
-    `free`; a unit of u adds `gain` to that. torque(w, rate, gain, u, c): the same at one moment,
-    where the speed's own rate is `rate` and a unit of u adds `gain` to it. early: as `loss`, over
-    the first half of a step, which need not be as fine; None: `loss` itself.
+    loss(w, free, gain, u, c, dt): mean over a step that begins at the speed w and would end at
+    `free` without the loss; a unit of u adds `gain` to that. torque(w, rate, gain, u, c): the
+    instantaneous loss, where the speed's own rate is `rate` and a unit of u adds `gain` to it.
+    early: as `loss`, for the first half of a step, with fewer parts; None: `loss` itself.
     """
 
     loss: Callable[[Any, Any, Any, Any, Any, Any], Any] = lambda w, free, gain, u, c, dt: 0.0
@@ -252,12 +253,13 @@ class LossFamily(Family):
 class RateFamily(Family):
     """rate(s, a, own, t, c, site) -> {state: added rate}; `own` are the model's own rates.
 
-    `parts`: it acts on the mean rate of so many parts of the step, not half before and half after:
+    `parts`: if not 0, it acts on the mean rate of each of so many parts of the step, instead of
+    half before and half after the step,
 
         x+ = x + h (own + rate(x)),   own = (f(x, h) - x) / h,   h = dt / parts
 
-    right where it limits a rate whose own time constant may be shorter than the step.
-    `brakes`: it opposes the motion of its target, which half a step of it never turns round.
+    which is correct for a limit of a rate whose time constant may be shorter than the step.
+    `brakes`: it opposes the motion of its target; half a step of it never reverses the motion.
     """
 
     rate: Callable[[Any, Any, Any, Any, Any, Site], Values] = lambda s, a, own, t, c, site: {}
@@ -269,10 +271,10 @@ class RateFamily(Family):
 
 @dataclass(frozen=True)
 class MediumFamily(Family):
-    """The model, and the rates found beside it, act relative to a medium that moves (`medium`).
+    """A moving medium, relative to which the model and rates found beside it act (`medium`).
 
-    shift(s, c, site) -> {velocity: the medium's own, in the axes of that state}
-    drift(c, site) -> {position: the medium's velocity over ground}
+    shift(s, c, site) -> {velocity state: the medium's velocity in the axes of that state}
+    drift(c, site) -> {position state: the medium's velocity over ground}
     """
 
     shift: Callable[[Any, Any, Site], Values] = lambda s, c, site: {}
@@ -289,7 +291,7 @@ class SensorFamily(Family):
 
 @dataclass(frozen=True)
 class SensorDelayFamily(Family):
-    """The logged values of the target states are `d` seconds old, all by the same."""
+    """The logged values of all target states are `d` seconds old."""
 
 
 @dataclass(frozen=True)
@@ -304,7 +306,7 @@ class ParamFamily(Family):
 
 @dataclass(frozen=True)
 class Effect:
-    """A family at a target: what `family:target` names. Built by `grounded.effects.effect`."""
+    """A family at a target, named `family:target`. Built by `Library.effect`."""
 
     family: Family
     site: Site
@@ -326,7 +328,7 @@ class Effect:
         return {q.name: q.start for q in self.quantities if q.fixed}
 
     def tuned(self, name: str, value: float) -> Effect:
-        """The same effect with another constant."""
+        """Return the same effect with another value of a constant."""
         new = (
             replace(q, start=value, tuned=True) if q.name == name else q for q in self.quantities
         )
@@ -334,19 +336,19 @@ class Effect:
 
     @property
     def known(self) -> bool:
-        """Whether the model has it already, and its values are changes."""
+        """Whether the model has the effect already, so that its values are changes."""
         return any(q.known for q in self.quantities)
 
     @property
     def places(self) -> float:
-        """How many places the scan looks at (the price of looking is its logarithm)."""
+        """Number of independent grid points of the scan, whose logarithm is part of the price."""
         return float(np.prod([max(q.places, 1.0) for q in self.free]))
 
     def complete(self, values: Mapping[str, float]) -> Mapping[str, float]:
-        """All quantities with a value: the given ones, the constants.
+        """Return the values of all quantities, given ones and constants.
 
         Raises:
-            GroundedError: for a name that is not a quantity, or one that is missing.
+            GroundedError: if a name is not a quantity, or a quantity has no value.
         """
         names = [q.name for q in self.quantities]
         for name in values:
@@ -362,11 +364,10 @@ class Effect:
 
 
 def beyond(value: Any, most: Any) -> Any:
-    """How far a value lies outside of -most to most, exactly 0 within: what a limit takes off it.
+    """Return by how much a value exceeds the range -most to most, exactly 0 within it.
 
-    It is compared as a part of the limit, since planning rounds corners off (`Task.smoothing`): in
-    the limit's own unit that width may be more than the whole of it, and a plan through such a
-    corner has nothing to do with the limit.
+    The comparison is relative to the limit, because planning rounds corners over a fixed width
+    (`Task.smoothing`). In the limit's unit, that width could be larger than the limit itself.
     """
     most = np.maximum(most, LEAST_LIMIT)
     part = value / most
@@ -377,7 +378,7 @@ LEAST_LIMIT = 1e-12
 
 
 def braked(effect: Effect, s: Any, added: Values, half: Any) -> Values:
-    """The rates that an effect adds, for a kick of `half` a step that turns no motion round."""
+    """Return the added rates, those of a brake bounded so that `half` a step reverses no motion."""
     if not getattr(effect.family, "brakes", False):
         return added
     most = {n: np.abs(s[n]) / half for n in added}
@@ -385,7 +386,7 @@ def braked(effect: Effect, s: Any, added: Values, half: Any) -> Values:
 
 
 def scales_of(model: Model, states: Array, inputs: Array, dt: float, duration: float) -> Scales:
-    """Sizes of the signals in recorded data: states (N, n), inputs (N, m)."""
+    """Return the sizes of the signals in recorded data: states (N, n), inputs (N, m)."""
     low, high, quantiles = {}, {}, {}
     for names, values in ((model.state_names, states), (model.input_names, inputs)):
         for i, name in enumerate(names):

@@ -1,13 +1,13 @@
-"""What opposes a motion: viscous, Coulomb, quadratic, static.
+"""Friction of a velocity: viscous, Coulomb, quadratic, static.
 
     v' = model + rate(v)
 
-Viscous and quadratic drag act on any velocity. Coulomb friction's sign is smoothed over a small
-width w (a hundredth of the largest speed, or what data show, up to three tenths): with noise around
-zero a sharp sign would chatter, and real friction needs some way to build up. None of the three
-turns a motion round within a step, however strong it is, or takes off more than the model damps.
-Where the friction is a joint's, and an input drives it, `joint` has it as a torque.
-Stiction holds what is slower than v_s: the model's own rate is cancelled up to c,
+Viscous and quadratic drag act on any velocity. The sign of Coulomb friction is smoothed over a
+small width w (a hundredth of the largest speed, or a fitted value up to three tenths): with noise
+around zero a sharp sign would chatter, and real friction needs some distance to build up. None of
+the three reverses a motion within a step, however strong it is, or reduces the damping below zero.
+For the friction of a joint that an input drives, `joint` has a torque instead.
+Stiction holds a velocity below v_s, where the model's own rate is cancelled up to c,
 
     v' = own - exp(-(v / v_s)^2) clip(own + 2 v, -c, c)               (the 2 is 2 per second)
 """
@@ -21,13 +21,14 @@ import numpy as np
 from grounded.effects import places
 from grounded.effects.family import Quantity, RateFamily, Site, Values, beyond, per, width
 
-HALTS = 2.0  # times the fastest motion, a control step: what opposes it by more is no friction
+HALTS = 2.0  # most that friction may take off in a control step, in units of the largest speed
 
 
 def _least(site: Site, power: int) -> float:
-    """How far below zero: less friction than modelled, as far as the model damps the motion.
+    """Return the lower bound of a friction coefficient, minus the damping of the model.
 
-    In units of speed^(1 - power) per second; power 1 is a viscous one.
+    In units of speed^(1 - power) per second; power 1 is viscous friction. A negative coefficient
+    means less friction than modelled.
     """
     model, name = site.model, site.target
     if not site.scales.moves(name):
@@ -39,9 +40,10 @@ def _least(site: Site, power: int) -> float:
 
 
 def _opposing(site: Site, name: str, unit: str, power: int) -> Quantity:
-    """Of a friction that grows with this power of the speed; one that halts all motion is none.
+    """Return the coefficient of a friction that grows with this power of the speed.
 
-    A dead or exchanged sensor of the speed asked for 1e136 1/s.
+    A value that would stop any motion within a step is not claimed: it is the sign of a dead or
+    exchanged sensor of the speed.
     """
     peak = max(site.scales.peak(site.target), 1e-12)
     most = HALTS / site.scales.dt * peak ** (1 - power)

@@ -1,4 +1,4 @@
-"""How a vehicle moves over the ground: drift, slip, understeer, slope, places that differ.
+"""Effects of a vehicle's motion over the ground: drift, slip, understeer, slope, patches.
 
 With the position (x, y), the heading psi and the speed v of the model's roles:
 
@@ -51,7 +51,7 @@ def _speed(site: Site) -> str:
 
 
 def _velocity(s: Any, a: Any, site: Site) -> Any:
-    """The speed, be it a state or commanded."""
+    """Return the speed, which may be a state or an input."""
     name = _speed(site)
     return s[name] if name in site.model.state_names else a[name]
 
@@ -62,7 +62,7 @@ def _understeer(site: Site) -> tuple[Quantity, ...]:
 
 
 def _patch(site: Site) -> tuple[Quantity, ...]:
-    """Where the vehicle has been, on a grid of 6 x 6 places (or 12 along an axis)."""
+    """Return the quantities of a patch, on a grid of 6 x 6 places (12 along one axis) visited."""
     where = places.position(site.model)
     count = 6 if len(where) == 2 else 12
     spreads = [site.scales.spread(name) for name in where]
@@ -106,7 +106,7 @@ def _understeer_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Va
 
 
 def _grip(site: Site) -> tuple[Quantity, ...]:
-    """From twice the largest lateral acceleration that the speeds and headings allow, downwards."""
+    """Return the limit of lateral acceleration, scanned down from twice the largest estimate."""
     model, scales = site.model, site.scales
     turning = scales.spread(site.target) / max(scales.duration, scales.dt)
     rate = places.role(model, "heading_rate")
@@ -157,7 +157,7 @@ def _moving(model: Model) -> bool:
 
 
 def _turning(model: Model) -> list[str]:
-    """The heading of something whose speed is known: a state, or commanded."""
+    """Return the heading, if the speed is a state or an input."""
     name = places.heading(model)
     return [name] if name and (places.speed(model) or places.speed_input(model)) else []
 

@@ -1,16 +1,18 @@
-"""What a motion takes off the input that drives it: friction and inertia of a joint.
+"""Losses of an input to the motion that it drives: friction and inertia of a joint.
 
     u_eff = u - T(w),      target `tau<-w`: the input tau, and the velocity w that it drives
 
-A joint's friction is a torque: through the inertia matrix, M(q)^-1 T, it acts on all accelerations,
-not on its own alone. So it is put in where the model's own torque enters, and needs nothing of the
-model but its step, be it NumPy, MuJoCo or any black box. How it is solved within a step: `losses`.
+A joint's friction is a torque. Through the inertia matrix, M(q)^-1 T, it acts on all accelerations,
+not only on the joint's own. So it is subtracted where the model's own torque enters, and needs only
+the model's step, be it NumPy, MuJoCo or any black box. `losses` solves for it within a step.
 
-Where tau drives w alone through a constant inertia, the same friction is a Coulomb and a viscous
-one of w itself, an inertia a gain of its rate, and they go by those names (`renamed`).
+If tau drives w alone through a constant inertia, the friction equals a Coulomb and a viscous
+friction of w, and an added inertia equals a gain of its rate. These names are used then
+(`renamed`).
 
-Pairs are found from the model: those where tau always pushes w the same way (a torque and its own
-joint's velocity; the inertia matrix is positive there, elsewhere it changes sign or brakes).
+Pairs are found from the model: tau always pushes w in the same direction. (This holds for a torque
+and its own joint's velocity, since diagonals of the inverse inertia matrix are positive; elements
+off the diagonal change sign.)
 """
 
 from __future__ import annotations
@@ -27,11 +29,11 @@ from grounded.effects.losses import PARTS, dry
 from grounded.frozen import Array
 from grounded.model import Model
 
-ALIKE = 0.999  # cosine from which two slopes are one
-ONLY = 2e-3  # of a speed's answer: what an input may do besides
-TURNS = 4  # times as many samples where axes stand anywhere
-SOME = 0.1  # of a parameter's uncertainty, to see what it does
-FORCES = ("N", "V", "A")  # what a unit of an effort begins with: N m, V ...
+ALIKE = 0.999  # cosine from which two slopes are equivalent
+ONLY = 2e-3  # relative response of other states below which an input drives one speed alone
+TURNS = 4  # factor on the number of samples for positions over their whole range
+SOME = 0.1  # fraction of a parameter's uncertainty by which it is varied
+FORCES = ("N", "V", "A")  # first letters of the units of efforts: N m, V ...
 
 
 def _friction(site: Site) -> tuple[Quantity, ...]:
@@ -43,18 +45,18 @@ def _friction(site: Site) -> tuple[Quantity, ...]:
 
 
 def _per_acceleration(site: Site) -> str:
-    """N m by rad/s is kg m^2, N by m/s kg; others as a fraction."""
+    """Return the unit of an inertia: kg m^2 for N m and rad/s, kg for N and m/s, or a fraction."""
     tau, w = (site.unit(name) for name in coupled(site))
     other = f"{tau} s^2/{w.removesuffix('/s')}".removeprefix("1 ")
     return {"N m": "kg m^2", "N": "kg"}.get(tau, other)
 
 
 def has_viscous(model: Model, tau: str, w: str) -> bool:
-    """Whether uncertain parameters are the viscous part already: k w d f / d tau = d f / d p.
+    """Check whether uncertain parameters already describe viscous friction.
 
-    One of them, or what uncertain ones do together: a motor's gain K and time constant T in
-    w' = (K u - w) / T make any viscous friction, and data could not tell it from them. A constant
-    (a back-EMF from the data sheet) is none: it stays as it is, and what it lacks is found.
+    That is the case if k w d f / d tau = d f / d p for one of them, or for a combination: a motor's
+    gain K and time constant T in w' = (K u - w) / T can imitate any viscous friction. Constants (a
+    back-EMF from the data sheet) don't count, since they are not fitted.
     """
     uncertain = [i for i, p in enumerate(model.params.values()) if p.spread > 0]
     dt, (x, u) = places.probe(model, 1e-4), places.samples(model, 8 * (1 + len(uncertain)))
@@ -72,19 +74,19 @@ def has_viscous(model: Model, tau: str, w: str) -> bool:
 
 
 def _strongest(site: Site) -> float:
-    """A dry friction beyond which nothing would ever move: twice the largest input seen.
+    """Return an upper bound of dry friction, twice the largest input seen.
 
-    An input that hardly does anything (a joint without a motor) bounds nothing.
+    It is infinite for an input that is always zero (a joint without a motor).
     """
     tau, _ = coupled(site)
     return 2 * site.scales.peak(tau) if site.scales.moves(tau) else np.inf
 
 
 def pairs_of(model: Model) -> list[str]:
-    """`tau<-w` for every effort and the velocity that it always pushes the same way.
+    """Return `tau<-w` for every effort and the velocity that it always pushes the same way.
 
-    Efforts are inputs in N, N m, V or A, of a simulator also those without a unit, and whatever
-    moves several velocities through an inertia.
+    Efforts are inputs in N, N m, V or A; of a simulator, also inputs without a unit; and any input
+    that moves several velocities through an inertia.
     """
     own, units = getattr(model.step, "timestep", 0.0), model.inputs.items()
     efforts = [n for n, unit in units if unit.startswith(FORCES) or (own and unit == "1")]
@@ -102,17 +104,18 @@ def pairs_of(model: Model) -> list[str]:
 
 
 def _pushed(model: Model, f_u: Array, tau: str, velocities: Sequence[str]) -> str | None:
-    """The velocity that an input always pushes the same way, most of all."""
+    """Return the velocity that an input pushes most strongly in a constant direction, or None."""
     by = {w: f_u[:, model.state_names.index(w), model.input_names.index(tau)] for w in velocities}
     least = {w: float(g.min()) for w, g in by.items() if g.min() > 1e-9}
     return max(least, key=lambda w: least[w], default=None)
 
 
 def _coupled(model: Model, inputs: Sequence[str]) -> dict[str, str | None]:
-    """The same for inputs of any unit that move a second velocity too, wherever the axes stand.
+    """Return the velocity driven by inputs of any unit that also move a second velocity.
 
-    Velocities are those of a position (q' = w). A diagonal of an inertia matrix is positive for all
-    q: what pushes one way here and the other there (a thrust that is tilted) is no joint's motor.
+    Velocities are those of a position (q' = w), tested over the range of all positions. Diagonals
+    of an inverse inertia matrix are positive for all q, so an input whose direction changes with
+    the position (a tilted thrust) is not a joint's motor.
     """
     axes = places.integrated(model)
     velocities = list(dict.fromkeys(w for w, _ in axes.values()))
@@ -129,7 +132,7 @@ def _coupled(model: Model, inputs: Sequence[str]) -> dict[str, str | None]:
         j = model.input_names.index(tau)
         by = {v: size[model.state_names.index(v), j] for v in velocities}
         if w is not None and not any(by[v] > ONLY * by[w] for v in velocities if v != w):
-            found[tau] = None  # coulomb_friction:w says the same
+            found[tau] = None  # coulomb_friction:w is equivalent
     return found
 
 
@@ -139,7 +142,7 @@ def _inertia(w: Any, free: Any, gain: Any, u: Any, c: Any, dt: Any) -> Any:
 
 
 def _carried(moved: Any, gain: Any, u: Any) -> Any:
-    """What a gear carries, the mean of what drives and what resists: `moved` is by all of it."""
+    """Return the load of a gear, the mean of drive and resistance; `moved` is the net effect."""
     return np.abs(u - 0.5 * moved / gain)
 
 
@@ -160,7 +163,7 @@ def _loaded(site: Site) -> tuple[Quantity, ...]:
 
 
 def alone(model: Model, tau: str, w: str) -> bool:
-    """Whether tau moves nothing but w, and always as much: through a constant inertia."""
+    """Check whether tau moves only w, through a constant inertia."""
     dt, (x, u) = places.probe(model, 1e-5), places.samples(model, 8)
     _, f_u = model.system.linearise(x, u, model.values, dt)
     by, i = f_u[:, :, model.input_names.index(tau)], model.state_names.index(w)
@@ -172,11 +175,12 @@ GAINS = ("input_gain", "rate_gain", "added_inertia")
 
 
 def like_a_load(model: Model, names: Collection[str]) -> bool:
-    """Whether two at least of these effects change the inertia of joints that share one.
+    """Check whether at least two of these effects look like a payload of an arm.
 
-    Each alone is a gear, a motor. What an arm carries, or a link's mass that is off, is in all of
-    the inertia matrix and in gravity: without a parameter for it, gains stand in its place. Where
-    an uncertain parameter changes the inertia, that was free beside them: they are what they say.
+    One such effect is a gear or a motor. Two or more on joints with coupled inertia suggest a
+    payload, or a wrong mass of a link, which changes the whole inertia matrix and gravity. Without
+    a parameter for it, gains imitate it. If an uncertain parameter changes the inertia, it was free
+    beside these effects, and they are what they claim to be.
     """
     gains = {name for name in names if name.partition(":")[0] in GAINS}
     if len(gains) < 2 or _uncertain_inertia(model):
@@ -189,7 +193,7 @@ def like_a_load(model: Model, names: Collection[str]) -> bool:
 
 
 def _uncertain_inertia(model: Model) -> bool:
-    """Whether an uncertain parameter, be it zero, changes what inputs accelerate."""
+    """Check whether an uncertain parameter (even one at zero) changes accelerations by inputs."""
     dt, (x, u) = places.probe(model, 1e-2), places.samples(model, 8)
 
     def pushes(values: Array) -> Array:
@@ -202,7 +206,7 @@ def _uncertain_inertia(model: Model) -> bool:
 
 
 def renamed(model: Model) -> dict[str, str]:
-    """Names that a joint has already where its inertia is constant: {dropped: kept}."""
+    """Return effects of a joint with constant inertia that are equivalent: {dropped: kept}."""
     found: dict[str, str] = {}
     for pair in pairs_of(model):
         tau, _, w = pair.partition("<-")
@@ -213,7 +217,7 @@ def renamed(model: Model) -> dict[str, str]:
 
 
 def one_friction(one: Effect, other: Effect) -> bool:
-    """Whether both describe the friction, dry or viscous, of one motion: no model has it twice."""
+    """Check whether two effects describe the same friction (dry or viscous) of one motion."""
     (a, of), (b, at) = ((e.family.name, e.site.target.rpartition("<-")[2]) for e in (one, other))
     joints = {joint_friction.name, load_friction.name}
     if of == at and "viscous_friction" in (a, b) and joints & {a, b}:

@@ -1,28 +1,29 @@
-"""A step with losses: what a motion takes off the inputs that drive it, solved within the step.
+"""A step with losses of joints, solved implicitly within the step.
 
 Over a step of h
 
-    w_free            the speed that w has at the end without the loss
+    w_free            speed w at the end of the step without the loss
     B = d w / d tau   what a unit of tau, held over the step, adds to it
-    w_end = w_free - B T                                                    T: mean over the step
+    w_end = w_free - B T                                                    T: mean loss in the step
 
-and w' = (w_free - w) / h - B T(w) / h is solved for this one speed, in a few implicit parts of the
-step, as if all else were constant over it. A dry friction slows a joint until it stands, holds it
-while the rest is less than c, and lets it go the other way for what is left of the step; it can't
-be too stiff for a step. It builds up over a width of speed, a hundredth of the largest or what data
-show, never so wide that it were a viscous one. Losses of several joints act on each other by B
-(k, k): a few sweeps of Gauss and Seidel.
+The equation w' = (w_free - w) / h - B T(w) / h is solved for this one speed, in a few implicit
+parts of the step, with everything else constant over the step. A dry friction slows a joint until
+it stops, holds it while the other torques are less than c, and otherwise lets it move the other way
+for the rest of the step; it can't be too stiff for a step. It builds up over a width of speed, a
+hundredth of the largest speed or a fitted value, never as wide as a viscous friction. Losses of
+several joints are coupled by B (k, k) and solved by a few Gauss-Seidel sweeps.
 
-Held over the step, the mean T leads w where it should be, but not what w moves meanwhile: a loss
-that grows within the step takes less off early, more off late. With T_1, the mean over the first
-half, and a loss that grows evenly, each position q' = c w is ahead by
+The mean T, held over the step, gives the correct w at the end, but not the correct positions: a
+loss that grows within the step takes off less early and more late. With T_1, the mean over the
+first half, and a loss that grows linearly, each position q' = c w is ahead by
 
     c h B (T - T_1) / 3                                              (`ahead`)
 
-A hundredth of a step's way; without it a delay found from positions is half a millisecond short.
+That is a hundredth of the motion in a step. Without it, a delay estimated from positions is half a
+millisecond too short.
 
-A diagnosis asks this hundreds of thousands of times, of a few hundred rows: arrays are left to
-compiled code, where the families' functions can be compiled.
+A diagnosis solves this hundreds of thousands of times for a few hundred rows, so arrays are handled
+by compiled code if the functions of the families can be compiled.
 """
 
 from __future__ import annotations
@@ -40,30 +41,30 @@ from grounded.effects.family import Effect, LossFamily, coupled
 from grounded.frozen import Array
 
 SWEEPS = 3
-PARTS = 4  # of a step
-NUDGE = 1e-2  # of the input's unit: the difference that B is taken over
+PARTS = 4  # implicit parts of a step
+NUDGE = 1e-2  # finite-difference step for B, in the input's unit
 NONE = np.zeros(0)
 
 Pairs = Sequence[tuple[Effect, Mapping[str, Any]]]
-Left = tuple[Array, dict[str, Array]]  # inputs (..., m), and what positions get beside them
-Integrated = Mapping[str, tuple[str, float]]  # positions: their velocity, and its factor
+Left = tuple[Array, dict[str, Array]]  # inputs (..., m) after losses, and terms of positions
+Integrated = Mapping[str, tuple[str, float]]  # {position: (its velocity, factor)}
 Losses = tuple[Callable[..., Any], ...]
 
 
 class Loads(NamedTuple):
-    """What losses are solved from: of each pair, and what inputs do to all states."""
+    """The quantities from which losses are solved, one entry per pair (effect, values)."""
 
     w: Sequence[Any]  # speed at the start
-    free: Sequence[Any]  # and at the end, without a loss
+    free: Sequence[Any]  # speed at the end without a loss
     gain: Sequence[Sequence[Any]]  # B [w][tau]
     u: Sequence[Any]  # the input
-    answers: Sequence[Mapping[str, Any]]  # what a unit of it adds to each state
+    answers: Sequence[Mapping[str, Any]]  # what a unit of the input adds to each state
 
 
 def step_with(
     pairs: Pairs, s: Any, a: Named, dt: Any, step: Callable[[Named], Any], moved: Integrated
 ) -> dict[str, Any]:
-    """The next state by name, with what is left of the inputs `a`: step(a) -> next state."""
+    """Return the next state by name under losses of the inputs `a`; step(a) -> next state."""
     at, given = loads(pairs, s, a, step), dict(a)
     losses = solved(pairs, at, dt)
     for (effect, _), loss in zip(pairs, losses, strict=True):
@@ -75,7 +76,7 @@ def step_with(
 
 
 def loads(pairs: Pairs, s: Any, a: Named, step: Callable[[Named], Any]) -> Loads:
-    """What the losses of a step are solved from; step(a) -> next state by name."""
+    """Return what the losses of a step are solved from; step(a) -> next state by name."""
     free, found = step(a), dict[str, dict[str, Any]]()
     for name in dict.fromkeys(coupled(effect.site)[0] for effect, _ in pairs):
         more = [a[n] + NUDGE if n == name else a[n] for n in a]
@@ -87,7 +88,7 @@ def loads(pairs: Pairs, s: Any, a: Named, step: Callable[[Named], Any]) -> Loads
 def loads_from(
     pairs: Pairs, s: Any, a: Mapping[str, Any], free: Any, answers: Mapping[str, Any]
 ) -> Loads:
-    """The same, where a step without losses leads, and what a unit of each input adds to it."""
+    """Return the same from the state after a step without losses, and its slopes by the inputs."""
     drives = [coupled(effect.site) for effect, _ in pairs]
     gain = [[answers[tau][w] for tau, _ in drives] for _, w in drives]
     speeds, ends = ([x[w] for _, w in drives] for x in (s, free))
@@ -96,7 +97,7 @@ def loads_from(
 
 
 def solved(pairs: Pairs, at: Loads, dt: Any) -> list[Any]:
-    """The mean loss of each pair over a step of dt."""
+    """Return the mean loss of each pair over a step of dt."""
     losses, values = tuple(_family(effect).loss for effect, _ in pairs), [v for _, v in pairs]
     if (found := _compiled(losses, values, at, (), dt)) is not None:
         return found
@@ -104,7 +105,7 @@ def solved(pairs: Pairs, at: Loads, dt: Any) -> list[Any]:
 
 
 def _swept(losses: Losses, values: Sequence[Mapping[str, Any]], at: Loads, dt: Any) -> list[Any]:
-    """The same of whatever NumPy takes: each loss beside the others, again and again."""
+    """Solve the losses in NumPy by Gauss-Seidel sweeps."""
     count = len(losses)
     found: list[Any] = [0.0] * count
     for _ in range(SWEEPS if count > 1 else 1):
@@ -121,7 +122,7 @@ def _beside(
     i: int,
     dt: Any,
 ) -> Any:
-    """The mean loss of one pair beside those that were found of the others."""
+    """Return the mean loss of one pair, given the current losses of the others."""
     rest, own = at.free[i], np.maximum(np.abs(at.gain[i][i]), 1e-12)
     for j, other in enumerate(found):
         if j != i:
@@ -132,12 +133,12 @@ def _beside(
 def ahead(
     pairs: Pairs, at: Loads, losses: Sequence[Any], dt: Any, moved: Integrated
 ) -> dict[str, Any]:
-    """How much farther positions get in a step than with the losses' means held over it.
+    """Return what positions gain in a step over a step with the mean losses held.
 
     Args:
         pairs: effects with their quantities.
-        at: what the losses were solved from.
-        losses: their means over the step.
+        at: the quantities from which the losses were solved.
+        losses: mean losses over the step.
         dt: the step [s].
         moved: the positions among the states, see `places.integrated`.
     """
@@ -170,9 +171,9 @@ def _compiled(
     found: Sequence[Any],
     dt: Any,
 ) -> list[Any] | None:
-    """The losses of rows by machine code; None where these are no rows, or there is no such code.
+    """Solve the losses of arrays with compiled code; None for other types, or without a compiler.
 
-    found: the mean of each, where those beside them are known; else all are solved.
+    found: current mean losses, of which each is solved once beside the others; empty: solve all.
     """
     free = at.free[0]
     if not (isinstance(free, np.ndarray) and free.dtype == np.float64):
@@ -195,12 +196,12 @@ def _compiled(
 
 @cache
 def _kernel(losses: Losses, names: tuple[tuple[str, ...], ...], known: bool) -> System | None:
-    """The losses of many rows as a step of the speeds; None where they can't be compiled.
+    """Compile the losses of many rows, as a step function of the speeds; None if that fails.
 
     Args:
-        losses: of each pair.
-        names: of each pair's quantities.
-        known: whether the mean of each is given.
+        losses: the loss function of each pair.
+        names: names of each pair's quantities.
+        known: whether current mean losses are given.
     """
     pairs = range(len(losses))
     quantities = [[f"{name}_{i}" for name in own] for i, own in enumerate(names)]
@@ -230,10 +231,10 @@ def _kernel(losses: Losses, names: tuple[tuple[str, ...], ...], known: bool) -> 
 
 
 def dry(w: Any, free: Any, gain: Any, c: Any, b: Any, width: Any, parts: int = PARTS) -> Any:
-    """Mean of c clip(w / width, -1, 1) + b w over a step that would end at `free`.
+    """Return the mean of c clip(w / width, -1, 1) + b w over a step that would end at `free`.
 
-    By the implicit Euler method for the one, the trapezoidal rule for the other: in each part the
-    end is known in closed form.
+    The first term uses the implicit Euler method, the second the trapezoidal rule, so that the end
+    of each part is known in closed form.
     """
     part = gain / parts
     push, by = (free - w) / parts, np.maximum(1 + 0.5 * part * b, 0.1)

@@ -1,20 +1,20 @@
-"""What a vehicle floats or flies in moves itself, or pushes it: a current, a wind.
+"""Effects of a surrounding medium that moves or pushes: a current, a wind.
 
-With the heading psi and velocities u ahead, v to the side of a plane (x' = u cos psi - v sin psi,
-y' = u sin psi + v cos psi; `places.body_velocity`), all over ground:
+With the heading psi and the body velocities u ahead and v to the side in the plane
+(x' = u cos psi - v sin psi, y' = u sin psi + v cos psi; `places.body_velocity`), all over ground:
 
-    current      the medium moves by (a, b) over ground, and what the model says of u, v holds of
-                 the velocity through it: with V_c adding (a, b), turned into the vehicle's axes,
+    current      the medium moves by (a, b) over ground, and the model's equations for u and v
+                 apply to the velocity through it. With V_c adding (a, b) in the vehicle's axes,
 
                      s+ = V_c(f(V_-c(s))),     x+ = ... + dt a,    y+ = ... + dt b
 
     push_world   u' += a cos psi + b sin psi,   v' += -a sin psi + b cos psi
 
-The first is Galileo's change of axes and exact for any model of forces that depend on velocities,
-linear drag or quadratic, more of it sideways than ahead: one (a, b) in m/s, where a push would need
-another size for each. What turns with the axes (v r, -u r) comes out as it was. A model without a
-drag of its own does not feel a current; what pushes it all the same (a wind on a hull, a floor that
-tilts) is the second.
+The first is a Galilean transformation. It is exact for any model of forces that depend on
+velocities, with linear or quadratic drag, different ahead and sideways: one (a, b) in m/s, where a
+push would need a different size for each. Terms of the rotating axes (v r, -u r) are unchanged. A
+model without drag does not feel a current; what pushes it nevertheless (wind on a hull, a tilted
+floor) is the second.
 
 T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2011, section 8.3:
 equations of motion with ocean currents, in terms of the relative velocity.
@@ -41,23 +41,23 @@ from grounded.effects.family import (
 from grounded.frozen import Array
 from grounded.model import Model
 
-SAME = 1e-6  # of the squared length: what may differ
-FELT = 1e-4  # [1/s^2]: what a medium that moves by 0.2 changes of a velocity's rate at least
+SAME = 1e-6  # relative difference of squared lengths of equivalent effects
+FELT = 1e-4  # [1/s^2] smallest change of a velocity's rate by a medium that moves by 0.2
 
 
 def medium_of(model: Model) -> Effect | None:
-    """The medium that moves in a model, as it joined it."""
+    """Return the moving medium that was added to a model, or None."""
     found = getattr(model.step, "medium", None)
     return found if isinstance(found, Effect) else None
 
 
 def through_it(effect: Effect, s: Any, c: Any) -> Named:
-    """States s over ground as the medium sees them."""
+    """Convert states s over ground to states through the medium."""
     return _moved(s, effect.family.shift(s, c, effect.site), -1.0)  # type: ignore[attr-defined]
 
 
 def over_ground(effect: Effect, s: Any, c: Any, dt: Any) -> dict[str, Any]:
-    """The inverse, dt after: the medium has moved on."""
+    """Convert states through the medium to states over ground, after a step of dt."""
     family, site = effect.family, effect.site
     assert isinstance(family, MediumFamily)
     after = _moved(_moved(s, family.shift(s, c, site), 1.0), family.drift(c, site), dt)
@@ -69,7 +69,7 @@ def _moved(s: Any, by: Values, times: Any) -> Named:
 
 
 def _in_its_axes(s: Any, c: Any, site: Site) -> Values:
-    """(a, b) of the ground in the axes of the vehicle."""
+    """Return the vector (a, b), given in the axes of the ground, in the axes of the vehicle."""
     heading = places.heading(site.model)
     assert heading is not None
     cos, sin = np.cos(s[heading]), np.sin(s[heading])
@@ -87,13 +87,13 @@ def _pushed(model: Model) -> list[str]:
 
 
 def _carried(model: Model) -> list[str]:
-    """Velocities of a model to which it is not the same whether the medium moves."""
+    """Return the velocities of a model that a moving medium affects."""
     felt, _ = _felt(model)
     return _pushed(model) if np.abs(felt).max(initial=0.0) > FELT else []
 
 
 def renamed(model: Model) -> dict[str, str]:
-    """{dropped: kept}: a push is a current where the drag is linear and alike both ways."""
+    """Return {dropped: kept}: with linear, isotropic drag a push is equivalent to a current."""
     felt, axes = _felt(model)
     lengths = float(np.sum(felt * felt)) * float(np.sum(axes * axes))
     same = lengths > 0 and float(np.sum(felt * axes)) ** 2 > (1 - SAME) * lengths
@@ -101,9 +101,9 @@ def renamed(model: Model) -> dict[str, str]:
 
 
 def _felt(model: Model) -> tuple[Array, Array]:
-    """What a medium that moves adds to the rates of (u, v), and its velocity in their axes.
+    """Return what a moving medium adds to the rates of (u, v), and its velocity in their axes.
 
-    (S, 2) each, at S samples; (0, 2) of a model that has no such velocities.
+    (S, 2) each, at S samples; (0, 2) if the model has no such velocities.
     """
     if not (found := places.body_velocity(model)):
         return np.zeros((0, 2)), np.zeros((0, 2))

@@ -1,4 +1,4 @@
-"""What the memory states of adopted effects hold: when a trial begins, and all along it."""
+"""Values of the memory states of adopted effects, at the start of a trial and along it."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from grounded.trial import Trial
 
 
 def settled(model: Model, a: Named, p: Named) -> dict[str, Any]:
-    """What the memories of inputs hold after the inputs a were held for long, by `input_family`."""
+    """Return the settled memories of inputs under constant inputs a, by `input_family`."""
     found = getattr(model.step, "settled", None)
     return {} if found is None else dict(found(a, p))
 
 
 def true_values(names: Sequence[str], memory: Collection[str]) -> dict[int, int]:
-    """Which memory states hold true values behind a late log, each with the state that logs them.
+    """Return the memory states that hold true values behind a delayed log.
 
     Args:
-        names: of all states, (n,).
-        memory: those among them that adopted effects added.
+        names: names of all states, (n,).
+        memory: those that adopted effects added.
 
     Returns:
-        Indices into `names`: of the memory, of the state.
+        {index of the memory state: index of the state that logs it}.
     """
     own = [(k, n) for k, n in enumerate(names) if n not in memory]
     return {
@@ -39,7 +39,7 @@ def true_values(names: Sequence[str], memory: Collection[str]) -> dict[int, int]
 
 
 def shifted(signal: Array, held: Array, steps: float) -> Array:
-    """A held signal (S, T) delayed by any fraction of steps: its mean over each step."""
+    """Delay a zero-order-hold signal (S, T) by any number of steps; return its mean over each."""
     whole = int(np.floor(steps + 1e-9))
     part = max(0.0, steps - whole)
     T = signal.shape[1]
@@ -48,7 +48,7 @@ def shifted(signal: Array, held: Array, steps: float) -> Array:
 
 
 def late_inputs(inputs: Array, held: Array, latency: Array, dt: float) -> Array:
-    """What arrives of inputs (S, T, m), `held` (S, m) before, after a latency (m,) [s]."""
+    """Return inputs (S, T, m) after a latency (m,) [s], with `held` (S, m) before them."""
     if not latency.any():
         return inputs
     each = [shifted(inputs[:, :, j], held[:, j], d / dt) for j, d in enumerate(latency.tolist())]
@@ -56,15 +56,14 @@ def late_inputs(inputs: Array, held: Array, latency: Array, dt: float) -> Array:
 
 
 def memory_of(wrapped: Model, base: Model, trial: Trial, latency: Array | None = None) -> Array:
-    """The memory states along a recorded trial, (T + 1, wrapped.n - base.n).
+    """Return the memory states along a recorded trial, (T + 1, wrapped.n - base.n).
 
-    They start at what held before t = 0 (`memory_start`), and follow the logged states and what
-    arrives of the commands.
+    They start at `memory_start` and follow the logged states and the received commands.
 
     Args:
         wrapped: the model with memory.
-        base: whose states the trial has.
-        trial: with `start_inputs`, or 0 was held before it.
+        base: the model without, whose states the trial has.
+        trial: the trial; without `start_inputs`, 0 was held before it.
         latency: transport delay of the inputs (m,) [s], which acts before the memory; None: none.
     """
     inputs = trial.inputs
@@ -81,9 +80,10 @@ def memory_of(wrapped: Model, base: Model, trial: Trial, latency: Array | None =
 
 
 def memory_start(wrapped: Model, base: Model, trial: Trial) -> Array:
-    """The memory states at t = 0, (wrapped.n - base.n,): of a clock 0, of a sensor what it showed.
+    """Return the memory states at t = 0, (wrapped.n - base.n,).
 
-    What was held before went through the input effects that stand before a memory.
+    A clock starts at 0, a true value behind a delayed log at the log. Memories of inputs start
+    settled at the held inputs, after the input effects that act before them.
     """
     held = np.zeros(base.m) if trial.start_inputs is None else trial.start_inputs
     inputs = Named("input", base.input_names, list(held))

@@ -1,4 +1,4 @@
-"""In which order several effects act, and are wrapped around a model (`family`, its last lines)."""
+"""The order in which several effects act, and are wrapped around a model (see `family`)."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from grounded.effects.family import (
 
 
 def acting_order(families: Sequence[Family]) -> list[int]:
-    """Indices of the effects on inputs, the one that acts first on a command first."""
+    """Return the indices of the effects on inputs in the order in which they act on a command."""
     own = [i for i, f in enumerate(families) if isinstance(f, InputFamily | MemoryFamily)]
     return sorted(own, key=lambda i: getattr(families[i], "transport", False))
 
 
 def joining_order(old: Sequence[Family], new: Sequence[Family]) -> list[tuple[bool, int]]:
-    """The order in which new effects join a model that has others: (whether new, which one).
+    """Return the order of old and new effects, as pairs (whether new, index).
 
-    They were fitted on the model with the old ones in it: on commands they act before these, on all
-    else after them.
+    New effects were fitted on the model with the old ones. On commands they act before the old
+    ones, otherwise after them.
     """
     first = [i for i, f in enumerate(new) if isinstance(f, InputFamily | MemoryFamily)]
     last = [i for i in range(len(new)) if i not in first]
@@ -39,7 +39,7 @@ def joining_order(old: Sequence[Family], new: Sequence[Family]) -> list[tuple[bo
 
 
 def wrapping_order(families: Sequence[Family]) -> list[int]:
-    """Indices of all effects, the one that is wrapped first (the innermost) first."""
+    """Return the indices of all effects in wrapping order, the innermost first."""
     inputs = acting_order(families)
     rest = [i for i in range(len(families)) if i not in inputs]
     return [*sorted(rest, key=lambda i: _depth(families[i])), *reversed(inputs)]
@@ -52,6 +52,6 @@ def _depth(family: Family) -> float:
         return 3.5
     if isinstance(family, RateFamily):
         return 2 if family.parts else 3
-    if isinstance(family, SensorDelayFamily | SensorLagFamily):  # their memories begin at the log
+    if isinstance(family, SensorDelayFamily | SensorLagFamily):  # their memories start at the log
         return 5 if isinstance(family, SensorDelayFamily) else 6
     return 4

@@ -1,9 +1,9 @@
-"""Where an effect can apply: the states of a model by what they are.
+"""Targets of effects in a model: its states and inputs by their meaning.
 
-Roles come from the model (`Model.roles`); where it has none, a position is a state called x and y
-(or north and east), a heading an angle called psi, yaw or heading, a speed one called v or speed. A
-velocity is any state whose unit is per second: friction acts on those. What can't be told is not
-offered.
+Roles come from the model (`Model.roles`). Without roles, a position is a pair of states called x
+and y (or north and east), a heading is an angle called psi, yaw, heading or theta, and a speed is a
+state called v or speed. A velocity is any state whose unit is per second; friction acts on those.
+Effects whose targets can't be determined are not candidates.
 """
 
 from __future__ import annotations
@@ -17,29 +17,29 @@ from grounded.model import Model
 
 POSITIONS = (("x", "y"), ("north", "east"), ("px", "py"), ("pos_x", "pos_y"))
 HEADINGS = ("psi", "yaw", "heading", "theta")
-SHORT = 1e-5  # [s], a step that shows the rates
-STRAIGHT = 1e-3  # of velocities near 1: what a short step leaves
+SHORT = 1e-5  # step for instantaneous rates [s]
+STRAIGHT = 1e-3  # error of velocities of about 1 from such a step
 SPEEDS = ("v", "speed", "velocity", "vx", "u")
 
 
 def role(model: Model, name: str) -> tuple[str, ...]:
-    """States that play a role, () when the model doesn't say."""
+    """Return the states with a role, () if the model declares none."""
     found = model.roles.get(name, ())
     return (found,) if isinstance(found, str) else tuple(found)
 
 
 def inputs(model: Model) -> Sequence[str]:
-    """Every input."""
+    """Return every input."""
     return model.input_names
 
 
 def states(model: Model) -> Sequence[str]:
-    """Every state."""
+    """Return every state."""
     return model.state_names
 
 
 def position(model: Model) -> tuple[str, ...]:
-    """The states of a position on the ground (two of them, or one along an axis)."""
+    """Return the states of a position on the ground (two of them, or one along an axis)."""
     named = role(model, "position")
     if named:
         return named[:2]
@@ -47,26 +47,26 @@ def position(model: Model) -> tuple[str, ...]:
 
 
 def heading(model: Model) -> str | None:
-    """The direction of travel of something that moves on the ground."""
+    """Return the state of the heading, or None."""
     named = (*role(model, "heading"), *(h for h in HEADINGS if h in model.angles))
     return next(iter(named), None)
 
 
 def speed(model: Model) -> str | None:
-    """The speed along the heading."""
+    """Return the state of the speed along the heading, or None."""
     named = (*role(model, "speed"), *(s for s in SPEEDS if s in model.state_names))
     return next(iter(named), None)
 
 
 def speed_input(model: Model) -> str | None:
-    """The speed where it is commanded: an input that is called one."""
+    """Return the input that commands the speed, found by its name and unit, or None."""
     return next((n for n in SPEEDS if n in model.input_names and model.inputs[n] == "m/s"), None)
 
 
 def steering(model: Model) -> list[str]:
-    """What turns the heading: a steering angle among the states, or the inputs that do it at once.
+    """Return what turns the heading: steering angles among the states, or inputs.
 
-    The speed turns it too, but only together with these.
+    The speed is left out, since it turns the heading only together with these.
     """
     turned = heading(model)
     if turned is None:
@@ -80,9 +80,9 @@ def steering(model: Model) -> list[str]:
 
 
 def body_velocity(model: Model) -> tuple[str, ...]:
-    """The velocities ahead and to the side, (u, v), where a model has both in the plane.
+    """Return the body velocities (u, v), ahead and to the side, or () if a model lacks them.
 
-    x' = u cos psi - v sin psi,  y' = u sin psi + v cos psi,  at samples of its own rates.
+    They are found from the model's rates: x' = u cos psi - v sin psi, y' = u sin psi + v cos psi.
     """
     where, turned = position(model), heading(model)
     if len(where) < 2 or turned is None:
@@ -97,17 +97,17 @@ def body_velocity(model: Model) -> tuple[str, ...]:
 
 
 def velocities(model: Model) -> list[str]:
-    """States whose unit is per second: velocities, linear or angular."""
+    """Return the states whose unit is per second: linear or angular velocities."""
     return [n for n, u in model.states.items() if u.endswith("/s") or u.endswith("/ s")]
 
 
 def but_position(model: Model) -> list[str]:
-    """Every state that is no position."""
+    """Return every state that is not a position."""
     return [n for n in model.state_names if n not in position(model)]
 
 
 def plane(model: Model) -> list[str]:
-    """`x+y` for a model that moves in the plane with a heading, else nothing."""
+    """Return [`x+y`] for a model that moves in the plane with a heading, else []."""
     where = position(model)
     if len(where) == 2 and heading(model):
         return ["+".join(where)]
@@ -115,35 +115,35 @@ def plane(model: Model) -> list[str]:
 
 
 def dynamic(model: Model) -> list[str]:
-    """States that are neither a position nor a heading: those that forces and actuators drive."""
+    """Return the states other than position and heading, which forces and actuators drive."""
     still = {*position(model), *([heading(model)] if heading(model) else [])}
     rest = [n for n in model.state_names if n not in still]
     return rest or list(model.state_names)
 
 
 def pairs(model: Model) -> list[str]:
-    """`v<-delta` for every dynamic target and every other dynamic state as a source."""
+    """Return `target<-source` for every state but positions, with dynamic states as sources."""
     names = dynamic(model)
     return [f"{t}<-{s}" for t in but_position(model) for s in names if s != t]
 
 
 def samples(model: Model, count: int = 3) -> tuple[Array, Array]:
-    """States (count, n) and inputs (count, m) at random, the same ones every time."""
+    """Return random states (count, n) and inputs (count, m), the same ones every time."""
     rng = np.random.default_rng(0)
     x = rng.uniform(0.2, 1.0, (count, model.n))
     return x, rng.uniform(0.2, 1.0, (count, model.m))
 
 
 def probe(model: Model, dt: float) -> float:
-    """A step to look at a model with [s]: dt, or the nearest that its simulator can make."""
+    """Return a step for probing a model [s]: dt, or the nearest that its simulator supports."""
     own = float(getattr(model.step, "timestep", 0.0))
     return max(1, round(dt / own)) * own if own else dt
 
 
 def integrated(model: Model) -> dict[str, tuple[str, float]]:
-    """States whose rate is c times another state: {angle: (angular velocity, c)}.
+    """Return states whose rate is c times another state: {angle: (angular velocity, c)}.
 
-    A simulator that can't make a short step adds the velocity that it has after its own step.
+    For a simulator with a fixed time step, this is the velocity after the step.
     """
     (x, u), dt = samples(model), probe(model, 1e-8)
     after = model.system.step(x, u, model.values, dt)
@@ -172,9 +172,10 @@ def integrated(model: Model) -> dict[str, tuple[str, float]]:
 
 
 def told_by(model: Model, pair: Sequence[str]) -> set[str]:
-    """States that could tell whether sensors of a pair are late: what moves it, or moves with it.
+    """Return the states from which a common delay of the sensors of a pair is identifiable.
 
-    What nothing ties to the rest but itself and inputs of its own is late as its inputs are.
+    These are coupled to the pair, directly or through an input in common. Without any, a delay of
+    the pair is equivalent to a delay of its inputs.
     """
     names = (*model.state_names, *model.input_names)
     f_x, f_u = model.system.linearise(*samples(model, 8), model.values, probe(model, 1e-2))
@@ -189,15 +190,15 @@ def told_by(model: Model, pair: Sequence[str]) -> set[str]:
 
 
 def late_together(model: Model) -> list[str]:
-    """`q+w`: a position and its own velocity (q' = c w), which one sensor may give."""
+    """Return `q+w` for each position and its velocity (q' = c w), which one sensor may give."""
     pairs = [(q, w) for q, (w, _) in integrated(model).items()]
     return ["+".join(pair) for pair in pairs if told_by(model, pair)]
 
 
 def following(model: Model) -> list[str]:
-    """States that follow an input by themselves: a steering angle, a motor's speed, a servo.
+    """Return states that follow an input: a steering angle, a motor's speed, a servo.
 
-    Their rate depends on an input, on no state but themselves, and somewhere falls with them.
+    Their rate depends on an input, on no other state, and somewhere decreases with them.
     """
     dt = probe(model, 1e-2)
     f_x, f_u = model.system.linearise(*samples(model, 8), model.values, dt)

@@ -1,4 +1,4 @@
-"""A model's step in the user's own words: what effects are wrapped around."""
+"""A model's step as a plain function of named values, around which effects are wrapped."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Step = Callable[[Any, Any, Any, Any], dict[str, Any]]
 
 
 def plain_step(model: Model) -> Step:
-    """The model's step(s, a, p, dt) in the user's own words, integrating a derivative."""
+    """Return the model's step(s, a, p, dt) in named values; a derivative is integrated."""
     stepped, derivative, names = model.step, model.derivative, model.state_names
 
     def checked(function: Callable[..., Any], *at: Any) -> dict[str, Any]:
@@ -48,17 +48,17 @@ def plain_step(model: Model) -> Step:
 
 
 def param_name(effect: str, quantity: str) -> str:
-    """`dead_zone_throttle_c`: the wrapped model's name of a quantity of `dead_zone:throttle`."""
+    """Return the parameter name of a quantity: `dead_zone_throttle_c` for `dead_zone:throttle`."""
     family, _, targets = effect.partition(":")
     return f"{family}_{targets.replace('+', '_').replace('<-', '_from_')}_{quantity}"
 
 
 def quantities_of(effect: Effect, p: Any) -> dict[str, Any]:
-    """An effect's numbers among the parameters of the model that it joined."""
+    """Return an effect's quantities from the parameters of the wrapped model."""
     return {q.name: p[param_name(effect.name, q.name)] for q in effect.quantities}
 
 
 def own_state(model: Model, s: Any, true: Mapping[str, str] | None = None) -> Named:
-    """The model's states; `true`: the memory that stands for one that is only logged."""
+    """Return the model's states; `true` maps a logged state to the memory with its true value."""
     values = [s[(true or {}).get(n, n)] for n in model.state_names]
     return Named("state", model.state_names, values)

@@ -1,17 +1,16 @@
-"""Rates that the model lacks: constant, proportional, coupled, growing, periodic; and limited ones.
+"""Added rates: constant, proportional, coupled, growing, periodic; and limits of rates.
 
-    s' = model + rate                  the least specific families: they fit what has no name
+    s' = model + rate                  the least specific families, which name no mechanism
     s' = clip(model, -r, r)            a servo that follows with a lag, but at a limited speed
 
-`slew_limit` is not `rate_limit`, which bounds the command before the lag: here the lag's own rate
-is bounded, so large moves go at r until the target is near. It applies to states that follow an
-input by themselves: their rate depends on themselves and on inputs alone and falls with the state.
-It acts on the mean rate of each quarter of a step: the limit ends within a step where the target is
-near, and a lag much shorter than a step is no trouble. A step that it does not touch is the
-model's own.
+`slew_limit` differs from `rate_limit`, which bounds the command before the lag: here the lag's own
+rate is bounded, so large moves go at r until the target is near. It applies to states that follow
+an input independently: their rate depends only on inputs and on themselves, and falls with them. It
+acts on the mean rate of each quarter of a step, so the limit can end within a step, and the lag may
+be much shorter than a step. A step that does not reach the limit is the model's own.
 
-Nothing is added to the rate of a position or an angle whose rate is another state by definition: no
-force does that. What its sensors say of it is the instruments' matter, and `rate_gain` a gear's.
+No rate is added to a position or an angle whose rate is another state by definition, since no force
+can do that. Errors of its sensors are found by `grounded.instruments`; a gear is a `rate_gain`.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from grounded.effects.family import (
     speed_limit,
 )
 
-PERIODS = 1.5  # that the longest trial has of a wave, at least
+PERIODS = 1.5  # fewest periods of a wave in the longest trial
 
 
 def _coupling(site: Site) -> tuple[Quantity, ...]:
@@ -41,10 +40,11 @@ def _coupling(site: Site) -> tuple[Quantity, ...]:
 
 
 def _periodic(site: Site) -> tuple[Quantity, ...]:
-    """Frequencies from `PERIODS` a trial to a fifth of the sampling rate, half a bin apart.
+    """Return a wave's quantities, its frequency scanned in steps of half a bin.
 
-    What turns less often in the longest trial drifts, as far as anyone can see: half a cosine of
-    54 s stood for a battery that sagged through 30 s. An adopted wave was seen in other data.
+    The grid goes from `PERIODS` per trial to a fifth of the sampling rate. A slower wave can't be
+    distinguished from a drift: half a cosine of 54 s fits a battery that sags over 30 s. An adopted
+    wave may be slower, as it was found in other data.
     """
     scales = site.scales
     lowest = PERIODS / scales.duration
@@ -149,4 +149,4 @@ slew_limit = RateFamily(
 )
 
 FAMILIES = (offset, rate_gain, trend, coupling, periodic, slew_limit)
-ADDED = (offset, trend, coupling, periodic)  # to a state's rate: not where that is another state
+ADDED = (offset, trend, coupling, periodic)  # not for a state whose rate is another state

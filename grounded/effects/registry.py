@@ -1,18 +1,18 @@
-"""The library: all families, what of it applies to a model, and the way back from a name.
+"""The library of all families: effects that apply to a model, and effects by name.
 
 Third parties add families by the entry point group `grounded.effects` (read once, by the command
 line's options.py); here a library is a plain value.
 
-To the families of the other modules it adds `parameter`, p = nominal + d: the model is right in
-form, and one of its own parameters differs from its nominal value.
+In addition to the families of the other modules there is `parameter`, p = nominal + d: the model
+has the right equations, and one of its own parameters differs from its nominal value.
 
-Where two effects are the very same thing in a model, the name is offered that says most. A constant
-rate on a state may be just what a bias of an input does, or a parameter of the model; a gain of a
-rate just what a time constant or a wheelbase does. Such a rate has no name of its own (`aliases`):
+If two effects are equivalent in a model, only the more specific one is a candidate. A constant rate
+of a state may equal a bias of an input, or a parameter of the model; a gain of a rate may equal a
+time constant or a wheelbase. Such rate effects are dropped (`aliases`):
 
-    offset:s, rate_gain:s   dropped where   d rate / d p  or  d rate / d u   is k times its own rate
+    offset:s, rate_gain:s   dropped if   d rate / d p  or  d rate / d u   is k times its own rate
 
-at every one of many states and inputs, and at other parameters too.
+at many random states and inputs, and at other values of the parameters, too.
 """
 
 from __future__ import annotations
@@ -81,32 +81,32 @@ class Library:
             raise GroundedError(f"two effect families are called '{twice[0]}': rename one")
 
     def with_families(self, more: Iterable[Family]) -> Library:
-        """A library that also has these families."""
+        """Return a library that also has these families."""
         return Library((*self.families, *more))
 
     def without(self, names: Iterable[str]) -> Library:
-        """A library that lacks these families.
+        """Return a library without these families.
 
         Raises:
-            GroundedError: for a name that is not in it.
+            GroundedError: if a name is not in it.
         """
         gone = [self.family(name) for name in set(names)]
         return Library(tuple(family for family in self.families if family not in gone))
 
     def family(self, name: str) -> Family:
-        """The family of that name.
+        """Return the family of that name.
 
         Raises:
             GroundedError: if there is none.
         """
-        for family in (*self.families, correction):  # which is adopted, never blamed
+        for family in (*self.families, correction):  # a correction is adopted, but never blamed
             if family.name == name:
                 return family
         known = [family.name for family in self.families]
         raise GroundedError(f"there is no effect family '{name}': {nearest(name, known)}")
 
     def effect(self, name: str, model: Model, scales: Scales | None = None) -> Effect:
-        """The effect that `family:target` names, at a model.
+        """Return the effect `family:target` at a model.
 
         Raises:
             GroundedError: if the family is unknown or does not apply there.
@@ -122,7 +122,7 @@ class Library:
         return _build(family, target, model, scales or Scales())
 
     def candidates(self, model: Model, scales: Scales | None = None) -> tuple[Effect, ...]:
-        """Every effect that can apply to a model, in the library's order."""
+        """Return every effect that can apply to a model, in the library's order."""
         found, offered = [], [family.name for family in self.families]
         whole, model = model, moved_model(model)
         idle, outright = derived_states(model), outright_states(model)
@@ -139,7 +139,7 @@ class Library:
                 if isinstance(family, RateFamily) and family.needs_own and target in outright:
                     continue
                 if driven[2] and integrals.get(driven[0], ("",))[0] == driven[2]:
-                    continue  # it would be rate_gain under another name
+                    continue  # equivalent to rate_gain
                 if family in rate.ADDED and driven[0] in geometric:
                     continue
                 if same.get(f"{family.name}:{target}", "").partition(":")[0] in offered:
@@ -148,7 +148,7 @@ class Library:
         return tuple(found)
 
     def joints(self, model: Model, scales: Scales | None = None) -> tuple[Effect, ...]:
-        """The plain dry friction of every joint, where it goes by another name too."""
+        """Return the plain dry friction of every joint, even where `candidates` has an alias."""
         family = joint.joint_friction
         if family not in self.families:
             return ()
@@ -162,9 +162,9 @@ def _build(family: Family, target: str, model: Model, scales: Scales) -> Effect:
 
 
 def derived_states(model: Model) -> set[str]:
-    """Heading rates that nothing depends on: carried along so that they can be measured.
+    """Return heading rates on which nothing depends, carried along only to be measured.
 
-    Rate effects are not offered for them; one on the heading moves them too (`partner`).
+    They have no rate effects of their own; those on the heading change them, too (`partner`).
     """
     named = places.role(model, "heading_rate")
     if not named:
@@ -176,14 +176,14 @@ def derived_states(model: Model) -> set[str]:
 
 
 def outright_states(model: Model) -> set[str]:
-    """States that the model sets outright, whatever they were: they have no rate of their own."""
+    """Return states that the model sets regardless of their previous value, without dynamics."""
     f_x, _ = model.system.linearise(*places.samples(model), model.values, places.probe(model, 0.01))
     own = np.abs(f_x[:, np.arange(model.n), np.arange(model.n)]).max(axis=0)
     return {name for name, size in zip(model.state_names, own, strict=True) if size < 1e-9}
 
 
 def partner(model: Model, target: str) -> str | None:
-    """The derived heading rate that an added heading rate must show up in, or None."""
+    """Return the carried heading rate that follows the heading `target`, or None."""
     if target != places.heading(model):
         return None
     idle = derived_states(model)
@@ -191,16 +191,16 @@ def partner(model: Model, target: str) -> str | None:
 
 
 SAMPLES = 40
-SAME = 1e-7  # of the squared length: what may differ
-BESIDE = 1.3  # times the parameters: where the slopes must agree too
+SAME = 1e-7  # relative difference of squared lengths of equivalent rates
+BESIDE = 1.3  # factor on the parameters for the second comparison
 
 
 def aliases(model: Model, idle: Iterable[str] = ()) -> dict[str, str]:
-    """Names of rate effects that are the same as another effect: {dropped: kept}.
+    """Return the names of rate effects that are equivalent to another effect: {dropped: kept}.
 
     Args:
-        model: whose rates.
-        idle: states that are carried along or set outright; they are not compared.
+        model: the model.
+        idle: states without dynamics (carried along, or set outright), which are not compared.
     """
     rng, n = np.random.default_rng(0), model.n
     x, u = rng.uniform(-1, 1, (SAMPLES, n)), rng.uniform(-1, 1, (SAMPLES, model.m))
@@ -217,7 +217,7 @@ def aliases(model: Model, idle: Iterable[str] = ()) -> dict[str, str]:
 
 
 class _Rates:
-    """Rates (SAMPLES, n) that named rate effects add, slopes of the model's rates by name."""
+    """Rates (SAMPLES, n) that rate effects add, and slopes of the model's rates, by effect name."""
 
     def __init__(self, model: Model, x: Array, u: Array, p: Array, kept: list[int]) -> None:
         dt = places.probe(model, places.SHORT)
@@ -232,7 +232,7 @@ class _Rates:
                 f"offset:{name}": one[:, kept],
                 f"rate_gain:{name}": (one * own)[:, kept],
             }
-        for pair in joint.pairs_of(model):  # an armature of a cart is the cart's mass
+        for pair in joint.pairs_of(model):  # such as the mass of a cart
             tau, _, w = pair.partition("<-")
             by, rate = f_u[:, :, model.input_names.index(tau)], own[:, [model.state_names.index(w)]]
             self.named[f"added_inertia:{pair}"] = (by * rate)[:, kept]
@@ -242,14 +242,14 @@ class _Rates:
 
 
 def _along(slope: Array, own: Array) -> bool:
-    """Whether one is a multiple of the other, neither zero."""
+    """Check whether one array is a multiple of the other, neither of them zero."""
     a, b = slope.reshape(-1), own.reshape(-1)
     lengths = float(a @ a) * float(b @ b)
     return bool(lengths > 0 and np.isfinite(lengths) and (a @ b) ** 2 > (1 - SAME) * lengths)
 
 
 def _free(model: Model, name: str) -> bool:
-    """Whether a parameter may halve and double, so that it can stand for the effect."""
+    """Check whether a parameter may halve and double, so that it can replace an effect."""
     family, _, target = name.partition(":")
     if family != "parameter":
         return True

@@ -1,13 +1,13 @@
-"""What sensors make of a model's motion, and the true values behind late logs.
+"""Sensor effects in a model, and the true values behind delayed logs.
 
-Once a sensor's delay or lag has joined a model its states are what the log shows, old or filtered
-values, and the true ones are memory:
+After a sensor's delay or lag was added to a model, its states are the logged (old or filtered)
+values, and the true values are memory states:
 
-    true+ = f(true, u)         what moves things (a friction, a current) acts here
-    y+    = old(true+, line)   line: true values of earlier steps, or what the filter holds
+    true+ = f(true, u)         effects on the motion (a friction, a current) act here
+    y+    = old(true+, line)   line: true values of earlier steps, or the state of the filter
 
-`seen_names` says which state holds the value that physics sees under each name, `moved_model` is
-the model without its late sensors, and `logged` makes the logs anew of where the true values went.
+`seen_names` maps each name to the state with the value that the physics sees, `moved_model` returns
+the model without its delayed sensors, and `logged` updates the logs after the true values moved.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ Log = Callable[[Any, Mapping[str, Any], Any, Any], dict[str, Any]]  # (s, after,
 
 @dataclass(frozen=True, eq=False)
 class Behind:
-    """What lies behind a model's late logs.
+    """The true values behind a model's delayed logs.
 
     Args:
-        model: without the late sensors.
-        true: the memory that holds the true value of a state, by the state.
-        log: all states after a step from s, of `after`, in which the true ones are right.
+        model: the model without the delayed sensors.
+        true: {state: memory state with its true value}.
+        log: returns all states after a step from s, given `after` with correct true values.
     """
 
     model: Model
@@ -49,7 +49,7 @@ class Behind:
     log: Log
 
     def lifted(self, model: Model) -> Behind:
-        """The same of a model that an effect on inputs joined, which may have brought memory."""
+        """Return the same for a model with a further effect on inputs, which may add memory."""
 
         def log(s: Any, after: Mapping[str, Any], p: Any, dt: Any) -> dict[str, Any]:
             own = {n: after[n] for n in model.state_names}
@@ -59,13 +59,13 @@ class Behind:
 
 
 def behind_logs(model: Model) -> Behind | None:
-    """What lies behind a model's late logs; None where none is late."""
+    """Return the true values behind a model's delayed logs, or None."""
     found = getattr(model.step, "behind", None)
     return found if isinstance(found, Behind) else None
 
 
 def seen_names(model: Model) -> tuple[str, ...]:
-    """The model's states, (n,), as physics calls them: `v` is the true one, `v_logged` the log."""
+    """Return state names (n,) as effects see them: `v` is the true value, `v_logged` the log."""
     found = behind_logs(model)
     if found is None:
         return model.state_names
@@ -75,7 +75,7 @@ def seen_names(model: Model) -> tuple[str, ...]:
 
 
 def moved_model(model: Model) -> Model:
-    """The model of the true values alone, with the parameters of this one."""
+    """Return the model of the true values alone, with the current parameters."""
     found = behind_logs(model)
     if found is None:
         return model
@@ -83,15 +83,15 @@ def moved_model(model: Model) -> Model:
 
 
 def logged(model: Model, x: Array, after: Array, p: Array, dt: float) -> Array:
-    """States (..., n) after a step from x (..., n) with the logs, and their memory, made anew.
+    """Return states (..., n) after a step with the delayed logs and their memory updated.
 
-    It is linear in x and `after` together, so that it takes slopes as well.
+    The result is linear in x and `after` together, so that slopes can be passed instead of states.
 
     Args:
-        model: whose logs may be late.
-        x: where the step began.
-        after: where it led, right in the true values.
-        p: the model's parameters, (k,) or of each row (N, k).
+        model: the model, whose logs may be delayed.
+        x: states at the start of the step (..., n).
+        after: states at its end (..., n), correct in the true values.
+        p: the model's parameters (k,), or per row (N, k).
         dt: the step [s].
     """
     found = behind_logs(model)
@@ -105,7 +105,7 @@ def logged(model: Model, x: Array, after: Array, p: Array, dt: float) -> Array:
 
 
 def sensor_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
-    """The states themselves become what a wrong sensor says."""
+    """Return a step whose states are the readings of a sensor with a bias or scale."""
     model, family = effect.site.model, effect.family
     assert isinstance(family, SensorFamily)
     base, seen = plain_step(model), effect.site.targets
@@ -120,7 +120,7 @@ def sensor_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[st
 
 
 def late_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
-    """True values, and their past, become memory; the states themselves are the logs."""
+    """Return a step whose states are the delayed logs, true values and their past as memory."""
     model, earlier = effect.site.model, behind_logs(effect.site.model)
     true = {n: _true_name(model, n) for n in effect.site.targets}
     make = _delayed if isinstance(effect.family, SensorDelayFamily) else _filtered
@@ -177,6 +177,6 @@ def _filtered(
 
 
 def _true_name(model: Model, target: str) -> str:
-    """What the state is called that the log of `target` shows late; its log may be late twice."""
+    """Return the name of the true value behind the log of `target`, which may be delayed twice."""
     name = f"{target}_true"
     return _true_name(model, name) if name in model.states else name

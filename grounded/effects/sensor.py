@@ -1,9 +1,9 @@
-"""What is logged is not what is: scale of the odometry; bias, scale, delay, lag of a sensor.
+"""Effects of sensors: scale of the odometry; bias, scale, delay and lag of a sensor.
 
     y = measure(s),   so that a model of logged states is   y+ = measure( f( recover(y), u ) )
 
-A bias on a coordinate that nothing depends on (x of a car on a flat floor) can't be known and
-changes nothing.
+A bias of a coordinate that nothing depends on (x of a car on a flat floor) is not identifiable and
+has no consequences.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ def _lag(site: Site) -> tuple[Quantity, ...]:
 
 
 def lagging(behind: Any, moved: Any, tau: Any, dt: Any) -> Any:
-    """How far a filtered sensor is off after a step in which its state moved evenly.
+    """Return y - s of a filtered sensor after a step in which its state s moved at constant rate.
 
     Args:
-        behind: how far it was off before, y - s.
-        moved: what the state moved by.
+        behind: y - s before the step.
+        moved: change of s in the step.
         tau: time constant [s].
         dt: step [s].
     """

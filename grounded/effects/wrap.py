@@ -1,23 +1,24 @@
-"""An effect joins a model: the wrapped model is again a plain model, with more parameters.
+"""Adding an effect to a model: the wrapped model is again a plain model, with more parameters.
 
 One control step of the wrapped model, for commands held over the step:
 
     u_eff  = effect(u, z, t)                      input and memory families
     f      = f(s, u_eff - loss(s, f))             losses to a joint's friction, solved (`joint`)
-    own    = (f(s, u_eff) - s) / dt               the model's own rate, its mean over the step
+    own    = (f(s, u_eff) - s) / dt               the model's own mean rate over the step
     s1     = f(s + dt/2 rate(s), u_eff)           half of an added rate before the step ...
     s+     = s1 + dt/2 rate(s1)                   ... and half after it (Strang): second order in dt
     s+     = s + h (own + rate(s))                families that limit a rate, h = dt / parts
     s+     = V_c(f(V_-c(s))) + dt c               a medium that moves with c (`medium`)
     y+     = measure(s+),  s = recover(y)         sensor families
 
-Several rates are added up and all see the same `own`, whichever was wrapped first: `own` is never
-the rate of a model that has another of them in it. A limit acts inside the added halves.
+Several rates are summed and all see the same `own`, in whatever order they were wrapped: `own`
+never contains another added rate. Limits act between the added halves.
 
-It is a `step` model in plain NumPy, so that it is traced and compiled where the original was.
-Memory (a lag's output, a queue, a clock) becomes further states, all of them functions of the
-commands and the measured states (`memory`). In which order several effects are wrapped:
-`wrapping_order`; what moves the model goes inside late sensors, a medium and inputs (`_inside`).
+The result is a `step` model in plain NumPy, so that it is traced and compiled if the original was.
+Memory (a lag's output, a queue, a clock) becomes further states, which are functions of the
+commands and the measured states (`memory`). `wrapping_order` gives the order of several effects.
+Effects on the motion go inside delayed sensors, a medium and input effects that the model already
+has (`_inside`).
 """
 
 from __future__ import annotations
@@ -55,15 +56,15 @@ from grounded.model import Model, Param
 
 
 def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
-    """A model with the effect in it: parameters `family_target_c`, memory states where needed.
+    """Return the model with the effect: new parameters `family_target_c`, memory states if needed.
 
     Args:
         effect: built for the model that it will change (`Library.effect`).
-        values: the effect's quantities; fixed ones may be left out.
-        dt: control step [s]: how long a queue must be.
+        values: the effect's quantities; fixed ones may be omitted.
+        dt: control step [s], which sets the length of a queue.
 
     Raises:
-        GroundedError: for a quantity that is unknown or missing.
+        GroundedError: if a quantity is unknown or missing.
     """
     model, family = effect.site.model, effect.family
     whole = effect.complete(values)
@@ -113,7 +114,7 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
 
 @dataclass(frozen=True)
 class _Shell:
-    """The outermost effect of a model, what moves things excepted."""
+    """The outermost effect of a model that does not act on the motion (input, sensor, medium)."""
 
     effect: Effect
     whole: Values
@@ -126,9 +127,10 @@ def _shell(model: Model) -> _Shell | None:
 
 
 def _inside(around: _Shell, effect: Effect, values: Mapping[str, float], dt: float) -> Model:
-    """A model that gets an effect inside its outermost one: what moves things acts there.
+    """Return a model with an effect on the motion inside its outermost effect.
 
-    A friction brakes what moves, not the late log of it; a hull's drag acts through the water.
+    For example, a friction acts on the true velocity, not on its delayed log, and a hull's drag
+    acts on the velocity through the water.
     """
     model, outer = effect.site.model, around.effect
     inner = outer.site.model
@@ -141,14 +143,14 @@ def _inside(around: _Shell, effect: Effect, values: Mapping[str, float], dt: flo
     return replace(whole, params=params, name=name)
 
 
-SURE = 0.5  # of its value: prior standard deviation of an adopted effect's quantity
+SURE = 0.5  # prior standard deviation of an adopted quantity, relative to its value
 
 
 def _param(quantity: Quantity, value: float, constant_at_zero: bool) -> Param:
-    """A quantity as a parameter.
+    """Return a quantity as a parameter of the wrapped model.
 
-    One at 0 beside others of its effect is a part that no data showed, and stays so: what an input
-    from 0 up does on its other side.
+    A quantity at 0 beside others that are not is a part that the data did not show (the other side
+    of an input that was always positive), and becomes a constant.
     """
     fixed = quantity.fixed or (value == 0 and constant_at_zero)
     if fixed:
@@ -200,9 +202,9 @@ def _memory_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[s
 
 
 def _settled(effect: Effect) -> Callable[[Any, Any], dict[str, Any]]:
-    """What memories of inputs hold after the commands a were held for long, by a target's name.
+    """Return a function for the settled memories of inputs under constant commands, by name.
 
-    Each effect hands on what it makes of them to those that were wrapped before it.
+    Each effect passes its output on to the effects that were wrapped before it.
     """
     model, family = effect.site.model, effect.family
     inner = getattr(model.step, "settled", None)
@@ -221,7 +223,7 @@ def _settled(effect: Effect) -> Callable[[Any, Any], dict[str, Any]]:
 
 
 def _loss_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
-    """One more loss: solved together with those that the model has already."""
+    """Add a loss, solved together with those that the model already has."""
     model = effect.site.model
     inner, others = getattr(model.step, "losing", (model, ()))
     base, effects, moved = plain_step(inner), (*others, effect), integrated(inner)
@@ -236,7 +238,7 @@ def _loss_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str
 
 
 def _rate_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
-    """One more added or limited rate: it joins those that the model has already."""
+    """Add a rate or a limit to those that the model already has."""
     model = effect.site.model
     inner, others = getattr(model.step, "joined", (model, ()))
     effects = (*others, effect)
@@ -246,10 +248,10 @@ def _rate_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str
 
 
 def _joint_step(model: Model, effects: tuple[Effect, ...]) -> Step:
-    """A step with all rates at once, each of which sees the model's own, not the others'.
+    """Return a step with all rates, each of which sees the model's own rate without the others.
 
-    Nested, an effect would take another's rate for the model's and mean something else than the
-    diagnosis, `Predictor.advance`, of which these are the equations.
+    These are the equations of the diagnosis, `Predictor.advance`. In nested steps, an effect would
+    take another one's rate for the model's own.
     """
     base, instant, clocks = plain_step(model), _instant(model), _clocks(effects)
     limits = [e for e in effects if _family(e).parts]
@@ -262,10 +264,10 @@ def _joint_step(model: Model, effects: tuple[Effect, ...]) -> Step:
         then = {z: s[z] + dt for z in clocks}
         own = _mean_rate(start, base(start, a, p, dt), dt) if needs_own else {}
         state = _kicked(start, _added(rates, start, a, own, now, p, dt), dt)
-        after, own = _through(limits, base, state, a, p, dt, now)  # the mean over the very step
+        after, own = _through(limits, base, state, a, p, dt, now)  # own: mean over this step
         final = _kicked(after, _added(rates, after, a, own, then, p, dt), dt)
         result = dict(final)
-        for n, k in tied.items():  # a carried heading rate is the heading's rate, effects and all
+        for n, k in tied.items():  # a carried heading rate is the heading's, effects included
             first, last = instant(start, a, p, dt), instant(final, a, p, dt)
             before = _added(effects, start, a, first, now, p, dt).get(n, 0.0)
             later = _added(effects, final, a, last, then, p, dt).get(n, 0.0)
@@ -285,7 +287,7 @@ def _clocks(effects: Sequence[Effect]) -> list[str]:
 
 
 def _instant(model: Model) -> Step:
-    """The model's own rates at a moment: its derivative, or the mean over a very short step."""
+    """Return the model's instantaneous rates: its derivative, or the mean over a short step."""
     derivative, base = model.derivative, plain_step(model)
 
     def rates(s: Any, a: Any, p: Any, dt: Any) -> Any:
@@ -302,7 +304,7 @@ def _mean_rate(s: Named, ahead: Mapping[str, Any], dt: Any) -> dict[str, Any]:
 def _added(
     effects: Sequence[Effect], s: Named, a: Any, own: Any, clock: Mapping[str, Any], p: Any, dt: Any
 ) -> dict[str, Any]:
-    """Sum of the effects' rates at one moment, by state."""
+    """Return the sum of the effects' rates at one moment, by state."""
     total: dict[str, Any] = {}
     for e in effects:
         t = clock.get(_clock(e), 0.0)
@@ -315,7 +317,7 @@ def _added(
 def _through(
     limits: Sequence[Effect], base: Step, s: Named, a: Any, p: Any, dt: Any, now: Mapping[str, Any]
 ) -> tuple[Named, dict[str, Any]]:
-    """The model's step through limits, which act on its mean rate over parts of it; that rate."""
+    """Return the model's step under limits of its mean rate over parts of it, and its mean rate."""
     if not limits:
         ahead = base(s, a, p, dt)
         return Named("state", tuple(s), [ahead[n] for n in s]), _mean_rate(s, ahead, dt)
@@ -336,7 +338,7 @@ def _through(
 
 
 def _kicked(s: Named, rate: Values, dt: Any) -> Named:
-    """Half a step of an added rate alone."""
+    """Return the state after half a step of an added rate alone."""
     moved = [s[n] + 0.5 * dt * rate[n] if n in rate else s[n] for n in s]
     return Named("state", tuple(s), moved)
 

@@ -1,6 +1,6 @@
-"""Baselines: how many real trials each of seven methods needs, and where it ends.
+"""Comparison of seven methods by the number of real trials they need, and by their final policies.
 
-    paper        this algorithm as the paper has it: the bias alone, DDP to convergence
+    paper        this algorithm as in the paper: the bias alone, DDP to convergence
     grounded     this algorithm as the tool recommends it: matched inputs, damped steps
     refit+bias   the same, the model's parameters refitted to all trials before the bias is added
     gradient     this algorithm with policy gradient
@@ -8,13 +8,14 @@
     ilc          norm-optimal iterative learning control (`ilc`)
     differences  model-free: finite differences of the real utility (footnote 5), with BFGS
 
-A method sees the task with the crude model and a function that runs a policy on the real system;
-`differences` is told the true gradient, and charged the trials that differencing would have cost.
+A method gets the task with the crude model and a function that runs a policy on the real system.
+`differences` gets the true gradient, and is charged the trials that finite differences would cost.
 
-They meet on three manoeuvres of the car, three kinds of error (`bench`), a number of seeds. Of each
-policy that a method keeps, the TRUE utility counts: in a quiet world that of its trial, with noise
-the mean of fresh runs, because a winner's own trials flatter it. Zero is the model's own policy
-(the eighth method: model-based alone), one the optimum that knows the real car.
+They are compared on three manoeuvres of the car, with three kinds of error (`bench`) and several
+seeds. Each policy that a method keeps counts with its TRUE utility: without noise that of its
+trial, with noise the mean of fresh runs, because the measured utility of a selected policy is
+biased. Zero is the model's own policy (model-based control alone), one is the optimum of a search
+that knows the real car.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from grounded.trial import Trial, mean_trial
 
 
 def fitted_model(task: Task, trials: Sequence[Trial]) -> Model:
-    """The model with all its parameters fitted to whole trials."""
+    """Return the model with all its parameters fitted to whole trials."""
     from grounded.fit import fit
 
     whole = [trial for trial in trials if trial.finite_steps >= 3]
@@ -55,7 +56,7 @@ def fitted_model(task: Task, trials: Sequence[Trial]) -> Model:
 
 
 def refit_alone(case: Bench, options: SearchOptions, rounds: int = 6) -> list[Kept]:
-    """Fit to all trials so far, solve, run, again; the policy of the latest model is kept."""
+    """Repeat: solve, run, fit to all trials so far. The policy of the latest model is kept."""
     task, trials, kept = case.task, list[Trial](), list[Kept]()
     for _ in range(rounds):
         policy, _ = first_policy(task)
@@ -68,7 +69,7 @@ def refit_alone(case: Bench, options: SearchOptions, rounds: int = 6) -> list[Ke
 
 
 def learning_control(case: Bench, options: SearchOptions, rounds: int = 12) -> list[Kept]:
-    """Norm-optimal ILC: every update is taken; after a failed run the step is not repeated."""
+    """Run norm-optimal ILC; every update is accepted, and a failed run ends it."""
     policy, _ = first_policy(case.task)
     model = lifted(case.task, policy)
     kept: list[Kept] = []
@@ -85,10 +86,10 @@ def learning_control(case: Bench, options: SearchOptions, rounds: int = 12) -> l
 
 
 def differences(case: Bench, options: SearchOptions, budget: int = 5000) -> list[Kept]:
-    """BFGS on the real utility by the feed-forward; a gradient costs H m trials.
+    """Run BFGS on the real utility over the feed-forward; a gradient costs H m trials.
 
-    The gradient is the true system's own derivative, so no noise spoils it and no step size has to
-    be chosen: a bound from below on what differencing needs.
+    The gradient is the true system's derivative, without noise or step size, so the result is a
+    lower bound on the trials that finite differences need.
     """
     from scipy.optimize import minimize
 
@@ -127,7 +128,7 @@ def differences(case: Bench, options: SearchOptions, budget: int = 5000) -> list
 
 
 def run_method(name: str, case: Bench, options: SearchOptions) -> list[Kept]:
-    """The policies that a method keeps, in the order of real trials."""
+    """Return the policies that a method keeps, in the order of real trials."""
     ours: dict[str, dict[str, Any]] = {
         "paper": {"step": "full", "match_inputs": False},
         "grounded": {},
@@ -146,12 +147,12 @@ METHODS = ("paper", "grounded", "refit+bias", "gradient", "refit", "ilc", "diffe
 
 SHARES = (0.5, 0.9, 0.97, 0.99)
 BUDGET = 40  # trials of every method but finite differences
-FRESH = 20  # runs that judge a policy when there is noise
+FRESH = 20  # fresh runs per policy if there is noise
 
 
 @dataclass(frozen=True)
 class Line:
-    """One method on one case: trials to each of SHARES (None: not reached), and where it ended."""
+    """One method on one case: trials to each of SHARES (None: not reached), and its final share."""
 
     method: str
     manoeuvre: str
@@ -169,11 +170,11 @@ class BaselinesResult:
     lines: tuple[Line, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Lines by name."""
+        """Return the lines as plain values."""
         return {"shares": list(SHARES), "lines": [vars(line) for line in self.lines]}
 
     def tables(self) -> list[StudyTable]:
-        """Median trials to 50/90/97/99 % and the median and worst share reached, by method."""
+        """Return median trials to 50/90/97/99 %, median and worst share reached, by method."""
         cases = dict.fromkeys((line.manoeuvre, line.kind) for line in self.lines)
         return [self._table(manoeuvre, kind) for manoeuvre, kind in cases]
 
@@ -191,7 +192,7 @@ class BaselinesResult:
 
 
 def median_trials(trials: Sequence[int | None]) -> str:
-    """The median count; "-" when half of the seeds or more never got there."""
+    """Return the median count, or "-" if it was not reached by half of the seeds or more."""
     reached = np.median([np.inf if count is None else count for count in trials])
     return f"{reached:g}" if np.isfinite(reached) else "-"
 
@@ -204,17 +205,17 @@ def run(
     methods: Sequence[str] = METHODS,
     **how: Unpack[Running],
 ) -> BaselinesResult:
-    """Every method on every case; a job is one of them."""
+    """Run every method on every case, one job each."""
     cases = (
         case
         for case in every(manoeuvre=manoeuvres, kind=kinds, method=methods, seed=seeds)
-        if (case["method"], case["kind"]) != ("differences", "noise")  # given the true gradient
+        if (case["method"], case["kind"]) != ("differences", "noise")  # it gets the true gradient
     )
     return BaselinesResult(run_study(Line, baselines_job, cases, **how))
 
 
 def baselines_job(method: str, manoeuvre: str, kind: str, seed: int) -> dict[str, Any]:
-    """A job: one method, one case."""
+    """Run one job: one method on one case."""
     case = bench(manoeuvre, kind, seed)
     noisy = kind == "noise"
     options = SearchOptions(max_trials=BUDGET)

@@ -1,13 +1,13 @@
-"""A bench: one manoeuvre, one crude model, one simulated real car, and the optimum between them.
+"""Test cases of the studies: a manoeuvre, a crude model, a simulated real car, and the optimum.
 
     parametric   the real car is the model with every parameter times an independent U[0.8, 1.2]
     structural   the real car has effects that the model has no terms for (`real_car`), its latency,
                  and calibration errors of the size declared there, with random signs
     noise        structural, and every run scatters as the real car does
 
-The optimum is what the search reaches when it plans with the TRUE model and latency: no method sees
-it. It is a local optimum, like the paper's; `share` of the gap may therefore exceed one. What a
-policy is worth is its TRUE utility, the mean of fresh runs (`true_utility`).
+The optimum is what the search reaches when it plans with the TRUE model and latency, which no
+method sees. It is a local optimum, like the paper's, so `share` of the gap may exceed one. Policies
+are compared by their TRUE utility, the mean of fresh runs (`true_utility`).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Refit = Callable[[Task, Sequence[Trial]], Model]
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """`task` has the crude model, `truth` the same task with the true model and latency."""
+    """One case: `task` has the crude model, `truth` is the task with the true model and latency."""
 
     task: Task
     truth: Task
@@ -48,17 +48,17 @@ class Bench:
     seed: int
 
     def real(self, policy: Policy, run: int) -> Trial:
-        """The `run`-th real run of the study."""
+        """Simulate the `run`-th real run of the study."""
         rng = np.random.default_rng([self.seed, 11, run])
         return self.plant.run(policy, start_of(self.task), rng)
 
     def share(self, utility: float | Array, base: float, optimum: float) -> Array:
-        """How much of the gap between the model's own policy and the optimum is closed."""
+        """Return the share of the gap between the model's policy and the optimum that is closed."""
         return (np.asarray(utility, dtype=float) - base) / (optimum - base)
 
 
 def bench(manoeuvre: str, kind: str, seed: int) -> Bench:
-    """One case: a manoeuvre ("turn", "circle", "figure8"), a kind of error, a seed."""
+    """Return a case for a manoeuvre ("turn", "circle", "figure8"), a kind of error, a seed."""
     rng = np.random.default_rng([seed, 3])
     if kind == "parametric":
         wrong = car.values * rng.uniform(1 - SPREAD, 1 + SPREAD, len(car.values))
@@ -79,7 +79,7 @@ def bench(manoeuvre: str, kind: str, seed: int) -> Bench:
 
 
 def optimum(case: Bench) -> tuple[Policy, float]:
-    """The best policy found with the true model, and its utility in the quiet plant."""
+    """Return the best policy found with the true model, and its utility without noise."""
     quiet = replace(case, plant=replace(case.plant, noise=Noise()))
 
     def run(candidate: Candidate) -> Trial:
@@ -93,7 +93,7 @@ def optimum(case: Bench) -> tuple[Policy, float]:
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """A policy that a method would return after so many trials, and the utility it measured."""
+    """The policy that a method would return after `trials` trials, and its measured utility."""
 
     trials: int
     policy: Policy
@@ -103,16 +103,16 @@ class Kept:
 def searched(
     case: Bench, options: SearchOptions, *, refit: Refit | None = None, again: bool = False
 ) -> tuple[list[Kept], float, int]:
-    """This algorithm on the bench, through the function that proposes candidates.
+    """Run this project's search on a case.
 
     Args:
-        case: what is learned.
-        options: of the search.
-        refit: how the model is fitted to the trials so far; None: it is not.
-        again: run the incumbent once more beside every new candidate.
+        case: the case.
+        options: options of the search.
+        refit: fits the model to the trials so far; None: no refit.
+        again: whether the incumbent is run again with every new candidate.
 
     Returns:
-        The policies kept in turn, the utility that the last one claims, and how many trials ran.
+        The policies kept in turn, the measured utility of the last one, and the number of trials.
     """
     candidates: list[Candidate] = []
     trials: list[Trial] = []
@@ -138,7 +138,7 @@ def searched(
 
 
 def scaled(plant: Plant, level: float) -> Plant:
-    """The plant with all standard deviations times `level`."""
+    """Return the plant with all noise standard deviations times `level`."""
     noise = Noise(
         **{
             kind: {name: level * std for name, std in getattr(plant.noise, kind).items()}
@@ -149,12 +149,12 @@ def scaled(plant: Plant, level: float) -> Plant:
 
 
 def start_of(task: Task) -> dict[str, float]:
-    """The start state by name."""
+    """Return the start state by name."""
     return dict(zip(task.model.state_names, map(float, task.start), strict=True))
 
 
 def true_utility(task: Task, plant: Plant, policy: Policy, runs: int, seed: int = 1) -> float:
-    """Mean utility of fresh runs of a policy: what a winner's own trials flatter.
+    """Return the mean utility of fresh runs of a policy, free of selection bias.
 
     A run that crashes counts with the utility of a car that stayed at the start.
     """
@@ -166,7 +166,7 @@ def true_utility(task: Task, plant: Plant, policy: Policy, runs: int, seed: int 
 def many_runs(
     task: Task, plant: Plant, policy: Policy, streams: Sequence[np.random.Generator]
 ) -> list[Trial]:
-    """`plant.run` of one policy for many streams side by side, one run a stream.
+    """Simulate `plant.run` of one policy for many random streams at once, one run per stream.
 
     The plant's states and inputs must be the policy's, in the same order.
     """
@@ -192,7 +192,7 @@ def many_runs(
 
 
 def _actions(policy: Policy, x: Array, sent: Array, t: int) -> Array:
-    """The inputs of step t (N, m) for measured states x (N, n) and the inputs sent before."""
+    """Return the inputs of step t (N, m) for measured states x (N, n) and earlier inputs."""
     u: Array = np.tile(policy.feedforward[t], (len(x), 1))
     if policy.gain is not None and policy.reference is not None:
         past = [
@@ -208,6 +208,6 @@ def _actions(policy: Policy, x: Array, sent: Array, t: int) -> Array:
 
 
 def standing_still(task: Task) -> float:
-    """Utility of never moving: a floor for runs that ended early."""
+    """Return the utility of never moving, a floor for runs that ended early."""
     error = task.model.difference(np.tile(task.start, (task.horizon + 1, 1)), task.target)
     return -float((np.nan_to_num(error) ** 2 @ task.reward.state).sum())

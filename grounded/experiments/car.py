@@ -5,9 +5,9 @@
     figure8   closed loop, 63 %
 
 "We repeated the experiments 3-4 times for each maneuver, with similar results" (footnote 19). Each
-repetition is one world: the simulated real car with its scatter, a stream of its own. Beside what
-the trials claim stands the TRUE utility, the mean of fresh runs, and the optimum of a search that
-knows the real car. One quiet repetition, without scatter, shows the method by itself.
+repetition is the simulated real car with its scatter and its own random stream. In addition to the
+utility measured in the trials, the study reports the TRUE utility, the mean of fresh runs, and the
+optimum of a search that knows the real car. One repetition without scatter shows the method alone.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FRESH = 30
 
 @dataclass(frozen=True)
 class CarRun:
-    """One repetition. `utilities` are what its trials claim, `true` the mean of fresh runs."""
+    """One repetition. `utilities` are measured in its trials, `true` are means of fresh runs."""
 
     manoeuvre: str
     seed: int
@@ -50,7 +50,7 @@ class CarRun:
 
     @property
     def improvement(self) -> float:
-        """Of the true utility."""
+        """Improvement of the true utility."""
         return improvement(*self.true)
 
 
@@ -61,11 +61,11 @@ class CarResult:
     runs: tuple[CarRun, ...]
 
     def of(self, manoeuvre: str, noisy: bool) -> list[CarRun]:
-        """Repetitions of one manoeuvre."""
+        """Return the repetitions of one manoeuvre."""
         return [run for run in self.runs if (run.manoeuvre, run.noisy) == (manoeuvre, noisy)]
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `grounded experiment car --json`: a row a run, with its improvement."""
+        """Return the document of `grounded experiment car --json`, a row per run."""
         runs = [
             {key: value for key, value in vars(run).items() if key != "paths"}
             | {"improvement": run.improvement}
@@ -75,7 +75,7 @@ class CarResult:
         return {"runs": runs, "figures": figures, "paper": PAPER}
 
     def tables(self) -> list[StudyTable]:
-        """Improvement and trials beside the paper's, quiet and with scatter."""
+        """Return improvement and trials beside the paper's, without and with scatter."""
         found = []
         for noisy, title in ((False, "RC car that repeats itself"), (True, "RC car with scatter")):
             some = [run for run in self.runs if run.noisy == noisy]
@@ -103,7 +103,7 @@ def run(
     manoeuvres: Sequence[str] = NAMES,
     **how: Unpack[Running],
 ) -> CarResult:
-    """Every manoeuvre once without scatter and once for each seed with it."""
+    """Run every manoeuvre once without scatter, and with scatter once for each seed."""
     cases = (
         {"manoeuvre": manoeuvre, "seed": seed, "noisy": noisy}
         for manoeuvre in manoeuvres
@@ -114,7 +114,7 @@ def run(
 
 
 def real_case(manoeuvre: str, seed: int, noisy: bool) -> Bench:
-    """The simulated real car as it is declared, not one of the bench's variants of it."""
+    """Return a case with the simulated real car as declared, not a variant of it."""
     task, model = car_task(manoeuvre, car), real_car()
     latency = np.array([LATENCY[name] for name in car.input_names])
     truth = replace(task.with_model(model), latency=latency)
@@ -122,7 +122,7 @@ def real_case(manoeuvre: str, seed: int, noisy: bool) -> Bench:
 
 
 def car_job(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
-    """A job: one repetition of one manoeuvre."""
+    """Run one job: one repetition of one manoeuvre."""
     case = real_case(manoeuvre, seed, noisy)
     options = SearchOptions(max_trials=BUDGET)
     trials: list[Trial] = []

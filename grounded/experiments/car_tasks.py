@@ -6,7 +6,8 @@
 
 A target is the exact motion of a kinematic car along a path of smooth curvature kappa(s) at a
 smooth speed V(t) of the front wheels: delta = atan(kappa L), rear-axle speed V cos(delta),
-psi' = V sin(delta) / L. Speeds up at RAMP_UP, slows at RAMP_DOWN (the car brakes at about 1 m/s^2).
+psi' = V sin(delta) / L. It accelerates at RAMP_UP and slows down at RAMP_DOWN (the car brakes at
+about 1 m/s^2).
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _Profile = list[tuple[float, float, float]]  # length [m], curvature [1/m], spee
 
 
 def _path(name: str) -> tuple[_Profile, float]:
-    """Segments of a manoeuvre and its duration [s]."""
+    """Return the segments of a manoeuvre and its duration [s]."""
     quarter = np.pi / 2
     if name == "turn":
         return [(0.7, 0.0, 1.2), (quarter * 0.7, 1 / 0.7, 1.0), (2.0, 0.0, 1.4)], 3.0
@@ -44,7 +45,7 @@ def _path(name: str) -> tuple[_Profile, float]:
 
 
 def target(name: str, wheelbase: float = 0.15) -> Array:
-    """States to follow, (H + 1, 6), in the order of `grounded.models.car`, none left free."""
+    """Return the target states (H + 1, 6), all set, in the order of `grounded.models.car`."""
     profile, duration = _path(name)
     H = round(duration / DT)
     ends = np.cumsum([length for length, _, _ in profile])
@@ -71,7 +72,7 @@ def target(name: str, wheelbase: float = 0.15) -> Array:
 
 
 def _reachable(limit: Array, step: float) -> Array:
-    """The speed limit lowered ahead of slow segments, so that RAMP_DOWN suffices."""
+    """Return the speed limit, lowered ahead of slow segments so that RAMP_DOWN suffices."""
     reachable = limit.copy()
     for i in range(len(limit) - 2, -1, -1):
         reachable[i] = min(limit[i], np.sqrt(reachable[i + 1] ** 2 + 2 * RAMP_DOWN * step))
@@ -79,7 +80,7 @@ def _reachable(limit: Array, step: float) -> Array:
 
 
 def car_task(name: str, model: Model) -> Task:
-    """One of NAMES as a task for a car model; tracked are position, heading and speed."""
+    """Return one of NAMES as a task for a car model, tracking position, heading and speed."""
     states = target(name)
     tracked = np.array([state in WEIGHTS for state in model.state_names])
     weights = np.array([WEIGHTS.get(state, 0.0) for state in model.state_names])

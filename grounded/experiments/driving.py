@@ -1,4 +1,4 @@
-"""A car is driven by hand under a camera that sees two markers at 30 Hz (footnotes 15 and 17)."""
+"""Manual driving of a car, filmed by a camera that sees two markers at 30 Hz (footnotes 15, 17)."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from grounded.frozen import Array
 from grounded.model import Model
 
 RATE = 30  # [Hz] of the camera and of the driver's inputs
-RUN = 60.0  # [s] one film
+RUN = 60.0  # [s] length of one film
 CAMERA = 0.002  # [m] noise of a marker's position
-PROCESS = (2e-3, 1e-2, 3e-4, 3e-4, 5e-4, 1e-3)  # [state's unit] per camera frame
-START = (0.05, 0.02, CAMERA, CAMERA, 0.02, 0.1)  # how well a car at rest is known
+PROCESS = (2e-3, 1e-2, 3e-4, 3e-4, 5e-4, 1e-3)  # [state's unit] process noise per camera frame
+START = (0.05, 0.02, CAMERA, CAMERA, 0.02, 0.1)  # standard deviation of the state of a car at rest
 
 
 def markers(length: float) -> Measurement:
-    """The camera: positions of the front and the rear marker, `length` apart [m]."""
+    """Return the camera's measurement: positions of front and rear marker, `length` apart [m]."""
 
     def seen(x: Array) -> Array:
         ahead = length * np.stack([np.cos(x[:, 4]), np.sin(x[:, 4])], axis=1)
@@ -34,7 +34,7 @@ def markers(length: float) -> Measurement:
 
 
 def hands(steps: int, rng: np.random.Generator) -> Array:
-    """A driver's steering and throttle (steps, 2): circles, straights, slow corners, stops."""
+    """Return a driver's steering and throttle (steps, 2): circles, straights, corners, stops."""
     u = np.zeros((steps, 2))
     t, target = 0, np.zeros(2)
     while t < steps:
@@ -63,7 +63,7 @@ def hands(steps: int, rng: np.random.Generator) -> Array:
 
 
 def drive(truth: Model, latency: float, minutes: float, rng: np.random.Generator) -> list[Record]:
-    """Films of a minute each: what the camera saw and what the driver did."""
+    """Return films of a minute each: the camera's measurements and the driver's commands."""
     steps = round(RUN * RATE)
     commands = [hands(steps, rng) for _ in range(max(1, round(minutes * 60 / RUN)))]
     see = markers(truth.params["L"].value)
@@ -80,16 +80,16 @@ def film(
     camera: float = CAMERA,
     process: Sequence[float] = PROCESS,
 ) -> list[Record]:
-    """What the camera sees of a car that is driven from rest, one record a run.
+    """Simulate the film of a car that is driven from rest, one record per run.
 
     Args:
         truth: the car, its states in the order of `grounded.models.car`.
         latency: true transport delay of each input [s], (2,).
         commands: steering and throttle of each run, all of the same length, (steps, 2).
-        see: the markers.
-        rng: of disturbances and pixels.
+        see: the measurement of the markers.
+        rng: random generator of process and measurement noise.
         camera: noise of a marker's position [m].
-        process: disturbance of each state per frame, (6,).
+        process: process noise of each state per frame, (6,).
     """
     steps, runs = len(commands[0]), len(commands)
     times = np.asarray(np.arange(steps + 1) / RATE)
@@ -110,7 +110,7 @@ def film(
 
 
 def at_rest(y: Array) -> tuple[Array, Array]:
-    """The state of a car at rest, (6,), and how well the first frame y (4,) shows it, (6,)."""
+    """Return the state (6,) of a car at rest from its first frame y (4,), and its std (6,)."""
     ahead = y[:2] - y[2:]
     start = np.array([0.0, 0.0, *y[2:], np.arctan2(ahead[1], ahead[0]), 0.0])
     return start, np.array(START)

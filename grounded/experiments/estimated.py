@@ -7,15 +7,16 @@ states (camera), and, for comparison, on the true states at the same instants (t
     each new estimate the controller of the nearest 20 Hz step -> command, sent at once
     afterwards        the smoother over all frames             -> the stored trial, 20 Hz
 
-The filter knows the CRUDE model with its modelled latency; the car and its delays are the real
-ones. A trial's inputs are the means of what was sent over each control step. No marker shows the
-heading rate: disturbances move delta and v without it, and its estimate drifts away. As in the
-paper, rigid-body kinematics gives it: psi_rate = v sin(delta) / L of the estimate.
+The filter uses the CRUDE model with its modelled latency; the car and its delays are the real ones.
+A trial's inputs are the means of what was sent over each control step. The markers do not show the
+heading rate, which would drift in the estimate, since disturbances change delta and v without it.
+As in the paper, it is computed from rigid-body kinematics: psi_rate = v sin(delta) / L of the
+estimate.
 
-Both searches are judged by the TRUE utility, that of the true states in fresh runs, flown as the
-search flew. "Optimum" is the policy of a search that knows the true model, planned without
-disturbances: a local optimum, which the trials may beat. The noise that the filter assumes is
-estimated from two minutes of manual driving: what the crude model gets wrong counts as process
+Both searches are compared by the TRUE utility, that of the true states in fresh runs under the same
+kind of feedback. "Optimum" is the policy of a search that knows the true model, planned without
+disturbances: a local optimum, which the trials may exceed. The noise that the filter assumes is
+estimated from two minutes of manual driving, where errors of the crude model count as process
 noise. Nothing is tuned by manoeuvre or seed.
 """
 
@@ -51,17 +52,17 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 FINE = 4  # integration steps of the real car within a frame; 2 of them are a row of the film
-ROWS = 2  # rows of the film a frame: 60 Hz has both the frames and the 20 Hz control steps
+ROWS = 2  # rows of the film per frame: 60 Hz contains the frames and the 20 Hz control steps
 
 
 @dataclass(frozen=True, eq=False)
 class Flown:
-    """One run, as the search sees it and as it was. The policy has n states, m inputs, H steps."""
+    """One run as the search sees it, and its true states (n states, m inputs, H steps)."""
 
     trial: Trial  # smoothed states
     truth: Trial  # true states
     live: Array  # (H + 1, n) estimates nearest to each control step, as the controller had them
-    nis: float  # mean normalised innovation squared; 1 where the filter's noise is right
+    nis: float  # mean normalised innovation squared; 1 if the filter's noise is right
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +70,11 @@ class Filmed:
     """The real car under a camera.
 
     Args:
-        task: the manoeuvre with the crude model and latency: all that the filter knows.
+        task: the manoeuvre with the crude model and latency, which the filter uses.
         plant: the real car; its noise gives start scatter and disturbances, not the measurements.
         see: what the camera measures.
         camera: noise of each channel [m].
-        noise: that the filter assumes.
+        noise: the noise that the filter assumes.
     """
 
     task: Task
@@ -83,10 +84,7 @@ class Filmed:
     noise: NoiseStd
 
     def run(self, policy: Policy, rng: np.random.Generator, *, estimated: bool = True) -> Flown:
-        """Executes a policy once; `estimated` False: the controller is given the true states.
-
-        The trial then holds the true states too.
-        """
+        """Execute a policy once; without `estimated`, controller and trial get the true states."""
         frames = round(policy.horizon * policy.dt * RATE)
         film = _Film(self, policy, frames, rng)
         runner = Runner(policy)
@@ -100,14 +98,14 @@ class Filmed:
 
 
 def kinematic(x: Array, model: Model) -> Array:
-    """Car states (..., 6) with the heading rate that the other states imply [rad/s]."""
+    """Return car states (..., 6) with the heading rate implied by the other states [rad/s]."""
     delta, v = x[..., 0], x[..., 1]
     rate = v * np.sin(delta) / model.params["L"].value
     return np.concatenate([x[..., :5], rate[..., None]], axis=-1)
 
 
 class _Film:
-    """What happens during one run, frame by frame."""
+    """The simulation of one run, frame by frame."""
 
     def __init__(
         self, filmed: Filmed, policy: Policy, frames: int, rng: np.random.Generator
@@ -137,7 +135,7 @@ class _Film:
         )
 
     def seen(self, k: int) -> Array:
-        """Frame k is filmed; the estimate after it, (n,)."""
+        """Film frame k and return the estimate after it, (n,)."""
         see = self.filmed.see
         y = see.function(self.x[None])[0]
         self.y[ROWS * k] = y + self.filmed.camera * self.rng.standard_normal(see.ny)
@@ -146,7 +144,7 @@ class _Film:
         return np.asarray(self.live[k])
 
     def advance(self, k: int, u: Array) -> None:
-        """Command u (m,) is sent at frame k; the real car moves on to frame k + 1."""
+        """Send command u (m,) at frame k and advance the real car to frame k + 1."""
         self.sent[k] = u
         self.tracker.sent(k / RATE, u)
         times = (k + np.arange(FINE + 1) / FINE) / RATE
@@ -161,7 +159,7 @@ class _Film:
                 self.true[ROWS * k + (i + 1) // (FINE // ROWS)] = self.x
 
     def flown(self, estimated: bool) -> Flown:
-        """The run on the control grid."""
+        """Return the run on the control grid."""
         policy, rows = self.policy, round(ROWS * RATE * self.policy.dt)
         grid = np.asarray(np.arange(policy.horizon + 1) * policy.dt)
         frames = len(self.sent)
@@ -189,7 +187,7 @@ class _Film:
         return kinematic(smoothed[0].states, task.model)
 
     def _commands(self, times: Array, count: int, y: Array | None = None) -> Record:
-        """The first `count` commands on a clock `times`; with frames y, a record of the run."""
+        """Return a record of the first `count` commands at `times`, with frames y if given."""
         nothing = np.zeros((len(times), 0))
         return Record(
             times,
@@ -218,16 +216,16 @@ class EstimatedRun:
     manoeuvre: str
     seed: int
     states: str  # "camera" or "true"
-    utilities: tuple[float, ...]  # what the trials claim
+    utilities: tuple[float, ...]  # measured in the trials
     true: tuple[float, float, float]
     trials: int
-    nis: float | None  # of the filter, mean over the trials; 1 where its noise is right
-    live: tuple[float, float, float] | None  # rms error of what the controller had ...
+    nis: float | None  # of the filter, mean over the trials; 1 if its noise is right
+    live: tuple[float, float, float] | None  # rms error of the live estimates ...
     smoothed: tuple[float, float, float] | None  # ... and of the trials: [m], [rad], [m/s]
 
     @property
     def improvement(self) -> float:
-        """Of the true utility."""
+        """Improvement of the true utility."""
         return improvement(*self.true[:2])
 
 
@@ -238,11 +236,11 @@ class EstimatedResult:
     runs: tuple[EstimatedRun, ...]
 
     def of(self, manoeuvre: str, states: str) -> list[EstimatedRun]:
-        """Searches of one manoeuvre on one kind of states."""
+        """Return the searches of one manoeuvre on one kind of states."""
         return [run for run in self.runs if (run.manoeuvre, run.states) == (manoeuvre, states)]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return the result as plain values."""
         return {
             "camera_m": CAMERA,
             "runs": [vars(run) | {"improvement": run.improvement} for run in self.runs],
@@ -250,7 +248,7 @@ class EstimatedResult:
         }
 
     def tables(self) -> list[StudyTable]:
-        """Improvement on estimated beside true states, and how good the estimates were."""
+        """Return the improvement on estimated and on true states, and errors of the estimates."""
         names = dict.fromkeys(run.manoeuvre for run in self.runs)
         groups = [(name, way, self.of(name, way)) for name in names for way in WAYS]
         told = ("true utility", "improvement", "optimum", "trials an iteration", "paper")
@@ -294,13 +292,13 @@ def run(
     manoeuvres: Sequence[str] = NAMES,
     **how: Unpack[Running],
 ) -> EstimatedResult:
-    """Every manoeuvre for each seed, on estimated and on true states."""
+    """Run every manoeuvre for each seed, on estimated and on true states."""
     cases = every(manoeuvre=manoeuvres, states=WAYS, seed=map(int, seeds))
     return EstimatedResult(run_study(EstimatedRun, estimated_job, cases, **how))
 
 
 def assumed_noise(case: Bench, see: Measurement, seed: int) -> NoiseStd:
-    """Process and measurement noise of the crude model on manual driving of the real car."""
+    """Estimate process and measurement noise of the crude model from manual driving."""
     rng = np.random.default_rng([seed, 13])
     plant, task = case.plant, case.task
     assert task.latency is not None
@@ -317,7 +315,7 @@ def assumed_noise(case: Bench, see: Measurement, seed: int) -> NoiseStd:
 
 
 def estimated_job(manoeuvre: str, seed: int, states: str) -> dict[str, Any]:
-    """A job: one search on estimated ("camera") or true states."""
+    """Run one job: one search on estimated ("camera") or true states."""
     case = real_case(manoeuvre, seed, True)
     see = markers(SPACING)
     filmed = Filmed(case.task, case.plant, see, CAMERA, assumed_noise(case, see, seed))
@@ -345,7 +343,7 @@ def estimated_job(manoeuvre: str, seed: int, states: str) -> dict[str, Any]:
 
 
 def _true_utility(filmed: Filmed, policy: Policy, seed: int, states: str) -> float:
-    """Mean utility of the true states in fresh runs; a crash counts as a car that never moved."""
+    """Return the mean true utility of fresh runs; a crash counts as a car that never moved."""
     streams = (np.random.default_rng([seed, 17, i]) for i in range(FRESH))
     runs = [filmed.run(policy, rng, estimated=states == "camera").truth for rng in streams]
     utilities = [filmed.task.utility(truth) for truth in runs]
@@ -353,7 +351,7 @@ def _true_utility(filmed: Filmed, policy: Policy, seed: int, states: str) -> flo
 
 
 def _quality(flights: Sequence[Flown]) -> dict[str, Any]:
-    """Mean NIS and rms errors of position, heading and speed, live and smoothed."""
+    """Return mean NIS and rms errors of position, heading and speed, live and smoothed."""
     whole = [f for f in flights if np.isfinite(f.nis)]
     if not whole:
         return {"nis": None, "live": None, "smoothed": None}
@@ -365,7 +363,7 @@ def _quality(flights: Sequence[Flown]) -> dict[str, Any]:
 
 
 def _rms(error: Array) -> list[float]:
-    """Of position [m], heading [rad] and speed [m/s], from errors (rows, 6)."""
+    """Return rms of position [m], heading [rad] and speed [m/s], from errors (rows, 6)."""
     square = np.mean(error**2, axis=0)
     at, heading, speed = np.sqrt(square[2] + square[3]), np.sqrt(square[4]), square[1] ** 0.5
     return [float(at), float(heading), float(speed)]

@@ -38,11 +38,11 @@ LIMITS = {
     "aileron": (-0.8, 0.8),
     "elevator": (-0.8, 0.8),
     "rudder": (-0.8, 0.8),
-}  # [1, rad]: of motor and servos; wide enough for the trims of 99 of 100 perturbed models
+}  # [1, rad] of motor and servos; wide enough for the trims of 99 of 100 perturbed models
 
 
 def figure8_profile() -> tuple[Array, Array]:
-    """Speed [m/s] and curvature [1/m] before smoothing, each (H + 1,), positive to the right."""
+    """Return speed [m/s] and curvature [1/m] (positive to the right) before smoothing, (H + 1,)."""
     ramp = (FAST - SLOW) / RAMP
     run_up = (FAST**2 - SLOW**2) / (2 * RAMP)
     arc = 1.5 * math.pi * RADIUS / SLOW
@@ -58,7 +58,7 @@ def figure8_profile() -> tuple[Array, Array]:
 
 
 def figure8_target() -> tuple[Array, Array, Array]:
-    """North, east, altitude [m] (H + 1, 3), speed [m/s] and turn rate [rad/s] (H + 1,)."""
+    """Return north, east, altitude [m] (H + 1, 3), speed [m/s] and turn rate [rad/s] (H + 1,)."""
     speed, curvature = (hann_smoothed(s, round(SMOOTHING / DT)) for s in figure8_profile())
     rate = curvature * speed
     track = np.concatenate([[0.0], np.cumsum(0.5 * DT * (rate[1:] + rate[:-1]))])
@@ -69,7 +69,7 @@ def figure8_target() -> tuple[Array, Array, Array]:
 
 
 def flight_task(model: Model, started_by: Model | None = None) -> Task:
-    """The figure-8 for a model of the aircraft: positions tracked, nothing else.
+    """Return the figure-8 as a task for a model of the aircraft; only positions are tracked.
 
     Weights per step: 1 on each position error [1/m2], 1 on inputs, 1e5 on input changes.
 
@@ -101,6 +101,6 @@ def flight_task(model: Model, started_by: Model | None = None) -> Task:
 
 
 def perturbed(model: Model, rng: np.random.Generator, spread: float = 0.2) -> Model:
-    """An approximate model: every parameter times an independent U[1 - spread, 1 + spread]."""
+    """Return a model with every parameter times an independent U[1 - spread, 1 + spread]."""
     factors = rng.uniform(1 - spread, 1 + spread, len(model.values))
     return model.with_values(dict(zip(model.param_names, model.values * factors, strict=True)))

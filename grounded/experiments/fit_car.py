@@ -1,6 +1,6 @@
-"""The car's parameters from half an hour of manual driving (footnote 17).
+"""Estimation of the car's parameters from half an hour of manual driving (footnote 17).
 
-As the paper did it: the wheelbase is measured with a tape, steering angles on the bench for various
+As in the paper, the wheelbase is measured with a tape and steering angles on the bench for various
 inputs; 30 minutes of driving are filmed at 30 Hz. The film gives first values (`first_values`):
 
     a1, b1          a line through the steering angles measured on the bench
@@ -8,9 +8,9 @@ inputs; 30 minutes of driving are filmed at 30 Hz. The film gives first values (
     stall           the largest throttle at which the car stood
     tau_delta, latency, tau_v, a4   from how heading rate and speed follow the inputs
 
-From these `grounded.fit` climbs the likelihood of all the data, parameters, stall threshold and
+From these, `grounded.fit` maximises the likelihood of all data over parameters, stall threshold and
 latency together. Every seed is another car (each parameter +-20 %), another driver and other noise.
-The check: the stated 95 % intervals hold the true values.
+The study checks that the stated 95 % intervals contain the true values.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from grounded.models.car import model as car
 def first_values(
     films: Sequence[Record], length: float, angles: tuple[Array, Array]
 ) -> dict[str, float]:
-    """Where the climb begins, as in footnote 17: regressions and step responses.
+    """Return initial values by regressions and step responses, as in footnote 17.
 
     Args:
         films: the camera's records.
@@ -62,7 +62,7 @@ def first_values(
 
 
 def _seen(film: Record, length: float) -> tuple[Array, Array]:
-    """Front-wheel speed [m/s] and heading rate [rad/s] at each frame, (steps,), from a film."""
+    """Return front-wheel speed [m/s] and heading rate [rad/s] at each frame, (steps,)."""
     front, rear = film.measured[:, :2], film.measured[:, 2:]
     heading = np.unwrap(np.arctan2(*(front - rear).T[::-1]))
     width = 4  # frames on either side
@@ -75,7 +75,7 @@ def _seen(film: Record, length: float) -> tuple[Array, Array]:
 
 
 def _steady(u: Array, v: Array) -> Array:
-    """Rows [steering, throttle, speed] of the last half second of each stretch of held inputs."""
+    """Return rows [steering, throttle, speed], means over half a second of long held inputs."""
     rows, hold = [], 0
     for t in range(1, len(u)):
         hold = hold + 1 if np.abs(u[t] - u[t - 1]).max() < 0.1 else 0
@@ -86,7 +86,7 @@ def _steady(u: Array, v: Array) -> Array:
 
 
 def _lagged(x: Array, tau: float) -> Array:
-    """First-order response to x, sampled at RATE, from zero."""
+    """Return the first-order response to x, sampled at RATE, from zero."""
     from scipy.signal import lfilter
 
     decay = np.exp(-1 / (RATE * tau))
@@ -96,7 +96,7 @@ def _lagged(x: Array, tau: float) -> Array:
 def _steering_response(
     runs: Sequence[tuple[Array, Array, Array]], a1: float, b1: float, length: float
 ) -> tuple[float, float]:
-    """Latency and tau_delta [s] for which the heading rate follows v sin(delta) / L best."""
+    """Return latency and tau_delta [s] for which v sin(delta) / L fits the heading rate best."""
     best = (np.inf, 0.1, 0.1)
     for frames in range(0, 8):
         for tau in (0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.3):
@@ -112,7 +112,7 @@ def _steering_response(
 def _speed_response(
     runs: Sequence[tuple[Array, Array, Array]], steady: tuple[float, float, float], latency: float
 ) -> tuple[float, float]:
-    """tau_v [s] and a4 [m/s^2] from how fast the speed rises and falls after the throttle moves."""
+    """Return tau_v [s] and a4 [m/s^2] from the slopes of the speed after changes of throttle."""
     a2, a3, b2 = steady
     gaps, rises, falls = [], [], []
     frames = round(latency * RATE)
@@ -136,14 +136,14 @@ FITTED = ("a1", "b1", "a2", "b2", "a3", "a4", "tau_delta", "tau_v", "stall")
 
 @dataclass(frozen=True)
 class FitCarResult:
-    """For each seed the true, first and fitted values, the intervals, and whether they hold."""
+    """True, first and fitted values by seed, and whether the intervals contain the true ones."""
 
     runs: tuple[dict[str, Any], ...]
     minutes: float
 
     @property
     def coverage(self) -> dict[str, float]:
-        """Share of seeds whose interval holds the true value, by parameter."""
+        """Share of seeds whose interval contains the true value, by parameter."""
         names = self.runs[0]["params"]
         return {
             name: float(np.mean([run["params"][name]["inside"] for run in self.runs]))
@@ -151,7 +151,7 @@ class FitCarResult:
         }
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return the result as plain values."""
         every = [p["inside"] for run in self.runs for p in run["params"].values()]
         return {
             "minutes": self.minutes,
@@ -161,7 +161,7 @@ class FitCarResult:
         }
 
     def tables(self) -> list[StudyTable]:
-        """Per parameter: error of the first value, of the fit, the stated std, the coverage."""
+        """Return, per parameter, errors of first value and fit, the stated std, the coverage."""
         rows = []
         for name, share in self.coverage.items():
             each = [run["params"][name] for run in self.runs]
@@ -181,11 +181,11 @@ def fit_car(
     minutes: float = 30.0,
     **how: Unpack[Running],
 ) -> FitCarResult:
-    """The study, one job a seed.
+    """Run the study, one job per seed.
 
     Args:
-        seeds: of the cars, drivers and noise.
-        minutes: of driving.
+        seeds: seeds of the cars, drivers and noise.
+        minutes: duration of driving.
         how: where the jobs run, see `run_jobs`.
     """
     jobs = [Job(fit_car_job, {"seed": int(seed), "minutes": minutes}) for seed in seeds]
@@ -194,7 +194,7 @@ def fit_car(
 
 
 def fit_car_job(seed: int, minutes: float) -> dict[str, Any]:
-    """One car: driven, filmed, estimated."""
+    """Run one job: drive and film one car, and estimate its parameters."""
     rng = np.random.default_rng(seed)
     truth, latency = true_car(rng)
     records = drive(truth, latency, minutes, rng)
@@ -224,14 +224,14 @@ def fit_car_job(seed: int, minutes: float) -> dict[str, Any]:
 
 
 def true_car(rng: np.random.Generator) -> tuple[Model, float]:
-    """A car like the model's, every parameter off by up to 20 %, and its latency [s]."""
+    """Return a car with every parameter off by up to 20 %, and its latency [s]."""
     values = {name: param.value * rng.uniform(0.8, 1.2) for name, param in car.params.items()}
     values["b1"] = rng.uniform(-0.04, 0.04)
     return car.with_values(values), float(rng.uniform(0.08, 0.12))
 
 
 def bench_angles(truth: Model, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Steering angles [rad] measured by hand for inputs from -1 to 1, car standing."""
+    """Return inputs from -1 to 1 and the steering angles [rad] measured at standstill."""
     u = np.linspace(-1, 1, 9)
     p = truth.params
     return u, p["a1"].value * u + p["b1"].value + BENCH * rng.standard_normal(len(u))

@@ -3,11 +3,11 @@
     real system      the aircraft with its 43 true parameters, closed loop, no noise
     crude model      every parameter times an independent U[0.8, 1.2], one model a run
     start            trimmed straight flight of the real aircraft, measured before the manoeuvre
-    discarded        models whose first controller is unstable in the real system: the flight leaves
-                     the finite numbers or the target by more than the radius of the turns
+    discarded        models whose first controller is unstable in the real system: the flight
+                     diverges, or leaves the target by more than the radius of the turns
 
-The search is the one that the command line drives, with its default options; the optimum is DDP on
-the true parameters, which the search never sees.
+The search is that of the command line with its default options. The optimum is DDP with the true
+parameters, which the search never sees.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ PAPER = {
     "trials": 5,
     "discarded": 0.2,
 }
-FIGURE_STEP = 5  # Figure 1 is kept at 10 Hz
+FIGURE_STEP = 5  # Figure 1 is stored at 10 Hz
 
 
 @dataclass(frozen=True)
 class FlightRun:
-    """One approximate model. Utilities: the model's policy, then after each improvement."""
+    """One approximate model. Utilities: of the model's policy, then after each improvement."""
 
     seed: int
     discarded: bool
@@ -69,7 +69,7 @@ class FlightRun:
 
 @dataclass(frozen=True)
 class FlightResult:
-    """Table 1, and the paths of Figure 1 for the run whose improvement is the median one."""
+    """Table 1, and the paths of Figure 1 for the run with the median improvement."""
 
     runs: tuple[FlightRun, ...]
     optimum: float
@@ -77,7 +77,7 @@ class FlightResult:
 
     @property
     def flown(self) -> tuple[FlightRun, ...]:
-        """Runs that count: not discarded."""
+        """The runs that were not discarded."""
         return tuple(run for run in self.runs if not run.discarded)
 
     @property
@@ -86,7 +86,7 @@ class FlightResult:
         return sorted(self.flown, key=lambda run: run.improvement)[len(self.flown) // 2]
 
     def summary(self) -> dict[str, Any]:
-        """The figures of Table 1."""
+        """Return the figures of Table 1."""
         first = [run.utilities[0] for run in self.flown]
         last = [run.utilities[-1] for run in self.flown]
         mean, se = mean_se([run.improvement for run in self.flown])
@@ -108,7 +108,7 @@ class FlightResult:
         }
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `grounded experiment flight --json`: a row a run, and the means."""
+        """Return the document of `grounded experiment flight --json`: a row per run, and means."""
         runs = [
             {k: v for k, v in vars(run).items() if k != "paths"} | {"optimum": self.optimum}
             for run in self.runs
@@ -118,7 +118,7 @@ class FlightResult:
         return dict(plain({"runs": runs, **self.summary(), "figure": figure, "paper": PAPER}))
 
     def tables(self) -> list[StudyTable]:
-        """Table 1 beside the paper's."""
+        """Return Table 1 beside the paper's."""
         found = self.summary()
         first = mean_text([run.utilities[0] for run in self.flown], ",.0f", ",.0f")
         last = mean_text([run.utilities[-1] for run in self.flown], ",.0f", ",.0f")
@@ -146,11 +146,11 @@ def run(
     step: str = "damped",
     **how: Unpack[Running],
 ) -> FlightResult:
-    """Table 1 with `count` runs that were not discarded: seeds first_seed, first_seed + 1 ...
+    """Make Table 1 from `count` runs that are not discarded, seeds first_seed, first_seed + 1 ...
 
     Args:
-        count: runs that count.
-        first_seed: of the approximate models.
+        count: number of runs, without discarded ones.
+        first_seed: first seed of the approximate models.
         step: "damped" or "full", as in [search].
         how: where the jobs run, see `run_jobs`.
 
@@ -161,7 +161,7 @@ def run(
     seed = first_seed
     while sum(not r.discarded for r in found) < count:
         if len(found) >= 5 * count:
-            raise GroundedError(f"{len(found)} models and fewer than {count} flyable ones")
+            raise GroundedError(f"fewer than {count} of {len(found)} models were flyable")
         missing = count - sum(not r.discarded for r in found)
         cases = ({"seed": s, "step": step} for s in range(seed, seed + missing))
         found += run_study(FlightRun, flight_job, cases, **how)
@@ -171,13 +171,13 @@ def run(
 
 
 def flight_optimum() -> float:
-    """Utility of DDP on the true parameters."""
+    """Return the utility of DDP with the true parameters."""
     _, result = first_policy(flight_task(aircraft))
     return -result.cost
 
 
 def flight_job(seed: int, step: str) -> dict[str, Any]:
-    """A job: one approximate model, five iterations."""
+    """Run one job: one approximate model, five iterations."""
     truth = flight_task(aircraft)
     crude = perturbed(aircraft, np.random.default_rng(seed))
     task = flight_task(crude, started_by=aircraft)
@@ -201,7 +201,7 @@ def flight_job(seed: int, step: str) -> dict[str, Any]:
 
 
 def real_flight(truth: Task, candidate: Candidate) -> Trial:
-    """What the real aircraft does under a candidate; ends early when it leaves the numbers."""
+    """Simulate the real aircraft under a candidate; the trial ends early if it diverges."""
     flown = simulate(truth.problem(exact=True), candidate.policy)
     good = np.isfinite(flown.states).all(axis=1) & (np.abs(flown.states) < 1e6).all(axis=1)
     T = truth.horizon if good.all() else max(int(np.argmin(good)) - 1, 0)
@@ -216,7 +216,7 @@ def real_flight(truth: Task, candidate: Candidate) -> Trial:
 
 
 def unstable(truth: Task, flight: Trial) -> bool:
-    """Whether a flight ended early, or was ever a turn's radius away from the target."""
+    """Check whether a flight ended early, or was ever more than a turn's radius off target."""
     if flight.steps < truth.horizon:
         return True
     error: Array = flight.states[:, :3] - truth.target[:, :3]

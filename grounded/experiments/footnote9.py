@@ -1,13 +1,13 @@
-"""Footnote 9: a model that is arbitrarily wrong, and one iteration that mends it.
+"""Footnote 9: an arbitrarily wrong model whose policy one iteration makes optimal.
 
     H = 1,  f(s, a) = a,  R(s) = C exp(-s^2),        model f_hat(s, a) = a + b
 
-The model's optimal action is -b, worth C exp(-b^2) in the real system: for b and C large,
-arbitrarily worse than the optimum C. Its derivatives are exact, epsilon = 0, so Theorem 1 says
-that the algorithm gets there; the paper adds "in a single iteration".
+The model's optimal action is -b, with a real reward of C exp(-b^2): for large b and C, arbitrarily
+worse than the optimum C. Its derivatives are exact, epsilon = 0, so by Theorem 1 the algorithm
+reaches the optimum; the paper adds "in a single iteration".
 
-    solved     method A runs to convergence in the biased model. The project's own search does it on
-               -s^2 = log(R / C), which ranks the policies as R does.
+    solved     method A runs to convergence in the biased model. The project's own search does this
+               on -s^2 = log(R / C), which ranks the policies as R does.
     gradient   method A is one policy-gradient step on R itself, alpha = 1 halved while the real
                utility does not improve. The gradient 2 C b exp(-b^2) vanishes with b (to zero
                exactly from b = 28 on): footnote 9 holds for A run to convergence, not for a step.
@@ -36,7 +36,7 @@ OFFSETS = (1.0, 2.0, 3.0, 5.0, 10.0, 30.0)
 
 @dataclass(frozen=True)
 class Footnote9Row:
-    """One b. Utilities as a share of the optimum C."""
+    """Results for one b; utilities as a share of the optimum C."""
 
     b: float
     model_based: float
@@ -48,16 +48,16 @@ class Footnote9Row:
 
 @dataclass(frozen=True)
 class Footnote9Result:
-    """One row for each b."""
+    """Results for all b."""
 
     rows: tuple[Footnote9Row, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Rows by name."""
+        """Return the rows as plain values."""
         return {"rows": [vars(row) for row in self.rows], "paper": {"iterations": 1}}
 
     def tables(self) -> list[StudyTable]:
-        """Shares of the optimum by b."""
+        """Return the shares of the optimum by b."""
         head = ("b", "model-based", "one iteration (trials)", "policy gradient (trials)")
         rows = tuple(
             (
@@ -72,11 +72,11 @@ class Footnote9Result:
 
 
 def run(offsets: Sequence[float] = OFFSETS, *, iterations: int = 20) -> Footnote9Result:
-    """The model's policy, one iteration of the algorithm, and policy gradient, for each b.
+    """Compare the model's policy, one iteration of the algorithm, and policy gradient for each b.
 
     Args:
         offsets: values of b.
-        iterations: of the policy gradient, each with up to 30 halvings.
+        iterations: iterations of the policy gradient, each with up to 30 halvings.
     """
     rows = []
     for b in offsets:
@@ -93,7 +93,7 @@ def _next(s: Any, a: Any, p: Any, dt: float) -> dict[str, Any]:
 
 
 def footnote9_task(b: float) -> Task:
-    """The approximate MDP with the reward -s^2 on the state after one step."""
+    """Return the approximate MDP with the reward -s^2 on the state after one step."""
     model = Model(
         name="footnote 9", states={"s": "1"}, inputs={"a": "1"}, params={"b": Param(b)}, step=_next
     )
@@ -112,7 +112,7 @@ def footnote9_task(b: float) -> Task:
 
 
 def _solved(b: float) -> tuple[float, int]:
-    """Share of the optimum after one iteration, and real trials."""
+    """Return the share of the optimum after one iteration, and the number of real trials."""
     task = footnote9_task(b)
 
     def real(candidate: Candidate) -> Trial:
@@ -124,7 +124,7 @@ def _solved(b: float) -> tuple[float, int]:
 
 
 def _gradient(b: float, iterations: int) -> tuple[float, int]:
-    """Policy gradient with the paper's halving, on R / C itself."""
+    """Run policy gradient on R / C itself, with the paper's step halving."""
     a, trials = -b, 1
     for _ in range(iterations):
         best = math.exp(-(a**2))

@@ -1,4 +1,4 @@
-"""Norm-optimal iterative learning control: the field that the paper calls closest to its own.
+"""Norm-optimal iterative learning control, the field that the paper calls closest to its own.
 
 A manoeuvre repeated from the same start is a map from inputs to states. Linearised ONCE, along the
 run that the crude model predicts, and stacked over time (the "lifted" model),
@@ -13,9 +13,9 @@ x and inputs u the next feed-forward is v + delta v with
 
 (Amann, Owens & Rogers, "Iterative learning control using optimal feedback and feedforward actions",
 Int. J. Control 65, 1996; Bristow, Tharayil & Alleyne, "A survey of iterative learning control",
-IEEE Control Systems 26, 2006). The measured error enters as it is: a bias in the sense of step 4.
-What differs from the paper's algorithm: the linearisation never moves to the flown path, the gains
-stay as they are, every update is taken, without a line search.
+IEEE Control Systems 26, 2006). The measured error enters directly, like the bias of step 4. Unlike
+in the paper's algorithm, the linearisation never moves to the flown path, the gains are fixed, and
+every update is accepted without a line search.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from grounded.trial import Trial
 
 @dataclass(frozen=True, eq=False)
 class Lifted:
-    """Responses to every entry of the feed-forward: G_x (H + 1, n, H m), G_u (H, m, H m)."""
+    """Sensitivities to every entry of the feed-forward: G_x (H + 1, n, H m), G_u (H, m, H m)."""
 
     states: Array
     inputs: Array
 
 
 def lifted(task: Task, policy: Policy) -> Lifted:
-    """The model linearised along the run that it predicts for a policy."""
+    """Return the model linearised along the run that it predicts for a policy."""
     problem = task.problem()
     run, gain = simulate(problem, policy), policy.gain
     n, m, H = task.model.n, task.model.m, task.horizon
@@ -70,7 +70,7 @@ def lifted(task: Task, policy: Policy) -> Lifted:
 
 
 def update(task: Task, model: Lifted, policy: Policy, trial: Trial) -> Policy:
-    """The next policy after a whole trial: the same gains, another feed-forward."""
+    """Return the next policy after a whole trial, with the same gains and a new feed-forward."""
     gradient, curvature = _quadratic(task, model, trial)
     mu = np.tile(task.reward.input + task.reward.input_change, task.horizon)
     move = -np.linalg.solve(curvature + np.diag(mu), gradient)
@@ -78,7 +78,7 @@ def update(task: Task, model: Lifted, policy: Policy, trial: Trial) -> Policy:
 
 
 def gradient_of(task: Task, policy: Policy) -> tuple[float, Array]:
-    """Utility and its gradient (H, m) by the feed-forward when `task.model` is the real system."""
+    """Return the utility and its gradient (H, m) by the feed-forward; `task.model` is the truth."""
     problem = task.problem()
     policy = policy.laid_out(policy.state_names, policy.angles, problem.depths)
     run = simulate(task.problem(exact=True), policy)
@@ -88,7 +88,7 @@ def gradient_of(task: Task, policy: Policy) -> tuple[float, Array]:
 
 
 def _quadratic(task: Task, model: Lifted, trial: Trial) -> tuple[Array, Array]:
-    """Half the gradient and half the curvature of the cost by the feed-forward."""
+    """Return half the gradient and half the curvature of the cost by the feed-forward."""
     H, reward = task.horizon, task.reward
     assert task.input_target is not None
     error = np.nan_to_num(task.model.difference(trial.states, task.target))

@@ -1,18 +1,18 @@
-"""Jobs: a study is a list of independent, seeded jobs; how many workers there are changes nothing.
+"""Studies as lists of independent, seeded jobs, whose results do not depend on the workers.
 
 A job is a module-level function called with plain numbers and names, and returns plain JSON values.
-It draws all its randomness from its own seed, so the same seeds give the same results bit for bit
-on one worker or on fifty. Where they run, `grounded.engine` says; there is no scheduler of ours.
+It draws all random numbers from its own seed, so the same seeds give the same results bit for bit
+on one worker or on fifty. `grounded.engine` decides where jobs run.
 
-    finished    a mapping from the job's key to its result; jobs found in it are not run again. The
-                caller may keep it on disk: a study that was cut off goes on where it was. The key
-                holds a hash of our sources, so that results of two versions are never mixed.
+    finished    a mapping from a job's key to its result; jobs found in it are not run again. The
+                caller may keep it on disk, so that an interrupted study can be continued. The key
+                contains a hash of the sources, so that results of two versions are never mixed.
     lost worker its job is run again (by Dask itself, or here after a process died), not the study.
 
-At the end stand the numbers that studies report: means with standard errors, improvements, slopes,
-tables. The improvement of a utility (never positive) from U_0 to U is (U - U_0) / |U_0|, so 0.76
-means that 76 % of the cost is gone. The paper does not say whether its 76 % is a mean of ratios or
-a ratio of means; both are given.
+The module also has the statistics that studies report: means with standard errors, improvements,
+slopes, tables. The improvement of a utility (never positive) from U_0 to U is (U - U_0) / |U_0|, so
+0.76 means that 76 % of the cost is gone. The paper does not say whether its 76 % is a mean of
+ratios or a ratio of means; both are given.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from grounded.engine import Engine
 from grounded.errors import GroundedError
 
 Progress = Callable[[int, int], None]  # jobs done, jobs in all
-ROUNDS = 5  # times that jobs of lost workers are handed out again
+ROUNDS = 5  # most rounds in which jobs of lost workers are run again
 R = TypeVar("R")
 
 
 @cache
 def code() -> str:
-    """A hash of this package's sources: results of other code are other results."""
+    """Return a hash of this package's sources, since results depend on them."""
     digest = hashlib.sha256()
     root = Path(__file__).parents[1]
     for path in sorted(root.rglob("*.py")):
@@ -57,7 +57,7 @@ class Job:
 
     @property
     def key(self) -> str:
-        """What identifies its result: the code, the function's name and its arguments."""
+        """Key of its result: a hash of the code, the function's name and its arguments."""
         name = f"{code()} {self.function.__module__}.{self.function.__name__}"
         return f"{name}:{json.dumps(self.arguments, sort_keys=True)}"
 
@@ -77,13 +77,13 @@ def run_jobs(
     finished: MutableMapping[str, dict[str, Any]] | None = None,
     progress: Progress | None = None,
 ) -> list[dict[str, Any]]:
-    """Results in the order of the jobs.
+    """Run jobs and return their results in the same order.
 
     Args:
-        jobs: what to run.
-        engine: where; None: in this process.
-        finished: results by `Job.key`; read before, filled as jobs end.
-        progress: called with jobs done and jobs in all.
+        jobs: the jobs.
+        engine: where they run; None: in this process.
+        finished: results by `Job.key`; read first, and filled as jobs end.
+        progress: called with the number of jobs done and the total.
 
     Raises:
         GroundedError: if joblib or Dask is missing, or workers keep dying.
@@ -107,13 +107,13 @@ def run_jobs(
         if not waiting:
             return [results[job.key] for job in jobs]
     raise GroundedError(
-        f"{len(waiting)} of {total} jobs lost their worker {ROUNDS} times (out of memory?); the "
-        f"finished ones are kept, run the study again with fewer --jobs: {lost}"
+        f"{len(waiting)} of {total} jobs lost their worker {ROUNDS} times (out of memory?); "
+        f"finished jobs are kept: run the study again with fewer --jobs: {lost}"
     )
 
 
 def every(**axes: Iterable[Any]) -> list[dict[str, Any]]:
-    """The cases of a grid: each value of the first argument with each of the second, and so on."""
+    """Return the cases of a grid: all combinations of the values of the arguments."""
     return [dict(zip(axes, values, strict=True)) for values in product(*axes.values())]
 
 
@@ -123,12 +123,12 @@ def run_study(
     cases: Iterable[dict[str, Any]],
     **how: Unpack[Running],
 ) -> tuple[R, ...]:
-    """Runs one job a case and reads each result as a `kind`, JSON's lists as tuples.
+    """Run one job per case and return each result as a `kind`, JSON lists as tuples.
 
     Args:
-        kind: a dataclass that has the result's names as fields.
-        function: of the jobs.
-        cases: its arguments.
+        kind: a dataclass with the names in the results as fields.
+        function: the function of the jobs.
+        cases: the arguments of each job.
         how: where the jobs run, see `run_jobs`.
     """
     found = run_jobs([Job(function, case) for case in cases], **how)
@@ -139,7 +139,7 @@ def run_study(
 def _round(
     jobs: Sequence[Job], engine: Engine, keep: Callable[[str, dict[str, Any]], None]
 ) -> BaseException | None:
-    """Runs the jobs, keeps what comes back, returns the error of a lost worker."""
+    """Run the jobs and keep their results; return the error of a lost worker, or None."""
     wanted, foreign = {job.key for job in jobs}, False
     try:
         for key, result in _results(jobs, engine):
@@ -157,12 +157,12 @@ def _round(
 
 
 def _call(job: Job) -> tuple[str, dict[str, Any]]:
-    # Through JSON and back: a result that was kept on disk is the very same value.
+    # through JSON and back, so that new results equal those read from disk
     return job.key, json.loads(json.dumps(job.function(**job.arguments)))
 
 
 def _results(jobs: Sequence[Job], engine: Engine) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Results as they come, in any order."""
+    """Yield results as they arrive, in any order."""
     if not jobs:
         return
     if engine.alone:
@@ -174,7 +174,7 @@ def _results(jobs: Sequence[Job], engine: Engine) -> Iterator[tuple[str, dict[st
 
 
 def _lost() -> tuple[type[BaseException], ...]:
-    """The errors that say a worker died, not that a job failed; asked for after an error only."""
+    """Return the errors that mean that a worker died; imported only after an error."""
     kinds: list[type[BaseException]] = []
     for module, name in (
         ("joblib.externals.loky.process_executor", "TerminatedWorkerError"),
@@ -189,7 +189,7 @@ def _lost() -> tuple[type[BaseException], ...]:
 
 @dataclass(frozen=True)
 class StudyTable:
-    """A title, column heads and rows of text, for the terminal and for docs/experiments.md."""
+    """A title, column headers and rows of text, for the terminal and for docs/experiments.md."""
 
     title: str
     head: tuple[str, ...]
@@ -197,18 +197,18 @@ class StudyTable:
 
 
 def improvement(before: float, after: float) -> float:
-    """Share of the cost that is gone."""
+    """Return the share of the cost that is gone."""
     return (after - before) / abs(before)
 
 
 def mean_text(values: Sequence[float], digits: str = ".1%", of_error: str = ".1%") -> str:
-    """`76.1% (±0.4%)`; the mean alone where there is one value."""
+    """Return text such as `76.1% (±0.4%)`, or the mean alone for a single value."""
     mean, se = mean_se(values)
     return f"{mean:{digits}}" if len(values) < 2 else f"{mean:{digits}} (±{se:{of_error}})"
 
 
 def mean_se(values: Sequence[float]) -> tuple[float, float]:
-    """Mean and one standard error of it (nan for fewer than two values)."""
+    """Return the mean and its standard error (NaN for fewer than two values)."""
     data = np.asarray(values, dtype=float)
     if len(data) < 2:
         return (float(data.mean()) if len(data) else math.nan), math.nan
@@ -216,5 +216,5 @@ def mean_se(values: Sequence[float]) -> tuple[float, float]:
 
 
 def loglog_slope(x: Sequence[float], y: Sequence[float]) -> float:
-    """Least-squares slope of log y over log x."""
+    """Return the least-squares slope of log y over log x."""
     return float(np.polyfit(np.log(x), np.log(y), 1)[0])

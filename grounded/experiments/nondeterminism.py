@@ -1,9 +1,10 @@
-"""How deterministic the car is: the same inputs, again and again (section 5.2).
+"""Repeatability of the car: scatter of the end-points for the same inputs (section 5.2).
 
 "For the same input sequence, the end-points of the trajectories differed from a few centimeters up
-to 50cm (for 2 second runs)", the paper thinks because of slightly different starts, and most when
-the car drives around the stalling speed of its motor. Here the simulated real car runs each
-sequence from starts that scatter, with its disturbances; the spread of the end-points is read off.
+to 50cm (for 2 second runs)". The paper attributes this to slightly different starts, and finds it
+largest when the car drives around the stalling speed of its motor. Here the simulated real car runs
+each sequence from scattered starts and with disturbances, and the spread of its end-points is
+measured.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ LEVELS = (0.0, 1.0, 3.0)  # multiples of the real car's own scatter
 
 
 def sequences() -> dict[str, Array]:
-    """Open-loop inputs (H, 2), steering and throttle, each for two seconds."""
+    """Return open-loop inputs (H, 2), steering and throttle, each for two seconds."""
     H = round(SECONDS / DT)
     t = np.arange(H) * DT
     one = np.ones(H)
@@ -51,18 +52,18 @@ class EndPointSpread:
 
 @dataclass(frozen=True)
 class NondeterminismResult:
-    """One spread for each sequence and level of scatter."""
+    """The spread for each sequence and level of scatter."""
 
     spreads: tuple[EndPointSpread, ...]
     runs: int
 
     def to_json(self) -> dict[str, Any]:
-        """Spreads by name."""
+        """Return the spreads as plain values."""
         paper = {"largest": [0.03, 0.5], "seconds": SECONDS}
         return {"runs": self.runs, "spreads": [vars(s) for s in self.spreads], "paper": paper}
 
     def tables(self) -> list[StudyTable]:
-        """The largest distance between two end-points, by sequence and scatter."""
+        """Return the largest distance between two end-points, by sequence and scatter."""
         names = list(dict.fromkeys(s.sequence for s in self.spreads))
         levels = sorted({s.level for s in self.spreads})
         found = {(s.sequence, s.level): s for s in self.spreads}
@@ -83,14 +84,14 @@ def run(
     seed: int = 0,
     **how: Unpack[Running],
 ) -> NondeterminismResult:
-    """Repeats every sequence `runs` times at each level of scatter."""
+    """Repeat every sequence `runs` times at each level of scatter."""
     cases = every(sequence=sequences(), level=levels, runs=[runs], seed=[seed])
     spreads = run_study(EndPointSpread, nondeterminism_job, cases, **how)
     return NondeterminismResult(spreads, runs)
 
 
 def nondeterminism_job(sequence: str, level: float, runs: int, seed: int) -> dict[str, Any]:
-    """A job: the end-points of one sequence."""
+    """Run one job: the end-points of one sequence."""
     inputs = sequences()[sequence]
     task = car_task("turn", car)
     policy = task.policy(np.zeros((task.horizon, 2)), None, None)

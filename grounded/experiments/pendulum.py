@@ -1,6 +1,6 @@
-"""The pendulum's task: from hanging to standing in two seconds, then hold.
+"""A pendulum's task (swing up in two seconds, then hold) and its simulated real system.
 
-A simulated REAL pendulum: heavier than the model thinks, with dry friction in its bearing.
+The real pendulum is heavier than the model assumes, and has dry friction in its bearing.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ DT, UP, HOLD = 0.02, 2.0, 1.0  # [s]
 
 
 def pendulum_task(model: Model) -> Task:
-    """Follow a smooth swing to theta = pi with torques of at most 8 N m."""
+    """Return the task to follow a smooth swing to theta = pi with torques of at most 8 N m."""
     t = DT * np.arange(round((UP + HOLD) / DT) + 1)
     part = np.clip(t / UP, 0.0, 1.0)
     theta = np.pi * (10 * part**3 - 15 * part**4 + 6 * part**5)  # rest to rest, minimum jerk
@@ -44,7 +44,7 @@ HEAVIER = 1.3
 
 
 def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
-    """ds/dt with a torque that opposes the motion."""
+    """Return ds/dt with dry friction."""
     crude = pendulum.dynamics(s, a, p)
     torque = p.friction * np.tanh(s.omega / 0.05)
     return {"theta": crude["theta"], "omega": crude["omega"] - torque / (p.m * p.l**2)}

@@ -1,10 +1,10 @@
-"""A simulated REAL car: what the crude model of `grounded.models.car` has no terms for.
+"""A simulated REAL car, with effects for which the crude model `grounded.models.car` has no terms.
 
-Declared here as data and nowhere else; neither the model nor the search nor the diagnosis may
-import it. The effects are those that the paper suspects (section 5.2): calibration errors of 6 to
-20 %, asymmetric carpet threading that makes the car drift 0.1 m a 1 m circle and changes yaw, speed
-and the stalling speed with the heading, understeer, a servo that saturates softly, and latency
-beyond the modelled 0.1 s.
+They are declared only here; neither the model nor the search nor the diagnosis may import it. They
+are those that the paper suspects (section 5.2): calibration errors of 6 to 20 %, an asymmetric
+carpet that makes the car drift 0.1 m per circle of 1 m and changes yaw, speed and the stalling
+speed with the heading, understeer, a servo that saturates softly, and a latency beyond the modelled
+0.1 s.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ SCATTER = Noise(
 
 
 def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
-    """ds/dt of the real car."""
+    """Return ds/dt of the real car."""
     across = np.sin(s.psi - p.thread) ** 2
     throttle = np.where(a.throttle > p.stall + p.thread_stall * across, a.throttle, 0.0)
     bent = a.steering - p.cubic * a.steering**3
@@ -62,7 +62,7 @@ def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
     yaw = s.v * np.sin(s.delta) * grip + p.thread_yaw * s.v * np.sin(twice)
     slide = p.drift * s.v * np.cos(s.psi - p.thread)
     rear = s.v * np.cos(s.delta)
-    # a gyro shows all that turns the car: yaw by the chain rule, thread and understeer too
+    # a gyro shows the full yaw rate, carpet and understeer included: its derivative by chain rule
     yaw_dot = s.v * np.cos(s.delta) * delta_dot * grip
     yaw_dot += v_dot * np.sin(s.delta) * grip * (1 - 2 * p.understeer * s.v**2 * grip * p.L)
     yaw_dot += p.thread_yaw * (v_dot * np.sin(twice) + 2 * s.v * np.cos(twice) * yaw)
@@ -77,7 +77,7 @@ def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
 
 
 def real_car(calibration: dict[str, float] | None = None, unmodelled: bool = True) -> Model:
-    """The true dynamics; a study may give its own calibration errors or leave out the effects.
+    """Return the true dynamics, optionally with other calibration errors or without the effects.
 
     Args:
         calibration: true value over the crude model's, by parameter name.
@@ -102,5 +102,5 @@ def real_car(calibration: dict[str, float] | None = None, unmodelled: bool = Tru
 
 
 def real_plant(noisy: bool = False) -> Plant:
-    """The simulated real car as a plant; deterministic unless `noisy`."""
+    """Return the simulated real car as a plant, deterministic unless `noisy`."""
     return Plant(model=real_car(), latency=LATENCY, noise=SCATTER if noisy else Noise())

@@ -1,16 +1,17 @@
-"""The line search when trials scatter: what a comparison of single trials costs, and what helps.
+"""The line search with noisy trials: the cost of comparing single trials, and rules that help.
 
-Rules at four levels of scatter, as multiples of the simulated car's own (`real_car.SCATTER`).
-Judged is the TRUE utility, the mean of fresh runs, of each policy that a rule accepts:
+Rules are compared at four levels of scatter, multiples of the simulated car's own
+(`real_car.SCATTER`), by the TRUE utility, the mean of fresh runs, of each policy that a rule
+accepts:
 
     false      accepted steps that made the policy truly worse
     closed     share of the gap between the model's policy and the optimum that the final one closes
-    early      the same after EARLY trials: who has fewer batteries than BUDGET
-    flattered  utility that the winner's own trials claim, minus its true utility, by the gap
+    early      the same after EARLY trials, for smaller budgets than BUDGET
+    flattered  measured utility of the winner minus its true utility, relative to the gap
 
 A rule runs a candidate `repeats` times and averages states, inputs and utilities; the bias is that
-of the mean. "incumbent again" runs the best policy once more beside every candidate, so that a
-lucky winner loses its luck; "losses checked" does so only after a loss that may be luck
+of the mean. "incumbent again" reruns the best policy with every candidate, so that a lucky
+measurement is averaged out; "losses checked" does so only after a loss that may be due to chance
 ([search] rerun_incumbent).
 """
 
@@ -37,13 +38,13 @@ FRESH = 30  # runs that judge a policy
 
 @dataclass(frozen=True)
 class LineSearchRule:
-    """How trials decide."""
+    """A rule for accepting candidates by their trials."""
 
     name: str
     repeats: int
     max_halvings: int
-    again: bool = False  # the incumbent is run again beside every candidate
-    checked: bool = False  # ... only after a loss that may be luck
+    again: bool = False  # the incumbent is rerun with every candidate
+    checked: bool = False  # ... only after a loss that may be due to chance
 
 
 RULES = (
@@ -59,7 +60,7 @@ RULES = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """One rule on one case."""
+    """The result of one rule on one case."""
 
     rule: str
     manoeuvre: str
@@ -80,14 +81,14 @@ class NoiseResult:
     outcomes: tuple[Outcome, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Outcomes by name, and the rule that follows from them."""
+        """Return the outcomes as plain values, and the recommended rule."""
         return {"outcomes": [vars(o) for o in self.outcomes], "recommended": self.recommended}
 
     @property
     def recommended(self) -> str:
-        """The cheapest rule that closes as much as the best one, within a standard error.
+        """The rule with the fewest trials that closes as much as the best, within a standard error.
 
-        Shares are compared case by case and seed by seed; cheap is the mean number of trials.
+        Shares are compared pairwise by case and seed.
         """
         closed = {rule: self._over_cases(rule, "closed") for rule in self._rules}
         best = closed[max(closed, key=lambda rule: float(closed[rule].mean()))]
@@ -104,7 +105,7 @@ class NoiseResult:
         return list(dict.fromkeys(o.rule for o in self.outcomes))
 
     def _over_cases(self, rule: str, what: str) -> Array:
-        """One figure a case and seed, in the same order for every rule."""
+        """Return one figure per case and seed, in the same order for every rule."""
         own = sorted(
             (o.manoeuvre, o.level, o.seed, getattr(o, what))
             for o in self.outcomes
@@ -137,7 +138,7 @@ class NoiseResult:
         return [o for o in self.outcomes if (o.rule, o.manoeuvre, o.level) == wanted]
 
     def tables(self) -> list[StudyTable]:
-        """By manoeuvre and level: false acceptances, share closed, flattery; then all cases."""
+        """Return tables by manoeuvre and level, then one of all cases."""
         cases = dict.fromkeys((o.manoeuvre, o.level) for o in self.outcomes)
         each = [self._table(manoeuvre, level) for manoeuvre, level in cases]
         return [*each, self._summary()]
@@ -174,13 +175,13 @@ def run(
     rules: Sequence[LineSearchRule] = RULES,
     **how: Unpack[Running],
 ) -> NoiseResult:
-    """Every rule on every case; a job is one of them."""
+    """Run every rule on every case, one job each."""
     cases = every(manoeuvre=manoeuvres, level=levels, rule=map(vars, rules), seed=seeds)
     return NoiseResult(run_study(Outcome, repeats_job, cases, **how))
 
 
 def repeats_job(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -> dict[str, Any]:
-    """A job: one rule, one case."""
+    """Run one job: one rule on one case."""
     how = LineSearchRule(**rule)
     case = bench(manoeuvre, "noise", seed)
     best, _ = optimum(case)

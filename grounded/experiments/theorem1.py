@@ -1,19 +1,19 @@
-"""Theorem 1: how near a stationary point the algorithm ends with a model wrong by epsilon.
+"""Theorem 1: distance from a stationary point where the algorithm ends, for a model error epsilon.
 
-A pendulum with a torque, H = 40 steps, deterministic; the model's dynamics are the true ones plus a
-smooth error whose derivatives by states and inputs are at most epsilon (of the rates; of a step,
-that times dt, which K takes up),
+A deterministic pendulum with a torque, H = 40 steps. The model's dynamics are the true ones plus a
+smooth error whose derivatives by states and inputs are at most epsilon (in the rates; in a step,
+epsilon dt, a factor that is absorbed in K),
 
     f_hat = f + epsilon e(s, a),      |de/ds|, |de/da| <= 1.
 
-Method A is policy gradient on the inputs, the line search is exact (eta = 0), and the search runs
-until the real utility can't be improved along the model's gradient. Then the theorem says
+Method A is policy gradient on the inputs, with an exact line search (eta = 0), until the real
+utility can't be improved along the model's gradient. Then the theorem states
 
     |grad U - grad U^| <= K epsilon       (Eqn 7: slope 1 in a log-log plot)
     |grad U|^2         <= 2 K^2 epsilon^2 (Eqn 6: slope 2)
 
-K is measured: the largest |grad U - grad U^| / epsilon along the way. (Two slips of the paper:
-Eqn 1 omits the policy in h_t, and what Eqn 12 guarantees a successful search is
+K is measured as the largest |grad U - grad U^| / epsilon along the way. (Two errata of the paper:
+Eqn 1 omits the policy in h_t, and the improvement that Eqn 12 guarantees a successful search is
 K^2 epsilon^2 / (2 M).)
 """
 
@@ -45,7 +45,7 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 
 @dataclass(frozen=True)
 class Theorem1Row:
-    """One search: gradient error at the start, the squared gradient at its end, K of its way."""
+    """One search: gradient error at its start, squared gradient at its end, largest K."""
 
     epsilon: float
     seed: int
@@ -67,9 +67,9 @@ class Theorem1Result:
     rows: tuple[Theorem1Row, ...]
 
     def slopes(self) -> dict[str, tuple[float, float]]:
-        """Slopes of the gradient error and of the squared gradient over epsilon: mean, error.
+        """Return slopes of gradient error and squared gradient over epsilon: mean, std error.
 
-        One slope a seed, because each shape of the model's error has a K of its own.
+        One slope per seed, because K depends on the shape of the model's error.
         """
         found: dict[str, list[float]] = {"gradient_error": [], "squared_gradient": []}
         for seed in dict.fromkeys(row.seed for row in self.rows):
@@ -80,7 +80,7 @@ class Theorem1Result:
         return {name: mean_se(values) for name, values in found.items()}
 
     def to_json(self) -> dict[str, Any]:
-        """Rows and slopes by name."""
+        """Return rows and slopes as plain values."""
         slopes = {k: {"slope": v[0], "se": v[1]} for k, v in self.slopes().items()}
         worst = max(row.ratio for row in self.rows)
         paper = {"gradient_error": 1, "squared_gradient": 2}
@@ -89,7 +89,7 @@ class Theorem1Result:
         return dict(plain(found))
 
     def tables(self) -> list[StudyTable]:
-        """Medians by epsilon, and the slopes beside the theorem's."""
+        """Return medians by epsilon, and the slopes beside the theorem's."""
         rows = []
         for epsilon in dict.fromkeys(row.epsilon for row in self.rows):
             own = [row for row in self.rows if row.epsilon == epsilon]
@@ -133,19 +133,19 @@ def run(
     epsilons: Sequence[float] = EPSILONS,
     **how: Unpack[Running],
 ) -> Theorem1Result:
-    """A search for each epsilon and seed; the seed draws the shape of the model's error."""
+    """Run a search for each epsilon and seed; the seed sets the shape of the model's error."""
     cases = every(epsilon=map(float, epsilons), seed=seeds)
     return Theorem1Result(run_study(Theorem1Row, theorem1_job, cases, **how))
 
 
 def _dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
-    # the errors' derivatives: |cos| times weights whose squares add up to one, so at most epsilon
+    # its derivatives are epsilon |cos| times weights of unit norm, so at most epsilon
     wrong = p.eps * np.sin(p.w1 * s.angle + p.w2 * s.rate + p.w3 * a.torque + p.phase)
     return {"angle": s.rate, "rate": a.torque - np.sin(s.angle) - 0.2 * s.rate + wrong}
 
 
 def theorem1_task(epsilon: float, seed: int) -> Task:
-    """Swing a pendulum to one radian and hold it, with a model that is wrong by epsilon."""
+    """Return the task to swing a pendulum to one radian and hold it, with a model error epsilon."""
     rng = np.random.default_rng([seed, 5])
     weights = rng.normal(size=3)
     weights /= np.linalg.norm(weights)
@@ -175,7 +175,7 @@ def theorem1_task(epsilon: float, seed: int) -> Task:
 
 
 def theorem1_job(epsilon: float, seed: int) -> dict[str, Any]:
-    """A job: one search to its end."""
+    """Run one job: one search to its end."""
     task = theorem1_task(epsilon, seed)
     truth = task.with_model(task.model.with_values({"eps": 0.0}))
     real = truth.problem(exact=True)
@@ -196,7 +196,7 @@ def theorem1_job(epsilon: float, seed: int) -> dict[str, Any]:
 
 
 def _line_search(real: Problem, u: Array, direction: Array, cost: float) -> Array | None:
-    """The best point along a direction in the real system; None when none is better (eta = 0)."""
+    """Return the best point along a direction in the real system, None if none is better."""
 
     def costs(at: Array) -> Array:
         return real.system.rollout(real, u, k=direction, alphas=at).cost

@@ -28,7 +28,7 @@ def test_states_that_never_moved_give_no_cause():
     found = diagnose(pendulum, list(stuck(swings(), 0, 1)))
     assert found.kind == "unknown" and not found.effects
     assert [s for s in found.unknowable if "never moved" in s] == [
-        f"state {name} never moved, so nothing can be said of what acts on it"
+        f"state {name} never moved, so effects on it can't be identified"
         for name in ("theta", "omega")
     ]
 

@@ -116,7 +116,7 @@ def test_a_trial_that_hardly_tells_a_tie_apart_is_not_run_next(diagnosed, monkey
     trials = [w.planner.lift(trial) for trial in w.task_trials()]
     monkeypatch.setattr(excitation, "TIE", 1e9)
     identity, sentence = _probe(w, found, trials, Library(), write=False)
-    assert identity == "" and "tells enough" in sentence
+    assert identity == "" and "informative enough" in sentence
     assert offered(w, found)[0]  # who asks for it
 
 

@@ -1,15 +1,17 @@
-"""Which effect? Hypotheses are made, fitted and weighed against each other.
+"""Search for the effects that explain the gap: hypotheses are made, fitted and compared.
 
-From the question to what remains:
+The modules:
 
-    attribution   START HERE: the question, from the first look to the last candidate
-    scan          a first look at every candidate effect
-    explored      what was fitted, and what it is worth
-    search        what to try next
-    joint_model   all joints of an arm at once
-    plainest      the plain dry friction of a joint, beside what has more numbers
-    lookalike     what acts nearly the same on these data
-    one_clock     late commands, or late sensors: one thing
-    leftover      what no effect explains
-    correction    a curve that predicts what no effect explains
+    attribution   START HERE: the whole search, from the first scan to the last effect added
+    scan          linear estimate of what every candidate effect would gain
+    explored      the hypotheses fitted so far, and their evidence
+    search        the fits to try next
+    joint_model   friction and inertia of all joints of an arm at once
+    plainest      plain dry friction of a joint, as a rival of effects with more parameters
+    counterpart   effects that a shift of a parameter undoes
+    lookalike     effects whose signals are nearly the same in these data
+    stand_in      look-alikes fitted in place of an effect, with the parameters free
+    one_clock     delayed commands and delayed sensors, which are equivalent
+    leftover      structure that no effect explains
+    correction    a curve that predicts the leftover
 """

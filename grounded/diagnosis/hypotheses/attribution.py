@@ -1,9 +1,10 @@
-"""Which effect: hypotheses compared by evidence, confirmed on trials that were left out.
+"""The search for effects: forward selection by evidence, with swaps and removals.
 
-The search: fit the model without effects under plain noise, coloured noise, heavy tails, and with
-its parameters calibrated; scan every candidate beside the likely ones of these; refine a shortlist;
-scan again with the noise that the best hypothesis leaves; add a second effect where it pays, swap
-and drop what another explains better.
+The model without effects is fitted under white noise, coloured noise and heavy tails, and with its
+parameters calibrated. Every candidate is scanned beside the likely ones of these fits, and a
+shortlist is refined. The scan is repeated with the noise of the best hypothesis. Further effects
+are added while the evidence rises, and each effect is replaced where another one explains the data
+better. Confirmation on held-out trials follows later (`validation`).
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ from grounded.effects import Effect
 from grounded.progress import interruptible
 from grounded.result import listed
 
-USUAL_EFFECTS = 3  # that are looked for at first
-HOPEFUL = 4  # larger sets that are fitted to the end
-TUNED = 2  # sets whose constants are set by the data
-FORETOLD = (2.0, 0.05)  # scatters, and least gain, from which what predicts better is grown too
-AT_FIRST = 8  # iterations of a further effect that is tried
-HALVES = 2  # single effects that are also grown where another hypothesis is likelier
+USUAL_EFFECTS = 3  # most effects searched for at first
+HOPEFUL = 4  # best larger sets of effects that are fitted to convergence
+TUNED = 2  # best sets whose constants are optimised
+FORETOLD = (2.0, 0.05)  # scatters and gain by which a rival must predict better to be extended too
+AT_FIRST = 8  # iterations of the first fit of a further effect
+HALVES = 2  # single effects that are also extended though other hypotheses are likelier
 RESTARTED = 3  # large effects that are also fitted from a start of their own
 
 
@@ -49,15 +50,19 @@ def attribute(
     tick: Callable[[str], None] | None = None,
     joints: Sequence[Effect] = (),
 ) -> tuple[HypothesisSearch, Fitted]:
-    """Searches for the effects that make the gap; returns the search and its best fit.
+    """Search for the effects that cause the gap.
 
     Args:
         data: from `prepare`.
         candidates: the effects that may be blamed.
-        max_effects: at most so many at once; None: `USUAL_EFFECTS`, more where joints share an
-            inertia and each of them is off.
-        tick: called with what is being done, for a progress display.
-        joints: plain frictions that stand beside richer ones, whether they are candidates or not.
+        max_effects: the largest number of effects at once; None: `USUAL_EFFECTS`, or more if
+            joints share an inertia and each of them is off.
+        tick: called with the current activity, for a progress display.
+        joints: plain dry frictions of joints, tried in place of richer ones even if they are not
+            candidates.
+
+    Returns:
+        The search and its best fit.
     """
     search, most = HypothesisSearch(data, candidates, tick, joints), max_effects or USUAL_EFFECTS
     with (
@@ -69,12 +74,12 @@ def attribute(
 
 
 def so_far(search: HypothesisSearch, most: int, decided: Sequence[str] | None = None) -> str:
-    """The best hypothesis that was fitted, and what it predicts, for someone who can't wait.
+    """Return a summary of the best hypothesis so far, shown when a diagnosis is interrupted.
 
-    decided: the effects that stood when one more was looked for; None before that.
+    decided: the effects confirmed before a further one was sought; None before that.
     """
     if not search.of_size(0):
-        return "no hypothesis was fitted yet"
+        return "no hypothesis has been fitted yet"
     with np.errstate(all="ignore"):
         ruler, best, crude = Ruler(search.predictor), search.chosen(most), search.of_size(0)[0]
         crude = search.fits.get((Structure(), 0.0, ()), crude)
@@ -86,18 +91,18 @@ def so_far(search: HypothesisSearch, most: int, decided: Sequence[str] | None = 
         for i, name in zip(ruler.shown, ruler.names, strict=True)
     )
     causes = [*best.hypothesis.names, *["calibrated parameters"] * (best.hypothesis.spread > 0)]
-    told = f"of {len(search.fits)} hypotheses the likeliest has {listed(causes) or 'no cause'}"
-    more = "nothing has confirmed it"
+    told = f"the likeliest of {len(search.fits)} hypotheses has {listed(causes) or 'no cause'}"
+    more = "not confirmed on held-out trials"
     if decided is not None:
-        more = f"{listed(decided) or 'no cause'} stood when one more was looked for"
+        more = f"confirmed before the search for one more: {listed(decided) or 'no cause'}"
     return (
-        f"so far, {told}; {more}; no diagnosis is stored. {seconds:.2g} s ahead predictions miss "
+        f"so far, {told}; {more}; no diagnosis is stored. Predictions {seconds:.2g} s ahead miss "
         f"{rows}"
     )
 
 
 def _searched(search: HypothesisSearch, *, any_number: bool) -> tuple[HypothesisSearch, Fitted]:
-    """Where to grow from, the likeliest; with outliers in the data, the best with their weights."""
+    """Return the search and its best single effect; with outliers, those under their weights."""
     search.nulls()
     best = _explore(search, any_number=any_number)
     if outliers(best):
@@ -107,10 +112,10 @@ def _searched(search: HypothesisSearch, *, any_number: bool) -> tuple[Hypothesis
 
 
 def _explore(search: HypothesisSearch, *, any_number: bool) -> Fitted:
-    """The best hypothesis of one effect, or without when there is none to try.
+    """Return the best hypothesis of at most one effect.
 
-    Where any number may be blamed, and none alone is nearly as likely as what all joints do
-    together, that.
+    If any number of effects is allowed and all joints of an arm together are far likelier than any
+    single effect, return that hypothesis.
     """
     null = search.best_null()
     plain = search.fits.get((Structure(), 0.0, ()), null)
@@ -119,7 +124,7 @@ def _explore(search: HypothesisSearch, *, any_number: bool) -> Fitted:
     singles = search.of_size(1)
     if not singles:
         return null
-    # a large effect has a long way from its first look
+    # a large effect starts far from its optimum after the scan
     search.finished(singles[:SHORTLIST], 8, rivals=True)
     if any_number and (whole := joint_model(search)) is not None:
         more = search.score(whole) - search.score(search.of_size(1)[0])
@@ -146,23 +151,24 @@ def _explore(search: HypothesisSearch, *, any_number: bool) -> Fitted:
 
 
 def _kind(fit: Fitted) -> tuple[object, ...]:
-    """What rivals have to be given too: the effects beside, the noise's structure, the prior."""
+    """Return a fit's effects, noise structure and prior width, which its rivals must share."""
     h = fit.hypothesis
     return h.names, fit.noise.structure, h.spread
 
 
 def outliers(fit: Fitted) -> bool:
-    """Whether whitened innovations beyond 4 are far more frequent than a normal law has them."""
+    """Check whether whitened innovations beyond 4 are far more frequent than for normal noise."""
     count = float((np.abs(fit.white) > 4.0).sum())
     expected = 6.3e-5 * fit.white.size
     return count > 4 + 3 * expected
 
 
 def _starts(search: HypothesisSearch, size: int, best: Fitted) -> list[Fitted]:
-    """What a further effect is sought beside: the likeliest, the same under plain noise, one more.
+    """Return the fits to extend by one effect.
 
-    What the further effect does may so far have passed for coloured noise or for parameters; and
-    one that predicts clearly better may need it to be likelier.
+    These are the likeliest; the same under white noise with exact parameters, because coloured
+    noise or parameters may have absorbed the further effect; and one that predicts clearly better,
+    which may become the likeliest with it.
     """
     likely = [
         f
@@ -179,10 +185,11 @@ def _starts(search: HypothesisSearch, size: int, best: Fitted) -> list[Fitted]:
 
 
 def _foretold(search: HypothesisSearch, size: int, best: Fitted) -> Fitted:
-    """What predicts best of the likely sets: far from the noise, evidence favours what acts often.
+    """Return which of the likely sets predicts held-out trials best.
 
-    (A friction that grows with the load predicts a second ahead what a constant one, hundreds of
-    nats likelier step by step, does not.)
+    Far above the noise, evidence favours effects that act often. For example, a friction that grows
+    with the load may predict a second ahead much better than a constant one that is hundreds of
+    nats likelier step by step.
     """
     ruler, floor = Ruler(search.predictor), search.score(search.best_null()) + LARGE_GAIN
     rivals = [fit for fit in search.of_size(size)[:HOPEFUL] if search.score(fit) > floor]
@@ -197,10 +204,11 @@ def _foretold(search: HypothesisSearch, size: int, best: Fitted) -> Fitted:
 
 
 def _halves(search: HypothesisSearch, starts: Sequence[Fitted]) -> list[Fitted]:
-    """The likeliest effects with exact parameters under white noise that nothing grows from yet.
+    """Return the likeliest single effects under white noise and exact parameters, not yet extended.
 
-    What two make together passes for a third with more numbers: a bias and a trend for a slow wave.
-    (Not where calibration alone is likelier: two effects can do what two wrong parameters do.)
+    Two effects together may be mistaken for a third with more parameters, such as a bias and a
+    trend for a slow wave. Effects less likely than calibration alone are left out, since two
+    effects can imitate two wrong parameters.
     """
     null, score = search.fits.get((Structure(), 0.0, ())), search.score
     plain = [
@@ -215,10 +223,10 @@ def _halves(search: HypothesisSearch, starts: Sequence[Fitted]) -> list[Fitted]:
 
 
 def promised(search: HypothesisSearch, fit: Fitted) -> float:
-    """By how much the likeliest of one effect more is likelier than a fit, at a first fit [nats].
+    """Return the largest gain of one more effect beside a fit, from a short fit [nats].
 
-    A scan alone can't tell: coloured noise or parameters, fitted without an effect, hide it, and
-    make way only as it grows. Nothing of this is remembered.
+    A scan is not enough: coloured noise and parameters fitted without an effect hide it, and give
+    way only when they are fitted together. The fits are not kept.
     """
     starts = search.one_more(fit, search.most)
     fits = refine(search.predictor, [fit, *starts], iterations=AT_FIRST, worth=search.score)
@@ -228,14 +236,14 @@ def promised(search: HypothesisSearch, fit: Fitted) -> float:
 
 
 def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
-    """The likeliest of up to `most` effects: add one, then swap each for what goes better."""
+    """Return the likeliest of up to `most` effects: add one, then try to replace each, repeat."""
     size = len(best.hypothesis.effects)
     while 1 <= size < most:
         starts = _starts(search, size, best)
         halves = _halves(search, starts) if size == 1 else []
         grown = [search.extended(start, AT_FIRST) for start in starts]
         grown += [search.extended(half, 4) for half in halves]
-        firsts = [max(fits, key=search.score) for fits in grown if fits]  # each has its own noise
+        firsts = [max(fits, key=search.score) for fits in grown if fits]  # noise differs between
         search.finished(list(dict.fromkeys([*search.of_size(size + 1)[:HOPEFUL], *firsts])), 10)
         search.again(search.of_size(size + 1)[:2])
         search.finished(search.of_size(size + 1)[:TUNED], TO_THE_TOP)
@@ -247,7 +255,7 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         if not larger or search.score(larger[0]) < search.score(best) + CLAIM:
             break
         best = larger[0]
-        for name in best.hypothesis.names:  # what goes better with the others?
+        for name in best.hypothesis.names:  # does another effect fit better beside the others?
             search.extended(search.without(best, name), 6)
         best = search.of_size(size + 1)[0]
         size += 1

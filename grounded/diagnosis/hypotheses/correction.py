@@ -1,9 +1,9 @@
-"""When no cause fits: the shape of what is left over one variable, and a correction from it.
+"""An empirical correction of the leftover as a smooth curve, for use when no known cause fits.
 
-Of all states and inputs the one is taken over which a smooth curve (`grounded.effects.correction`)
-gains most likelihood on trials left out; a second one joins where it gains CLAIM nats more. It may
-be adopted if it passes a test of its own: predictions of each trial, with weights from the other
-trials, must be better beyond their own scatter from trial to trial. It explains nothing.
+The correction of a channel's rate is a curve (`grounded.effects.correction`) over the state or
+input for which it gains most likelihood on held-out trials; a second curve is added if it gains
+CLAIM nats more. It may be adopted if predictions of each trial, with weights from the other trials,
+improve by more than their scatter between trials. It is not an explanation.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from grounded.effects.correction import KNOTS, bells
 from grounded.effects.family import per
 from grounded.frozen import Array
 
-MOST = 2  # variables
-LEAST = 0.02  # of the held-out error that must go
-SURE = 2.0  # standard errors over the trials
+MOST = 2  # most variables
+LEAST = 0.02  # smallest relative reduction of the held-out squared error to be adoptable
+SURE = 2.0  # the same in standard errors over the trials
 
 
 @dataclass(frozen=True)
 class _Curve:
-    """A variable, the ends of its range, the bells over it (L, B, KNOTS)."""
+    """A variable, the ends of its range, and the basis functions over it (L, B, KNOTS)."""
 
     over: str
     lo: float
@@ -40,20 +40,23 @@ class _Curve:
     columns: Array
 
     def values(self, weights: Array) -> dict[str, float]:
-        """Quantities of the effect."""
+        """Return the quantities of the effect."""
         return {"lo": self.lo, "hi": self.hi} | {f"w{k}": float(w) for k, w in enumerate(weights)}
 
 
 def correction(
     predictor: Predictor, fit: Fitted, left: Sequence[Leftover], where: Horizon
 ) -> Correction | None:
-    """The correction of the channel with the largest leftover; None where nothing is left.
+    """Fit and test a correction of the channel with the largest leftover.
 
     Args:
-        predictor: the data.
+        predictor: evaluates hypotheses on the data.
         fit: the best hypothesis, beside which the correction is fitted.
-        left: what it leaves, most first.
-        where: the predictions that the correction is judged by.
+        left: its leftovers, largest first.
+        where: the predictions on which the correction is tested.
+
+    Returns:
+        The correction; None without a leftover, with a single trial, or if no curve gains enough.
     """
     if not left or predictor.data.count < 2:
         return None
@@ -81,7 +84,7 @@ def _joined(curves: Sequence[_Curve]) -> Array:
 
 
 def _curves(predictor: Predictor, fit: Fitted) -> list[_Curve]:
-    """Bells over every measured state and every input as it arrives."""
+    """Return basis functions over every measured state and every received input."""
     data, model = predictor.data, predictor.data.model
     x, u = fit.track[:-1], predictor.inputs(fit.hypothesis)
     signals = {n: x[..., i] for i, n in enumerate(model.state_names) if i not in data.hidden}
@@ -102,7 +105,7 @@ def _judged(
     weights: Array,
     where: Horizon,
 ) -> Correction:
-    """The acceptance test: squared errors of each trial, without and with weights of the others."""
+    """Test a correction by the squared errors of each trial, with weights from the others."""
     data, h = predictor.data, fit.hypothesis
     of_start = data.trial_of[where.run]
     gains = []
@@ -122,7 +125,7 @@ def _judged(
     for k, one in enumerate(curves):
         whole = weights[-1][k * KNOTS : (k + 1) * KNOTS]
         apart = weights[:-1, k * KNOTS : (k + 1) * KNOTS]
-        spread = np.sqrt((len(apart) - 1) * apart.var(axis=0))  # of the jackknife
+        spread = np.sqrt((len(apart) - 1) * apart.var(axis=0))  # jackknife
         places = np.linspace(one.lo, one.hi, KNOTS)
         shapes.append(
             Curve(
@@ -147,7 +150,7 @@ def _judged(
 def _with(
     h: Hypothesis, predictor: Predictor, channel: str, curves: Sequence[_Curve], weights: Any
 ) -> Hypothesis:
-    """The hypothesis with the correction."""
+    """Return the hypothesis with the correction added."""
     for k, one in enumerate(curves):
         name = f"correction:{channel}<-{one.over}"
         effect = Library().effect(name, predictor.data.model, predictor.data.scales)

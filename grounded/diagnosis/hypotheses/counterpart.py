@@ -1,7 +1,7 @@
-"""Effects that a parameter's shift undoes: a mass 20 % larger beside a force 20 % larger.
+"""Effects that a parameter's shift undoes, such as a force 20 % larger beside a mass 20 % larger.
 
-Neither is a finding. What is left of the two, a bend of the model or the first samples of a trial,
-is told by the parameter alone.
+Neither is a finding: the little that remains of the two (a curvature of the model, the first
+samples of a trial) can be expressed by the parameter alone.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from grounded.frozen import Array
 
 
 def counterparts(predictor: Predictor, h: Hypothesis) -> list[str]:
-    """The effects on inputs and rates that one parameter's shift leaves less than LEFT of.
+    """Return the names of effects on inputs and rates that some parameter's shift nearly cancels.
 
-    Both are seen beside all the rest: what they change of a step, each alone and together.
+    Both act beside the rest of the hypothesis. They cancel if together they change a step by less
+    than LEFT of what each changes alone.
     """
     kinds = RateFamily | InputFamily | LossFamily | MediumFamily
     effects = [e.name for e in h.effects if isinstance(e.family, kinds)]
@@ -41,7 +42,7 @@ def counterparts(predictor: Predictor, h: Hypothesis) -> list[str]:
     whole, found = step(h), []
     less = {name: step(h.minus(name)) for name in effects}
     for other in bare:
-        rest = step(other)  # the effects, the parameter as it was
+        rest = step(other)  # all effects, the parameter at its nominal value
         for name in effects:
             shift, effect = between(whole, rest), between(whole, less[name])
             if name not in found and abs(shift - effect) < LEFT * min(shift, effect):
@@ -52,7 +53,7 @@ def counterparts(predictor: Predictor, h: Hypothesis) -> list[str]:
 
 
 def _unshifted(predictor: Predictor, h: Hypothesis) -> Iterator[Hypothesis]:
-    """The hypothesis with each parameter that it moves as the model has it."""
+    """Yield the hypothesis with each parameter that it shifts back at its nominal value."""
     for effect in h.effects:
         if isinstance(effect.family, ParamFamily):
             yield h.minus(effect.name)

@@ -1,18 +1,19 @@
-"""Which hypotheses an attribution has fitted so far, their evidence, the best of them.
+"""The hypotheses fitted so far, their evidence, and the best of them.
 
-    evidence(h) = b log p(y | h) - what naming its effects costs - what the noise structure costs
+    evidence(h) = b log p(y | h) - sum of the prices of its effects - price of its noise structure
 
-with one b for all, 1 where the likeliest leaves white noise (`grounded.filter.tempering`).
-
-What naming an effect costs, the price of its numbers, of looking for it, of where it might be:
+b is the tempering factor, the same for all hypotheses: 1 if the likeliest of them leaves white
+innovations, less if they are correlated (`grounded.filter.tempering`). The price of an effect is a
+BIC penalty for its free values plus a penalty for the number of alternatives searched,
 
     price = k/2 ln N + ln(places looked at) + ln(targets of the family)
 
-k free values, N time steps. Thresholds, frequencies and places that were scanned pay for the
-looking, and families that could have been blamed at many targets for the choice. A parameter of the
-model pays by its prior (a fifth of its size) instead; a friction below zero, which is less of the
-model's own, by the same prior beside. Effects that cancel are no finding, nor is a gain that more
-than doubles in a trial or a log twice too large (`Quantity.absurd`).
+with k free values and N time steps. The second term applies to thresholds, frequencies and places
+that were scanned on a grid; the third to families that could have been blamed at many targets. A
+parameter of the model pays by its prior (standard deviation a fifth of its size) instead. A
+negative friction, which reduces the model's own, pays by the same prior in addition. Effects that
+cancel are rejected, as are implausible sizes: a gain that more than doubles in a trial, or a log
+twice too large (`Quantity.absurd`).
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ from grounded.filter.tempering import Tempering, tempering
 from grounded.frozen import Array
 
 CLAIM = 3.0  # nats from which an effect is claimed
-TIE = 3.0  # nats within which two explanations are not told apart
+TIE = 3.0  # nats within which two explanations are indistinguishable
 
 
 class FittedHypotheses:
-    """Fits by noise structure, freedom of the parameters, and effects: the best of each."""
+    """The best fit for each noise structure, prior width of the parameters, and set of effects."""
 
     def __init__(self, data: Data, candidates: Sequence[Effect]) -> None:
         self.data, self.predictor = data, Predictor(data)
@@ -52,7 +53,7 @@ class FittedHypotheses:
         self.crowd = {e.name: families.count(e.family.name) for e in candidates}
 
     def price(self, effect: Effect, values: Mapping[str, float]) -> float:
-        """What an effect pays beside its likelihood, in nats."""
+        """Return the price of an effect at given values [nats]."""
         key = (effect.name, len(effect.free), *sorted(values.items()))
         if key not in self._prices:
             targets = self.crowd.get(effect.name, 1)
@@ -60,7 +61,7 @@ class FittedHypotheses:
         return self._prices[key]
 
     def score(self, fit: Fitted) -> float:
-        """Evidence of a fit in nats, up to a constant of the data."""
+        """Return the evidence of a fit [nats], up to a constant of the data."""
         h = fit.hypothesis
         if self.cancelling(h):
             return -math.inf
@@ -75,18 +76,18 @@ class FittedHypotheses:
         )
 
     def paid(self, h: Hypothesis) -> float:
-        """What all effects of a hypothesis pay beside its likelihood [nats]."""
+        """Return the price of all effects of a hypothesis [nats]."""
         return sum(self.price(e, v) for e, v in h.pairs)
 
     def cancelling(self, h: Hypothesis) -> bool:
-        """Whether effects of a hypothesis all but cancel: none of them is a finding."""
+        """Check whether effects of a hypothesis nearly cancel, so that none can be claimed."""
         key = tuple(zip(h.names, (tuple(v.values()) for v in h.values), strict=True))
         if key not in self._cancelling:
             self._cancelling[key] = cancelling(self.predictor, h)
         return self._cancelling[key]
 
     def keep(self, fits: Sequence[Fitted]) -> None:
-        """Remembers the best fit of every hypothesis under every structure."""
+        """Store fits, the best of each hypothesis under each noise structure; update tempering."""
         before = max((fit.evidence for fit in self.fits.values()), default=-math.inf)
         likeliest = max(fits, key=lambda fit: fit.evidence, default=None)
         if likeliest is not None and likeliest.evidence > before:
@@ -98,22 +99,22 @@ class FittedHypotheses:
                 self.fits[key] = fit
 
     def best_null(self) -> Fitted:
-        """The likeliest fit without effects."""
+        """Return the likeliest fit without effects."""
         return max((f for f in self.fits.values() if not f.hypothesis.effects), key=self.score)
 
     def exact_null(self) -> Fitted:
-        """The likeliest fit without effects and with the parameters as they are."""
+        """Return the likeliest fit without effects and with exact parameters."""
         bare = (f for (_, spread, names), f in self.fits.items() if not names and spread == 0)
         return max(bare, key=self.score)
 
     def calibrates(self) -> bool:
-        """Whether calibrating the model's parameters explains more than noise does."""
+        """Check whether calibrating the parameters explains the data better than noise alone."""
         best = self.best_null()
         spread = best.hypothesis.spread
         return spread > 0 and self.score(best) > self.score(self.exact_null()) + CLAIM
 
     def of_size(self, count: int) -> list[Fitted]:
-        """All fits with that many effects, best first, one a set of effects."""
+        """Return the best fit of each set of `count` effects, best first."""
         best: dict[tuple[str, ...], Fitted] = {}
         for (_, _, names), fit in self.fits.items():
             if len(names) == count and (
@@ -123,42 +124,45 @@ class FittedHypotheses:
         return sorted(best.values(), key=lambda f: -self.score(f))
 
     def chosen(self, most: int) -> Fitted:
-        """The hypothesis that would be claimed: every effect more has to pay for itself."""
+        """Return the hypothesis to claim: each further effect must gain CLAIM nats."""
         chosen = self.best_null()
         for size in range(1, most + 1):
             for fit in self.of_size(size)[:1]:
                 if self.score(fit) > self.score(chosen) + CLAIM:
                     chosen = fit
         if not chosen.hypothesis.effects and self.calibrates():
-            # one parameter is a calibration too: it need only be likelier than the shift of all
+            # a single parameter is a calibration, too: it need only beat the shift of all of them
             single = [f for f in self.of_size(1) if parametric(f)]
             chosen = max([chosen, *single[:1]], key=self.score)
         return chosen
 
 
 def parametric(fit: Fitted) -> bool:
-    """Whether all that a fit blames is the model's own parameters."""
+    """Check whether all effects of a fit are parameters of the model."""
     effects = fit.hypothesis.effects
     return bool(effects) and all(isinstance(e.family, ParamFamily) for e in effects)
 
 
-PARAM_PRIOR = 0.2  # prior relative error of one parameter that is blamed
-BRIEF = 0.1  # of a control step: shorter delays and lags are a matter of time stamps
+PARAM_PRIOR = 0.2  # prior standard deviation of a blamed parameter, relative to its size
+BRIEF = 0.1  # of a control step: shorter delays and lags may be errors of the time stamps
 TIMES = {"delay": "d", "sensor_delay": "d", "first_order_lag": "tau", "sensor_lag": "tau"}
-LEFT = 0.25  # of what effects do alone, from which together they are more than counterparts
-SAME = 0.05  # part of a dead zone's power that a mere offset may lack and still be the same
+LEFT = 0.25  # effects cancel if together they do less than this fraction of what each does alone
+SAME = 0.05  # a dead zone is a mere offset if they differ by less than this part of its power
 
 
 def price(
     predictor: Predictor, effect: Effect, values: Mapping[str, float], targets: int = 1
 ) -> float:
-    """What an effect pays beside its likelihood [nats].
+    """Return the price of an effect, subtracted from its gain in log-likelihood [nats].
 
     Args:
-        predictor: the data.
-        effect: which.
-        values: its values, for those whose price depends on them.
-        targets: at how many targets its family could have been blamed.
+        predictor: evaluates hypotheses on the data.
+        effect: the effect.
+        values: its values, which the price may depend on.
+        targets: the number of targets at which its family could have been blamed.
+
+    Returns:
+        The price; infinite for a value that can't be claimed.
     """
     data = predictor.data
     if isinstance(effect.family, ParamFamily):
@@ -178,13 +182,13 @@ def price(
 
 
 def cancelling(predictor: Predictor, h: Hypothesis) -> bool:
-    """Whether effects leave little of one another: two added rates, or three effects and more."""
+    """Check whether two added rates, or three or more effects, nearly cancel."""
     size = sizes(predictor)
     return _two_rates_cancel(predictor, h, size) or _several_cancel(predictor, h, size)
 
 
 def sizes(predictor: Predictor) -> Array:
-    """What changes of each state are measured in, (n,): those of one unit share a scale."""
+    """Return the scale of each state's changes, (n,), common to all states of one unit."""
     units, scales = predictor.data.model.states, predictor.data.scales
     return np.array(
         [max(scales.spread(n) for n in units if units[n] == unit) for unit in units.values()]
@@ -192,7 +196,7 @@ def sizes(predictor: Predictor) -> Array:
 
 
 def _two_rates_cancel(predictor: Predictor, h: Hypothesis, size: Array) -> bool:
-    """Whether the sum of two added rates is less than LEFT of the larger; `size` (n,) of states."""
+    """Check whether two added rates sum to less than LEFT of the larger; `size`: scales (n,)."""
     rates, data = rates_of(h), predictor.data
     if len(rates) < 2:
         return False
@@ -209,11 +213,11 @@ def _two_rates_cancel(predictor: Predictor, h: Hypothesis, size: Array) -> bool:
 
 
 def _several_cancel(predictor: Predictor, h: Hypothesis, size: Array) -> bool:
-    """Whether three effects or more change a step by less than LEFT of what each does alone.
+    """Check whether three or more effects change a step by less than LEFT of what each does alone.
 
-    Rates and what an actuator makes of a command alike: a rate that is half as fast again, of a
-    weaker input, beside less friction is a time constant that is three percent shorter. (Two of
-    them that differ in kind, a dead zone and a gain, may well both be there.)
+    This covers effects on rates and on inputs. For example, a larger rate gain with a weaker input
+    and less friction may just be a time constant that is 3 % shorter. (Two effects of different
+    kinds, such as a dead zone and a gain, may well both be present.)
     """
     data, x = predictor.data, predictor.data.y[:-1]
     kinds = RateFamily | InputFamily | MediumFamily
@@ -243,7 +247,7 @@ def _several_cancel(predictor: Predictor, h: Hypothesis, size: Array) -> bool:
 
 
 def _of_less_friction(effect: Effect, values: Mapping[str, float]) -> float:
-    """What a friction below zero pays: the model's own, which is less, has a parameter's prior."""
+    """Return the price of a negative friction: the prior of a parameter of the model's own."""
     if not getattr(effect.family, "brakes", False):
         return 0.0
     less = [values.get(q.name, 0.0) / q.low for q in effect.free if -math.inf < q.low < 0]
@@ -251,23 +255,23 @@ def _of_less_friction(effect: Effect, values: Mapping[str, float]) -> float:
 
 
 def _of_parameter(effect: Effect, values: Mapping[str, float], steps: int) -> float:
-    """A normal prior of a fifth of the parameter's size, not a free parameter's cost."""
+    """Return the price of a blamed parameter, by a normal prior of a fifth of its size."""
     value = effect.site.model.params[effect.site.target].value
     size = PARAM_PRIOR * (abs(value) or 1.0)
     return 0.5 * (values.get("d", 0.0) / size) ** 2 + 0.25 * math.log(max(steps, 2)) + 1.0
 
 
 def _of_change(effect: Effect, values: Mapping[str, float], steps: int) -> float:
-    """The same of an effect that was adopted: as uncertain as its numbers that are parameters."""
+    """Return the price of a change of an adopted effect, by the prior of its adopted values."""
     sizes = {q.name: SURE * q.known for q in effect.free if q.known}
     pulls = sum(0.5 * (values.get(name, 0.0) / size) ** 2 for name, size in sizes.items())
     return pulls + 0.25 * len(effect.free) * math.log(max(steps, 2)) + 1.0
 
 
 def _mere_offset(predictor: Predictor, effect: Effect, values: Mapping[str, float]) -> bool:
-    """Whether a dead zone acts as one offset all the time, because nothing ever rests in it.
+    """Check whether a dead zone acts as a constant offset, because the input never rests in it.
 
-    Then its threshold was not searched for among many: any would have been the same effect.
+    Then all thresholds of the grid have the same effect, and the search costs nothing.
     """
     if effect.family.name != "dead_zone" or "c" not in values:
         return False

@@ -1,13 +1,14 @@
-"""All joints of an arm at once: dry and viscous friction and inertia of each, then what is needed.
+"""Backward elimination for an arm: friction and inertia of all joints at once, then removals.
 
-Of an arm whose every joint differs from its model none moves as the model says by the friction of
-one. Alone each true effect gains little, and a weak input of all joints goes before it, so a search
-that adds one effect at a time never gets there. Here the search starts from the other end, from
-what an identification of robots fits: every joint with friction and a rotor's inertia. What the
-evidence does not need is taken out again, one by one; what it still needs is added.
+If every joint of an arm differs from its model, the friction of a single joint makes no joint move
+as logged. Each true effect alone gains little, and a common weak input of all joints is likelier,
+so a search that adds one effect at a time never finds them. This search starts from the full model
+of robot identification: every joint with dry and viscous friction and a rotor inertia. Effects
+that do not pay by evidence are removed one by one; then others that do are added.
 
-Source: Swevers, Verdonck & De Schutter, Dynamic Model Identification for Industrial Robots (2007);
-the order of the removals is Wald's test (values against their covariance), each is fitted again.
+Source: Swevers, Verdonck & De Schutter, Dynamic Model Identification for Industrial Robots (2007).
+Wald's test (values against their covariance) gives the order of the removals; the rest is fitted
+again after each.
 """
 
 from __future__ import annotations
@@ -35,20 +36,22 @@ from grounded.effects.family import coupled
 from grounded.effects.joint import added_inertia
 from grounded.frozen import Array
 
-STICKING = (0.03, 0.2)  # of an input's peak: dry frictions from which all joints start
-MANY = 3  # joints, and effects, from which a search that adds one at a time may not get there
-AGAIN = 8  # iterations after an effect was taken out or added
-BEYOND = 4  # effects that are added at most to those of the joints
-LATE = ("delay", "first_order_lag")  # what motors on one bus, of one kind, have in common
-OWN = 0.3  # of a joint's own inertia: what is added at the start
+STICKING = (0.03, 0.2)  # initial dry frictions, as fractions of an input's peak
+MANY = 3  # joints, and effects, above which adding one effect at a time may fail
+AGAIN = 8  # iterations after an effect was removed or added
+BEYOND = 4  # most effects added to those of the joints
+LATE = ("delay", "first_order_lag")  # families that motors on one bus or of one kind share
+OWN = 0.3  # initial added inertia, as a fraction of a joint's own
 
 
 def joint_model(search: HypothesisSearch) -> Fitted | None:
-    """The likeliest hypothesis with all that joints may have, less what it can spare.
+    """Fit friction and inertia of all joints together, then remove what evidence does not need.
 
-    All that is fitted is added to the search. Returns None where fewer than MANY joints
-    share an inertia (of a simulator, which is slow, two), one effect is likelier, or fewer than
-    MANY effects are needed.
+    All fits are added to the search.
+
+    Returns:
+        The best fit. None if fewer than MANY joints (two of a simulator, which is slow) share an
+        inertia, if a single effect is likelier, or if fewer than MANY effects remain.
     """
     joints = _joints(search)
     if len(joints) < (2 if simulated(search.data.model) else MANY):
@@ -62,7 +65,7 @@ def joint_model(search: HypothesisSearch) -> Fitted | None:
         return None
     best = _spared(search, best)
     if len(best.hypothesis.effects) < MANY:
-        return None  # one after the other, they are found too
+        return None  # adding one at a time finds them, too
     if not simulated(search.data.model):
         tune(search, [best])
         best = max(search.of_size(len(best.hypothesis.effects)), key=search.score)
@@ -71,7 +74,7 @@ def joint_model(search: HypothesisSearch) -> Fitted | None:
 
 
 def _joints(search: HypothesisSearch) -> list[tuple[Effect, Effect]]:
-    """Friction and inertia of each joint whose inertia is coupled with others'."""
+    """Return friction and inertia of each joint whose inertia is coupled with other joints."""
     candidates = {e.name: e for e in search.candidates}
     inertias = [e for e in search.candidates if e.family.name == added_inertia.name]
     found = []
@@ -82,7 +85,7 @@ def _joints(search: HypothesisSearch) -> list[tuple[Effect, Effect]]:
 
 
 def _starts(search: HypothesisSearch, joints: Sequence[tuple[Effect, Effect]]) -> list[Start]:
-    """All joints with little and with much friction, parameters free or not, with a lag or none."""
+    """Return starts with little or much friction, free or exact parameters, a lag or none."""
     data = search.data
     bare, spreads = Hypothesis(), [0.0]
     if param_scale(data.model).any():
@@ -103,7 +106,7 @@ def _starts(search: HypothesisSearch, joints: Sequence[tuple[Effect, Effect]]) -
 
 
 def _coloured(search: HypothesisSearch, fit: Fitted) -> Fitted:
-    """The fit, or the same under noise of another correlation time, where that is likelier."""
+    """Return the likeliest of the fit and the same under noise of other correlation times."""
     starts = [
         (fit.hypothesis, fit.noise.allowing(Structure(tau), search.data.dt), fit.track)
         for tau in search.taus
@@ -113,7 +116,7 @@ def _coloured(search: HypothesisSearch, fit: Fitted) -> Fitted:
 
 
 def _spared(search: HypothesisSearch, fit: Fitted) -> Fitted:
-    """Without the effects that evidence does not ask for, the least needed first."""
+    """Remove effects that do not pay, the least needed first."""
     while fit.hypothesis.effects:
         less = _less(search, fit, int(_losses(search, fit).argmin()))
         if less is fit or search.score(less) < search.score(fit) - CLAIM:
@@ -123,7 +126,7 @@ def _spared(search: HypothesisSearch, fit: Fitted) -> Fitted:
 
 
 def _losses(search: HypothesisSearch, fit: Fitted) -> Array:
-    """About what evidence would lose without each effect, by Wald's test [nats], (effects,)."""
+    """Return the approximate loss of evidence without each effect, by Wald's test [nats]."""
     h, covariance, at = fit.hypothesis, fit.covariance, 0
     found = []
     for effect, values in h.pairs:
@@ -135,14 +138,14 @@ def _losses(search: HypothesisSearch, fit: Fitted) -> Array:
 
 
 def _less(search: HypothesisSearch, fit: Fitted, index: int) -> Fitted:
-    """The fit without one of its effects, all the rest fitted again; the fit where none can be."""
+    """Refit without one effect; return the fit unchanged if that can't be filtered."""
     start = fit.hypothesis.minus(fit.hypothesis.names[index])
     found = search.refined([(start, fit.noise, fit.track)], AGAIN)
     return found[0] if found else fit
 
 
 def shared(search: HypothesisSearch, fit: Fitted) -> Fitted:
-    """With one delay, or one lag, of all inputs in the place of those of some, where that pays."""
+    """Replace delays and lags of some inputs by one of all inputs, if that is likelier."""
     rest = fit.hypothesis
     late = [(e, v) for e, v in rest.pairs if e.family.name in LATE]
     if not late:
@@ -159,7 +162,7 @@ def shared(search: HypothesisSearch, fit: Fitted) -> Fitted:
 
 
 def _completed(search: HypothesisSearch, fit: Fitted, most: int) -> Fitted:
-    """With what the joints alone don't do: a lag of all motors, one that is weaker."""
+    """Add effects beside those of the joints, such as a lag of all motors, while evidence rises."""
     while len(fit.hypothesis.effects) < most:
         further = search.extended(fit, iterations=AGAIN, late=False)
         best = max(further, key=search.score, default=fit)

@@ -1,15 +1,14 @@
-"""What no effect explains: is there a gap left, in which channel, where, how large?
+"""Test for structure that no effect explains: its channel, its size, and where it acts.
 
-A flexible reference model is given the chance to predict what the best hypothesis leaves: for each
-channel a correction of its rate, linear in features that no engineer would name,
+A flexible regression tries to predict the residual of the best hypothesis: for each channel, a
+correction of its rate that is linear in many generic features,
 
-    bins and powers of every input, what was commanded up to 0.3 s ago, products of inputs with each
+    bins and powers of every input, earlier inputs by up to 7 steps, products of inputs with each
     other, with dynamic states and with parts of the trial, bins of time, direction of motion.
 
-Its columns are whitened by the filter of the best hypothesis and solved by ridge regression on all
-trials but one; what counts is the likelihood gained on the trial left out. Noise, however coloured
-or heavy, gains nothing there. A correction that does gain is a leftover: stated with its channel,
-its size and the region where it acts.
+Its columns are whitened by the filter of the best hypothesis, and the weights solved by ridge
+regression on all trials but one. What counts is the gain in likelihood on the trial left out.
+Noise, however coloured or heavy-tailed, gains nothing there. A correction that gains is a leftover.
 """
 
 from __future__ import annotations
@@ -29,25 +28,25 @@ from grounded.filter import kalman
 from grounded.frozen import Array
 
 CLAIM = 5.0  # nats gained on held-out trials from which a leftover is stated
-PENALTIES = (3.0, 30.0)  # ridge: prior variances of the whitened columns' weights, relative
+PENALTIES = (3.0, 30.0)  # ridge: relative prior variances of the weights
 LAGS = (1, 2, 4, 7)  # steps
-RHO_LAGS = 10
+RHO_LAGS = 10  # autocorrelation lags of the test for white innovations
 
 
 @dataclass(frozen=True, eq=False)
 class Leftover:
-    """What remains in one channel: gain [nats] on held-out trials, size [unit/s] of the rate."""
+    """A leftover in one channel: gain on held-out trials [nats], rms size of the rate [unit/s]."""
 
     channel: str
     gain: float
     size: float
     unit: str
-    correction: Array  # (L, B) the rate that the flexible model adds, its weights from other trials
+    correction: Array  # (L, B) rate added by the regression, its weights from other trials
     improvement: Array  # (L, B) held-out gain of each step [nats]
 
 
 def leftovers(predictor: Predictor, fit: Fitted) -> list[Leftover]:
-    """The channels in which a flexible model predicts held-out trials better, most first."""
+    """Return the channels in which the regression predicts held-out trials better, best first."""
     data = predictor.data
     if len(np.unique(folds(data))) < 2:
         return []
@@ -65,7 +64,7 @@ def leftovers(predictor: Predictor, fit: Fitted) -> list[Leftover]:
 
 
 def flexible(predictor: Predictor, fit: Fitted) -> Array:
-    """Features of every step, (L, B, K), each of unit size."""
+    """Return the features of every step, (L, B, K), each of unit size."""
     data, h = predictor.data, fit.hypothesis
     model = data.model
     x, u = fit.track[:-1], predictor.inputs(h)
@@ -92,7 +91,7 @@ def flexible(predictor: Predictor, fit: Fitted) -> Array:
 
 
 def _scaled(value: Array) -> Array:
-    """Zero mean, unit spread, clipped to three."""
+    """Return values with zero mean and unit standard deviation, clipped to +-3."""
     spread = float(value.std())
     return np.asarray(np.clip((value - value.mean()) / max(spread, 1e-12), -3, 3))
 
@@ -102,12 +101,12 @@ def _lagged(value: Array, steps: int) -> Array:
 
 
 def _rate(value: Array) -> Array:
-    """Backward difference: what is known at the time."""
+    """Return the backward difference, which uses no later sample."""
     return np.concatenate([np.zeros_like(value[:1]), np.diff(value, axis=0)])
 
 
 def _bins(value: Array, count: int) -> list[Array]:
-    """1 inside each of `count` bins of equal width."""
+    """Return an indicator for each of `count` bins of equal width that is not nearly empty."""
     edges = np.linspace(float(value.min()), float(value.max()) + 1e-9, count + 1)
     pairs = itertools.pairwise(edges)
     inside = [((value >= a) & (value < b)).astype(float) for a, b in pairs]
@@ -117,7 +116,7 @@ def _bins(value: Array, count: int) -> list[Array]:
 def _channel(
     predictor: Predictor, fit: Fitted, gains: kalman.Gains, features: Array, i: int
 ) -> tuple[float, Array, Array]:
-    """Held-out gain of correcting one channel's rate: total, by step (L, B); the correction."""
+    """Return the held-out gain in one channel (total, by step (L, B)) and its correction (L, B)."""
     gain, by_step, weights = held_out_columns(predictor, fit, gains, features, i)
     left_out, rate = folds(predictor.data), np.zeros_like(by_step)
     for k, trial in enumerate(np.unique(left_out)):
@@ -129,13 +128,18 @@ def _channel(
 def held_out_columns(
     predictor: Predictor, fit: Fitted, gains: kalman.Gains, features: Array, i: int
 ) -> tuple[float, Array, Array]:
-    """What features (L, B, K) of state i's rate gain on each trial, fitted to the others.
+    """Fit a correction of one state's rate on all folds but one, and score it on that fold.
 
-    `gains` are those of the fit (`filter_of`).
+    Args:
+        predictor: evaluates hypotheses on the data.
+        fit: the hypothesis whose residual is predicted.
+        gains: its Kalman gains (`filter_of`).
+        features: (L, B, K).
+        i: index of the state.
 
     Returns:
-        The gain [nats]; the same by step (L, B); weights (S + 1, K) without each of the S folds,
-        and of all.
+        The gain on held-out folds [nats]; the same by step (L, B); weights (S + 1, K) without each
+        of the S folds, and from all.
     """
     data = predictor.data
     L, B, K = features.shape
@@ -155,7 +159,7 @@ def held_out_columns(
     scale = np.sqrt(np.maximum(np.diag(G), 1e-300))
     best: tuple[float, Array, Array] = (-np.inf, np.zeros((L, B)), np.zeros((len(trials) + 1, K)))
     for spread in PENALTIES:
-        prior = np.diag(scale**2) / spread  # the columns' own size: a weight explains `spread` nats
+        prior = np.diag(scale**2) / spread  # each weight may explain about `spread` nats
         total, by_step, each = 0.0, np.zeros((L, B)), []
         for trial, Gt, st in zip(trials, grams, scores, strict=True):
             weights = -np.linalg.solve(G - Gt + prior + 1e-12 * np.eye(K), s - st)
@@ -173,13 +177,13 @@ def held_out_columns(
 
 
 def filter_of(predictor: Predictor, fit: Fitted, *, covariances: bool = False) -> kalman.Gains:
-    """The gains of a fit's filter."""
+    """Return the Kalman gains of a fit."""
     h, F = fit.hypothesis, step_jacobian(predictor, fit.hypothesis, fit.track)
     return gains_of(predictor, h, fit.noise, fit.track, F, covariances=covariances)
 
 
 def whiteness(fit: Fitted, seen: Array) -> dict[str, float]:
-    """Ljung-Box of each channel's whitened innovations over 10 lags: p-values by index."""
+    """Return the Ljung-Box p-value of each channel's whitened innovations, {index: p}, 10 lags."""
     from scipy.special import chdtrc
 
     found = {}

@@ -1,14 +1,14 @@
-"""What acts nearly the same as a claimed effect in these trials: look-alikes that hardly differ.
+"""Look-alikes: effects that produce nearly the same signal in these trials as a claimed one.
 
-Evidence can rest on a few moments: a dead zone and a dry friction are one constant force while the
-car rolls, and differ only where it stands. So beside the ties (explanations within a few nats) the
-look-alikes of each claimed effect are measured by their shape. The effect's own signal is
+Evidence may come from a few moments: a dead zone and a dry friction are the same constant force
+while the car rolls, and differ only where it stands. So in addition to ties (explanations within a
+few nats), the look-alikes of each claimed effect are compared by their signals. The signal of an
+effect is
 
     s = whitened (f with the effect - f without it)
 
-after what the other effects can take up is projected out, the model's parameters as they were
-calibrated; a candidate whose best values reproduce most of |s|^2 is named with that share, whatever
-the evidence says besides.
+with the part that the other effects can absorb projected out, at the calibrated parameters. A
+candidate whose best values reproduce most of |s|^2 is named with that share, whatever its evidence.
 """
 
 from __future__ import annotations
@@ -30,14 +30,21 @@ from grounded.effects import Effect, ParamFamily
 from grounded.filter import kalman
 
 NEARLY = 0.75  # share of an effect's signal from which a look-alike is named
-IDENTICAL = 1e-6  # of a slope's power that may differ where two are one thing
-MOST = 3  # that are named for one effect
+IDENTICAL = 1e-6  # fraction of a slope's power by which two equivalent effects may differ
+MOST = 3  # most look-alikes named per effect
 
 
 def lookalikes(
     predictor: Predictor, fit: Fitted, candidates: Sequence[Effect], nearly: float = NEARLY
 ) -> tuple[Likeness, ...]:
-    """Look-alikes of each claimed effect that reproduce nearly all of its signal, most first."""
+    """Return the look-alikes that reproduce nearly all of a claimed effect's signal, best first.
+
+    Args:
+        predictor: evaluates hypotheses on the data.
+        fit: the fit with the claimed effects.
+        candidates: effects that may be look-alikes.
+        nearly: share of the signal from which an effect is named.
+    """
     found: list[Likeness] = []
     for effect in fit.hypothesis.effects:
         own = [c for c in candidates if related(effect, c) and c.name not in fit.hypothesis.names]
@@ -54,17 +61,17 @@ def of_parameters(
     candidates: Sequence[Effect],
     nearly: float = NEARLY,
 ) -> tuple[Likeness, ...]:
-    """Effects that act like a parameter of a calibrated model being off, most first.
+    """Return the effects that act like the error of a calibrated parameter, best first.
 
-    Each parameter by itself, the others as they were calibrated: a gain of an actuator and the
-    parameter behind it are one thing.
+    Each parameter is taken separately, with the others at their calibrated values. For example, a
+    gain of an actuator is equivalent to the parameter that scales it.
 
     Args:
-        predictor: the data.
+        predictor: evaluates hypotheses on the data.
         null: the calibrated fit without effects.
         off: indices of the parameters.
-        candidates: what may act alike.
-        nearly: share of its signal from which an effect is named.
+        candidates: effects that may be look-alikes.
+        nearly: share of the signal from which an effect is named.
     """
     assert null.hypothesis.shift is not None
     model, found = predictor.data.model, list[Likeness]()
@@ -84,10 +91,10 @@ def of_parameters(
 
 
 def one_thing(predictor: Predictor, index: int, effect: Effect) -> bool:
-    """Whether an effect does what a parameter does in the model itself, whatever is run.
+    """Check whether an effect is equivalent to a parameter of the model in any trial.
 
-    Seen far from the trials: every state and input drawn by itself, anywhere in its range. There
-    the slope of a step in the one is a multiple of its slope in the other.
+    Tested at random points, every state and input drawn independently over its range: the slope of
+    a step in the effect must be a multiple of its slope in the parameter.
     """
     data, rng = predictor.data, np.random.default_rng(0)
     if len(effect.free) != 1 or index not in calibrated(data):
@@ -107,7 +114,7 @@ def one_thing(predictor: Predictor, index: int, effect: Effect) -> bool:
 
 
 def related(one: Effect, other: Effect) -> bool:
-    """Whether one of two families lists the other among its look-alikes."""
+    """Check whether one of two families lists the other among its look-alikes."""
     a, b = one.family, other.family
     return b.name in a.lookalikes or a.name in b.lookalikes
 
@@ -115,7 +122,7 @@ def related(one: Effect, other: Effect) -> bool:
 def _likely(
     predictor: Predictor, fit: Fitted, effect: Effect, own: Sequence[Effect], nearly: float
 ) -> list[Likeness]:
-    """The candidates that reproduce more than `nearly` of an effect's signal, most first."""
+    """Return the candidates that reproduce more than `nearly` of an effect's signal, best first."""
     shares = _shares(predictor, fit, effect, own) if own else []
     likely = [Likeness(effect.name, c.name, s) for c, s in zip(own, shares, strict=True)]
     near = sorted((one for one in likely if one.share > nearly), key=lambda one: -one.share)
@@ -125,14 +132,14 @@ def _likely(
 def _shares(
     predictor: Predictor, fit: Fitted, effect: Effect, own: Sequence[Effect]
 ) -> list[float]:
-    """Share of an effect's signal that the best values of each candidate reproduce."""
+    """Return the share of an effect's signal that each candidate reproduces at its best values."""
     h, data = fit.hypothesis, predictor.data
     if h.shift is not None:
         moved = dict(zip(data.model.param_names, data.model.values + h.shift, strict=True))
         data = replace(data, model=data.model.with_values(moved))
         h = replace(h, shift=None, spread=0.0)
     predictor, without = Predictor(data), h.minus(effect.name)
-    # all in the filter that knows nothing of the effect: its look-alikes are scanned there too
+    # all with the filter of the hypothesis without the effect, as its look-alikes are scanned
     gains = filter_of(predictor, replace(fit, hypothesis=without))
     delays = delays_of(without, data)
     x, model = fit.track[:-1], data.model

@@ -1,8 +1,8 @@
-"""Late commands and late sensors: one thing to any model that no clock enters.
+"""Equivalence of delayed commands and delayed sensors in a time-invariant model.
 
-If every sensor of what some inputs drive shows d ago, y(t) = x(t - d), then x' = f(x, u) is
-y' = f(y, u(t - d)): the very equations of commands that arrive d late. No run tells which it is,
-unless one clock stamps a command and what it did.
+If all sensors of the part that some inputs drive are delayed by d, y(t) = x(t - d), then
+x' = f(x, u) becomes y' = f(y, u(t - d)), which are the equations for commands delayed by d. No run
+can distinguish the two, unless the same clock stamps a command and its response.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ import numpy as np
 from grounded.effects import Effect, places
 from grounded.model import Model
 
-SLIGHT = 1e-9  # of a step's largest slope: no dependence
+SLIGHT = 1e-9  # fraction of a step's largest slope that counts as no dependence
 FAMILIES = {"delay": "sensor_delay", "sensor_delay": "delay"}
 
 
 @dataclass(frozen=True)
 class OneClock:
-    """A claimed delay, and the other side that may be late instead.
+    """A claimed delay and the equivalent delay of the other side.
 
     Args:
-        effect: as it is claimed.
-        like: the effect of the other side.
-        inputs: those that drive what is late.
-        states: all of it that has a sensor.
-        whole: that is every sensor and every input.
+        effect: name of the claimed effect.
+        like: name of the equivalent effect.
+        inputs: the inputs of the delayed part of the model.
+        states: its states that have a sensor.
+        whole: whether these are all sensors and all inputs.
     """
 
     effect: str
@@ -38,7 +38,7 @@ class OneClock:
     whole: bool
 
     def sentence(self) -> str:
-        """What a person should know of it."""
+        """Return an explanation for the user."""
         commands = "the commands" if self.whole else f"the commands of {_and(self.inputs)}"
         sensors = "all sensors" if self.whole else f"the sensors of {_and(self.states)}"
         return (
@@ -50,12 +50,12 @@ class OneClock:
 def one_clock(
     model: Model, effects: Sequence[Effect], shown: Sequence[str]
 ) -> tuple[OneClock, ...]:
-    """Of each delay among effects that holds for all inputs of a part of a model, or all sensors.
+    """Find delays that cover all inputs, or all sensors, of an independent part of a model.
 
     Args:
-        model: whose structure tells its parts.
-        effects: claimed ones.
-        shown: states that a sensor has.
+        model: its structure defines the parts.
+        effects: the claimed effects.
+        shown: names of states that have a sensor.
     """
     some = [e for e in effects if e.family.name in FAMILIES]
     parts = _parts(model) if some else []
@@ -74,7 +74,7 @@ def one_clock(
 
 
 def _parts(model: Model) -> list[set[str]]:
-    """States and inputs that hang together, each with what it drives or is driven by."""
+    """Return the connected parts of a model, sets of states and inputs that are coupled."""
     dt = places.probe(model, 1e-2)
     f_x, f_u = model.system.linearise(*places.samples(model, 8), model.values, dt)
     slopes = np.abs(np.concatenate([f_x - np.eye(model.n), f_u], axis=-1)).max(axis=0)

@@ -1,9 +1,10 @@
-"""The dry friction of one motion at its plainest, fitted beside whatever has more numbers.
+"""Plain dry friction of a joint, fitted as a rival of frictions with more parameters.
 
-A friction that grows with its load, a constant one with a stiction beside, a joint's with a viscous
-part that is nothing: each holds the plain friction of the joint as a case, with less to be paid.
-Where the joint's inertia is constant that friction goes by the name of `coulomb_friction`, whose
-rate holds nothing at rest; what does would win against it for that alone.
+A load-dependent friction, a Coulomb friction beside a stiction, and a joint friction whose viscous
+part is zero all contain the plain friction of the joint as a special case with a lower price. If
+the joint's inertia is constant, the candidate for that friction is `coulomb_friction`. It is an
+added rate and can't hold a joint at rest, so any richer friction that can would win for that reason
+alone. Therefore the joint's own friction is fitted as well.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from grounded.effects.joint import joint_friction, load_friction
 
 
 def plainer(search: HypothesisSearch, fit: Fitted) -> list[Fitted]:
-    """The plainer forms of a fit, under noise of its structure."""
+    """Return the fits of the plainer forms of a fit, under noise of the same structure."""
     found = []
     for h in plain_forms(search, fit.hypothesis):
         key = _key(replace(fit, hypothesis=h))
@@ -36,7 +37,7 @@ def plainer(search: HypothesisSearch, fit: Fitted) -> list[Fitted]:
 
 
 def _numbers(fit: Fitted) -> int:
-    """What a fit has to say: of two of one name the likelier is kept, the plainer or not."""
+    """Return the number of effects and values, since of two fits of one name only one is kept."""
     return len(fit.hypothesis.effects) + len(fit.hypothesis.theta)
 
 
@@ -46,7 +47,7 @@ def _key(fit: Fitted) -> tuple[Structure, float, tuple[str, ...]]:
 
 
 def plain_forms(search: HypothesisSearch, h: Hypothesis) -> Iterator[Hypothesis]:
-    """The same hypothesis with each dry friction at its plainest, where it is not."""
+    """Yield the hypothesis with each dry friction replaced by its plain form."""
     by_family = {(e.family.name, _motion(e)): (e, v) for e, v in h.pairs}
     for (family, motion), (effect, values) in by_family.items():
         joint = search.joints.get(motion)
@@ -67,12 +68,12 @@ def _motion(effect: Effect) -> str:
 
 
 def _of_joint(joint: Effect, values: Mapping[str, float]) -> dict[str, float]:
-    """What a friction of the joint that grows with its load has without that."""
+    """Return the values of a load-dependent friction without the dependence on the load."""
     return {q.name: float(values[q.name]) for q in joint.quantities}
 
 
 def push(joint: Effect) -> float:
-    """The acceleration that a unit of the input makes, in the middle of what it does."""
+    """Return the median acceleration per unit of the joint's input."""
     model, (tau, w) = joint.site.model, coupled(joint.site)
     dt, (x, u) = places.probe(model, 1e-5), places.samples(model, 8)
     _, f_u = model.system.linearise(x, u, model.values, dt)

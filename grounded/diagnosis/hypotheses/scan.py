@@ -1,15 +1,15 @@
-"""A first look at every candidate: what would it add, and how much likelier would the data be?
+"""A score test of every candidate effect: its best values and gain in likelihood beside one fit.
 
-Each candidate's columns (what it adds to a step, or to a measurement) are filtered with the gains
-of one fit and compared with its innovations:
+Each candidate's columns (what it adds to a step, or to a measurement) are whitened with the Kalman
+gains of the fit and regressed on its innovations:
 
-    linear quantity     a column for a unit of it; its value in one solve
-    scanned quantity    a column for each grid value: the whole change, coefficient one; together
-                        with linear quantities (a patch's strength, a wave's two amplitudes) these
-                        are solved at each grid point
+    linear quantity     one column per unit of the quantity; its value from one solve
+    scanned quantity    one column per grid value, the whole change with coefficient one. Linear
+                        quantities beside it (a patch's strength, a wave's two amplitudes) are
+                        solved at each grid point
 
-What the fit already estimates (its effects' values, the parameters' shifts) is projected out, so
-that a candidate is credited only with what they can't explain.
+The columns of what the fit already estimates (values of its effects, shifts of the parameters) are
+projected out, so that a candidate is credited only with what they can't explain.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ from grounded.engine import SentOnce, each
 from grounded.filter import kalman
 from grounded.frozen import Array
 
-BLOCK = 160  # columns filtered at once
-MOST_NUMBERS = 2.5e5  # of one block of whitened columns: what stays in the cache goes fastest
-CACHED = 2e4  # numbers that are put in their places at once
+BLOCK = 160  # most columns filtered at once
+MOST_NUMBERS = 2.5e5  # size of one block of whitened columns; what fits in the cache is fastest
+CACHED = 2e4  # numbers copied at once
 _EMPTY: Array = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What a scan found of a candidate: the best values, the gain in log-likelihood there."""
+    """The result of a scan for one candidate: its best values and their gain [nats]."""
 
     effect: Effect
     values: dict[str, float]
     gain: float
-    others: tuple[dict[str, float], ...] = ()  # other places that are nearly as good
+    others: tuple[dict[str, float], ...] = ()  # other grid points that gain nearly as much
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ _Results = dict[tuple[int, int], list[tuple[str, float, Array, Array]]]
 
 
 def scan_candidates(predictor: Predictor, fit: Fitted, candidates: Sequence[Effect]) -> list[Look]:
-    """Every candidate beside what `fit` already holds; same order as the candidates."""
+    """Scan every candidate beside what `fit` already holds; return looks in the same order."""
     context = _Context(predictor, fit)
     results: _Results = {}
     size = max(8, min(BLOCK, int(MOST_NUMBERS / fit.white.size)))
@@ -97,7 +97,7 @@ def scan_candidates(predictor: Predictor, fit: Fitted, candidates: Sequence[Effe
 
 
 def _looked(context: _Context, block: Sequence[_Point]) -> _Results:
-    """The products of a block of columns; all those of a grid point lie in one block."""
+    """Return the products of a block of columns, which holds all columns of each grid point."""
     results: _Results = {}
     columns = [column for point in block for column in context.columns(*point)]
     if columns:
@@ -106,7 +106,7 @@ def _looked(context: _Context, block: Sequence[_Point]) -> _Results:
 
 
 class _Context(SentOnce):
-    """What all candidates share: the fit's track, Jacobian and gains."""
+    """The fit's track, Jacobian and gains, shared by all candidates."""
 
     def __init__(self, predictor: Predictor, fit: Fitted) -> None:
         self.predictor, self.fit = predictor, fit
@@ -138,7 +138,7 @@ class _Context(SentOnce):
     def _tried(
         self, effect: Effect, grid: dict[str, float]
     ) -> Iterator[tuple[str, float, dict[str, float]]]:
-        """A small amount of each linear quantity by name, or the whole change; all values then."""
+        """Yield the name, amount and all values of each column: a small amount, or the change."""
         linear = [q.name for q in effect.free if not q.grid]
         values = {**effect.fixed, **dict.fromkeys(linear, 0.0), **grid}
         for name in linear:
@@ -167,11 +167,11 @@ class _Context(SentOnce):
 
     @cached_property
     def _by_state(self) -> Array:
-        """F by the state it leads from, (n, L, B, n): few are touched by one effect."""
+        """F with its columns first, (n, L, B, n), since one effect changes only a few states."""
         return np.ascontiguousarray(np.moveaxis(self.F, -1, 0))
 
     def _passed(self, change: Array) -> Array:
-        """What F makes of a change of states (L, B, n)."""
+        """Return F times a change of the states (L, B, n)."""
         found = np.zeros_like(change)
         for k in np.flatnonzero(change.reshape(-1, change.shape[-1]).any(axis=0)):
             found += self._by_state[k] * change[..., k, None]
@@ -180,7 +180,7 @@ class _Context(SentOnce):
     def _rates_at(
         self, effect: Effect, values: dict[str, float], when: int, instant: bool = False
     ) -> Array:
-        """The added rate at the start (0) or the end (1) of every step."""
+        """Return the added rate at the start (0) or the end (1) of every step."""
         data = self.predictor.data
         x = self.x if when == 0 else self.after
         if medium := moving(self.fit.hypothesis, self.predictor.seen):
@@ -193,27 +193,27 @@ class _Context(SentOnce):
 
     @cached_property
     def mean(self) -> Named:
-        """The model's own rates, mean over every step."""
+        """The model's own mean rates over every step."""
         ahead = self.predictor.moved(self.fit.hypothesis, self.x, self.u)
         return self.predictor.named((ahead - self.x) / self.predictor.data.dt)
 
     @cached_property
     def instants(self) -> tuple[Named, Named]:
-        """The same at the start and at the end of every step."""
+        """The model's own rates at the start and at the end of every step."""
         h = self.fit.hypothesis
         start, end = (self.predictor.instant(h, x, self.u) for x in (self.x, self.after))
         return self.predictor.named(start), self.predictor.named(end)
 
     @cached_property
     def stepping(self) -> tuple[Predictor, Array]:
-        """What makes a step with a candidate, and what it makes without: slopes of a simulator."""
+        """The predictor for steps with a candidate (linear for a simulator), and steps without."""
         near = tangent(self.predictor, h := self.fit.hypothesis, self.x, self.u)
         if near is self.predictor:
             return near, self.after
         return near, near.advance(h, self.x, self.u, self.predictor.data.time)
 
     def _step(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
-        """The whole step again, with the candidate in it."""
+        """Return columns from repeating the whole step with the candidate in it."""
         data, (predictor, base) = self.predictor.data, self.stepping
         found = []
         for name, amount, values in self._tried(effect, grid):
@@ -238,7 +238,7 @@ class _Context(SentOnce):
         return found
 
     def filter(self, block: list[_Column], results: _Results) -> None:
-        """Whitens a block of columns, keeps their products with residual, base, each other."""
+        """Whiten a block of columns; store their products with residual, base and each other."""
         L, B, n = self.white.shape
         wide = kalman.whole(len(block), n)
         d = _side_by_side([column.d for column in block], (L, B, n, wide))
@@ -256,7 +256,7 @@ class _Context(SentOnce):
 
     @cached_property
     def base_white(self) -> Array:
-        """Whitened columns of what the fit estimates, (L B n, C)."""
+        """Whitened columns of the fit's own unknowns, (L B n, C)."""
         d, r = base_columns(self.predictor, self.fit)
         white = np.zeros((*d.shape[:-1], 0))
         if d.shape[-1]:
@@ -265,12 +265,12 @@ class _Context(SentOnce):
 
     @cached_property
     def base_score(self) -> Array:
-        """Slope of the log-posterior by what the fit estimates, (C,); zero at its best."""
+        """Slope of the negative log posterior in the fit's own unknowns, (C,); 0 at its optimum."""
         score = self.base_white.T @ self.white.reshape(-1)
         return np.asarray(score + self.fit.prior_pull(self.predictor.data))
 
     def best(self, i: int, effect: Effect, results: _Results) -> Look:
-        """The grid point with the largest gain, its linear values solved."""
+        """Return the grid point with the largest gain, with its linear values solved."""
         looks = []
         for point, grid in enumerate(grid_points(effect)):
             entries = results.get((i, point), [])
@@ -303,7 +303,7 @@ class _Context(SentOnce):
 
 
 def _side_by_side(columns: Sequence[Array], shape: tuple[int, ...]) -> Array:
-    """Columns of one shape, or empty, as the last axis; some steps at a time stay in the cache."""
+    """Stack columns of one shape (empty ones: zero) along the last axis, in cached parts."""
     found = np.zeros(shape)
     there = [(j, column) for j, column in enumerate(columns) if column.size]
     some = max(1, int(CACHED / np.prod(shape[1:])))
@@ -315,18 +315,18 @@ def _side_by_side(columns: Sequence[Array], shape: tuple[int, ...]) -> Array:
 
 
 def inside(effect: Effect, names: Sequence[str], value: Array) -> Array:
-    """Values of linear quantities, kept in their bounds."""
+    """Return values of linear quantities, clipped to their bounds."""
     bounds = {q.name: (q.low, q.high) for q in effect.free}
     return np.array([np.clip(v, *bounds[name]) for name, v in zip(names, value, strict=True)])
 
 
-NEAR = 3.0  # nats within which another grid point is tried too
-NEARLY = 0.7  # or part of the best one's gain
+NEAR = 3.0  # nats below the best gain within which another grid point is tried too,
+NEARLY = 0.7  # or fraction of the best gain, whichever is lower
 MOST_OTHERS = 2
 
 
 def grid_points(effect: Effect) -> list[dict[str, float]]:
-    """All combinations of scanned values; one empty point for an effect that is all linear."""
+    """Return all combinations of scanned values; one empty point if all quantities are linear."""
     grids = {q.name: q.grid for q in effect.free if q.grid}
     return [dict(zip(grids, point, strict=True)) for point in itertools.product(*grids.values())]
 
@@ -334,7 +334,7 @@ def grid_points(effect: Effect) -> list[dict[str, float]]:
 def elsewhere(
     effect: Effect, looks: list[tuple[float, dict[str, float]]]
 ) -> tuple[dict[str, float], ...]:
-    """Grid points that gain nearly as much and are neighbours of none that was taken."""
+    """Return further grid points that gain nearly as much and are not neighbours of each other."""
     best = looks[0][0]
     enough = min(best - NEAR, NEARLY * best)
     taken = [looks[0][1]]
@@ -347,7 +347,7 @@ def elsewhere(
 
 
 def apart(effect: Effect, one: dict[str, float], other: dict[str, float]) -> bool:
-    """Whether two grid points are no neighbours."""
+    """Check that two grid points are not neighbours."""
     for q in effect.free:
         if q.grid:
             grid = np.sort(np.array(q.grid))
@@ -358,7 +358,10 @@ def apart(effect: Effect, one: dict[str, float], other: dict[str, float]) -> boo
 
 
 def faint(effect: Effect, grid: dict[str, float], score: float, gram: float) -> float:
-    """How much of the smallest grid value: below it an effect that is absent at zero is linear."""
+    """Return the fraction of the smallest grid value that fits best, 1.0 at other grid points.
+
+    Below the smallest value, an effect that vanishes at zero is taken as linear.
+    """
     (scanned,) = (q for q in effect.free if q.grid)
     least = min(map(abs, scanned.grid))
     if scanned.start != 0 or abs(grid[scanned.name]) > least or gram <= 0:

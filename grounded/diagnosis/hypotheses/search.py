@@ -1,7 +1,7 @@
-"""The search of one attribution: fits started from where, under which noise, with what beside.
+"""The steps of the search: which hypotheses are fitted, from which start and under which noise.
 
-`HypothesisSearch` adds to the hypotheses that were fitted (`hypotheses`); `attribution` says in
-which order. `tune` sets constants of large effects, which are no parameters.
+`HypothesisSearch` adds fits to those done so far (`explored`); `attribution` says in which order.
+`tune` and `sweep` set the constants of effects, which are not parameters of the fits.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ from grounded.effects import Effect, ParamFamily, SensorLagFamily, one_friction
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 
-SPREADS = (0.1, 0.3)  # of the parameters' priors, by which they are calibrated
-CRUDE = 1.0  # the same where one has moved beyond: all that its prior allows
-SHORTLIST = 14  # effects that are refined of a scan, and half as many parameters
-TAUS = (0.05, 0.1, 0.3)  # [s] of coloured noise
-SLOW = (1.0, 2.0, 6.0)  # the same in steps, where a step is longer than all of them
+SPREADS = (0.1, 0.3)  # prior widths of calibrated parameters, as fractions of the user's
+CRUDE = 1.0  # the same once a parameter has moved beyond: its full prior
+SHORTLIST = 14  # effects of a scan that are refined, and half as many parameters
+TAUS = (0.05, 0.1, 0.3)  # correlation times of coloured noise [s]
+SLOW = (1.0, 2.0, 6.0)  # the same in steps, where a step is longer than all of TAUS
 BESIDE = 4  # effects that are fitted with the parameters freed
-FIRST, COARSE, LAST = 3.0, 1.4, 1.05  # factors by which a constant is moved
+FIRST, COARSE, LAST = 3.0, 1.4, 1.05  # factors by which a constant is changed
 ROUNDS = 12
-WIDEST, TRIED = 100.0, 7  # a constant from end to end: its range, and values tried in it
-LOUD = 0.45  # of what a step leaves: the noise of a delayed sensor at the start of a fit
-LATE = slice(1, 4, 2)  # of the grid: where the delay of two states together starts
-LARGE_GAIN = 50.0  # nats from which a hypothesis is also started by itself
-TO_THE_TOP = 25  # iterations of fits that decide: most need fewer, and stop by themselves
-LARGE = 8  # states; above, or of a simulator, one correlation time and half the shortlist do
+WIDEST, TRIED = 100.0, 7  # sweep of a constant: its range as a factor, number of values tried
+LOUD = 0.45  # initial noise of a delayed sensor, as a fraction of its one-step residual's variance
+LATE = slice(1, 4, 2)  # grid values from which the common delay of two states starts
+LARGE_GAIN = 50.0  # nats above which a hypothesis is also fitted from a start of its own
+TO_THE_TOP = 25  # most iterations of fits that decide; most converge earlier
+LARGE = 8  # states; above, or for a simulator, one correlation time and half the shortlist
 
 
 Start = tuple[Hypothesis, NoiseModel, Array]
 
 
 class HypothesisSearch(FittedHypotheses):
-    """The fits of one attribution (`FittedHypotheses`), and the ways to more of them.
+    """The fits of one attribution (`FittedHypotheses`), and methods that add more of them.
 
-    `joints`: by motion, the plain dry friction of its joint, a candidate or not (`plainest`).
+    `joints`: {velocity: plain dry friction of its joint}, candidates or not (`plainest`).
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class HypothesisSearch(FittedHypotheses):
         self.taus = self.taus or [k * data.dt for k in SLOW[: len(taus)]]
         self.most = SHORTLIST // 2 if large else SHORTLIST
         self.beside = BESIDE // 2 if large else BESIDE
-        # the scan can't see them: it has the noise and the track of a log that is not late
+        # the scan can't find them, since its noise and track belong to a log without delay
         self.together = [e for e in candidates if len(delayed([e])) > 1]
 
     def refined(
@@ -78,7 +78,7 @@ class HypothesisSearch(FittedHypotheses):
         *,
         rivals: bool = False,
     ) -> list[Fitted]:
-        """Refines, remembers, returns; of rivals the worse half only part of the way."""
+        """Refine hypotheses and keep the fits; of rivals, the worse half stops early."""
         fits = refine(
             self.predictor,
             starts,
@@ -90,7 +90,7 @@ class HypothesisSearch(FittedHypotheses):
         return fits
 
     def finished(self, fits: Sequence[Fitted], iterations: int, *, rivals: bool = False) -> None:
-        """Goes on with fits of any noise structure, those of one structure together."""
+        """Continue fits of any noise structures, those of one structure together."""
         for structure in dict.fromkeys(fit.noise.structure for fit in fits):
             of_one = [f for f in fits if f.noise.structure == structure]
             self.refined(of_one, iterations, rivals=rivals)
@@ -98,7 +98,7 @@ class HypothesisSearch(FittedHypotheses):
     # -- without effects ------------------------------------------------------------------------
 
     def nulls(self) -> Fitted:
-        """The model alone under every noise structure, and with its parameters calibrated."""
+        """Fit the model alone under every noise structure and with calibrated parameters."""
         found = self.refined([self.fresh(Hypothesis())], iterations=20)
         if not found:
             raise undefined(self.predictor)
@@ -110,7 +110,7 @@ class HypothesisSearch(FittedHypotheses):
         return self.best_null()
 
     def fresh(self, h: Hypothesis) -> Start:
-        """Where a hypothesis starts by itself: about the log, with the noise it leaves there."""
+        """Return a start from the log as the track, with the noise of the residuals about it."""
         data, track = self.data, self.data.y.copy()
         predicted = self.predictor.next(h, track[:-1])
         residual = data.model.difference(predicted, track[1:])
@@ -118,20 +118,20 @@ class HypothesisSearch(FittedHypotheses):
         scale[list(data.hidden)] = 0.0  # nothing disturbs a memory
         noise = noise_guess(residual, data.seen, scale).behind(data.now)
         if late := [data.model.state_names.index(name) for name in delayed(h.effects)]:
-            log_r = noise.log_r.copy()  # a delay hides it: from above, it finds its way down
+            log_r = noise.log_r.copy()  # the delay hides it; a fit decreases it from above
             log_r[late] = np.logaddexp(noise.log_q, log_r + math.log(2))[late] + math.log(LOUD)
             noise = replace(noise, log_r=log_r)
         return h, noise, track
 
     def anew(self, fit: Fitted, effect: Effect, values: Mapping[str, float]) -> Start:
-        """An effect beside a fit's own, with noise and track of a start by itself."""
+        """Return a `fresh` start of a fit's hypothesis with one more effect."""
         h, noise, track = self.fresh(fit.hypothesis.plus(effect, values))
         noise = noise.allowing(fit.noise.structure, self.data.dt)
         weight_w, weight_v = fit.noise.weight_w, fit.noise.weight_v
         return h, replace(noise, weight_w=weight_w, weight_v=weight_v), track
 
     def again(self, fits: Sequence[Fitted]) -> list[Fitted]:
-        """Large effects from a start of their own: the noise without them is far away."""
+        """Refit large effects from a fresh start, as the noise of a fit without them is far off."""
         floor = self.score(self.best_null()) + LARGE_GAIN
         far = [f for f in fits if self.score(f) > floor]
         tried = [f.hypothesis for f in far]
@@ -144,10 +144,9 @@ class HypothesisSearch(FittedHypotheses):
         return self.refined(starts, iterations=12)
 
     def fair(self, best: Fitted) -> None:
-        """The model alone, starting from the noise and the shifts that the best hypothesis has.
+        """Refit the model alone from the noise and the shifts of the best hypothesis.
 
-        What is compared with must have climbed as high as it can, or a better noise passes for an
-        effect.
+        The reference must have converged, or a better noise model would be taken for an effect.
         """
         h = best.hypothesis
         bare = Hypothesis(shift=h.shift, spread=h.spread)
@@ -162,7 +161,7 @@ class HypothesisSearch(FittedHypotheses):
         self.calibrated(alone)
 
     def structures(self, fit: Fitted) -> list[Fitted]:
-        """A hypothesis with coloured noise of several correlation times (if it had none)."""
+        """Fit a hypothesis with coloured noise of several correlation times (if it has none)."""
         if fit.noise.structure.tau is not None:
             return []
         starts = [
@@ -172,9 +171,9 @@ class HypothesisSearch(FittedHypotheses):
         return self.refined(starts, iterations=8 if fit.hypothesis.effects else TO_THE_TOP)
 
     def calibrated(self, fit: Fitted) -> list[Fitted]:
-        """The same hypothesis with the model's parameters free to move a little, or more.
+        """Fit a hypothesis with the model's parameters free within fractions of their priors.
 
-        Where one already moved by more than that: as far as its prior allows.
+        If a parameter moves by more than that, fit it with the full prior, too.
         """
         shift = np.zeros(self.data.model.system.k)
         if fit.hypothesis.spread > 0 or not param_scale(self.data.model).any():
@@ -189,16 +188,16 @@ class HypothesisSearch(FittedHypotheses):
         return found
 
     def far(self, fit: Fitted) -> bool:
-        """Whether a parameter has moved beyond what it was given."""
+        """Check whether a parameter has moved by more than its prior standard deviation."""
         h, unit = fit.hypothesis, param_scale(self.data.model)
         assert h.shift is not None
         return bool((np.abs(h.shift) > h.spread * unit).any())
 
     def beside_parameters(self) -> None:
-        """Where the parameters are off: the likeliest effects with the parameters freed beside.
+        """If the parameters are off, refit the likeliest effects with the parameters free.
 
-        Started from exact parameters, where the effect has its size; started from parameters that
-        took its part, it would not grow.
+        They start from the fit with exact parameters, in which the effect has its full size.
+        Started from parameters that already absorbed it, an effect would not grow.
         """
         if not self.calibrates():
             return
@@ -212,11 +211,11 @@ class HypothesisSearch(FittedHypotheses):
             self.calibrated(fit)
 
     def _empty(self) -> HypothesisSearch:
-        """A new search of the same candidates."""
+        """Return a new search with the same candidates."""
         return HypothesisSearch(self.data, self.candidates, self.tick, tuple(self.joints.values()))
 
     def with_weights(self, clean_fit: Fitted) -> HypothesisSearch:
-        """A new search on the same data with a clean fit's outlier weights in all noise."""
+        """Return a new search on the same data, all with the outlier weights of `clean_fit`."""
         other = self._empty()
         weights = clean_fit.noise
         starts = []
@@ -238,7 +237,7 @@ class HypothesisSearch(FittedHypotheses):
     # -- one effect more --------------------------------------------------------------------------
 
     def shortlist(self, fit: Fitted, count: int) -> list[Look]:
-        """The candidates that would add most to a fit, after their price."""
+        """Return the candidates that would gain most beside a fit, less their price."""
         taken = set(fit.hypothesis.names)
         free = [
             e
@@ -260,12 +259,19 @@ class HypothesisSearch(FittedHypotheses):
     def extended(
         self, fit: Fitted, count: int = 0, iterations: int = 7, *, late: bool = True
     ) -> list[Fitted]:
-        """The fit with each shortlisted effect added, refined; late: states late together, too."""
+        """Refine the fit with each shortlisted effect added.
+
+        Args:
+            fit: what is extended.
+            count: length of the shortlist; 0: the usual one.
+            iterations: most iterations of each fit.
+            late: include common delays of two states.
+        """
         starts = self.one_more(fit, count or self.most, late=late)
         return self.refined([fit, *starts], iterations, rivals=True)[1:]
 
     def one_more(self, fit: Fitted, count: int, *, late: bool = True) -> list[Start]:
-        """Where a fit with each shortlisted effect added starts."""
+        """Return the starts of a fit with each shortlisted effect added."""
         starts: list[Start] = []
         for look in self.shortlist(fit, count):
             h = fit.hypothesis
@@ -274,7 +280,7 @@ class HypothesisSearch(FittedHypotheses):
                 for values in (look.values, *look.others)
             ]
             if isinstance(look.effect.family, SensorLagFamily):
-                # what passes a filter is far quicker than what it shows: so is its noise
+                # the signal before a sensor's filter is much faster, and so is its noise
                 starts.append(self.anew(fit, look.effect, look.values))
         for effect in self.together if late else ():
             if not delayed([effect]) & delayed(fit.hypothesis.effects):
@@ -282,13 +288,13 @@ class HypothesisSearch(FittedHypotheses):
         return starts
 
     def without(self, fit: Fitted, name: str) -> Fitted:
-        """The fit with one effect taken out, its noise and track kept: where rivals are sought."""
+        """Return a fit without one effect, noise and track kept, beside which rivals are sought."""
         start = (fit.hypothesis.minus(name), fit.noise, fit.track)
         alone = refine(self.predictor, [start], iterations=1, fixed_noise=True)
         return alone[0] if alone else self.best_null()
 
     def under(self, structure: Structure, spread: float) -> HypothesisSearch | None:
-        """What was fitted under one noise and freedom of the parameters; None without a null."""
+        """Return the fits under one noise structure and prior width; None without a null."""
         other = self._empty()
         exact = (structure, 0.0, ())
         kept = {k: f for k, f in self.fits.items() if k[:2] == (structure, spread) or k == exact}
@@ -297,15 +303,15 @@ class HypothesisSearch(FittedHypotheses):
 
 
 def undefined(predictor: Predictor) -> GroundedError:
-    """Says where a model gives no finite number along the log."""
+    """Return the error for a model that does not give finite predictions along the log."""
     data, h = predictor.data, Hypothesis()
     with np.errstate(all="ignore"):
         after = predictor.next(h, data.y[:-1])
     bad = np.argwhere(~np.isfinite(after).all(axis=-1) & (data.valid.T > 0))
     if not len(bad):
         return GroundedError(
-            "the model's own predictions of these trials diverge: fit its parameters, or check "
-            "their units",
+            "the model's predictions of these trials diverge: fit its parameters, or check their "
+            "units",
             then=NextCommand("fit"),
         )
     t, b = bad[0]
@@ -315,19 +321,19 @@ def undefined(predictor: Predictor) -> GroundedError:
         for name, value in zip(data.model.state_names, data.y[t, b], strict=True)
     )
     return GroundedError(
-        f"the model '{data.model.name}' is no number at a state that was measured: trial {trial}, "
-        f"t = {data.time[t, b]:.3g} s, {values}; noise can carry a log beyond where a square root "
-        "or a logarithm holds: bound its argument in the model (np.maximum(x, 0))"
+        f"the model '{data.model.name}' is not finite at a measured state: trial {trial}, "
+        f"t = {data.time[t, b]:.3g} s, {values}; noise can carry a logged value outside the domain "
+        "of a square root or a logarithm: bound the argument in the model (np.maximum(x, 0))"
     )
 
 
 def tune(search: HypothesisSearch, fits: list[Fitted]) -> None:
-    """Tries other constants of large effects (over which speed a dry friction builds up).
+    """Optimise constants of large effects (such as the speed over which dry friction builds up).
 
-    A constant is no parameter: for a small effect any sensible one will do. Where an effect is
-    worth many nats, a wrong one leaves so much that further effects are blamed for it. So it is
-    walked up and down by shrinking factors, the rest fitted anew at each, and pays as one more
-    number.
+    A constant is not fitted with the other values: for a small effect, any sensible one will do. If
+    an effect gains many nats, a wrong constant leaves so much that further effects are blamed for
+    it. So it is varied by shrinking factors, with the rest fitted again each time, and counts as
+    one more parameter.
     """
     floor = search.score(search.best_null()) + LARGE_GAIN
     for fit in fits:
@@ -340,10 +346,10 @@ def tune(search: HypothesisSearch, fits: list[Fitted]) -> None:
 
 
 def sweep(search: HypothesisSearch) -> None:
-    """Tries constants from end to end for every effect, before effects are compared.
+    """Try constants over their whole range for every effect, before effects are compared.
 
-    Else a dry friction that builds up slowly loses to a dead zone for its constant alone. What is
-    large then is kept, and further effects are scanned with its constants.
+    Otherwise a dry friction that builds up slowly would lose to a dead zone because of its constant
+    alone. Fits with large gains are kept, and further effects are scanned with their constants.
     """
     null = search.score(search.best_null())
     starts = [
@@ -367,7 +373,7 @@ def sweep(search: HypothesisSearch) -> None:
 
 
 def _walked(search: HypothesisSearch, fit: Fitted, index: int, name: str) -> Fitted:
-    """The likeliest fit along one constant: uphill by factors, then to the top of a parabola."""
+    """Maximise over one constant: uphill by factors, then to the top of a parabola."""
     factor = FIRST
     for _ in range(ROUNDS):
         at = fit.hypothesis.values[index][name]

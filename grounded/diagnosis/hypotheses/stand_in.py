@@ -1,14 +1,15 @@
-"""Look-alikes swapped in: what does an effect's work as well once the parameters move.
+"""Fits of look-alikes in place of a claimed effect, while parameters are free.
 
-Where parameters are calibrated beside the effects, or one is claimed, a look-alike and another
-value of a parameter may be the effect: (c - w)/0.137 - 0.97 w is (0.88 c - w)/0.121. The search
-stops refining what lost on its way, often under another noise. So each look-alike is put in its
-effect's place, from the noise and the shifts of the best fit, and fitted to the end, before
-anything ties.
+If parameters are calibrated beside the effects, or one is claimed, a look-alike with another value
+of a parameter may equal the effect: (c - w)/0.137 - 0.97 w is (0.88 c - w)/0.121. The search gives
+up losing hypotheses before they converge, and often fits them under another noise. So each
+look-alike is put in its effect's place, starting from the noise and the shifts of the best fit, and
+fitted to convergence before ties are decided.
 
-Twins like these still differ by some nats: half a friction acts before a step and half after it, a
-gain all through it. So two that are one thing at every moment, wherever the state and the input
-are, and predict alike, tie whatever the evidence says (`Claims.rivals`).
+Such twins still differ by some nats because of the time discretisation: half of a friction acts
+before a step and half after it, while a gain acts during the whole step. So two effects whose rates
+are equal at all states and inputs, and which predict equally well, tie whatever their evidence
+(`Claims.rivals`).
 """
 
 from __future__ import annotations
@@ -30,17 +31,17 @@ from grounded.diagnosis.report import Likeness
 from grounded.effects import Effect, InputFamily, ParamFamily, RateFamily, one_friction
 from grounded.frozen import Array
 
-MOMENT = 1e-5  # of a step: what a model's rate at one moment is taken over
-SIDE = 1e-4  # of a unit or a parameter's scale: half of a difference quotient
+MOMENT = 1e-5  # fraction of a step over which an instantaneous rate is computed
+SIDE = 1e-4  # half the finite-difference step, in units or a parameter's scale
 
 
 def swap(search: HypothesisSearch, best: Fitted, alike: Sequence[Likeness]) -> None:
-    """Fits look-alikes of the effects of a fit whose parameters move in their place, to the end.
+    """Fit look-alikes in place of the effects of a fit whose parameters are free.
 
     Args:
-        search: which remembers the fits.
-        best: what is claimed; where no parameter moves nothing is fitted.
-        alike: look-alikes of its effects; what is known at its top is left as it is.
+        search: stores the fits.
+        best: the claimed fit; if none of its parameters is free, nothing is fitted.
+        alike: look-alikes of its effects; those already converged are left as they are.
     """
     if not moving(search.data, best.hypothesis):
         return
@@ -53,7 +54,7 @@ def swap(search: HypothesisSearch, best: Fitted, alike: Sequence[Likeness]) -> N
 
 
 def _start(search: HypothesisSearch, best: Fitted, one: Likeness) -> list[tuple]:  # type: ignore[type-arg]
-    """Where a look-alike in the place of its effect starts; nothing where it is at its top."""
+    """Return the start of a look-alike in place of its effect; none if it already converged."""
     names = tuple(sorted({*best.hypothesis.names} - {one.effect} | {one.like}))
     known = search.fits.get((best.noise.structure, best.hypothesis.spread, names))
     (effect,) = (e for e in search.candidates if e.name == one.like)
@@ -66,7 +67,7 @@ def _start(search: HypothesisSearch, best: Fitted, one: Likeness) -> list[tuple]
 
 
 def moving(data: Data, h: Hypothesis) -> list[int]:
-    """The parameters that a hypothesis may set, as indices: calibrated ones, or those it blames."""
+    """Return the indices of a hypothesis' free parameters: the calibrated or the blamed ones."""
     if h.spread > 0:
         return [int(i) for i in calibrated(data)]
     blamed = [e.site.target for e in h.effects if isinstance(e.family, ParamFamily)]
@@ -74,11 +75,11 @@ def moving(data: Data, h: Hypothesis) -> list[int]:
 
 
 def twins(predictor: Predictor, one: Effect, other: Effect, free: Sequence[int]) -> bool:
-    """Whether an effect is another one beside other values of some parameters (`moving`).
+    """Check whether an effect equals another one combined with shifts of parameters (`moving`).
 
-    Seen far from the trials, every state and input drawn by itself, the rate that the one adds is a
-    sum of the other's and of what the parameters change, at every moment. Effects of one value each
-    that act at once; a simulator's rates at a moment are not known.
+    Tested at random points, every state and input drawn independently: the rate that the one adds
+    must be a linear combination of the other's and of the parameters' slopes. Only for effects with
+    one value and no memory, and not for simulators, whose instantaneous rates are not known.
     """
     data, h = predictor.data, Hypothesis()
     if simulated(data.model) or not (_at_once(one) and _at_once(other)):
@@ -110,11 +111,11 @@ def twins(predictor: Predictor, one: Effect, other: Effect, free: Sequence[int])
     return bool(own.any()) and float(left @ left) < IDENTICAL * float(own @ own)
 
 
-SAMPLES = 500  # states and inputs at which two effects are compared
+SAMPLES = 500  # random points at which two effects are compared
 
 
 def _at_once(effect: Effect) -> bool:
-    """Whether an effect is one number that acts without memory and is absent at zero."""
+    """Check whether an effect has one value, no memory, and vanishes at zero."""
     family = effect.family
     acts = isinstance(family, RateFamily | InputFamily) and not getattr(family, "parts", 0)
     timed = getattr(family, "timed", False)
@@ -122,7 +123,7 @@ def _at_once(effect: Effect) -> bool:
 
 
 def _rate(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Array:
-    """Rates of states x (N, n) under inputs u (N, m) at one moment, effects and all, (N, n)."""
+    """Return the instantaneous rates of states x (N, n) under inputs u (N, m), effects included."""
     given, names = u.copy(), predictor.data.model.input_names
     for effect, values in predictor.acting(h):
         assert isinstance(effect.family, InputFamily)

@@ -1,14 +1,15 @@
-"""How likely trials are under a hypothesis: model, effects with their values, and noise.
+"""Likelihood of the trials under a hypothesis: the model, effects with their values, and noise.
 
-Read from the data upwards (the Kalman filter itself is `grounded.filter`):
+The modules, each building on those above it (the Kalman filter itself is `grounded.filter`):
 
-    data          trials as one record, cut into runs of equal length
-    hypothesis    effects with their values, and what they predict
-    simulated     what a simulator was asked already; tangent: steps from close by
-    delays        a sensor that shows earlier states
-    noise         the noise, estimated beside everything else
-    linearise     a hypothesis to first order: the columns that are filtered
-    step          the step that is proposed at the best point
-    refine        many hypotheses up their likelihood at once
-    fitted        where each ended
+    data          all trials as one record, cut into runs of equal length
+    hypothesis    effects with their values, and shifts of the model's parameters
+    predictor     what a hypothesis predicts
+    simulated     cached slopes of a simulator; tangent: steps nearby from these slopes
+    delays        sensors that show earlier states
+    noise         variances of process and measurement noise, estimated with everything else
+    linearise     linearisation about a track: the columns that are filtered
+    step          the next step of the fit: Gauss-Newton and scoring
+    refine        maximum likelihood of many hypotheses at once
+    fitted        the result of a fit
 """

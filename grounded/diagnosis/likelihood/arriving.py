@@ -1,7 +1,7 @@
-"""What arrives of the commands behind effects on inputs, and what was held before a trial.
+"""Inputs received after effects on inputs, and the inputs held before a trial.
 
-Delays come last, together with the task's own latency: two shifts by parts of a step, one after the
-other, are not the shift by both.
+All delays are applied last and added to the task's own latency, because two successive shifts by
+fractions of a step differ from one shift by their sum.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Acting = Sequence[tuple[Effect, Mapping[str, float]]]
 
 
 def arriving(acting: Acting, data: Data) -> Array:
-    """Commands (S, T, m) behind effects, in their order, and behind all delays."""
+    """Return the inputs (S, T, m) received after all effects, in their order, and all delays."""
     latency = data.latency.copy()
     for effect, values in acting:
         if effect.family.name == "delay":
@@ -29,7 +29,7 @@ def arriving(acting: Acting, data: Data) -> Array:
 
 
 def _sent_on(acting: Acting, data: Data) -> tuple[Array, Array]:
-    """The same before any delay, and what was held before (S, m)."""
+    """Return the inputs (S, T, m) after all effects but delays, and those held before (S, m)."""
     u, held = data.commands, data.held
     for effect, values in acting:
         if effect.family.name != "delay":
@@ -38,10 +38,10 @@ def _sent_on(acting: Acting, data: Data) -> tuple[Array, Array]:
 
 
 def memories_moved(acting: Acting, data: Data) -> Array:
-    """What effects add to the memory states that runs begin with, (B, n).
+    """Return what effects add to the memory states at the start of runs, (B, n).
 
-    A lag that was adopted has settled at what a gain before it makes of the input that was held.
-    Only the begin of a trial is known; zeros elsewhere.
+    An adopted lag starts settled at the input held before the trial, and an effect that acts before
+    it (a gain) changes that input. The result is zero for runs that do not begin a trial.
     """
     model, found = data.model, np.zeros((len(data.valid), data.model.n))
     _, held = _sent_on(acting, data)
@@ -62,9 +62,9 @@ def memories_moved(acting: Acting, data: Data) -> Array:
 def _transformed(
     effect: Effect, values: Mapping[str, float], u: Array, held: Array, data: Data
 ) -> tuple[Array, Array]:
-    """Commands (S, T, m), and what was held before them (S, m), after an input or memory effect.
+    """Apply an input or memory effect to commands (S, T, m) and to the inputs held before (S, m).
 
-    What was held went through the effects before, too; a memory has settled at it.
+    A memory starts settled at the held input.
     """
     family, names = effect.family, data.model.input_names
     out, before = u.copy(), held.copy()

@@ -1,14 +1,14 @@
-"""Steps of a simulator one after the other, with losses: one call of it a step.
+"""Rollouts of a simulator with losses of joints, at about one call of the simulator per step.
 
-What a joint loses in a step is solved from the speed it would reach without a loss, and from what a
-unit of the input adds to all states (`effects.losses`). To ask a simulator for each takes k + 2
-calls a step for k inputs. From step to step a loss changes little, so here each step is made with
-what was lost in the step before, T-,
+The loss of a joint in a step is solved from the speed it would reach without a loss, and from what
+a unit of each input adds to all states (`effects.losses`). Computing these with a simulator takes
+k + 2 calls per step for k inputs. A loss changes little from step to step, so here each step is
+made with the loss of the step before, T-, and corrected to first order,
 
     x' = f(x, u - T-) - B (T - T-),        w_free = w' + B T-
 
-and B, which changes as slowly as the robot's posture, is taken anew every FRESH steps. Where T is
-far from T- (a joint that turns round), the step is made again with T.
+B changes as slowly as the robot's posture and is computed anew every FRESH steps. Where T is far
+from T- (a joint that reverses), the step is repeated with T.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from grounded.effects.family import coupled
 from grounded.effects.losses import NUDGE, ahead, loads_from, solved
 from grounded.frozen import Array
 
-FRESH = 5  # steps after which B is taken anew
-FAR = 0.1  # of an input's peak: a loss that changed by more
+FRESH = 5  # steps after which B is computed anew
+FAR = 0.1  # change of a loss, as a fraction of the input's peak, above which a step is repeated
 
 
 def stepper(predictor: Predictor, h: Hypothesis) -> Callable[[Array, Array, Array], Array]:
-    """Its `advance` of many steps one after the other: from x (M, n) with u (M, m) at t (M,)."""
+    """Return the step function of rollouts of a hypothesis: x (M, n), u (M, m), t (M,) -> x."""
     model, dt = predictor.data.model, predictor.data.dt
     if losses_of(h) and simulated(model):
         one = Carried(predictor.data, predictor._inputs)
@@ -45,12 +45,12 @@ def stepper(predictor: Predictor, h: Hypothesis) -> Callable[[Array, Array, Arra
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Carried(Predictor):
-    """A predictor that is asked for one step after the other, of rows (M, n) that stay the same."""
+    """A predictor for rollouts: successive steps of the same rows (M, n)."""
 
     memory: dict[str, Any] = field(default_factory=dict)
 
     def moved(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
-        """The model's step with what its motion takes off the inputs, without further rates."""
+        """Return the model's step with the joints' losses, without added or limited rates."""
         pairs = losses_of(h)
         if dt is not None or not pairs or moving(h, self.seen):
             return super().moved(h, x, u, dt)
@@ -82,7 +82,7 @@ class Carried(Predictor):
     def _answers(
         self, x: Array, u: Array, p: Array, after: Array, which: set[int]
     ) -> dict[int, Array]:
-        """B: what a unit of each input, held over the step, adds to all states (..., n)."""
+        """Return B: what a unit of each input, held over the step, adds to all states (..., n)."""
         found = {}
         for tau in sorted(which):
             more = u.copy()

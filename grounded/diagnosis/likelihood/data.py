@@ -1,8 +1,9 @@
-"""Trials as the diagnosis sees them: one flat record, cut into runs of equal length.
+"""The trials as one flat record, cut into runs of equal length that are filtered side by side.
 
-A filter steps through time in Python, so all trials step together, and a long trial is cut into
-runs of at most 200 steps: since the whole state is measured, a run that starts anew loses next to
-nothing. What has a memory (commands, delays) is computed on whole trials first.
+The filter loops over time in Python, so all runs advance together along the batch axis. A long
+trial is cut into runs of at most 200 steps. Because the whole state is measured, restarting the
+filter at each cut loses almost no information. Anything with memory (commands, delays) is computed
+on whole trials before they are cut.
 
 Notation: S trials, B runs of L steps, n states, m inputs. Flat arrays hold all trials one after
 the other: states (sum T + S, n), steps (sum T, ...).
@@ -26,11 +27,11 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.trial import Trial
 
-LONGEST_RUN, SHORTER_RUN = 200, 150  # steps; the shorter of a simulator
-PIECES, SHORTEST_PIECE = 5, 50  # one log alone is held out by pieces; steps of a piece at least
-MOST_NUMBERS = 1.2e6  # of one (L, B, N, N) array: above it, the most informative runs are used
-SIMULATED = 800  # steps of a simulator, each of which is asked thousands of times
-BEGINNINGS = 8  # runs among them at most that are kept because a trial begins with them
+LONGEST_RUN, SHORTER_RUN = 200, 150  # most steps of a run; the second applies to a simulator
+PIECES, SHORTEST_PIECE = 5, 50  # a single log is held out in pieces of at least this many steps
+MOST_NUMBERS = 1.2e6  # size of one (L, B, N, N) array above which only informative runs are kept
+SIMULATED = 800  # total steps kept for a simulator, since each is evaluated thousands of times
+BEGINNINGS = 8  # most runs kept only because a trial begins with them
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +43,7 @@ class Data:
     states: Array  # (sum T + S, n) measured, angles unwrapped, NaN where missing
     commands: Array  # (S, T_max, m), the last command repeated to the end
     held: Array  # (S, m) the input held before t = 0
-    latency: Array  # (m,) [s] that the task already models
+    latency: Array  # (m,) [s] input delays that the task already models
     lengths: Any  # (S,) of int, T of each trial
     state_at: Any  # (B, L + 1) of int, into states
     step_at: Any  # (B, L) of int, into flat steps
@@ -51,9 +52,9 @@ class Data:
     scales: Scales
     skipped: int  # runs left out because there are too many
     ids: tuple[str, ...]
-    hidden: tuple[int, ...] = ()  # states that no sensor has: only their start is known
-    filters: Mapping[int, float] = field(default_factory=dict)  # sensors' time constants [s]
-    between: frozenset[str] = frozenset()  # sensors that were moved in time, between samples
+    hidden: tuple[int, ...] = ()  # states without a sensor: only their start is known
+    filters: Mapping[int, float] = field(default_factory=dict)  # sensor time constants [s] by state
+    between: frozenset[str] = frozenset()  # sensors shifted in time by a fraction of a sample
 
     @property
     def count(self) -> int:
@@ -62,18 +63,18 @@ class Data:
 
     @property
     def steps(self) -> int:
-        """Steps that the runs hold."""
+        """Number of steps in all runs."""
         return int(self.valid.sum())
 
     @cached_property
     def behind(self) -> Mapping[int, int]:
-        """Hidden true values, not even known at the start, each with the state that logs them."""
+        """Hidden true values, unknown even at the start: {its index: the state that logs it}."""
         names = self.model.state_names
         return true_values(names, [names[i] for i in self.hidden])
 
     @cached_property
     def now(self) -> Mapping[int, int]:
-        """Late logs, each with its true value of the moment: the first memory behind it."""
+        """Delayed logs, {log: its current true value}, which is the first memory behind the log."""
         first: dict[int, int] = {}
         for i, log in sorted(self.behind.items()):
             first.setdefault(log, i)
@@ -81,7 +82,7 @@ class Data:
 
     @cached_property
     def told(self) -> Any:
-        """Of which states trials say anything, if only where their fit begins, (n,) of bool."""
+        """States with at least one finite sample, if only the initial one, (n,) of bool."""
         return np.isfinite(self.states).any(axis=0)
 
     @cached_property
@@ -91,7 +92,7 @@ class Data:
 
     @cached_property
     def y(self) -> Array:
-        """The same by run, time-major (L + 1, B, n)."""
+        """The measured states by run, time-major (L + 1, B, n), gaps filled."""
         return np.ascontiguousarray(self.filled[self.state_at].swapaxes(0, 1))
 
     @cached_property
@@ -107,27 +108,27 @@ class Data:
 
     @cached_property
     def idle(self) -> Any:
-        """Steps that fill up shorter runs and were not run, (L, B) of bool."""
+        """Padding steps of shorter runs, (L, B) of bool."""
         return self.valid.T == 0
 
     @cached_property
     def time(self) -> Array:
-        """Time since the trial began at the start of each step, (L, B) [s]."""
+        """Time from the start of the trial to the start of each step, (L, B) [s]."""
         flat = np.concatenate([np.arange(T) * self.dt for T in self.lengths])
         return np.ascontiguousarray(flat[self.step_at].T)
 
     @cached_property
     def used(self) -> Any:
-        """Trials of which a run is kept, as indices."""
+        """Indices of the trials of which at least one run is kept."""
         return np.unique(self.trial_of)
 
     @cached_property
     def in_use(self) -> Data:
-        """The same with the commands of these trials alone."""
+        """The same data with the commands of the `used` trials alone."""
         return replace(self, commands=self.commands[self.used], held=self.held[self.used])
 
     def runs(self, per_step: Array) -> Array:
-        """Per-step values on whole trials (S, T_max, m) -> by run (L, B, m)."""
+        """Cut per-step values of whole trials (S, T_max, m) into runs (L, B, m)."""
         flat = np.concatenate([per_step[i, :T] for i, T in enumerate(self.lengths)])
         return np.ascontiguousarray(flat[self.step_at].swapaxes(0, 1))
 
@@ -139,29 +140,31 @@ def prepare(
     past: Array | None = None,
     hidden: Sequence[str] = (),
 ) -> Data:
-    """Trials of one time grid as one record.
+    """Combine trials with the same time step into one record.
 
     Args:
         model: the crude model.
-        trials: at least one with two finite steps; what follows the first gap in the inputs or the
-            last finite state is left out, gaps in single states stay (as missing).
+        trials: at least one with two finite steps. Samples after the first gap in the inputs or
+            after the last finite state are dropped; gaps in single states stay (as missing).
         latency: transport delay of the inputs [s] that is already modelled (m,).
-        past: the input held before t = 0 where a trial does not say (m,).
-        hidden: states that no sensor has (the memory of adopted effects): known at the start, what
-            the trials say of them later is where their fit begins. True values behind a late log
-            are known nowhere: theirs begins at the log, for a model that carried them on from the
-            start of a long trial has drifted, and where it lacks a speed it says nothing.
+        past: the input held before t = 0 in trials that do not record it (m,).
+        hidden: names of states without a sensor (the memory of adopted effects). Their start is
+            taken as known; their later values in the trials are only the initial track of the fit.
+            True values behind a delayed log are not known at all. Their track starts from the log,
+            because a model that carried them on from the start of a long trial drifts, and
+            predicts nothing where it lacks a speed.
 
     Raises:
-        GroundedError: for trials of other states or inputs, of different dt, or empty ones.
+        GroundedError: if the trials have other states or inputs than the model, different time
+            steps, or no two finite steps.
     """
     _check(model, trials)
     used = [(trial, trial.known_steps) for trial in trials]
     used = [(trial, T) for trial, T in used if T >= 2]
     if not used:
         raise GroundedError(
-            "no trial holds two finite steps: nothing to diagnose; verify the stored files, or "
-            "ingest a trial that ran",
+            "nothing to diagnose: no trial has two steps with finite values; verify the stored "
+            "files, or ingest a trial that ran",
             then=NextCommand("verify"),
         )
     dt, m = used[0][0].dt, model.m
@@ -206,7 +209,7 @@ def prepare(
 
 def _check(model: Model, trials: Sequence[Trial]) -> None:
     if not trials:
-        raise GroundedError("there are no trials to diagnose: run or ingest one first")
+        raise GroundedError("no trials to diagnose: run or ingest one first")
     for trial in trials:
         for what, found, known in (
             ("states", trial.state_names, model.state_names),
@@ -220,12 +223,12 @@ def _check(model: Model, trials: Sequence[Trial]) -> None:
         if abs(trial.dt - trials[0].dt) > 1e-9 * trials[0].dt:
             raise GroundedError(
                 f"trials have different time steps ({trials[0].dt:g} s and {trial.dt:g} s): "
-                "diagnose them apart"
+                "diagnose them separately"
             )
 
 
 def _cut(lengths: Any, longest: int) -> tuple[Any, Any, Array, Any]:
-    """Index arrays of runs: each trial in equal parts of so many steps at most."""
+    """Return the index arrays of runs: each trial in equal parts of at most `longest` steps."""
     pieces = []
     step0 = state0 = 0
     for i, T in enumerate(lengths):
@@ -244,11 +247,12 @@ def _cut(lengths: Any, longest: int) -> tuple[Any, Any, Array, Any]:
 
 
 def _informative(signals: Sequence[Array], begins: Any, most: int) -> Any:
-    """Which runs to keep: of groups of neighbours the one in which signals (B, any, k) vary most.
+    """Select at most `most` runs, those in which the signals (B, any, k) vary most.
 
-    Every signal counts by its variance within the run, in units of its variance over all: what
-    stands still tells of nothing. Groups, so that all trials and all of their time have a say. Some
-    are runs that a trial begins with, `begins`: whole trials are predicted from there.
+    A signal counts by its variance within the run, relative to its variance over all runs. One run
+    is taken from each group of neighbouring runs, so that all trials and all of their duration are
+    represented. Some of the runs kept are `begins`, those that a trial begins with, because whole
+    trials are predicted from there.
     """
     count = len(signals[0])
     if count <= most:
@@ -263,7 +267,7 @@ def _informative(signals: Sequence[Array], begins: Any, most: int) -> Any:
 
 
 def _filled(states: Array) -> Array:
-    """NaN replaced by the last finite value of its column (by the next at the start)."""
+    """Replace each NaN by the last finite value of its column (at the start by the next one)."""
     if np.isfinite(states).all():
         return states
     out = states.copy()

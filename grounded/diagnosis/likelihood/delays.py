@@ -1,22 +1,27 @@
-"""A late sensor, delayed or filtered: which sample of the log shows which state.
+"""Delayed and filtered sensors: which sample of the log shows which state.
+
+A delay is k whole steps and a fraction p of a step:
 
     y_i(t) = x_i(t - d),   d = (k + p) dt
     y_i(s + k) = (1 - p) x_i(s) + p x_i(s - 1)
 
-So under a hypothesis with a delay the log of its channel is moved by k steps, and the filter takes
-care of p (`grounded.filter.augmented`). What a sensor filters, tau y' = x - y, is kept by as much
-as it is old, with x a straight line from sample to sample:
+Under a hypothesis with a delay, the log of the channel is shifted by k steps, and the filter
+handles p by an augmented state (`grounded.filter.augmented`). A sensor with a first-order filter,
+tau y' = x - y, and x linear between samples obeys
 
     y_i(s) = (1 - m) x_i(s) + (m - c) x_i(s - 1) + c y_i(s - 1)
                                                     c = exp(-dt / tau),   m = (1 - c) tau / dt
 
-Both act on the process noise too: taken for the present state less an offset, a late sample would
-contradict every disturbance, and its delay would go to whatever slows the motion. The first k
-samples of a trial show what was before it, which no model predicts. All hypotheses are judged by
-the same data, so they count too (`before`): as samples of a state that drifted into the trial at
-rest, or at the pace of its beginning, whichever is likelier.
+Treating a late sample as the present state plus a computed offset would be wrong: process noise is
+seen late, too. Every disturbance would contradict the sample, and the delay would be attributed to
+anything that slows the motion.
 
-Noise (its weights) and adjoints belong to samples: outside the filter they stay in the log's order.
+The first k samples of a trial show states from before it, which no model predicts. They are
+included all the same (`before`), because all hypotheses must be compared on the same data: as
+samples of a random walk that enters the trial at rest, or at its initial rate, whichever is
+likelier.
+
+Noise weights and adjoints belong to samples: outside the filter they stay in the order of the log.
 """
 
 from __future__ import annotations
@@ -37,49 +42,49 @@ from grounded.filter.augmented import Delayed
 from grounded.filter.kalman import Adjoint
 from grounded.frozen import Array
 
-UNKNOWN = 1e6  # variances: how little is known of a state that was not measured at first
-SETTLED = 3.0  # time constants after which a filtered sensor has forgotten where it began
-UNLIKE = 1.0  # nats that a sample of what was before a trial costs at most more than others
+UNKNOWN = 1e6  # initial variance of an unmeasured state, in measurement variances
+SETTLED = 3.0  # time constants after which a filtered sensor has forgotten its initial value
+UNLIKE = 1.0  # most nats by which a sample from before a trial may be less likely than the others
 
 
 @dataclass(frozen=True, eq=False)
 class Delays:
-    """The late channels of a hypothesis, D of them: which, k, p and tau / dt of each."""
+    """The D late channels of a hypothesis, with k, p and tau / dt of each."""
 
     data: Data
     channel: tuple[int, ...]
     whole: tuple[int, ...]
     part: Array  # (D,)
-    tau: Array  # (D,) 0: not filtered
+    tau: Array  # (D,) in steps; 0: not filtered
 
     @property
     def weights(self) -> Array:
-        """Of the state, of that a step before, of what was shown then, (D, 3)."""
+        """Weights of x(s), x(s - 1) and y(s - 1) in the sample y(s), (D, 3)."""
         kept = np.exp(-1 / np.maximum(self.tau, 1e-9))
         mean, p = self.tau * (1 - kept), self.part
         return np.stack([(1 - p) * (1 - mean), p * (1 - mean) + mean - kept, kept], axis=-1)
 
     @property
     def oldest(self) -> int:
-        """How many steps before a moment its sample may still show."""
+        """Age in steps of the oldest state that a sample may show."""
         return int(max(self.whole + np.ceil(SETTLED * self.tau))) + 1
 
     def in_filter(self) -> Delayed:
-        """For the filter, every run the same."""
+        """Return the late channels for the filter, the same for every run."""
         B = len(self.data.valid)
         return Delayed(np.tile(self.channel, (B, 1)), np.tile(self.weights, (B, 1, 1)))
 
     def moved(self, h: Hypothesis) -> Delays:
-        """With the delays of another hypothesis but the samples of this one: p may leave 0 .. 1."""
+        """Take the delays of h but keep the shift by k steps, so that p may leave 0 .. 1."""
         steps = np.array(list(_named(h, self.data).values()))
         return replace(self, part=steps[:, 0] - np.array(self.whole), tau=steps[:, 1])
 
     def shown(self, now: Array, track: Array) -> Array:
-        """What sensors show of states `now` (L + 1, B, n) that followed those of the track."""
+        """Return what sensors show of states `now` (L + 1, B, n), each a step after the track's."""
         found = now.copy()
         for i, tau, (a, b, c) in zip(self.channel, self.tau, self.weights, strict=True):
             own = track[..., i]
-            before = np.concatenate([2 * own[:1] - own[1:2], own[:-1]])  # as if it came so
+            before = np.concatenate([2 * own[:1] - own[1:2], own[:-1]])  # extrapolated backwards
             found[..., i] = a * now[..., i] + b * before
             if c > 0:
                 shown = own + filter_lag(own, tau, self.first)
@@ -88,7 +93,7 @@ class Delays:
         return found
 
     def samples(self) -> tuple[Array, Array]:
-        """The log and what is seen of it, moved to the states it shows, (L + 1, B, n) each."""
+        """Return the log and its mask, shifted to the states it shows, (L + 1, B, n) each."""
         data = self.data
         y, seen = data.y.copy(), data.seen.copy()
         for i, k in zip(self.channel, self.whole, strict=True):
@@ -98,7 +103,7 @@ class Delays:
         return y, seen
 
     def aligned(self, values: Array, missing: float = 0.0) -> Array:
-        """Values of each sample, (L + 1, B, n, ...) or (L, B, n, ...), moved to the states."""
+        """Shift values per sample, (L + 1, B, n, ...) or (L, B, n, ...), to the states shown."""
         found, skip = values.copy(), len(self.data.state_at.T) - len(values)
         own, run = self.data.state_at.T[skip:], self._run()[skip:]
         for i, k in zip(self.channel, self.whole, strict=True):
@@ -107,7 +112,7 @@ class Delays:
         return found
 
     def restored(self, adjoint: Adjoint) -> Adjoint:
-        """An adjoint of the moved samples, back in the log's order."""
+        """Return an adjoint of the shifted samples in the order of the log."""
         found = {"u": adjoint.u.copy(), "D": adjoint.D.copy()}
         own, run = self.data.state_at.T[1:], self._run()[1:]
         for i, k in zip(self.channel, self.whole, strict=True):
@@ -117,7 +122,7 @@ class Delays:
         return replace(adjoint, **found)
 
     def noise(self, noise: NoiseModel) -> NoiseModel:
-        """The same noise with the weights of the moved samples."""
+        """Return the same noise with its weights shifted as the samples are."""
         if isinstance(noise.weight_v, float):
             return noise
         return replace(noise, weight_v=self.aligned(noise.weight_v, 1.0))
@@ -125,13 +130,14 @@ class Delays:
     def before(
         self, noise: NoiseModel, entry: Array | None, track: Array, white: Array, weight: Array
     ) -> float:
-        """Log density of the samples that show what was before the trials; without log 2 pi [nats].
+        """Return the log density of samples that show states from before the trials [nats].
 
-        At most UNLIKE nats a sample below what the others have: it may have moved in any way.
+        Without the terms log 2 pi. It is bounded below by UNLIKE nats per sample less than the mean
+        of the other samples, because the state may have moved in any way.
 
         Args:
-            noise: of the hypothesis.
-            entry: how noise enters (L, B, n, n); None: as it is.
+            noise: the noise of the hypothesis.
+            entry: how noise enters (L, B, n, n); None: the identity.
             track: (L + 1, B, n).
             white: whitened innovations (L, B, n) of all other samples.
             weight: 1 / their standard deviation, (L, B, n or more).
@@ -153,9 +159,9 @@ class Delays:
         return total
 
     def _drifted(self, noise: NoiseModel, i: int, drift: Array, pace: Array) -> float:
-        """Log density of the first samples, the state going `pace` (B,) a step, spread by `drift`.
+        """Return the log density of the first samples under a random walk with a mean rate.
 
-        A Kalman filter of one state; drift (k, B) are the variances of its steps.
+        A scalar Kalman filter: the state moves by `pace` (B,) per step, with variance drift (k, B).
         """
         data = self.data
         L, runs = len(data.time), self.first
@@ -172,24 +178,24 @@ class Delays:
 
     @cached_property
     def first(self) -> Any:
-        """Runs that no other run goes before, as indices."""
+        """Indices of the runs that do not continue another run."""
         ends = self.data.state_at[:, -1]
         return np.flatnonzero(~np.isin(self.data.state_at[:, 0], ends))
 
     @cached_property
     def kept(self) -> Any:
-        """Which flat states a run holds, of bool."""
+        """Flat states that are in a run, of bool."""
         found = np.zeros(len(self.data.states), bool)
         found[self.data.state_at] = True
         return found
 
     def _run(self) -> Any:
-        """Which states of a run are its own, (L + 1, B) of bool."""
+        """Return which states of a run are not padding, (L + 1, B) of bool."""
         valid = self.data.valid.T > 0
         return np.concatenate([np.ones_like(valid[:1]), valid])
 
     def _source(self, k: int) -> tuple[Any, Any]:
-        """Where in the flat states the sample of every state is, whether there is one."""
+        """Return the flat index of the sample that shows each state, and whether it exists."""
         data = self.data
         last = (np.cumsum(np.asarray(data.lengths) + 1) - 1)[data.trial_of]
         at = data.state_at.T + k
@@ -198,7 +204,7 @@ class Delays:
         return at, there & self.kept[at]
 
     def _carried(self, values: Array, source: Any, target: Any, missing: float) -> Array:
-        """Values (L, B, ...) from one place in the flat states to another: (index, whether)."""
+        """Move values (L, B, ...) between places in the flat states, each (index, mask)."""
         flat = np.full((len(self.data.states), *values.shape[2:]), missing)
         flat[source[0][source[1]]] = values[source[1]]
         there = target[1].reshape(*target[1].shape, *[1] * (values.ndim - 2))
@@ -206,7 +212,7 @@ class Delays:
 
 
 def delays_of(h: Hypothesis, data: Data) -> Delays | None:
-    """The delays of a hypothesis' sensors; None where it has none."""
+    """Return the delays of a hypothesis' sensors, or None."""
     named = _named(h, data)
     if not named:
         return None
@@ -217,13 +223,13 @@ def delays_of(h: Hypothesis, data: Data) -> Delays | None:
 
 
 def delayed(effects: Sequence[Effect]) -> set[str]:
-    """The states whose sensors some effects delay."""
+    """Return the names of the states whose sensors are delayed by some effect."""
     late = [effect for effect in effects if isinstance(effect.family, SensorDelayFamily)]
     return {name for effect in late for name in effect.site.targets}
 
 
 def _named(h: Hypothesis, data: Data) -> dict[int, list[float]]:
-    """By late channel its delay and its time constant, in steps; the instruments' filters first."""
+    """Return {channel: [delay, time constant]} in steps, including filters from `instruments`."""
     found = {i: [0.0, tau / data.dt] for i, tau in data.filters.items()}
     for effect, values in h.pairs:
         if isinstance(effect.family, SensorDelayFamily | SensorLagFamily):
@@ -235,10 +241,10 @@ def _named(h: Hypothesis, data: Data) -> dict[int, list[float]]:
 
 
 def filter_lag(track: Array, tau: float, settled: Any = ()) -> Array:
-    """How far a filtered sensor is off along a track (L + 1, B), tau in steps.
+    """Return a filtered sensor's output minus its input along a track (L + 1, B), tau in steps.
 
-    A run that goes on moved before as it does in its first two time constants; in those that begin
-    a trial, `settled`, the sensor has settled.
+    A run that continues a trial is assumed to have moved before at the mean rate of its first two
+    time constants. In the `settled` runs, which begin a trial, the sensor starts in steady state.
     """
     count = int(np.clip(np.ceil(2 * tau), 1, len(track) - 1))
     first = -(track[count] - track[0]) / count * tau
@@ -248,7 +254,7 @@ def filter_lag(track: Array, tau: float, settled: Any = ()) -> Array:
 
 
 def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt: float) -> Array:
-    """What a sensor effect adds to the log of its state along a track (L + 1, B)."""
+    """Return what a sensor effect adds to the log of its state along a track (L + 1, B)."""
     if isinstance(effect.family, SensorFamily):
         return np.asarray(effect.family.measure(track, values) - track)
     if isinstance(effect.family, SensorLagFamily):
@@ -256,7 +262,7 @@ def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt:
     steps = values["d"] / dt
     slope = np.vstack([track[1:2] - track[:1], np.diff(track, axis=0)])
     whole, part = int(np.floor(steps)), steps - np.floor(steps)
-    first = track[:1] - slope[:1] * np.arange(whole + 1, 0, -1)[:, None]  # as if it came so
+    first = track[:1] - slope[:1] * np.arange(whole + 1, 0, -1)[:, None]  # extrapolated backwards
     line = np.concatenate([first, track])
     count = len(track)
     old = (1 - part) * line[1 : count + 1] + part * line[:count]

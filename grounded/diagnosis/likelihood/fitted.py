@@ -1,4 +1,4 @@
-"""A hypothesis at its most likely values (`refine` returns it); how sure they are: `intervals`."""
+"""A hypothesis at its most likely values, as `refine` returns it; see `intervals` for `+-`."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ class Fitted:
 
     Per run (B): `gram` (B, C, C), `score` (B, C), `rss` (B,), `logdet` (B,) of the whitened columns
     in the order [effects' free values, shifts]; `white` (L, B, n) are the whitened innovations.
-    `states` is the track but where the model has kinks: there the track may not have followed the
-    filter, and be nearly as noisy as what was measured.
+    `states` equals the track unless the model has kinks. There the track may have been held during
+    the fit, and be nearly as noisy as the measurements.
     """
 
     hypothesis: Hypothesis
     noise: NoiseModel
     track: Array  # (L + 1, B, n) about which it is linearised
-    loglik: float  # of the data
-    evidence: float  # log p(y | h): the shifts integrated out
+    loglik: float  # log-likelihood of the data
+    evidence: float  # log p(y | h), the shifts integrated out
     gram: Array
     score: Array
     rss: Array
     logdet: Array
     white: Array
-    states: Array  # (L + 1, B, n) filtered: what predictions start from
-    settled: bool = False  # nothing rises from here: a fit that starts here ends here
+    states: Array  # (L + 1, B, n) filtered states, which predictions start from
+    settled: bool = False  # converged: a fit that starts here ends here
 
     @property
     def covariance(self) -> Array:
-        """Of the free values and shifts, (C, C), from the Fisher information."""
+        """Covariance of the free values and shifts, (C, C), from the Fisher information."""
         G = self.gram.sum(axis=0) + np.diag(self.prior)
         return np.linalg.pinv(G, hermitian=True)
 
     def prior_pull(self, data: Data) -> Array:
-        """The prior's slope at the shifts as they are, (C,)."""
+        """Return the slope of the negative log prior at the current shifts, (C,)."""
         h, pull = self.hypothesis, np.zeros(self.gram.shape[-1])
         k = len(h.theta)
         if h.shift is not None and len(pull) > k:
@@ -53,24 +53,24 @@ class Fitted:
 
     @property
     def prior(self) -> Array:
-        """Precision of each column, (C,): zero for effects."""
+        """Prior precision of each unknown, (C,): zero for values of effects."""
         h = self.hypothesis
         k = len(h.theta)
         return np.concatenate([np.zeros(k), shift_precision(h, self.gram.shape[-1] - k)])
 
 
 def shift_precision(h: Hypothesis, count: int) -> Array:
-    """Prior precision of the calibrated parameters' shifts (count,), in units of their scale."""
+    """Return the prior precision of the parameters' shifts (count,), in units of their scale."""
     return np.full(count, 1.0 / h.spread**2) if count else np.zeros(0)
 
 
 def calibrated(data: Data) -> Any:
-    """Parameters that have a scale, as indices: those that a shift makes sense for."""
+    """Return the indices of the uncertain parameters, those with a scale, which may be shifted."""
     return np.flatnonzero(param_scale(data.model) > 0)
 
 
 def moved(data: Data, h: Hypothesis, delta: Array) -> Hypothesis:
-    """A hypothesis with its values, and its shifts in units of their scale, moved by (C,)."""
+    """Return a hypothesis moved by delta (C,): values, then shifts in units of their scale."""
     k = len(h.theta)
     other = h.with_theta(h.theta + delta[:k])
     if len(delta) == k:
@@ -82,7 +82,7 @@ def moved(data: Data, h: Hypothesis, delta: Array) -> Hypothesis:
 
 
 def leave_one_out(fit: Fitted, trial_of: Array) -> tuple[Array, Array]:
-    """Changes of all values without each trial (S, C), and that trial's rss under them (S,).
+    """Return the changes of all values without each trial (S, C), and its rss with them (S,).
 
     One Newton step each: theta_{-i} = theta + (G - G_i)^-1 s_i.
     """

@@ -1,4 +1,4 @@
-"""A hypothesis: some effects with their values, the model's parameters shifted."""
+"""A hypothesis: effects with their values, and shifts of the model's parameters."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from grounded.model import Model
 class Hypothesis:
     """Effects with their values, and shifts of the model's parameters (k,) with a prior.
 
-    `spread` is the prior standard deviation of every shift in units of `param_scale`, the user's
-    own; 0: the parameters are taken as they are.
+    `spread` is the prior standard deviation of every shift in units of `param_scale`, which the
+    user gives; 0: the parameters are exact.
     """
 
     effects: tuple[Effect, ...] = ()
@@ -34,7 +34,7 @@ class Hypothesis:
 
     @cached_property
     def pairs(self) -> list[tuple[Effect, Mapping[str, float]]]:
-        """Each effect with its values."""
+        """The effects, each with its values."""
         return list(zip(self.effects, self.values, strict=True))
 
     @cached_property
@@ -43,7 +43,7 @@ class Hypothesis:
         return np.array([v[q.name] for e, v in self.pairs for q in e.free], float)
 
     def with_theta(self, theta: Array) -> Hypothesis:
-        """The same effects with other free values, kept inside their bounds."""
+        """Return the same effects with other free values, clipped to their bounds."""
         values, at = [], 0
         for effect in self.effects:
             some: dict[str, float] = dict(effect.fixed)
@@ -54,7 +54,7 @@ class Hypothesis:
         return replace(self, values=tuple(values))
 
     def plus(self, effect: Effect, values: Mapping[str, float]) -> Hypothesis:
-        """One more effect; constants among its values are its own from now on."""
+        """Add an effect; constants among its values replace the effect's own."""
         whole = {**effect.fixed, **values}
         for name, value in effect.fixed.items():
             if whole[name] != value:
@@ -62,23 +62,24 @@ class Hypothesis:
         return replace(self, effects=(*self.effects, effect), values=(*self.values, whole))
 
     def tuned(self, index: int, name: str, value: float) -> Hypothesis:
-        """One effect with another constant."""
+        """Change one constant of one effect."""
         effects, values = list(self.effects), list(self.values)
         effects[index] = effects[index].tuned(name, value)
         values[index] = {**values[index], name: value}
         return replace(self, effects=tuple(effects), values=tuple(values))
 
     def minus(self, name: str) -> Hypothesis:
-        """One effect less."""
+        """Remove an effect."""
         kept = [(effect, values) for effect, values in self.pairs if effect.name != name]
         effects, values = tuple(e for e, _ in kept), tuple(v for _, v in kept)
         return replace(self, effects=effects, values=values)
 
 
 def by_row(hypotheses: Sequence[Hypothesis], which: Any) -> Hypothesis:
-    """One whose numbers are arrays: row i has those of hypothesis `which[i]`, (M,) of int.
+    """Combine hypotheses with the same effects into one that steps many rows (M, n) at once.
 
-    Of the same effects, to step many rows (M, n) at once; shifts are (M, k).
+    Its values are arrays: row i has those of hypothesis `which[i]`, (M,) of int. Its shifts are
+    (M, k).
     """
     first = hypotheses[0]
     if len(hypotheses) == 1:
@@ -93,26 +94,26 @@ def by_row(hypotheses: Sequence[Hypothesis], which: Any) -> Hypothesis:
 
 
 def param_scale(model: Model) -> Array:
-    """Prior standard deviation of each parameter (k,): 0 of a constant."""
+    """Return the prior standard deviation of each parameter (k,), 0 for a constant."""
     return np.array([param.spread for param in model.params.values()], float)
 
 
 def rates_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
-    """The rate effects of halves of a step, with their values."""
+    """Return the effects that add rates (half before, half after a step), with their values."""
     return [(e, v) for e, v in h.pairs if isinstance(e.family, RateFamily) and not e.family.parts]
 
 
 def limits_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
-    """Those of parts of it: limits of rates."""
+    """Return the effects that limit rates (applied in parts of a step), with their values."""
     return [(e, v) for e, v in h.pairs if isinstance(e.family, RateFamily) and e.family.parts]
 
 
 def losses_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
-    """What the motion takes off the inputs that drive it."""
+    """Return the losses of joints, with their values."""
     return [(e, v) for e, v in h.pairs if isinstance(e.family, LossFamily)]
 
 
 def adds_to_steps(h: Hypothesis) -> bool:
-    """Whether a hypothesis adds more to the model's steps than what arrives of the inputs."""
+    """Check whether a hypothesis changes the model's steps other than by the inputs received."""
     medium = any(isinstance(e.family, MediumFamily) for e in h.effects)
     return bool(rates_of(h) or limits_of(h) or losses_of(h) or medium)

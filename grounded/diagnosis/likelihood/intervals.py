@@ -1,16 +1,17 @@
-"""How sure the values of a fit are: the largest of three answers.
+"""Standard deviations of the values of a fit: the largest of three estimates.
 
-The Fisher information believes the noise model. The jackknife asks the trials, each left out once
-(Efron & Tibshirani 1993, ch. 11). But trials of one manoeuvre share what is wrong with the model,
-and agree on a value that it bends. So the stretches of time are asked too: with s_p and G_p what a
-stretch of all trials has of the score and the information,
+1. The inverse Fisher information, which assumes that model and noise are right.
+2. The jackknife over trials, each left out once (Efron & Tibshirani 1993, ch. 11).
+3. A jackknife over stretches of time, each left out of all trials at once. Trials of one manoeuvre
+   share the errors of the model and agree on a biased value, which the second does not show. With
+   s_p and G_p the score and the information of a stretch p of all trials,
 
-    sum_p s_p' G_p^-1 s_p ~ chi-squared
+       sum_p s_p' G_p^-1 s_p ~ chi-squared
 
-where model and noise are right. Where chance hardly makes as much, the values change along the
-manoeuvre, and the jackknife that leaves out one stretch of all trials at once counts as well: a
-sandwich that is clustered by time (Cameron & Miller, A practitioner's guide to cluster-robust
-inference, 2015, its CR3). A value that the manoeuvre has from one stretch alone says nothing there.
+   if model and noise are right. This estimate counts only where the sum is too large to be chance,
+   so that the values change along the manoeuvre. It is a sandwich estimate clustered by time
+   (Cameron & Miller, A practitioner's guide to cluster-robust inference, 2015, its CR3). It says
+   nothing about a value that only one stretch determines.
 """
 
 from __future__ import annotations
@@ -23,19 +24,19 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.filter import kalman
 from grounded.frozen import Array
 
-STRETCHES = (5, 10, 20)  # of equal time: misfits are as long as they are
-LONG = 4  # steps that a stretch has at least
-CHANCE = 0.01  # of scores that differ so much, below which the model is taken to be wrong
-LEAST = 0.2  # of the information that must be left without a stretch, or counts as left
+STRETCHES = (5, 10, 20)  # numbers of stretches tried, since the duration of misfits is unknown
+LONG = 4  # fewest steps of a stretch
+CHANCE = 0.01  # p-value of differing scores below which the model is taken to be wrong
+LEAST = 0.2  # smallest fraction of the information taken to be left without a stretch
 
 
 def standard_deviations(predictor: Predictor, fit: Fitted, trial_of: Array) -> tuple[Array, Array]:
-    """Of every free value: standard deviation, half-width of the 95 % interval, (C,) each.
+    """Return each unknown's standard deviation and half-width of its 95 % interval, (C,) each.
 
     Args:
-        predictor: of the data of the fit.
-        fit: at its most likely values.
-        trial_of: what each run is left out with (B,).
+        predictor: evaluates hypotheses on the data of the fit.
+        fit: the fit at its most likely values.
+        trial_of: the group that each run is left out with, usually its trial (B,).
     """
     if fit.gram.shape[-1] == 0:
         return np.zeros(0), np.zeros(0)
@@ -57,7 +58,7 @@ def _student(freedom: int) -> float:
 
 
 def _by_stretch(predictor: Predictor, fit: Fitted) -> list[Array]:
-    """Changes of all values without each stretch, (P, C) a partition; none where all agree."""
+    """Return the changes of all values without each stretch, (P, C) per significant partition."""
     from scipy.special import chdtrc
 
     data = predictor.data
@@ -85,7 +86,7 @@ def _by_stretch(predictor: Predictor, fit: Fitted) -> list[Array]:
 
 
 def _whitener(information: Array) -> Array:
-    """A (C, K) with A' information A = 1, over all directions in which something is known."""
+    """Return A (C, K) with A' information A = 1, over all directions with any information."""
     scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     size, axes = np.linalg.eigh(information * np.outer(scale, scale))
     known = size > 1e-10
@@ -93,9 +94,9 @@ def _whitener(information: Array) -> Array:
 
 
 def _fisher(information: Array) -> Array:
-    """Standard deviations from an information matrix (C, C), each unknown in units of its own.
+    """Return standard deviations from an information matrix (C, C).
 
-    A direction in which nothing is known makes all that take part in it as good as unknown.
+    Unknowns that take part in a direction without information get a very large one.
     """
     scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     size, axes = np.linalg.eigh(information * np.outer(scale, scale))
@@ -103,15 +104,19 @@ def _fisher(information: Array) -> Array:
 
 
 def foretold(groups: Array, prior: Array) -> Array:
-    """Standard deviations that `standard_deviations` states on average where the model is right.
+    """Return the expected result of `standard_deviations` if the model is right.
 
-    Trials have scores s_i ~ N(0, G_i). At the most likely values, G the sum with the prior, their
-    covariance is G_i - G_i G^-1 G_i, and without trial i all values move by (G - G_i)^-1 s_i. So
-    the jackknife does not believe one trial that knows more than all others.
+    Trials have scores s_i ~ N(0, G_i). At the most likely values, with G the sum of all and the
+    prior, the scores have the covariance G_i - G_i G^-1 G_i. Leaving out trial i moves the values
+    by (G - G_i)^-1 s_i. So a single trial with more information than all others does not make the
+    jackknife's standard deviation small.
 
     Args:
         groups: information of each trial (S, C, C).
         prior: information that no trial adds (C, C).
+
+    Returns:
+        Standard deviations (C,).
     """
     total, count = groups.sum(axis=0) + prior, len(groups)
     inverse = np.linalg.pinv(total, hermitian=True)

@@ -1,28 +1,31 @@
-"""A hypothesis to first order: its Jacobian, its residual, what each of its values adds to a step.
+"""Linearisation of a hypothesis about its track: Jacobian, residual and sensitivities of each step.
+
+The error e of the track x obeys
 
     e_{t+1} = F_t e_t + d_t,   r_t = y_t - x_t - offset_t
 
-d and r as columns: the residual first, then the derivative by each value and each shift. Where a
-sensor is delayed, r_t is that of the sample that shows the state at t (`delays`). An error passes
-through a step by the model's Jacobian and those of its effects,
+d and r are arrays of columns: the first is the residual of the track, the others are its
+derivatives by each free value of the effects and each shift of a parameter. The filter whitens all
+columns at once. Of a delayed sensor, r_t is the residual of the sample that shows the state at t
+(`delays`). The Jacobian contains the model and the added rates of the effects,
 
     F_h = (1 + dt/2 A_1) F (1 + dt/2 A_0),     A = d rate / d x at the start, at the end
 
-An added rate that depends on the state (a coupling, a friction) moves errors as the model does:
-left out, the noise of one state shows up unexplained in another. Effects in proportion to the
-model's own rates take their slope from F. A heading rate that is only carried along is the
-heading's rate, effects and all: its row follows from the heading's slope. A dry friction's slope at
-rest is as steep as its smoothing is narrow; it is bounded, so that no error turns its sign within
-half a step.
+An added rate that depends on the state (a coupling, a friction) propagates errors as the model
+does. Without it, noise of one state would appear unexplained in another. Effects in proportion to
+the model's own rates take their slope from F. A heading rate that is only carried along equals the
+rate of the heading, effects included, so its row follows from the heading's slope. The slope of a
+dry friction at rest grows as its smoothing width shrinks; it is bounded so that no error changes
+sign within half a step.
 
-A threshold (the throttle below which a motor stalls) has no derivative: a small change moves no
-sample across it. Where a parameter's derivative is zero at every sample, the finite difference over
-a few per cent of its size takes its place, so that a threshold that is off is found like any other
-parameter, and not blamed on an effect.
+A threshold (the throttle below which a motor stalls) has zero derivative, since a small change
+moves no sample across it. If a parameter's derivative is zero at every sample, a finite difference
+over a few per cent of its size is used instead. So a wrong threshold is found like any other wrong
+parameter, and is not attributed to an effect.
 
-A run starts with the state as it was measured. What was not measured (a speed that the log does not
-hold, a sensor that had dropped out) starts anywhere: a wide prior about the track, and with every
-pass the track's start moves to where the whole run puts it (`smoothed`),
+A run starts at the measured state. A state that was not measured at the start (a speed that is not
+logged, a sensor that had dropped out) gets a wide prior about the track, and each pass moves the
+start of the track to its smoothed value (`smoothed`),
 
     E[e_0 | y] = - P_0 sum_t w_t nu_t,        nu, w: whitened innovations of the residual, and of a
                                               unit of e_0 entering the first step (columns of F_0)
@@ -56,16 +59,24 @@ from grounded.model import Model
 
 
 def columns_of(h: Hypothesis, data: Data) -> int:
-    """How many columns a hypothesis has: the residual, its values, its shifts."""
+    """Return the number of columns of a hypothesis: the residual, its values, its shifts."""
     return 1 + len(h.theta) + (len(calibrated(data)) if h.spread else 0)
 
 
 def linearise(
     predictor: Predictor, h: Hypothesis, track: Array, into: tuple[Array, Array] | None = None
 ) -> tuple[Array, Array, Array]:
-    """F (L, B, n, n); columns of d and r: the residual first, then each value, then each shift.
+    """Linearise a hypothesis about a track.
 
-    `into`: d and r, zeros of at least so many columns; else they are made.
+    Args:
+        predictor: evaluates the hypothesis on the data.
+        h: the hypothesis.
+        track: (L + 1, B, n).
+        into: d and r to fill, zeros with at least `columns_of` columns; None: they are allocated.
+
+    Returns:
+        F (L, B, n, n), d (L, B, n, C) and r (L + 1, B, n, C). The columns are the residual, the
+        derivative by each value, the derivative by each shift.
     """
     data, count = predictor.data, columns_of(h, predictor.data)
     model = data.model
@@ -73,7 +84,7 @@ def linearise(
     u = predictor.inputs(h)
     after = predictor.advance(h, x, u, data.time)
     d, r = into or (np.zeros((*a.shape, count)) for a in (after, track))
-    ahead = np.concatenate([track[:1], after])  # predicted: a measurement must not explain itself
+    ahead = np.concatenate([track[:1], after])  # predictions: a sample must not explain itself
     delays = delays_of(h, data)
     y, here, shown = data.y, track, ahead
     if delays is not None:
@@ -102,7 +113,7 @@ def linearise(
             if by_d.any() or by_r.any():
                 break
     d[..., 1 + len(theta) : count] = of_shifts
-    if data.idle.any():  # nothing is seen there: what would grow without bound stays as it is
+    if data.idle.any():  # padding is never measured: identity, so that nothing grows there
         F, d[data.idle] = np.where(data.idle[..., None, None], np.eye(model.n), F), 0.0
     return F, d, r
 
@@ -110,7 +121,7 @@ def linearise(
 def _sensitivities(
     predictor: Predictor, h: Hypothesis, x: Array, u: Array, after: Array
 ) -> tuple[Array, Array]:
-    """F (L, B, n, n) and what each shift adds to a step, (L, B, n, k); k = 0 without shifts."""
+    """Return F (L, B, n, n) and the step's slope in each shift (L, B, n, k); k = 0 without any."""
     if h.spread == 0:
         return step_jacobian(predictor, h, x, after), np.zeros((*x.shape, 0))
     which = calibrated(predictor.data)
@@ -121,9 +132,17 @@ def _sensitivities(
 def sensitivities_of(
     predictor: Predictor, h: Hypothesis, x: Array, u: Array, after: Array | None = None
 ) -> tuple[Array, Array]:
-    """Of a hypothesis' steps from x (L, B, n): F (L, B, n, n), slope in all parameters (..., k).
+    """Return slopes of a hypothesis' steps from x (L, B, n), in the state and in all parameters.
 
-    after: where they lead, if known.
+    Args:
+        predictor: evaluates the hypothesis on the data.
+        h: the hypothesis.
+        x: states at the start of each step (L, B, n).
+        u: inputs received during each step (L, B, m).
+        after: states at the end of each step (L, B, n), if known.
+
+    Returns:
+        F (L, B, n, n) and the slope in the parameters (L, B, n, k).
     """
     if medium := moving(h, predictor.seen):
         start = medium.through(x)
@@ -149,7 +168,7 @@ def sensitivities_of(
 def step_jacobian(
     predictor: Predictor, h: Hypothesis, track: Array, after: Array | None = None
 ) -> Array:
-    """F of every step along a track (L or more, B, n), (L, B, n, n)."""
+    """Return F of every step along a track (L or more, B, n), (L, B, n, n)."""
     data, u = predictor.data, predictor.inputs(h)
     x = track[: len(data.time)]
     if medium := moving(h, predictor.seen):
@@ -165,7 +184,10 @@ def step_jacobian(
 
 
 def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | None:
-    """G of the filter (L, B, n, n): a carried heading rate moves with what it is a function of."""
+    """Return how process noise enters, the filter's G (L, B, n, n), or None for the identity.
+
+    It is not the identity where a carried heading rate is a function of disturbed states.
+    """
     tied = predictor.tied()
     if not tied:
         return None
@@ -186,7 +208,7 @@ def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | No
 def filter_system(
     predictor: Predictor, h: Hypothesis, noise: NoiseModel, track: Array, F: Array
 ) -> tuple[LinearSystem, Delayed | None]:
-    """What the filter of a hypothesis is made of; F (L, B, n, n)."""
+    """Assemble the linear system of a hypothesis for the filter; F (L, B, n, n)."""
     data = predictor.data
     (L, B, n, _), delays = F.shape, delays_of(h, data)
     seen, delayed = data.seen, None
@@ -209,18 +231,18 @@ def gains_of(
     *,
     covariances: bool = False,
 ) -> kalman.Gains:
-    """The gains of a hypothesis' filter; F (L, B, n, n)."""
+    """Return the Kalman gains of a hypothesis; F (L, B, n, n)."""
     return kalman.gains(*filter_system(predictor, h, noise, track, F), covariances=covariances)
 
 
 def base_columns(predictor: Predictor, fit: Fitted) -> tuple[Array, Array]:
-    """What a fit's own values and shifts add to d and r: (L, B, n, C), (L + 1, B, n, C)."""
+    """Return the derivatives of d (L, B, n, C) and r (L + 1, B, n, C) by a fit's own unknowns."""
     _, d, r = linearise(predictor, fit.hypothesis, fit.track)
     return d[..., 1:], r[..., 1:]
 
 
 def step_sizes(h: Hypothesis) -> list[float]:
-    """Half a step of the difference quotient of each free value."""
+    """Return the finite-difference step of each free value."""
     sizes = []
     for effect, values in h.pairs:
         for q in effect.free:
@@ -235,7 +257,7 @@ def step_sizes(h: Hypothesis) -> list[float]:
 
 
 def _tried(h: Hypothesis) -> list[tuple[float, ...]]:
-    """The step of each free value; for a parameter that may be a threshold a larger one beside."""
+    """Return the steps to try for each free value; a parameter gets a larger one for thresholds."""
     effects = [effect for effect in h.effects for _ in effect.free]
     found: list[tuple[float, ...]] = [(size,) for size in step_sizes(h)]
     for j, effect in enumerate(effects):
@@ -255,13 +277,17 @@ def _nudged(h: Hypothesis, theta: Array, j: int, size: float) -> tuple[Hypothesi
     return other, moved
 
 
-PART = 0.05  # of a parameter's size, to each side
+PART = 0.05  # fraction of a parameter's size, to each side, of the step for thresholds
 
 
 def sensitivities(
     model: Model, x: Array, u: Array, p: Array, dt: float
 ) -> tuple[Array, Array, Array]:
-    """f_x (N, n, n), f_u (N, n, m), f_p (N, n, k) of a step from x (N, n) with inputs u (N, m)."""
+    """Return slopes of the model's step from x (N, n) with inputs u (N, m), secants at thresholds.
+
+    Returns:
+        f_x (N, n, n), f_u (N, n, m), f_p (N, n, k).
+    """
     f_x, f_u, f_p = model.system.sensitivities(x, u, p, dt)
     flat = np.flatnonzero(~f_p.any(axis=(0, 1)) & (param_scale(model) > 0))
     for i in flat:
@@ -279,7 +305,7 @@ WIDE = 10.0  # [SI unit] standard deviation of a state that is never measured
 
 
 def prior(data: Data) -> Array:
-    """Variances (n,) of states that were not measured when a run began."""
+    """Return the initial variances (n,) of states that were not measured when a run began."""
     found = []
     for i, name in enumerate(data.model.state_names):
         found.append(data.scales.spread(name) ** 2 if data.told[i] else WIDE**2)
@@ -287,13 +313,16 @@ def prior(data: Data) -> Array:
 
 
 def smoothed(data: Data, g: kalman.Gains, jacobian: Array, white: Array) -> Array | None:
-    """Where the run puts the start, (B, n) to be added to the track's; None: all was measured.
+    """Return the smoothed correction of the start of each run.
 
     Args:
-        data: of one or several batches of runs.
-        g: gains of the runs (L, B, ...), as many times data's runs as there are hypotheses.
+        data: the data; its runs may be repeated along the batch axis, once per hypothesis.
+        g: gains of the runs (L, B, ...).
         jacobian: F of the same runs (L, B, n, n).
         white: whitened innovations of the residual (L, B, n).
+
+    Returns:
+        (B, n) to add to the start of the track, zero where it was measured; None if all was.
     """
     if data.seen[0].all():
         return None

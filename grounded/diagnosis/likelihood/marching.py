@@ -1,9 +1,10 @@
-"""A hypothesis as one compiled step: thousands of steps in a row without Python between them.
+"""Compiled rollouts of a hypothesis: thousands of steps without Python between them.
 
-A prediction of a whole log asks for one step after the other; each costs a millisecond of Python
-where effects add to the model's own. What `grounded.effects.wrap` adopts are the same equations,
-so what moves the model joins it for this alone, with its numbers as parameters: one compile serves
-every value. The first step is compared with `Predictor.advance`.
+Predicting a whole log takes its steps one after the other, and each costs a millisecond of Python
+if effects add to the model's step. `grounded.effects.wrap` implements the same equations, so the
+effects that change the step are wrapped around the model for this purpose, with their values as
+parameters: it is compiled once for all values. The first step is checked against
+`Predictor.advance`.
 """
 
 from __future__ import annotations
@@ -25,20 +26,20 @@ from grounded.frozen import Array
 if TYPE_CHECKING:
     from grounded.diagnosis.likelihood.predictor import Predictor
 
-LONG = 400  # steps from which a compile pays
-AGREE = 1e-9  # of a state's size: steps that are one
-CARRIED = 1e-3  # the same of a heading's rate, whose own change `advance` takes over a short step
+LONG = 400  # fewest steps for which compiling pays
+AGREE = 1e-9  # tolerance of the check, relative to a state's size
+CARRIED = 1e-3  # the same for a heading rate, which `advance` computes by a short finite step
 
 
 @dataclass(frozen=True, eq=False)
 class March:
-    """The compiled step of a model with effects, and where their numbers go."""
+    """The compiled step of a model with effects, and the names of its parameters."""
 
     system: System
-    names: tuple[str, ...]  # of its parameters: what joins goes before what was adopted
+    names: tuple[str, ...]  # parameters: those of the hypothesis' effects before adopted ones
 
     def __call__(self, predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Array:
-        """States (T + 1, M, n) from x (M, n) through u (T, M, m)."""
+        """Roll out from x (M, n) with u (T, M, m): states (T + 1, M, n)."""
         own = dict(zip(predictor.data.model.param_names, predictor.params(h), strict=True))
         for effect, values in h.pairs:
             whole = effect.complete(values)
@@ -49,9 +50,9 @@ class March:
 
 
 def marched(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Array | None:
-    """States (T + 1, M, n) from x (M, n) through received inputs u (T, M, m), far ones and all.
+    """Roll out from x (M, n) with received inputs u (T, M, m): states (T + 1, M, n).
 
-    None where a hypothesis can't be compiled, or so few steps are asked for that it doesn't pay.
+    None if the hypothesis can't be compiled, or there are too few steps for that to pay.
     """
     if predictor.params(h).ndim > 1:
         return None
@@ -100,5 +101,5 @@ def _compiled(predictor: Predictor, h: Hypothesis) -> March | None:
 
 
 def _outer(effect: Effect) -> bool:
-    """Losses are solved within a step, rates are added around it."""
+    """Sort key: losses, solved within a step, are wrapped before rates, added around it."""
     return isinstance(effect.family, RateFamily)

@@ -1,8 +1,11 @@
-"""A hypothesis with a medium that moves: the same without it, seen from axes that move along.
+"""Hypotheses with a moving medium (a current, wind), as a change of axes.
+
+Velocities through the medium go into the step of the hypothesis without it, and the result is
+converted back to velocities over ground:
 
     f_h(x) = over(f_still(through(x))),     F_h = D over  F_still  D through
 
-Its model, the rates and the losses beside it all see velocities through the medium.
+So the model, the added rates and the losses all see velocities through the medium.
 """
 
 from __future__ import annotations
@@ -18,32 +21,32 @@ from grounded.effects import Effect, MediumFamily
 from grounded.effects.medium import over_ground, through_it
 from grounded.frozen import Array
 
-NUDGE = 1e-6  # of a state's unit: what slopes are taken over
+NUDGE = 1e-6  # finite-difference step in a state's unit
 
 
 @dataclass(frozen=True, eq=False)
 class Moving:
-    """One medium's change of axes, of states (..., n); `still`: the hypothesis without it."""
+    """The change of axes of one medium, for states (..., n)."""
 
-    still: Hypothesis
-    names: tuple[str, ...]  # of the states, as physics sees them
+    still: Hypothesis  # without the medium
+    names: tuple[str, ...]  # state names as effects see them (`seen_names`)
     effect: Effect
     values: Mapping[str, float]
 
     def through(self, x: Array) -> Array:
-        """States over ground as the medium sees them."""
+        """Convert states over ground to states through the medium."""
         return _array(through_it(self.effect, self._named(x), self.values))
 
     def over(self, x: Array, dt: float) -> Array:
-        """States that the medium saw, dt after it began to: over ground."""
+        """Convert states through the medium to states over ground, after a step of dt."""
         return _array(over_ground(self.effect, self._named(x), self.values, dt))
 
     def slopes(self, before: Array, after: Array) -> tuple[Array, Array]:
-        """D through at x before a step, D over at x after it, both as the medium sees them."""
+        """Return D through before a step and D over after it, both at states through the medium."""
         return self._slope(self.over(before, 0.0), -1.0), self._slope(after, 1.0)
 
     def _slope(self, x: Array, sign: float) -> Array:
-        """1 + sign d shift / d x, (..., n, n)."""
+        """Return 1 + sign d shift / d x, (..., n, n)."""
         n = x.shape[-1]
         found = np.broadcast_to(np.eye(n), (*x.shape, n)).copy()
         base = self.through(x) - x
@@ -62,7 +65,7 @@ def _array(values: Mapping[str, Array]) -> Array:
 
 
 def moving(h: Hypothesis, names: tuple[str, ...]) -> Moving | None:
-    """The medium that moves under a hypothesis, if one does; `names` as physics sees the states."""
+    """Return the moving medium of a hypothesis, or None; `names` as effects see the states."""
     for effect, values in h.pairs:
         if isinstance(effect.family, MediumFamily):
             return Moving(h.minus(effect.name), names, effect, values)

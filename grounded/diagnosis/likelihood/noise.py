@@ -1,26 +1,27 @@
-"""The noise of a real system: estimated, never assumed.
+"""Maximum likelihood of the variances of process and measurement noise.
 
-Process noise w (var Q) and measurement noise v (var R), diagonal, each channel its own. Two ways in
-which real noise differs from the textbook's, allowed before an effect is claimed:
+Process noise w (variance Q) and measurement noise v (variance R) are diagonal, one variance per
+channel. Two departures from white Gaussian noise are allowed before an effect is claimed:
 
-    coloured   beside w, a disturbance c_{t+1} = phi c_t + eta with phi = exp(-dt / tau): a gust, a
-               carpet, a swaying antenna (variance C of c, a channel)
-    heavy      v and w are Student-t of 4 degrees of freedom: each is normal with its own precision,
-               whose expectation weighs it, (dof + 1) / (dof + E[v^2] / R). The weights are found
-               for one fit (`cleaned`) and then belong to the data: every hypothesis is judged with
-               the same ones, so that outliers count for little and favour nobody.
+    coloured   in addition to w, a disturbance c_{t+1} = phi c_t + eta with phi = exp(-dt / tau): a
+               gust, a carpet, a swaying antenna (variance C of c, one per channel)
+    heavy      v and w are Student-t with 4 degrees of freedom: each sample is normal with its own
+               precision, weighted by its expectation (dof + 1) / (dof + E[v^2] / R). The weights
+               are found for one fit (`cleaned`) and kept with the data. All hypotheses are compared
+               with the same weights, so that outliers count for little and favour none of them.
 
-Variances climb the likelihood by scoring: with the smoother's adjoint r and its covariance N,
-d loglik / d log q = q sum(r^2 - N) / 2. Channels share their noise: an encoder's noise can pass for
-a disturbance of the speed behind it. So all variances step together, by the average of observed and
-expected information (Gilmour, Thompson & Cullis 1995, "Average information REML"). With P the
-inverse covariance of the data and V_i what noise i adds to it,
+Variances are fitted by scoring: with the smoother's adjoint r and its covariance N,
+d loglik / d log q = q sum(r^2 - N) / 2. The variances are coupled, since noise of an encoder can be
+mistaken for a disturbance of the speed behind it. So all of them step together, with the average of
+the observed and the expected information as the curvature (Gilmour, Thompson & Cullis 1995,
+"Average information REML"). With P the inverse covariance of the data and V_i its derivative by
+variance i,
 
     AI_ij = 1/2 (V_i P y)' P (V_j P y)
 
-P y is what the smoother says of each disturbance, so V_i P y is the answer of the system to the
-disturbance variance_i * adjoint_i: one more column for the filter. Never indefinite, exact where it
-matters, and one pass for all of them.
+The smoother gives P y per disturbance, so V_i P y is the response of the system to the disturbance
+variance_i * adjoint_i, which is one more column for the filter. The matrix is never indefinite, and
+one pass of the filter gives it for all variances.
 """
 
 from __future__ import annotations
@@ -36,32 +37,32 @@ from grounded.filter.kalman import Adjoint
 from grounded.frozen import Array
 
 DOF = 4.0
-UNSEEN = 1e-2  # of a state's scale: the disturbance of one that is never measured, at first
-NOTHING = 1e-4  # part of a channel's one-step variance below which a variance is nil
+UNSEEN = 1e-2  # initial disturbance of a state that is never measured, as a fraction of its scale
+NOTHING = 1e-4  # fraction of a channel's one-step variance below which a variance counts as zero
 
 
 @dataclass(frozen=True)
 class Structure:
-    """Which noise is allowed beside white: tau [s] of a coloured part, or None."""
+    """Noise allowed in addition to white noise: tau [s] of a coloured part, or None."""
 
     tau: float | None = None
 
     def phi(self, dt: float) -> float | None:
-        """The coloured part's correlation over a step."""
+        """Return the correlation of the coloured part over one step, None without one."""
         return None if self.tau is None else math.exp(-dt / self.tau)
 
     def numbers(self, n: int) -> int:
-        """How many more numbers than plain white noise it estimates, in effect.
+        """Return the effective number of parameters in addition to those of white noise.
 
-        A correlation time and one variance: in most channels the coloured part is nil and costs
-        nothing. Charging all n + 1 would make a claim cheaper than coloured noise.
+        Two are counted, a correlation time and one variance, because the coloured part is zero in
+        most channels. Counting all n + 1 would make an effect cheaper than coloured noise.
         """
         return 0 if self.tau is None else 2
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
-    """Log variances (n,) of w, v and c; weights of heavy tails (L, B, n) or 1.0."""
+    """Log variances (n,) of w, v and c, and outlier weights (L, B, n) or 1.0."""
 
     structure: Structure
     log_q: Array
@@ -73,11 +74,11 @@ class NoiseModel:
 
     @property
     def logs(self) -> tuple[Array, Array, Array]:
-        """All log variances, the coloured part's last."""
+        """All log variances: of w, of v, of the coloured part."""
         return self.log_q, self.log_r, self.log_c
 
     def process(self, dt: float) -> Array:
-        """Q for the filter: (L, B, N) or (N,)."""
+        """Return Q for the filter, (L, B, N) or (N,)."""
         q = np.asarray(np.exp(self.log_q) / self.weight_w)
         phi = self.structure.phi(dt)
         if phi is None:
@@ -86,7 +87,7 @@ class NoiseModel:
         return np.concatenate([q, np.broadcast_to(eta, q.shape)], axis=-1)
 
     def measurement(self, steps: int) -> Array:
-        """R for the filter: (L + 1, 1 or B, n)."""
+        """Return R for the filter, (L + 1, 1 or B, n)."""
         r = np.exp(self.log_r) / self.weight_v
         if r.ndim == 1:
             return np.broadcast_to(r, (steps + 1, 1, len(r)))
@@ -94,7 +95,7 @@ class NoiseModel:
 
     @property
     def plain(self) -> NoiseModel:
-        """Without weights, its variances what w and v come to with their outliers."""
+        """The same noise without weights, its variances those of w and v including outliers."""
         if isinstance(self.weight_w, float) or isinstance(self.weight_v, float):
             return self
         w, v = ((DOF + 1) / weight - DOF for weight in (self.weight_w, self.weight_v))
@@ -105,16 +106,16 @@ class NoiseModel:
         return replace(self, log_q=log_q, log_r=log_r, weight_w=1.0, weight_v=1.0)
 
     def start(self, runs: int) -> Array:
-        """Variance of the coloured part at t = 0, (B, 0 or n)."""
+        """Return the variance of the coloured part at t = 0, (B, 0 or n)."""
         if self.structure.tau is None:
             return np.zeros((runs, 0))
         return np.tile(np.exp(self.log_c), (runs, 1))
 
     def behind(self, now: Mapping[int, int]) -> NoiseModel:
-        """The same with what disturbs late logs in their true values of the moment, {log: true}.
+        """Move the process noise of delayed logs to their current true values, {log: true}.
 
-        A late log is an old true value and nothing else: what it seems to be disturbed by was seen
-        late. Were nothing to disturb the true value, no log would ever correct it.
+        A delayed log is just an old true value, so an apparent disturbance of it disturbed the true
+        value earlier. Without process noise the log would never correct the true value.
         """
         if not now:
             return self
@@ -124,16 +125,16 @@ class NoiseModel:
         return replace(self, log_q=log_q, log_c=log_q.copy(), floor=floor)
 
     def allowing(self, structure: Structure, dt: float) -> NoiseModel:
-        """The same noise, free to be coloured (or not): where its fit starts."""
+        """Return where a fit of the same noise with another structure starts."""
         if structure.tau is None:
             return replace(self, structure=structure)
-        # a tenth of the low-frequency power: summed over time c has about 2 tau / dt times its own
+        # a tenth of the low-frequency power: summed over time, c has about 2 tau / dt times its C
         share = math.log(0.1 * dt / (2 * structure.tau))
         log_c = np.maximum(self.log_q + share, self.floor)
         return replace(self, structure=structure, log_c=log_c)
 
     def towards(self, other: NoiseModel, part: float) -> NoiseModel:
-        """Part of the way to another noise of the same structure."""
+        """Return the noise a fraction `part` of the way to another of the same structure."""
         if part == 1.0 or other is self:
             return other
         logs = {
@@ -144,16 +145,17 @@ class NoiseModel:
 
 
 def noise_guess(residual: Array, seen: Array, scale: Array) -> NoiseModel:
-    """Variances from one-step residuals of the raw measurements, (L, B, n).
+    """Return initial variances from one-step residuals of the raw measurements, (L, B, n).
 
-    A residual's variance is about q + 2 r and its lag-one covariance -r; robust by medians.
+    A residual has a variance of about q + 2 r and a lag-one covariance of -r. Medians make the
+    estimate robust.
     """
     n = residual.shape[-1]
     floor = 2 * np.log(1e-6 * scale + 1e-300)
     log_q, log_r = np.empty(n), np.empty(n)
     for i in range(n):
         good = (seen[1:, :, i] > 0) & (seen[:-1, :, i] > 0)
-        steps = bool(good.any())  # else what is held from sample to sample is no step
+        steps = bool(good.any())  # else the residuals are those of held samples, not of steps
         good = good if steps else seen[1:, :, i] > 0
         e = residual[:, :, i]
         values = e[good]
@@ -164,7 +166,7 @@ def noise_guess(residual: Array, seen: Array, scale: Array) -> NoiseModel:
         lagged = float(np.mean((clipped[1:] * clipped[:-1])[both])) if both.any() else 0.0
         r = min(max(-lagged, 0.02 * total), 0.45 * total)
         log_r[i], log_q[i] = math.log(r), math.log(max(total - 2 * r, 0.05 * total))
-        if not values.size:  # never measured: from where its disturbance can be seen, up or down
+        if not values.size:  # never measured: large enough for the fit to move it either way
             log_q[i] = floor[i] + 2 * math.log(UNSEEN / 1e-6)
         if steps:
             floor[i] = max(floor[i], math.log(NOTHING * total))
@@ -174,7 +176,7 @@ def noise_guess(residual: Array, seen: Array, scale: Array) -> NoiseModel:
 
 
 def likelihood_slopes(noise: NoiseModel, adjoint: Adjoint, dt: float) -> Array:
-    """Slope d loglik / d log variance, (2 or 3, n): of w, v and, if any, the coloured part."""
+    """Return d loglik / d log variance, (2 or 3, n): of w, v and, if any, the coloured part."""
     n = len(noise.log_q)
     q, r = np.exp(noise.log_q) / noise.weight_w, np.exp(noise.log_r) / noise.weight_v
     parts = [(q, adjoint.r[..., :n], adjoint.N[..., :n]), (r, adjoint.u, adjoint.D)]
@@ -186,18 +188,18 @@ def likelihood_slopes(noise: NoiseModel, adjoint: Adjoint, dt: float) -> Array:
 
 
 def climbed(noise: NoiseModel, slope: Array, info: Array, count: int) -> NoiseModel:
-    """One step up the likelihood, all variances together.
+    """Take one scoring step in all variances together.
 
-    Along each principal direction of the information by itself, bounded there: so the step goes up
-    even where the information is poor. For one variance v of N numbers whose mean square is s, the
-    slope N (s / v - 1) / 2 over the average information N s / (2 v) is a = 1 - v / s; the step
-    -log(1 - a) leads to v = s at once, from however far.
+    The step is taken and bounded along each principal direction of the information separately, so
+    that it is an ascent step even where the information is poorly conditioned. For one variance v
+    of N numbers with mean square s, the slope N (s / v - 1) / 2 over the average information
+    N s / (2 v) is a = 1 - v / s; the step -log(1 - a) reaches v = s at once from any distance.
 
     Args:
-        noise: as it is.
-        slope: from `slopes`, (2 or 3, n).
-        info: (K, K) of all log variances.
-        count: time steps in all.
+        noise: the current noise.
+        slope: from `likelihood_slopes`, (2 or 3, n).
+        info: average information of all log variances (K, K).
+        count: number of time steps in all runs.
     """
     logs = np.stack(noise.logs[: len(slope)])
     free = ((logs > noise.floor) | (slope > 0)).reshape(-1)
@@ -211,7 +213,7 @@ def climbed(noise: NoiseModel, slope: Array, info: Array, count: int) -> NoiseMo
 
 
 def cleaned(noise: NoiseModel, adjoint: Adjoint) -> NoiseModel:
-    """One round of outlier weights: scales from the weighted disturbances, then new weights."""
+    """Do one round of outlier weights: variances from weighted disturbances, then new weights."""
     n = len(noise.log_q)
     q_t, r_t = np.exp(noise.log_q) / noise.weight_w, np.exp(noise.log_r) / noise.weight_v
     w2 = _moment(q_t, adjoint.r[..., :n], adjoint.N[..., :n])
@@ -230,7 +232,7 @@ def cleaned(noise: NoiseModel, adjoint: Adjoint) -> NoiseModel:
 
 
 def _moment(variance: Array, score: Array, cover: Array) -> Array:
-    """E[w^2] given the data."""
+    """Return E[w^2] given the data."""
     return np.maximum((variance * score) ** 2 + variance - variance**2 * cover, 0.0)
 
 
@@ -241,14 +243,14 @@ def working(
     dt: float,
     into: tuple[Array, Array],
 ) -> None:
-    """What each noise, as the smoother sees it, adds to d (L, B, n, K) and r (L + 1, B, n, K).
+    """Fill in the columns of d and r from which `average` computes the information.
 
     Args:
-        noise: K is 2 n, or 3 n with a coloured part.
-        adjoint: of the runs under this noise.
+        noise: the current noise; K is 2 n, or 3 n with a coloured part.
+        adjoint: the smoother's, of the runs under this noise.
         G: how noise enters (L, B, n, n), None for the identity.
-        dt: [s].
-        into: d and r, zeros.
+        dt: time step [s].
+        into: d (L, B, n, K) and r (L + 1, B, n, K), zeros.
     """
     L, B, n = adjoint.u.shape
     phi, i, (d, r) = noise.structure.phi(dt), np.arange(n), into
@@ -260,7 +262,8 @@ def working(
             np.multiply(G, sizes[..., None, :], out=d[..., at : at + n])
 
     enter(0, _scaled(noise.log_q, noise.weight_w, adjoint.r[..., :n]))
-    r[1:, ..., i, n + i] = -_scaled(noise.log_r, noise.weight_v, adjoint.u)  # d is foreseen, not r
+    # the opposite sign of d, which enters the prediction
+    r[1:, ..., i, n + i] = -_scaled(noise.log_r, noise.weight_v, adjoint.u)
     if phi is not None:
         kicks = np.exp(noise.log_c) * (1 - phi**2) * adjoint.r[..., n:]
         c = np.zeros((L, B, n))
@@ -274,6 +277,6 @@ def _scaled(log_variance: Array, weight: Array | float, adjoint: Array) -> Array
 
 
 def average(white: Array) -> Array:
-    """The average information (K, K) from whitened working columns (L, B, n, K)."""
+    """Return the average information (K, K) from the whitened columns of `working`."""
     flat = white.reshape(-1, white.shape[-1])
     return np.asarray(0.5 * flat.T @ flat)

@@ -1,11 +1,11 @@
-"""What a hypothesis predicts: the model, some effects with their values, its parameters shifted.
+"""Predictions of a hypothesis: the model with effects at given values and its parameters shifted.
 
     x_{t+1} = f_h(x_t, commands)        y_t = x_t + offset_h(x)
 
-Effects on inputs act on the command sequence of the whole trial, a joint's losses on what arrives
-of it at a step; rates act by Strang splitting, half before and half after the model's step, or,
-limits, on its mean rate; sensor effects act on what is compared with the log.
-The very equations that `grounded.effects.wrap` adopts, evaluated on arrays.
+Effects on inputs transform the command sequence of the whole trial. Losses of a joint reduce the
+input received in a step. Added rates act by Strang splitting, half before and half after the
+model's step; limits of rates act on its mean rate. Sensor effects change the output that is
+compared with the log. The equations are those of `grounded.effects.wrap`, evaluated on arrays.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ from grounded.engine import SentOnce
 from grounded.frozen import Array
 from grounded.rollout import each_stepped
 
-MOST_KEPT = 8_000_000  # numbers of inputs that a predictor keeps
-STEPS_KEPT = 16  # of a simulator
-LOADS_KEPT = 32_000  # states of which it keeps what losses are solved from
+MOST_KEPT = 8_000_000  # numbers in the cache of received inputs
+STEPS_KEPT = 16  # simulator steps in the cache
+LOADS_KEPT = 32_000  # states in the cache of `loads`
 
 
 @dataclass(frozen=True, eq=False)
 class Predictor(SentOnce):
-    """Evaluates hypotheses on one Data. Shapes: tracks (L + 1, B, n), inputs (L, B, m)."""
+    """Evaluate hypotheses on one `Data`. Shapes: tracks (L + 1, B, n), inputs (L, B, m)."""
 
     data: Data
     _inputs: dict[Any, Array] = field(default_factory=dict)
@@ -70,24 +70,24 @@ class Predictor(SentOnce):
 
     @cached_property
     def taken(self) -> Slopes:
-        """The slopes of a simulator that were taken."""
+        """The cache of a simulator's slopes."""
         model, scales = self.data.model, self.data.scales
         spreads = np.array([scales.spread(n) for n in model.state_names])
         peaks = np.array([scales.peak(n) for n in model.input_names])
         return self._taken or Slopes((spreads, peaks, np.abs(model.values) + param_scale(model)))
 
     def following(self) -> Predictor:
-        """One that keeps to the track of one hypothesis, where the model is a simulator."""
+        """Return a predictor whose caches follow one hypothesis' track, if a simulator; or self."""
         if not simulated(self.data.model):
             return self
         return replace(self, _taken=self.taken.following(), _loads={})
 
     def inputs(self, h: Hypothesis) -> Array:
-        """What the actuators receive under a hypothesis, by run (L, B, m)."""
+        """Return the inputs that the actuators receive under a hypothesis, by run (L, B, m)."""
         return self._kept("runs", h, lambda: self.data.runs(self.received(h)))
 
     def received(self, h: Hypothesis) -> Array:
-        """The same on whole trials, (S, T_max, m); zeros of those of which no run is kept."""
+        """Return the received inputs of whole trials, (S, T_max, m); zero if no run is kept."""
 
         def found() -> Array:
             data, whole = self.data.in_use, np.zeros_like(self.data.commands)
@@ -97,16 +97,16 @@ class Predictor(SentOnce):
         return self._kept("trials", h, found)
 
     def begun(self, h: Hypothesis) -> Array | None:
-        """What effects on inputs add to the memories that trials begin with, by run (B, n).
+        """Return what effects on inputs add to the initial memory states, by run (B, n).
 
-        None where the model has no memory, or a hypothesis no such effect.
+        None if the model has no memory states or the hypothesis no effects on inputs.
         """
         if not (self.data.hidden and self.acting(h)):
             return None
         return self._kept("begun", h, lambda: memories_moved(self.acting(h), self.data))
 
     def _kept(self, what: str, h: Hypothesis, make: Callable[[], Array]) -> Array:
-        """Made once for the same values."""
+        """Return the cached result for the same effects and values, or make it."""
         acting = self.acting(h)
         key = (what, *((e.name, tuple(sorted(v.items()))) for e, v in acting))
         if (found := self._inputs.get(key)) is None:
@@ -117,11 +117,11 @@ class Predictor(SentOnce):
 
     @staticmethod
     def acting(h: Hypothesis) -> list[tuple[Effect, Mapping[str, float]]]:
-        """The effects on inputs with their values, in the order in which they act."""
+        """Return the effects on inputs with their values, in the order in which they act."""
         return [h.pairs[i] for i in acting_order([effect.family for effect in h.effects])]
 
     def params(self, h: Hypothesis) -> Array:
-        """The model's parameters under a hypothesis (k,), or of each row (M, k)."""
+        """Return the model's parameters under a hypothesis (k,), or per row (M, k)."""
         p = np.array(self.data.model.values)
         if h.shift is not None:
             p = p + h.shift
@@ -134,7 +134,7 @@ class Predictor(SentOnce):
         return p
 
     def step(self, x: Array, u: Array, p: Array, dt: float | None = None) -> Array:
-        """The model's own step at any leading shape; of rows where each has its parameters."""
+        """Return the model's own step, any leading shape; with p (M, k), each row has its own."""
         rows, system = self.flat(x, u), self.data.model.system
         if p.ndim > 1:
             own = np.repeat(p, len(rows[0]) // max(1, len(p)), axis=0)
@@ -142,7 +142,7 @@ class Predictor(SentOnce):
             return moved.reshape(x.shape)
         if not simulated(self.data.model):
             return system.step(*rows, p, dt or self.data.dt).reshape(x.shape)
-        parts = (*rows, p, np.array(dt or self.data.dt))  # a simulator is slow: losses ask again
+        parts = (*rows, p, np.array(dt or self.data.dt))  # a simulator is slow and losses ask again
         key = blake2b(b"".join(part.tobytes() for part in parts)).digest()
         if (found := self._steps.get(key)) is None:
             if len(self._steps) >= STEPS_KEPT:
@@ -151,7 +151,7 @@ class Predictor(SentOnce):
         return found.reshape(x.shape).copy()
 
     def slopes(self, x: Array, u: Array, p: Array, dt: float | None = None) -> tuple[Array, Array]:
-        """Slopes of the model's own step at any leading shape: f_x (..., n, n), f_u (..., n, m)."""
+        """Return slopes of the model's own step: f_x (..., n, n), f_u (..., n, m)."""
         system = self.data.model.system
 
         def take(x: Array, u: Array) -> tuple[Array, ...]:
@@ -165,16 +165,16 @@ class Predictor(SentOnce):
         return f_x, f_u
 
     def flat(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """States (..., n) and inputs (..., m) as rows."""
+        """Return states (..., n) and inputs (..., m) as rows."""
         n, m = self.data.model.n, self.data.model.m
         return np.ascontiguousarray(x.reshape(-1, n)), np.ascontiguousarray(u.reshape(-1, m))
 
     def next(self, h: Hypothesis, x: Array) -> Array:
-        """f_h at the start of every step: x (L, B, n) -> (L, B, n)."""
+        """Return one step of a hypothesis from each x (L, B, n) of the track, (L, B, n)."""
         return self.advance(h, x, self.inputs(h), self.data.time)
 
     def advance(self, h: Hypothesis, x: Array, u: Array, t: Array) -> Array:
-        """One step of a hypothesis from x (..., n) with received inputs u (..., m) at times t."""
+        """Return one step of a hypothesis from x (..., n) with received u (..., m) at times t."""
         if medium := moving(h, self.seen):
             after = self.advance(medium.still, medium.through(x), u, t)
             return self.logged(h, x, medium.over(after, self.data.dt))
@@ -185,10 +185,10 @@ class Predictor(SentOnce):
         own = self.named((self.moved(h, x, u) - x) / dt) if needs_own else {}
         start = x + 0.5 * dt * self.added_rate(rates, x, u, t, own)
         after, mean = self.limited(h, start, u, t)
-        if needs_own:  # the mean over the very step: second order, steady where the model is stiff
+        if needs_own:  # mean over this step: second order, and stable for a stiff model
             own = self.named(mean)
         result = after + 0.5 * dt * self.added_rate(rates, after, u, t + dt, own)
-        for i, j in self.tied():  # a carried heading rate is the heading's rate, effects and all
+        for i, j in self.tied():  # a carried heading rate is the heading's rate, effects included
             found = []
             for s, when in ((x, t), (result, t + dt)):
                 rate = self.instant(h, s, u)
@@ -199,7 +199,7 @@ class Predictor(SentOnce):
         return self.logged(h, x, result)
 
     def logged(self, h: Hypothesis, x: Array, after: Array) -> Array:
-        """States after a step from x, or slopes of them, with late logs of where they went."""
+        """Return states after a step from x (or slopes of them) with delayed logs updated."""
         model = self.data.model
         return (
             after
@@ -208,9 +208,9 @@ class Predictor(SentOnce):
         )
 
     def marched(self, h: Hypothesis, x: Array, u: Array) -> Array | None:
-        """States (T + 1, M, n) from x (M, n) through u (T, M, m), of the model's steps alone.
+        """Roll the model out from x (M, n) with received u (T, M, m): states (T + 1, M, n).
 
-        None where a hypothesis adds to them, or the model is not compiled.
+        None if the hypothesis adds to the model's steps, or the model is not compiled.
         """
         march = getattr(self.data.model.system, "march", None)
         if march is None or adds_to_steps(h):
@@ -218,7 +218,7 @@ class Predictor(SentOnce):
         return np.asarray(march(x, u, self.params(h), self.data.dt))
 
     def moved(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
-        """The model's step with what its motion takes off the inputs, without further rates."""
+        """Return the model's step with the joints' losses, without added or limited rates."""
         if medium := moving(h, self.seen):
             x = medium.through(x)
             return medium.over(self.moved(medium.still, x, u, dt), dt or self.data.dt)
@@ -229,7 +229,7 @@ class Predictor(SentOnce):
         return after
 
     def left(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Left:
-        """What losses leave of inputs u (..., m) at x (..., n); what positions get (`ahead`)."""
+        """Return inputs u (..., m) less the losses at x (..., n), and position terms (`ahead`)."""
         pairs, names = losses_of(h), self.data.model.input_names
         if not pairs:
             return u, {}
@@ -240,12 +240,12 @@ class Predictor(SentOnce):
         return found, ahead(pairs, at, taken, dt, self.positions)
 
     def loads(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Loads:
-        """Of each loss: speed at the start, at the end without it, gains, the input (`joint`)."""
+        """Return what losses are solved from: speeds before, after without loss, gains, inputs."""
         names, p = self.data.model.input_names, self.params(h)
         drives = tuple(coupled(effect.site) for effect, _ in losses_of(h))
         rows = blake2b(x.tobytes() + u.tobytes() + p.tobytes()).digest()
         if (found := self._loads.get(key := (drives, dt, rows))) is not None:
-            return found  # other values of the losses at the same states: all is as it was
+            return found  # only the values of the losses differ, which this does not depend on
 
         def step(a: Named) -> Named:
             return self.named(self.step(x, np.stack([a[n] for n in names], axis=-1), p, dt))
@@ -254,7 +254,7 @@ class Predictor(SentOnce):
         slopes = self.taken.about(self.flat(x, u)[0]) if dt is None and self._taken else None
         if slopes is None:
             found = loads(losses_of(h), self.named(x), a, step)
-        else:  # what inputs do is known well enough from there
+        else:  # cached slopes by the inputs are accurate enough
             by_u = slopes[1].reshape(*x.shape, len(names))
             answers = {tau: self.named(by_u[..., names.index(tau)]) for tau, _ in drives}
             found = loads_from(losses_of(h), self.named(x), a, step(a), answers)
@@ -266,7 +266,7 @@ class Predictor(SentOnce):
     def loss_slopes(
         self, h: Hypothesis, x: Array, u: Array, f_x: Array, f_p: Array | None = None
     ) -> tuple[Array, Array]:
-        """Slopes of what losses take off the inputs: by state (..., m, n), parameter (..., m, k).
+        """Return slopes of the losses: by state (..., m, n) and by parameter (..., m, k).
 
         f_x, f_p: slopes of the model's own step (..., n, n), (..., n, k).
         """
@@ -292,7 +292,7 @@ class Predictor(SentOnce):
         return by_x, by_p
 
     def limited(self, h: Hypothesis, x: Array, u: Array, t: Array) -> tuple[Array, Array]:
-        """The model's step through the effects that limit its rates, and its mean rate."""
+        """Return the model's step under the effects that limit its rates, and its mean rate."""
         after, limits = self.moved(h, x, u), limits_of(h)
         free = (after - x) / self.data.dt
         if not limits:
@@ -314,20 +314,20 @@ class Predictor(SentOnce):
 
     @cached_property
     def seen(self) -> tuple[str, ...]:
-        """The states by the names under which physics sees their values (`seen_names`)."""
+        """State names as effects see them: a delayed log's current true value has its name."""
         return seen_names(self.data.model)
 
     def named(self, x: Array) -> Named:
-        """States, or their rates (..., n), by name."""
+        """Return states, or their rates (..., n), by name."""
         return Named("state", self.seen, [x[..., i] for i in range(len(self.seen))])
 
     def instant(self, h: Hypothesis, x: Array, u: Array) -> Array:
-        """The model's own rates at x (..., n), by a very short step."""
+        """Return the model's own rates at x (..., n), from a very short step."""
         short = 1e-3 * self.data.dt
         return np.asarray((self.moved(h, x, u, short) - x) / short)
 
     def tied(self) -> list[tuple[int, int]]:
-        """(heading, heading rate) where the rate is only carried along."""
+        """Return pairs (heading, heading rate) of rates that are only carried along."""
         names, model = self.seen, moved_model(self.data.model)
         key = ("tied",)
         if key not in self._inputs:
@@ -336,10 +336,10 @@ class Predictor(SentOnce):
         return [(int(i), int(j)) for i, j in self._inputs[key]]
 
     def added_rate(self, rates: Any, x: Array, u: Array, t: Array, own: Any) -> Array:
-        """Sum of the rates of (effect, values) pairs at x (..., n), (..., n) per second.
+        """Return the total rate that (effect, values) pairs add at x (..., n), (..., n) [1/s].
 
-        `own` are the model's own rates by name, for families that need them. In a medium that the
-        model says moves, they act on velocities through it (at the model's own values of it).
+        `own` are the model's own rates by name, for families that need them. If the model already
+        has a moving medium, the rates act on velocities through it, at the nominal values.
         """
         names, s = self.seen, self.named(x)
         if medium := medium_of(self.data.model):
@@ -359,7 +359,7 @@ class Predictor(SentOnce):
         return {name: float(param.value) for name, param in self.data.model.params.items()}
 
     def offset(self, h: Hypothesis, track: Array) -> Array | float:
-        """The log minus the state along a track (L + 1, B, n); 0.0 where sensors are right."""
+        """Return the log minus the state along a track (L + 1, B, n), 0.0 if sensors are exact."""
         names, dt, old = self.data.model.state_names, self.data.dt, track
         for i, tau in self.data.filters.items():
             old = old.copy()
@@ -373,7 +373,7 @@ class Predictor(SentOnce):
         return standing if old is track else standing + old - track
 
     def standing(self, h: Hypothesis, shown: Array) -> Array | float:
-        """What sensors add to what they are shown (..., n), however old it is; 0.0 if nothing."""
+        """Return what bias and scale of sensors add to the values they see (..., n), or 0.0."""
         sensors = [(e, v) for e, v in h.pairs if isinstance(e.family, SensorFamily)]
         if not sensors:
             return 0.0

@@ -1,4 +1,4 @@
-"""What added and limited rates make of the Jacobian of a step: A = d rate / d x (`linearise`)."""
+"""Jacobian of a step with added and limited rates, from A = d rate / d x (see `linearise`)."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects.sensed import behind_logs
 from grounded.frozen import Array
 
-SMALL = 1e-4  # of a state's spread: the difference that a slope is taken over
-STEEPEST = 1.0  # of a rate's own state, per half step
+SMALL = 1e-4  # finite-difference step as a fraction of a state's spread
+STEEPEST = 1.0  # most damping of a rate by its own state over half a step
 
 
 def with_effects(
     predictor: Predictor, h: Hypothesis, x: Array, u: Array, F: Array, after: Array | None = None
 ) -> Array:
-    """The Jacobian of a hypothesis' step from x (L, B, n); F (L, B, n, n) of the model alone."""
+    """Return the Jacobian of a hypothesis' step from x (L, B, n), given the model's own F."""
     one, data = np.eye(x.shape[-1]), predictor.data
     F = passed(predictor, h, x, u, F, one)
     if not rates_of(h) and not (limits_of(h) and predictor.tied()):
@@ -27,7 +27,7 @@ def with_effects(
     direct = rate_slopes(predictor, h, after, u, data.time + data.dt, None)
     later = F + half * direct @ F
     if any(e.family.needs_own for e, _ in rates_of(h)):
-        # at the end the model's own rate is still the mean of the step: a function of its start
+        # the model's own rate used at the end is the step's mean, a function of the start
         later += half * (rate_slopes(predictor, h, after, u, data.time + data.dt, mean) - direct)
     found = later @ (one + half * first)
     for heading, rate in predictor.tied():
@@ -40,7 +40,7 @@ def with_effects(
 
 
 def logged_slopes(predictor: Predictor, h: Hypothesis, F: Array) -> Array:
-    """The Jacobian of a step (..., n, n) with the rows of late logs of those of true values."""
+    """Return the Jacobian (..., n, n) with the rows of delayed logs made from the true values'."""
     if behind_logs(predictor.data.model) is None:
         return F
     columns = np.swapaxes(F, -1, -2)
@@ -56,10 +56,10 @@ def passed(
     slopes: Array,
     still: Array | float = 0.0,
 ) -> Array:
-    """What limits of rates leave of the model's slopes (L, B, n, k) from x (L, B, n).
+    """Return the model's slopes (L, B, n, k) from x (L, B, n) under limits of rates.
 
-    A state that moves as fast as it can no longer depends on the model: its slope is that of
-    standing `still` (n, k), for the part of the step that it does.
+    A state that moves at its limit no longer depends on the model. For that part of the step its
+    slope is `still` (n, k), that of a state at rest.
     """
     limits = limits_of(h)
     if not limits:
@@ -74,7 +74,7 @@ def passed(
             predictor.added_rate(limits, x, u, t, predictor.named(rate))
             for rate in (own, own + tiny)
         )
-        held += (more - added) / tiny / parts  # 0: free, -1: held back
+        held += (more - added) / tiny / parts  # 0: free, -1: at its limit
         x = x + dt * (own + added)
     return np.asarray(slopes + held[..., None] * (slopes - still))
 
@@ -89,10 +89,16 @@ def rate_slopes(
     *,
     now: bool = False,
 ) -> Array:
-    """Slope of the added rates (L, B, n, n) [1/s] at x (L, B, n).
+    """Return the slope of the added rates in the state, (L, B, n, n) [1/s], at x (L, B, n).
 
-    of_own: slope of the model's own rates, (L, B, n, n) or broadcastable; None: they stay.
-    now: of this very moment, limits too, not the mean over the step.
+    Args:
+        predictor: evaluates the hypothesis on the data.
+        h: the hypothesis.
+        x: states (L, B, n).
+        u: received inputs (L, B, m).
+        t: times (L, B) [s].
+        of_own: slope of the model's own rates, (L, B, n, n) or broadcastable; None: held constant.
+        now: use instantaneous rates, limits included, instead of means over the step.
     """
     rates, data = [*rates_of(h), *(limits_of(h) if now else [])], predictor.data
     n, half, names = x.shape[-1], 0.5 * data.dt, data.model.state_names
@@ -118,7 +124,7 @@ def rate_slopes(
 def heading_slope(
     predictor: Predictor, h: Hypothesis, x: Array, u: Array, t: Array, heading: int, rate: int
 ) -> Array:
-    """Slope of the heading's rate of this very moment, effects and all, (L, B, n) [1/s]."""
+    """Return the slope of the heading's instantaneous rate, effects included, (L, B, n) [1/s]."""
     short = 1e-3 * predictor.data.dt
     f_x, _ = predictor.slopes(x, u, predictor.params(h), short)
     one, name = np.eye(x.shape[-1]), predictor.seen[heading]

@@ -1,17 +1,18 @@
-"""Maximum likelihood of many hypotheses at once: effects, parameters, noise and track together.
+"""Maximum-likelihood fits of many hypotheses at once: effects, parameters, noise and track.
 
-For each hypothesis, again and again until nothing rises: predict along its own track; whiten by the
-Kalman filter; one Gauss-Newton step in the effects' values and the parameters' shifts; one scoring
-step in the noise; take the filtered track as the new track. All steps start from the best point so
-far, and one that does not rise is taken in part, so that nothing is lost by boldness (`Work`). A
-track that was filtered with a wrong model hides what is wrong with it, so every hypothesis gets its
-own.
+Each iteration of a fit predicts along the hypothesis' own track, whitens the residual with the
+Kalman filter, takes one Gauss-Newton step in the effects' values and the parameters' shifts and one
+scoring step in the noise, and makes the filtered track the new track. It repeats until the
+likelihood no longer rises. Each step starts from the best point so far; a step that does not raise
+the likelihood is shortened (`Work`). A track filtered with a wrong model hides the model's error,
+so every hypothesis has a track of its own.
 
-The shifts of the model's parameters have a normal prior and are integrated out (Laplace):
+The shifts of the model's parameters have a normal prior and are integrated out (Laplace), with G
+their Fisher information:
 
     log p(y | h) = loglik - shift' P shift / 2 - log det(1 + P^-1 G) / 2,   P = (spread scale)^-2
 
-All hypotheses of one noise structure step through time together, along the batch axis.
+All hypotheses with the same noise structure are filtered together, along the batch axis.
 """
 
 from __future__ import annotations
@@ -50,32 +51,32 @@ from grounded.filter.augmented import Delayed, joined
 from grounded.filter.kalman import LinearSystem
 from grounded.frozen import Array
 
-MOST_NUMBERS = 1e5  # of one (L, B, N, N) array: what fits in the cache goes fastest
-SHORTEST = 0.05  # part of a step that is still tried
-HALVED = 4  # iterations after which only the better half of rivals goes on
-CLOSE = 10.0  # nats behind the best within which all go on
-LITTLE = 0.1  # nats that part of a step must promise to be tried where the step fails
-NOTHING = 0.01  # nats: what promises less, after it hardly rose, is not tried at all
-LEAST = 1.0  # nats: less is hardly a rise
+MOST_NUMBERS = 1e5  # size of one (L, B, N, N) array of a block; what fits in the cache is fastest
+SHORTEST = 0.05  # smallest fraction of a step that is tried
+HALVED = 4  # iterations after which only the better half of rivals continues
+CLOSE = 10.0  # nats behind the best within which all rivals continue
+LITTLE = 0.1  # nats that a shortened step must promise to be tried
+NOTHING = 0.01  # nats: after a rise below LEAST, a step that promises less is not tried
+LEAST = 1.0  # nats: smaller rises may end a fit
 
 
 @dataclass(eq=False)
 class Work:
-    """One hypothesis on its way: mutable, private to this module."""
+    """The state of the fit of one hypothesis: mutable, private to this module."""
 
     h: Hypothesis
     noise: NoiseModel
     track: Array
     best: Fitted | None = None
     step: ProposedStep | None = None
-    part: float = 1.0  # of the step that is taken
-    still: bool = False  # it no longer rises
+    part: float = 1.0  # fraction of the step that is taken
+    still: bool = False  # the likelihood no longer rises
     given_up: bool = False  # too far behind its rivals
-    moving: bool = True  # the track too: where the model has kinks that may not help
-    along: Predictor | None = None  # of its own track, while it climbs
+    moving: bool = True  # the track moves with the step; at kinks of the model this may not help
+    along: Predictor | None = None  # predictor of its own track, during the fit
 
     def shorten(self, data: Data) -> None:
-        """The same step about the track as it was; then parts of it; then the end."""
+        """Retry the step with the track held, then shorter ones; stop if they are too short."""
         if self.moving:
             self.moving = False
         else:
@@ -87,11 +88,11 @@ class Work:
 
     @property
     def hope(self) -> float:
-        """Nats that the part of the step that is taken next promises."""
+        """The gain that the quadratic model expects of the next (shortened) step [nats]."""
         return 0.0 if self.step is None else self.step.promise * self.part * (2 - self.part)
 
     def go(self, data: Data) -> None:
-        """From the best point by a part of the step."""
+        """Move from the best point by the current fraction of the step."""
         assert self.best is not None
         assert self.step is not None
         best, step, part = self.best, self.step, self.part
@@ -111,15 +112,18 @@ def refine(
     fixed_noise: bool = False,
     worth: Callable[[Fitted], float] | None = None,
 ) -> list[Fitted]:
-    """Refines hypotheses that share a noise structure; the result has the same order.
+    """Fit hypotheses that share a noise structure.
 
     Args:
-        predictor: the data.
-        starts: fits to go on from, or (hypothesis, noise, track).
-        iterations: at most; a hypothesis that stopped rising is left alone.
-        tick: called as one or a few of them are done.
+        predictor: evaluates hypotheses on the data.
+        starts: fits to continue, or (hypothesis, noise, track).
+        iterations: most iterations; a fit whose likelihood no longer rises stops earlier.
+        tick: called whenever a block of fits is done.
         fixed_noise: keep the noise as it is.
-        worth: of rivals, by which the worse half is given up on the way; None: all go on.
+        worth: value of a rival; after a few iterations the worse half stops. None: all continue.
+
+    Returns:
+        The fits, in the order of `starts` (without those that could not be filtered at all).
     """
     works = [
         Work(s.hypothesis, s.noise, s.track, s if s.settled else None, still=s.settled)
@@ -148,9 +152,9 @@ def _after(
     size: int,
     tick: Callable[[], None] | None,
 ) -> list[Work]:
-    """The works after some iterations, blocks of at most `size` of one shape side by side.
+    """Run some iterations of all works, in blocks of at most `size` with filters of one shape.
 
-    `how`: so many iterations; whether the noise is fixed; whether no more will follow.
+    `how`: number of iterations; whether the noise is fixed; whether these are the last ones.
     """
     shapes = _of_one_shape(works, predictor.data)
     blocks = [a[at : at + size] for a in shapes for at in range(0, len(a), size)]
@@ -166,14 +170,14 @@ def _after(
 
 
 def _begun(predictor: Predictor, work: Work) -> Predictor:
-    """One from whose slopes, at where a work stands, all others set out."""
+    """Return a predictor with the slopes at one work's point cached, shared by all others."""
     begun = predictor.following()
     sensitivities_of(begun, work.h, work.track[:-1], begun.inputs(work.h))
     return begun
 
 
 def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool, bool]) -> list[Work]:
-    """Refines hypotheses of one shape, side by side."""
+    """Run the iterations of a block of works whose filters have one shape."""
     iterations, fixed_noise, last = how
     works = [replace(work, along=predictor.following()) for work in works]
     for left in range(iterations, 0, -1):
@@ -183,7 +187,7 @@ def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool, bool])
 
 
 def _halve(works: list[Work], worth: Callable[[Fitted], float]) -> None:
-    """The worse half stays where it is: who is that far behind by now does not overtake."""
+    """Give up the works in the worse half that are also more than CLOSE nats behind the best."""
     value = {id(work): worth(work.best) for work in works if work.best is not None}
     ranked = sorted(value.values(), reverse=True)
     for work in works:
@@ -193,7 +197,7 @@ def _halve(works: list[Work], worth: Callable[[Fitted], float]) -> None:
 
 
 def _of_one_shape(works: list[Work], data: Data) -> list[list[int]]:
-    """Indices of works that go on, by the size of their filters' states: so many late sensors."""
+    """Group the indices of unfinished works by the number of delayed sensors in their filters."""
     groups: dict[int, list[int]] = {}
     for i, work in enumerate(works):
         if work.still or work.given_up:
@@ -228,7 +232,7 @@ def _iterate(
     except np.linalg.LinAlgError:
         if len(works) == 1:
             works[0].still = True
-        else:  # one of them diverged: each alone
+        else:  # one of them diverged: filter each separately
             for work in works:
                 _iterate(predictor, [work], fixed_noise, last=last)
         return
@@ -247,7 +251,7 @@ def _iterate(
         fit = _scored(predictor, work, columns, g.logdet[:, there], error, before)
         if (rise := _rises(work, fit)) == 0:
             work.shorten(data)
-        elif not (last and rise >= LEAST):  # no step follows; nor is it still
+        elif not (last and rise >= LEAST):  # else it has not converged, and no step follows
             rises[i] = rise
     if not rises:
         return
@@ -275,7 +279,7 @@ def _climbed(
     g: kalman.Gains,
     white: Array,
 ) -> list[tuple[NoiseModel, float]]:
-    """Each work's noise after one step up the likelihood, and what it promises [nats]."""
+    """Return each work's noise after one scoring step, and the expected gain [nats]."""
     B, width = data.time.shape[1], data.model.n
     adjoints = kalman.smoother(g, white).parts(B)
     K = width * (2 if works[0].noise.structure.tau is None else 3)
@@ -299,7 +303,7 @@ def _climbed(
 
 
 def clean(predictor: Predictor, fit: Fitted, rounds: int = 8) -> Fitted:
-    """The same hypothesis with outliers weighed down, its noise fitted to the rest."""
+    """Return the fit of the same hypothesis with outliers weighted down, its noise refitted."""
     work = Work(fit.hypothesis, fit.noise, fit.track)
     for _ in range(rounds):
         if not np.isfinite(work.track).all():
@@ -324,7 +328,7 @@ def clean(predictor: Predictor, fit: Fitted, rounds: int = 8) -> Fitted:
 
 
 def _rises(work: Work, fit: Fitted) -> float:
-    """How far the point where the work stands is above its best so far; then it is kept."""
+    """Return the rise over the best point so far, 0.0 for none; keep the point if it rose."""
     rise = np.inf if work.best is None else fit.evidence - work.best.evidence
     if not (rise > 0 and np.isfinite(fit.evidence) and np.isfinite(fit.gram).all()):
         return 0.0
@@ -343,7 +347,7 @@ def _scored(
     error: Array,
     before: float,
 ) -> Fitted:
-    """The point where a work stands; the residual is the first of its columns."""
+    """Return a fit for the current point, from its whitened columns (residual first)."""
     data, h = predictor.data, work.h
     residual, columns = white[..., 0], white[..., 1:]
     L, B, n, C = columns.shape
@@ -373,6 +377,6 @@ def _scored(
         score=score,
         rss=rss,
         logdet=run_logdet,
-        white=residual.copy(),  # not a view: it would keep all columns
+        white=residual.copy(),  # a view would keep all columns in memory
         states=work.track + error,
     )

@@ -1,15 +1,15 @@
-"""A simulator as the crude model: its step takes microseconds, a compiled one nanoseconds.
+"""Caches for a simulator as the crude model, whose step takes microseconds instead of nanoseconds.
 
-A diagnosis asks for thousands of steps along much the same tracks, so what was found is used again:
+A diagnosis evaluates thousands of steps along nearly the same tracks, so results are reused:
 
-`Slopes`    of a step, at the same samples; and along the track of one hypothesis that climbs, they
-            are taken anew where it moved by more than NEAR of what the log spans. A filter is
-            linearised about a track that is no nearer to the truth than that
-`tangent`   steps from samples close by, with a value nudged or an input changed, by these slopes
-`carried`   one step after the other, with what joints lose
+`Slopes`    of steps from the same samples. Along the track of a hypothesis during its fit, slopes
+            are taken anew only where it moved by more than NEAR of the range of the log; the track
+            that the filter is linearised about is no more accurate than that
+`tangent`   steps from samples nearby, with a value or an input changed slightly, by these slopes
+`carried`   rollouts with losses of joints
 
-Each hypothesis that climbs follows its own track (`Slopes.following`), from the slopes at the first
-of those that climb together (`refine`), so that it does not matter what else is fitted, or where.
+Each fit follows its own track (`Slopes.following`), from the slopes at the first of the hypotheses
+fitted together (`refine`). So its result does not depend on which others are fitted, or where.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from grounded.compile.run.differenced import DifferencedSystem
 from grounded.frozen import Array
 from grounded.model import Model
 
-NEAR = 0.01  # of the spread of a state, the peak of an input, the size of a parameter
-KEPT = 24  # sets of slopes
+NEAR = 0.01  # fraction of a state's spread, an input's peak or a parameter's size
+KEPT = 24  # sets of slopes in the cache
 
 Take = Callable[[Array, Array], tuple[Array, ...]]  # x (N, n), u (N, m) -> slopes (N, ...)
 
 
 def simulated(model: Model) -> bool:
-    """Whether a model is a black box whose steps are called one after the other."""
+    """Check whether a model is a black box, without compiled steps and derivatives."""
     return isinstance(model.system, DifferencedSystem)
 
 
 @dataclass(frozen=True, eq=False)
 class _Taken:
-    """Slopes, and where each row of them was taken."""
+    """Slopes, and the point at which each row of them was taken."""
 
     x: Array
     u: Array
@@ -47,18 +47,18 @@ class _Taken:
 
 @dataclass(eq=False)
 class Slopes:
-    """The slopes of a simulator that were taken."""
+    """A cache of a simulator's slopes."""
 
     unit: tuple[Array, Array, Array]  # of states, inputs, parameters
     same: dict[bytes, tuple[Array, ...]] = field(default_factory=dict)
-    near: dict[bool, _Taken] | None = None  # with those of the parameters, or without
+    near: dict[bool, _Taken] | None = None  # key: whether slopes by parameters are included
 
     def following(self) -> Slopes:
-        """Those of one track, however it moves, from where these stand."""
+        """Return a cache that follows one track, starting from these slopes."""
         return Slopes(self.unit, self.same, dict(self.near or {}))
 
     def at(self, take: Take, x: Array, u: Array, p: Array, full: bool) -> tuple[Array, ...]:
-        """The slopes at x (N, n), u (N, m), parameters p (k,); `full` where they are among them."""
+        """Return slopes at x (N, n), u (N, m), p (k,); `full`: with those by the parameters."""
         near = self.near or {}
         old = near.get(full) or near.get(True)
         if old is None or old.x.shape != x.shape or self._far(2, p, old.p).any():
@@ -79,7 +79,7 @@ class Slopes:
         return found
 
     def about(self, x: Array) -> tuple[Array, ...] | None:
-        """Those that stand for as many rows as x (N, n), wherever they were taken."""
+        """Return the cached slopes of as many rows as x (N, n), wherever taken, or None."""
         old = (self.near or {}).get(True) or (self.near or {}).get(False)
         return old.found if old is not None and old.x.shape == x.shape else None
 
@@ -91,7 +91,7 @@ class Slopes:
         if (found := self.same.get(key)) is None:
             found = take(x, u)
         self.same.pop(key, None)
-        self.same[key] = found  # the last that was asked for goes last
+        self.same[key] = found  # least recently used first
         for old in list(self.same)[:-KEPT]:
             self.same.pop(old, None)
         return found

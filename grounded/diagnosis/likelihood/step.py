@@ -1,9 +1,10 @@
-"""The step that is proposed at a hypothesis' best point: its values, shifts, track and noise.
+"""The next step of a fit: values of the effects, shifts of the parameters, track and noise.
 
-Gauss-Newton within bounds: values stay inside theirs, parameters keep their sign or their user's
-limits, scanned values move by a few grid gaps at once. All of it bounds the step itself: what is
-clipped afterwards leaves the others relying on a move that is not made, and where two are tied (a
-viscous friction, a motor's gain) such a step leads down, and the fit ends where it began.
+The step in values and shifts is Gauss-Newton within bounds. Values stay inside their own,
+parameters keep their sign or the user's bounds, scanned values move by a few grid gaps at most.
+The bounds are part of the least-squares problem. Clipping the unbounded step instead would leave
+the other unknowns relying on a move that is not made. Where two unknowns are strongly correlated (a
+viscous friction, a motor's gain) the clipped step lowers the likelihood and the fit gets stuck.
 """
 
 from __future__ import annotations
@@ -19,26 +20,32 @@ from grounded.diagnosis.likelihood.linearise import step_sizes
 from grounded.diagnosis.likelihood.noise import NoiseModel
 from grounded.frozen import Array
 
-LEAP = 0.3  # of a parameter's scale that its shift moves at once
-GAPS = 20  # differences, two gaps of its grid, that a scanned value moves at once
+LEAP = 0.3  # most that a parameter's shift moves in one step, in units of its scale
+GAPS = 20  # most that a scanned value moves in one step, in units of `step_sizes` (two grid gaps)
 
 
 @dataclass(eq=False)
 class ProposedStep:
-    """A step proposed at the best point: of values, shifts, track; the noise it leads to."""
+    """A step from the best point in values, shifts and track, and the noise that it leads to."""
 
     delta: Array  # (C,) of the values, then of the shifts in units of param_scale
     track: Array
     noise: NoiseModel
-    promise: float  # nats that the quadratic model expects of it
+    promise: float  # gain expected by the quadratic model [nats]
 
 
 def proposed(
     data: Data, fit: Fitted, filtered: Array, noise: NoiseModel, promise: float
 ) -> ProposedStep:
-    """Gauss-Newton in values and shifts, scoring in the noise, the filtered track as the track.
+    """Propose a step: Gauss-Newton in values and shifts; track and noise are given.
 
-    `promise` is what the noise's part of the step is expected to gain [nats].
+    Args:
+        data: the data.
+        fit: the best point so far.
+        filtered: the filtered columns (L + 1, B, n, 1 + C): the track's correction, and its
+            derivatives by the values and shifts.
+        noise: the noise after its scoring step.
+        promise: the gain expected of the step in the noise [nats].
     """
     h = fit.hypothesis
     G = fit.gram.sum(axis=0) + np.diag(fit.prior)
@@ -55,11 +62,11 @@ def proposed(
 
 
 def bounded(G: Array, slope: Array, low: Array, high: Array) -> Array:
-    """The Gauss-Newton step -G^-1 slope within low <= step <= high, (K,) each.
+    """Return the Gauss-Newton step -G^-1 slope within low <= step <= high, (K,) each.
 
-    An unknown that would leave its bounds stops there, and the others step as is best with it
-    there: clipped afterwards, they would rely on a move that is not made. One whose slope is no
-    number (a value at which the effect overflows) does not move.
+    An unknown that would leave its bounds is fixed at the bound, and the step of the others is
+    solved again. One whose slope is not finite (a value at which the effect overflows) does not
+    move.
     """
     delta, free = np.zeros(len(slope)), np.isfinite(np.diag(G)) & np.isfinite(slope)
     G, slope = np.where(np.outer(free, free), G, 0.0), np.where(free, slope, 0.0)
@@ -77,7 +84,7 @@ def bounded(G: Array, slope: Array, low: Array, high: Array) -> Array:
 
 
 def room(data: Data, h: Hypothesis, size: int) -> tuple[Array, Array]:
-    """How far each unknown may step down and up inside its bounds, (size,): values, then shifts."""
+    """Return how far each unknown may step down and up within its bounds: values, then shifts."""
     low, high, k = np.full(size, -np.inf), np.full(size, np.inf), len(h.theta)
     free = [q for e in h.effects for q in e.free]
     low[:k] = np.minimum([q.low for q in free] - h.theta, 0.0)
@@ -93,7 +100,7 @@ def room(data: Data, h: Hypothesis, size: int) -> tuple[Array, Array]:
 
 
 def _far(h: Hypothesis, size: int) -> Array:
-    """How far each unknown moves at once, (size,): between grid points anything may be."""
+    """Return the largest step of each unknown, (size,): for scanned values a few grid gaps."""
     far, free = np.full(size, LEAP), [q for e in h.effects for q in e.free]
     gaps = [GAPS * s if q.grid else np.inf for s, q in zip(step_sizes(h), free, strict=True)]
     far[: len(gaps)] = gaps
@@ -101,12 +108,12 @@ def _far(h: Hypothesis, size: int) -> Array:
 
 
 def inside(data: Data, shift: Array) -> Array:
-    """Keeps parameters inside their bounds."""
+    """Return the shift (k,) clipped so that the parameters stay inside their bounds."""
     values = data.model.values
     return np.asarray(np.clip(values + shift, *_bounds(data)) - values)
 
 
 def _bounds(data: Data) -> tuple[Array, Array]:
-    """The `reach` of the model's parameters, (k,) each."""
+    """Return the lower and upper `reach` of the model's parameters, (k,) each."""
     ends = np.array([p.reach for p in data.model.params.values()], float).reshape(-1, 2)
     return ends[:, 0], ends[:, 1]

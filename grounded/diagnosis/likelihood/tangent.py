@@ -1,4 +1,4 @@
-"""Steps of a simulator to first order: what a nudged value does, without asking it again."""
+"""First-order steps of a simulator, for finite differences without calling it again."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from grounded.frozen import Array
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Tangent(Predictor):
-    """A predictor whose model is linear about x (L, B, n), u (L, B, m); to compare with itself."""
+    """A predictor whose model is linear about x (L, B, n), u (L, B, m).
+
+    For differences between its own predictions only.
+    """
 
     x: Array
     u: Array
@@ -24,7 +27,7 @@ class Tangent(Predictor):
     slopes_there: tuple[Array, Array]
 
     def step(self, x: Array, u: Array, p: Array, dt: float | None = None) -> Array:
-        """The model's own step, by slopes where it is one of this track's."""
+        """Return the model's own step: linearised along this track, the simulator's elsewhere."""
         if dt is not None or x.shape != self.x.shape or not np.array_equal(p, self.p):
             return super().step(x, u, p, dt)
         f_x, f_u = self.slopes_there
@@ -33,7 +36,7 @@ class Tangent(Predictor):
 
 
 def tangent(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Predictor:
-    """Predicts from near x (L, B, n) with inputs near u (L, B, m); a compiled model as ever."""
+    """Return a predictor linearised about x (L, B, n), u (L, B, m), if the model is a simulator."""
     if not simulated(predictor.data.model):
         return predictor
     if medium := moving(h, predictor.seen):

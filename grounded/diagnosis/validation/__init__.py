@@ -1,17 +1,20 @@
-"""Evidence proposes, held-out predictions decide: what is claimed, in units, and how sure.
+"""Validation on held-out trials: which of the likely effects are claimed, and how certain they are.
 
-Read from the measurement to what is said of it:
+The modules, from the measurement to the claims:
 
-    ruler              held-out open-loop errors over 0.1, 0.5, 1 s and whole runs, in units
-    gain               what one hypothesis predicts better than another
-    visits             where an effect acts, and whether few trials show it
-    motions            in how many motions that differ an effect is seen
-    decide             the ruler's decision on what the evidence proposes
-    measured           what a decision is said to be worth
-    held_out           the gap and utilities on other trials
-    prediction_error   where the gap lies
-    split              what the error is made of
-    claims             what is claimed, with intervals
-    limits             what the data can't tell
-    agreement          whether the trials agree; what changed between two groups
+    ruler              held-out open-loop errors over 0.1, 0.5, 1 s and whole trials, in units
+    ahead              the open-loop predictions themselves
+    gain               improvement of one hypothesis over another, and its scatter
+    single_steps       the same by one-step likelihoods, each trial left out in turn
+    visits             where an effect acts, and whether only few trials show it
+    motions            in how many different motions an effect is seen
+    decide             the decision between likely hypotheses, by the ruler
+    measured           errors, noise floor, credit and leftover of a decision
+    held_out           the noise-normalised gap and utilities, held out
+    prediction_error   where the gap is, by channel, time and region
+    split              explained, unexplained and irreducible parts of the error
+    claims             the claimed effects with intervals, their rivals and look-alikes
+    averaged           intervals averaged over models
+    limits             what the data can't determine
+    agreement          whether the trials agree; changes between two groups of trials
 """

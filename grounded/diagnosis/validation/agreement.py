@@ -1,22 +1,21 @@
-"""Do the trials agree? Every claimed value by trial, and what changed between two groups of trials.
+"""Agreement between trials: every claimed value by trial, and changes between groups of trials.
 
-At the values that are most likely on all trials, a group of runs has the score s and the
-information G of its own, so that by itself it would have the value
+At the values most likely on all trials, each group g of runs has its own score s_g and information
+G_g. With all other values held, the group alone would give the value
 
-    theta_g = theta - s_g / G_g,     standard deviation 1 / sqrt(G_g),
+    theta_g = theta - s_g / G_g,     standard deviation 1 / sqrt(G_g).
 
-all other values as they are. That the groups share one value is tested by
+The hypothesis that all groups share one value is tested by
 
     chi2 = sum_g s_g^2 / G_g - (sum_g s_g)^2 / sum_g G_g,    groups - 1 degrees of freedom.
 
-A model that is not quite right makes more of it than chance, so trials disagree only where the
-chance is small and the values are far apart.
+An imperfect model increases chi2 beyond chance, so trials are said to disagree only if the p-value
+is small and the values are far apart.
 
-Between two groups the difference of their values, by its standard error, is the evidence of a
-change. The error is at least what leaving each trial out in turn says of it (Efron & Stein, "The
-jackknife estimate of variance", Annals of Statistics 9, 1981), and trials that are left out must be
-likelier with the change. The greatest is taken first, and what it explains of the others is taken
-off them.
+Between two groups, the difference of their values relative to its standard error is the evidence of
+a change. The standard error is at least that of the jackknife over trials (Efron & Stein, "The
+jackknife estimate of variance", Annals of Statistics 9, 1981), and held-out trials must be likelier
+with the change. Changes are found by forward selection, the largest first, each given those before.
 """
 
 from __future__ import annotations
@@ -34,28 +33,28 @@ from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.report import Agreement, Changed, Estimate, TrialValue
 from grounded.frozen import Array
 
-CHANCE = 1e-3  # of all trials sharing a value: below it they don't
-APART = 0.05  # of the value, and of the standard deviation beyond chance
-OFF = 3.0  # standard deviations of a trial that is off
-GOES_WITH = 0.8  # correlation from which a value goes with a condition
-CHANGE = 5.0  # nats
-RIVALS = 8  # hypotheses of one and of two effects that are asked for a change too
+CHANCE = 1e-3  # p-value of a common value below which trials disagree, if
+APART = 0.05  # their scatter beyond chance is more than this fraction of the value
+OFF = 3.0  # standard deviations from which a single trial is off
+GOES_WITH = 0.8  # correlation from which a value depends on a condition
+CHANGE = 5.0  # nats from which a change is stated
+RIVALS = 8  # hypotheses of one, and of two effects, that are also tested for changes
 
 
 @dataclass(frozen=True)
 class _Value:
-    """One free value: a column of the fit."""
+    """A free value, which is a column of the fit."""
 
     effect: str
     quantity: str
     unit: str
     value: float
-    scale: float  # of the column: its own unit for each unit of the fit's
+    scale: float  # units of the value per unit of the column
     column: int
 
 
 def _values(fit: Fitted, data: Data, blamed: Sequence[str]) -> list[_Value]:
-    """The claimed effects' free values, and the parameters that were calibrated or blamed."""
+    """Return the free values of the claimed effects, and the blamed parameters of a calibration."""
     found, at, h = [], 0, fit.hypothesis
     for effect, values in h.pairs:
         for q in effect.free:
@@ -74,7 +73,7 @@ def _values(fit: Fitted, data: Data, blamed: Sequence[str]) -> list[_Value]:
 
 
 def _by_group(fit: Fitted, group: Any, count: int) -> tuple[Array, Array]:
-    """Scores (g, C) and information (g, C, C) of groups of runs (B,)."""
+    """Return the scores (g, C) and the information (g, C, C) of groups of runs (B,)."""
     s = np.array([fit.score[group == g].sum(axis=0) for g in range(count)])
     G = np.array([fit.gram[group == g].sum(axis=0) for g in range(count)])
     return s, G
@@ -83,12 +82,12 @@ def _by_group(fit: Fitted, group: Any, count: int) -> tuple[Array, Array]:
 def by_trial(
     fit: Fitted, data: Data, blamed: Sequence[str]
 ) -> tuple[tuple[TrialValue, ...], tuple[Agreement, ...]]:
-    """Every claimed value by trial, and whether the trials agree.
+    """Return every claimed value by trial, and tests of whether the trials agree.
 
     Args:
         fit: the best hypothesis.
         data: its trials.
-        blamed: parameters that the verdict names, `parameter:L`.
+        blamed: parameters named by the verdict, such as `parameter:L`.
     """
     from scipy.special import chdtrc
 
@@ -121,7 +120,7 @@ def by_trial(
 
 
 def _goes_with(data: Data, some: Any, own: Array) -> str:
-    """What a value that differs rises or falls with: the trials' order, a signal's mean."""
+    """Return what a differing value correlates with (order of trials, mean of a signal), or ""."""
     if len(some) < 5:
         return ""
     edges = np.cumsum([0, *(data.lengths + 1)])
@@ -142,22 +141,22 @@ def _goes_with(data: Data, some: Any, own: Array) -> str:
 
 @dataclass(frozen=True)
 class Compared:
-    """Two groups of trials: the values that differ, and those that do not."""
+    """A comparison of two groups of trials: the values that differ, and those that do not."""
 
     changed: tuple[Changed, ...]
     unchanged: tuple[Changed, ...]
 
 
 def compared(search: HypothesisSearch, best: Fitted, first: Sequence[bool]) -> Compared:
-    """What differs between two groups of trials, the greatest evidence first.
+    """Return what differs between two groups of trials, largest evidence first.
 
-    What one group alone has may be too little for all trials together: so every hypothesis that
-    was weighed is asked, and the one counts that is likeliest with its changes.
+    An effect of one group alone may be too weak to be claimed on all trials. So the likeliest
+    hypotheses are tested for changes, too, and the one that is likeliest with its changes counts.
 
     Args:
-        search: of the data of all trials.
+        search: the search on the data of all trials.
         best: the hypothesis that was chosen.
-        first: which trials are of the first group (S,).
+        first: mask of the trials of the first group (S,).
     """
     fits = [best, search.best_null()]
     fits += [fit for size in (1, 2) for fit in search.of_size(size)[:RIVALS]]
@@ -170,7 +169,7 @@ def compared(search: HypothesisSearch, best: Fitted, first: Sequence[bool]) -> C
 
 
 def _compared(fit: Fitted, data: Data, first: Sequence[bool]) -> Compared:
-    """The same of one hypothesis; a change must be told by the trials that are left out, too."""
+    """Compare two groups under one hypothesis; held-out trials must support each change."""
     from scipy.special import chdtrc
 
     group = np.where(np.asarray(first)[data.trial_of], 0, 1)
@@ -203,21 +202,21 @@ def _compared(fit: Fitted, data: Data, first: Sequence[bool]) -> Compared:
 
 
 def _units(trial_of: Array, group: Array) -> Array:
-    """What is left out in turn, (B,): trials; where a group has one, the pieces of its record."""
+    """Return the jackknife unit of each run, (B,): its trial, or itself if a group has only one."""
     alone = [len(np.unique(trial_of[group == g])) < 2 for g in (0, 1)]
     return np.asarray(np.arange(len(trial_of)) if any(alone) else trial_of, float)
 
 
 @dataclass(frozen=True)
 class _Difference:
-    """Of one column between the groups, beside those that differ already."""
+    """The difference of one column between the groups, given those that differ already."""
 
     shifts: Array  # (2,) from the common value
     stds: Array  # (2,)
 
     @property
     def evidence(self) -> float:
-        """Half of chi-squared with one degree of freedom [nats]."""
+        """Half of a chi-squared with one degree of freedom [nats]."""
         square = float((self.stds**2).sum())
         apart = float(self.shifts[0] - self.shifts[1]) ** 2
         return 0.5 * apart / square if 0 < square < np.inf else 0.0
@@ -226,7 +225,7 @@ class _Difference:
 def _difference(
     fit: Fitted, group: Array, taken: Sequence[int], k: int, units: Array
 ) -> _Difference:
-    """A column's own value in each group; as uncertain as leaving units out says, at least."""
+    """Return a column's value in each group, with at least the jackknife's standard error."""
     columns = [*taken, k]
     shifts, stds = np.zeros(2), np.full(2, np.inf)
     for g in (0, 1):
@@ -251,7 +250,7 @@ def _difference(
 
 
 def _pays(fit: Fitted, group: Array, taken: Sequence[int], k: int, units: Array) -> bool:
-    """Whether units that are left out are likelier where the groups differ in a column, too."""
+    """Check whether held-out units are likelier if the groups also differ in a column."""
     if min(len(np.unique(units[group == g])) for g in (0, 1)) < 2:
         return True  # nothing can be left out
     gain = 0.0
@@ -272,7 +271,7 @@ def _pays(fit: Fitted, group: Array, taken: Sequence[int], k: int, units: Array)
 def _fitted(
     fit: Fitted, group: Array, used: Array, common: list[int], apart: list[int], g: int
 ) -> Array:
-    """The values (C,) of a group where some columns are common to both and some are not."""
+    """Return the values (C,) of group g, with some columns common to both and some separate."""
     C = fit.score.shape[1]
     count = len(common) + 2 * len(apart)
     N, b = np.zeros((count, count)), np.zeros(count)

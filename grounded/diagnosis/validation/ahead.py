@@ -1,7 +1,7 @@
-"""Open-loop predictions from many moments of the log at once, and by how much they miss it.
+"""Errors of open-loop predictions from many moments of the log at once.
 
-Each moment may have a hypothesis of its own: those of the folds differ in their numbers alone, so
-all folds step together, and a step costs little more than one fold's.
+Each moment may have its own hypothesis. Those of different folds differ only in their values, so
+all folds are stepped together at little more than the cost of one.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from grounded.diagnosis.likelihood.marching import marched
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.frozen import Array
 
-FAR = 1e6  # a state beyond it has diverged
+FAR = 1e6  # size of a state above which it has diverged
 
 
 def missed(
@@ -31,17 +31,20 @@ def missed(
     steps: int,
     added: Array | None = None,
 ) -> Array:
-    """Y - prediction 0 to `steps` steps after M moments, (steps + 1, M, n), NaN if unseen.
+    """Return measurement minus prediction, 0 to `steps` steps after each of M moments.
 
     Args:
-        predictor: the data.
-        hypotheses: of the same effects.
-        which: of them predicts from each moment, (M,) of int.
-        track: the states to begin from, (L + 1, B, n).
+        predictor: evaluates hypotheses on the data.
+        hypotheses: hypotheses with the same effects.
+        which: index of the hypothesis that predicts from each moment, (M,) of int.
+        track: states from which predictions start, (L + 1, B, n).
         at: step within the run of each moment, (M,) of int.
-        run: its run, (M,) of int.
-        steps: how far ahead.
-        added: to every step within a run, (L, B, n).
+        run: run of each moment, (M,) of int.
+        steps: number of steps ahead.
+        added: added to every step within a run, (L, B, n).
+
+    Returns:
+        Errors (steps + 1, M, n), NaN where not measured.
     """
     data = predictor.data
     trial = data.trial_of[run]
@@ -53,20 +56,20 @@ def missed(
     sent, begin = np.empty((*t.shape, data.model.m)), dict[int, int]()
     for h, own in each:
         sent[:, own] = predictor.received(h)[trial[own], t[:, own]]
-        delays = delays_of(h, data)  # what sensors may still show
+        delays = delays_of(h, data)  # sensors may show states from before the start
         begin[id(h)] = 0 if delays is None else delays.oldest
     oldest = max(begin.values())
     path = [track[np.maximum(at - j, 0), run] for j in range(oldest, -1, -1)]
     together = by_row([h for h, _ in each], np.searchsorted(np.unique(which), which))
     advance = stepper(predictor, together)
     if added is None and (marched := _marched(predictor, each, path[-1], sent)) is not None:
-        path, sent = [*path, *marched[1:]], sent[:0]  # every step is made
+        path, sent = [*path, *marched[1:]], sent[:0]  # all steps are done
     for j, (u, now) in enumerate(zip(sent, t[: len(sent)] * data.dt, strict=True)):
         x = advance(path[-1], u, now)
         if added is not None:
             inside = (at + j < len(added))[:, None]
             x = x + np.where(inside, added[np.minimum(at + j, len(added) - 1), run], 0.0)
-        path.append(np.fmax(np.fmin(x, FAR), -FAR))  # what is no number is far too
+        path.append(np.fmax(np.fmin(x, FAR), -FAR))  # NaN becomes FAR, too
     states = np.stack(path)
     logged = np.empty_like(states[oldest:])
     for h, own in each:
@@ -82,7 +85,7 @@ def missed(
 def _marched(
     predictor: Predictor, each: Sequence[tuple[Hypothesis, Any]], x: Array, sent: Array
 ) -> Array | None:
-    """States (steps + 1, M, n) of compiled steps alone; None where there is more, or one is far."""
+    """Return compiled rollouts (steps + 1, M, n); None if not compiled, or one diverges."""
     found = np.empty((len(sent) + 1, *x.shape))
     for h, own in each:
         z = predictor.marched(h, x[own], sent[:, own])

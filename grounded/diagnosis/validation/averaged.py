@@ -1,13 +1,14 @@
-"""How sure a claim's values are where other fits of the same effects are likely, too.
+"""Bayesian model averaging of a claim's standard deviations and intervals.
 
-Parameters that are held as they were given may be off all the same: where evidence hardly tells, or
-calibration was dropped because predictions don't need it, the claim's own interval is that of exact
-parameters. So it is averaged over the noise structures and over parameters held and moving, by
-their evidence (Hoeting, Madigan, Raftery & Volinsky, Bayesian model averaging, 1999):
+The claim's own interval assumes its noise structure, and exact parameters if they were not
+calibrated. Yet the parameters may be off, if evidence hardly separates the fits or calibration was
+dropped because predictions don't need it. So the variance is averaged, by evidence, over all fits
+of the same effects: other noise structures, parameters held or free (Hoeting, Madigan, Raftery &
+Volinsky, Bayesian model averaging, 1999),
 
     var = sum_f p_f (var_f + (value_f - value)^2)
 
-about the claim's own value. A fit that predicts trials left out clearly worse has no part in it.
+about the claim's own value. Fits that predict held-out trials clearly worse are left out.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ from grounded.diagnosis.validation.decide import BETTER
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.frozen import Array
 
-SLIGHT = 0.01  # of the claim's evidence: less has no part
-NORMAL = 1.96  # standard deviations to each side that hold 95 %
-MOST = 50.0  # nats by which another fit counts as likelier
+SLIGHT = 0.01  # smallest weight of another fit, relative to the claim's
+NORMAL = 1.96  # half-width of a 95 % interval in standard deviations
+MOST = 50.0  # most nats by which another fit counts as likelier
 
 Sure = tuple[Array, Array]
 
@@ -34,13 +35,13 @@ Sure = tuple[Array, Array]
 def averaged(
     search: FittedHypotheses, fit: Fitted, ruler: Ruler, of: Callable[[Fitted], Sure]
 ) -> Sure:
-    """Standard deviations and half-widths of the 95 % intervals of a claim's values, (C,) each.
+    """Return averaged standard deviations and half-widths of 95 % intervals, (C,) each.
 
     Args:
-        search: with all fits of the same effects.
+        search: holds all fits of the same effects.
         fit: the claim.
-        ruler: that may rule out some of them.
-        of: the same of one fit by itself.
+        ruler: excludes fits that predict clearly worse.
+        of: returns both for a single fit.
     """
     std, half = (np.array(a) for a in of(fit))
     own, size = _values(fit.hypothesis), len(fit.hypothesis.theta)
@@ -58,7 +59,7 @@ def averaged(
 
 
 def _rivals(search: FittedHypotheses, fit: Fitted, ruler: Ruler) -> list[tuple[Fitted, float]]:
-    """Other fits of the same free values, and how likely each is beside the claim."""
+    """Return other fits of the same free values, and the weight of each relative to the claim."""
     names, own, found = sorted(fit.hypothesis.names), _values(fit.hypothesis), []
     for (_, _, some), other in search.fits.items():
         nats = search.score(other) - search.score(fit)
@@ -70,5 +71,5 @@ def _rivals(search: FittedHypotheses, fit: Fitted, ruler: Ruler) -> list[tuple[F
 
 
 def _values(h: Hypothesis) -> dict[tuple[str, str], int]:
-    """Rows of the free values by effect and name."""
+    """Return {(effect, quantity): index} of the free values."""
     return {key: i for i, key in enumerate((e.name, q.name) for e in h.effects for q in e.free)}

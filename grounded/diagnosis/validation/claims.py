@@ -1,14 +1,15 @@
-"""What is claimed, with values and intervals; what lost; what ties; what is nearly the same.
+"""The claimed effects with values and intervals; rejected ones, ties and look-alikes.
 
-Where calibrating the model's own parameters explains the gap, those that are off are named. Around
-the calibrated fit the log-posterior of the shifts is a parabola, H its curvature. With only a set S
-of the parameters free the best that is left is lower by
+If calibrating the model's own parameters explains the gap, the parameters that are off are named by
+forward selection. The log posterior of the shifts is approximated by a parabola at the calibrated
+fit, with curvature H. If only a set S of the parameters may differ from nominal, its maximum is
+lower by
 
     loss(S) = 1/2 b' (H_rr - H_rS H_SS^-1 H_Sr) b,        r: the others, b: their shifts
 
-Parameters are taken into S one by one, each time the one that lowers the loss most, until what the
-others would add is not worth a claim. So two parameters that only one combination of the data
-knows (a gain and a time constant) are not both blamed for it.
+Parameters are added to S one by one, each time the one that lowers the loss most, until the loss is
+below ENOUGH. So if the data only determine a combination of two parameters (a gain and a time
+constant), not both are blamed.
 """
 
 from __future__ import annotations
@@ -41,19 +42,19 @@ from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.effects import Effect
 from grounded.frozen import Array
 
-ENOUGH = 3.0  # nats that the parameters that are not named may still hold
+ENOUGH = 3.0  # nats that the parameters not named may still gain
 
 
 @dataclass(frozen=True)
 class Blame:
-    """A parameter that is off: its index in the model, what is lost without it [nats]."""
+    """A parameter that is off: its index in the model, and the loss at its nominal value [nats]."""
 
     index: int
     nats: float
 
 
 def loss(H: Array, b: Array, free: list[int]) -> float:
-    """What is lost when only `free` shifts may differ from zero [nats]."""
+    """Return the loss of log posterior if only `free` shifts may differ from zero [nats]."""
     rest = [i for i in range(len(b)) if i not in free]
     if not rest:
         return 0.0
@@ -65,10 +66,11 @@ def loss(H: Array, b: Array, free: list[int]) -> float:
 
 
 def moved_parameters(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> tuple[Blame, ...]:
-    """The parameters of a calibrated fit that have to differ, most important first.
+    """Return the parameters of a calibrated fit that must differ from nominal, by importance.
 
-    By evidence as few as leave ENOUGH to the others; of these each without which, the others fitted
-    again, predictions are as good within what matters is as good as right.
+    Evidence selects as few as possible, so that the others gain less than ENOUGH. Of these, a
+    parameter is left out if predictions at its nominal value, the others fitted again, are as good
+    up to a negligible difference.
     """
     data, h = search.data, fit.hypothesis
     if h.spread == 0 or h.shift is None:
@@ -91,38 +93,38 @@ def moved_parameters(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> tup
         gains = {i: ruler.gain(unmoved(data, fit, k + i, b[i]), fit).mean for i in free}
         most = max(free, key=lambda i: gains[i])
         free = [i for i in free if gains[i] >= least or i == most]
-    # a parabola about the fit reaches no further than the fit itself
+    # the parabola can't gain more than the fit itself
     whole = max(search.score(fit) - search.score(search.exact_null()), 0.0)
     worth = {i: min(search.tempering.factor * nats[i], whole) for i in free}
     return tuple(Blame(int(which[i]), worth[i]) for i in sorted(free, key=lambda i: -nats[i]))
 
 
 def unmoved(data: Data, fit: Fitted, column: int, shift: float) -> Fitted:
-    """The fit with one parameter as it was, the others fitted again: one Newton step."""
+    """Return the fit with one parameter at nominal, the others fitted again by a Newton step."""
     H = fit.gram.sum(axis=0) + np.diag(fit.prior)
     rest = np.delete(np.arange(len(H)), column)
     delta = np.zeros(len(H))
     delta[column] = -shift
     delta[rest] = shift * np.linalg.pinv(H[np.ix_(rest, rest)], hermitian=True) @ H[rest, column]
     gram, score = fit.gram.copy(), fit.score - fit.gram @ delta
-    gram[:, column], gram[..., column], score[:, column] = 0.0, 0.0, 0.0  # it stays there
+    gram[:, column], gram[..., column], score[:, column] = 0.0, 0.0, 0.0  # it is fixed there
     return replace(fit, hypothesis=moved(data, fit.hypothesis, delta), gram=gram, score=score)
 
 
-UNTOLD = 1e6  # times a value: a standard deviation that says nothing was learnt of it
-LEAST_TOLD = 0.1  # standard deviations: a smaller strength is not listed, no number is known of it
+UNTOLD = 1e6  # times a value: standard deviation from which it counts as unknown
+LEAST_TOLD = 0.1  # standard deviations below which a strength is not listed
 RANKED = 12  # explanations that are listed
-SAME = 0.95  # share of a parameter's signal from which an effect is the same thing
+SAME = 0.95  # share of a parameter's signal from which an effect is equivalent
 
 
 def has_size(effect: Effect, known: Mapping[str, Estimate]) -> bool:
-    """Whether estimates say how strong an effect is: its coefficients, or else its thresholds."""
+    """Check whether the strength of an effect is known: its coefficients, or else thresholds."""
     strengths = [q.name for q in effect.free if not q.grid] or list(known)
     return not all(abs(known[n].value) < LEAST_TOLD * known[n].std for n in strengths)
 
 
 class Claims:
-    """What the best hypothesis blames: effects, or parameters where calibrating them is enough."""
+    """The effects that the decision claims, or the parameters if calibration is enough."""
 
     def __init__(
         self, decision: Decision, credit: dict[str, float], known: Limits, ruler: Ruler
@@ -143,13 +145,13 @@ class Claims:
         self.alike = () if known.no_cause else lookalikes(self.predictor, best, candidates)
         late = [e for e, values in best.hypothesis.pairs if values.get("d", 0.0) >= 0]
         self.one_clock = one_clock(self.data.model, late, ruler.names)
-        swap(search, best, self.alike)  # what ties is asked of fits that are at their top
+        swap(search, best, self.alike)  # ties are decided between converged fits
         self.like_parameters = (
             of_parameters(self.predictor, self.null, off, candidates) if off else ()
         )
 
     def ranking(self, where: Any, before: float) -> tuple[Ranked, ...]:
-        """The claimed effects first (those that make most of the error), then what lost."""
+        """Return the claimed effects by credit, then rivals and rejected effects by evidence."""
         rows: list[Ranked] = []
         parts = self.parts()
         after = normalised(
@@ -166,7 +168,7 @@ class Claims:
                 rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
                 listed.append(name)
         others = (f for f in self.whole.of_size(1) if f.hypothesis.names[0] not in listed)
-        likely = (f for f in others if math.isfinite(self.whole.score(f)))  # an absurd one is not
+        likely = (f for f in others if math.isfinite(self.whole.score(f)))  # no absurd values
         sized = (f for f in likely if has_size(f.hypothesis.effects[0], self.estimates(f)[0]))
         singles = list(islice(sized, max(RANKED - len(rows), 3)))
         gaps = gaps_of(self.predictor, singles, where)
@@ -178,7 +180,7 @@ class Claims:
         return tuple(rows)
 
     def off(self, after: float, before: float) -> list[Ranked]:
-        """The model's own parameters, where calibrating them explains the gap."""
+        """Return rows of the model's own parameters, if calibrating them explains the gap."""
         model, known, rows = self.data.model, self.parameters(), []
         for blame in self.blamed:
             name = model.param_names[blame.index]
@@ -191,7 +193,7 @@ class Claims:
                     effect=f"parameter:{name}",
                     params={"d": d},
                     fixed={},
-                    evidence=blame.nats if blame.nats > ENOUGH else math.nan,  # a parabola errs
+                    evidence=blame.nats if blame.nats > ENOUGH else math.nan,  # too inexact
                     gap_after=after,
                     shrinkage=1 - after / before if before > 0 else 0.0,
                     claimed=not self.known.no_cause,
@@ -200,9 +202,10 @@ class Claims:
         return rows
 
     def parts(self) -> dict[str, float]:
-        """What the evidence loses without each claimed effect, parameters free or not as with it.
+        """Return the loss of evidence without each claimed effect, parameters as free as with it.
 
-        An effect of the others that vanished (a delay too short to be one) is left out with it.
+        If another effect becomes invalid without it (a delay too short to count), both are left
+        out.
         """
         search, found = self.search, {}
         whole = search.score(self.best)
@@ -216,7 +219,7 @@ class Claims:
         return found
 
     def as_free(self, size: int) -> list[Fitted]:
-        """Fits of so many effects, calibrated if the claim is: what a parameter does is its own."""
+        """Return fits of `size` effects, best first, calibrated if and only if the claim is."""
         free = self.best.hypothesis.spread > 0
         fits = self.search.fits.values()
         return [
@@ -241,7 +244,7 @@ class Claims:
         )
 
     def estimates(self, fit: Fitted) -> list[dict[str, Estimate]]:
-        """Values with intervals, effect by effect."""
+        """Return the values of each effect with standard deviations and intervals."""
         stds, halves = self._sure if fit is self.best else self._alone(fit)
         found, at = [], 0
         for effect, values in zip(fit.hypothesis.effects, fit.hypothesis.values, strict=True):
@@ -257,17 +260,18 @@ class Claims:
 
     @cached_property
     def _sure(self) -> tuple[Array, Array]:
-        """How sure the claim's values are, by all that is likely of the same effects."""
+        """Model-averaged standard deviations and half-widths of the claim's values."""
         return averaged(self.search, self.best, self.ruler, self._alone)
 
     def _alone(self, fit: Fitted) -> tuple[Array, Array]:
         return standard_deviations(self.predictor, fit, folds(self.data))
 
     def groups(self) -> tuple[tuple[str, ...], ...]:
-        """For each claimed effect, what could stand in its place within a few nats.
+        """Return groups of indistinguishable explanations, the claimed one first in each.
 
-        For parameters that are off: the effects that are the same thing, or as likely alone. Where
-        parameters move beside effects: what is the same thing with other values of those, too.
+        For a claimed effect these are rivals within a few nats and, if parameters are free, effects
+        that are equivalent with other values of these. For parameters that are off, they are
+        effects that are equivalent or as likely alone.
         """
         found = []
         for name in dict.fromkeys(one.effect for one in self.like_parameters):
@@ -292,7 +296,7 @@ class Claims:
         return tuple(found)
 
     def equivalent(self, groups: tuple[tuple[str, ...], ...]) -> tuple[tuple[str, ...], ...]:
-        """Of the groups, those that are one thing in the model: no trial helps."""
+        """Return the groups that are equivalent in the model, which no trial can separate."""
         effects = {e.name: e for e in self.search.candidates}
         model, found = self.data.model, []
         late = {(one.effect, one.like) for one in self.one_clock}
@@ -311,7 +315,7 @@ class Claims:
         return tuple(found)
 
     def rivals(self, name: str) -> list[tuple[str, Fitted]]:
-        """What may stand in the place of a claimed effect, beside all the others: name and fit."""
+        """Return up to two effects that tie with a claimed one beside all the others, with fits."""
         rest = set(self.names) - {name}
         found: dict[str, Fitted] = {}  # likeliest first
         for f in self.as_free(len(self.names)):
@@ -321,11 +325,11 @@ class Claims:
         return list(found.items())[:2]
 
     def _ties(self, name: str, other: str, fit: Fitted) -> bool:
-        """Whether a fit with another effect in the place of one is as likely, or is the same thing.
+        """Check whether a fit with another effect in place of one is as likely, or equivalent.
 
-        Two that are one thing differ by how a step is integrated, hundreds of which add up to nats.
-        They tie where predictions of trials left out don't tell them and what is known beforehand,
-        of the parameters above all, favours neither by more than a tie.
+        Equivalent effects differ only in the integration of a step, but over hundreds of steps that
+        adds up to nats. They tie if held-out predictions don't separate them and their priors
+        (mainly those of the parameters) differ by less than TIE.
         """
         score, best = self.search.score, self.best
         if score(best) - score(fit) < TIE:
@@ -339,7 +343,7 @@ class Claims:
         return not unlike and not any(gain.beyond(*BETTER) for gain in gains)
 
     def _one_thing(self, name: str, other: str) -> bool:
-        """Whether two effects are the same thing, with other values of the parameters that move."""
+        """Check whether two effects are equivalent with other values of the free parameters."""
         key = name, other
         if key not in self._same:
             effects = {e.name: e for e in (*self.search.joints.values(), *self.search.candidates)}
@@ -350,7 +354,7 @@ class Claims:
         return self._same[key]
 
     def tied(self, parts: Mapping[str, float]) -> dict[str, tuple[Fitted, float]]:
-        """Each rival's fit in the place of a claimed effect, and its evidence there."""
+        """Return each rival's fit in place of a claimed effect, and its evidence there."""
         best, found = self.search.score(self.best), dict[str, tuple[Fitted, float]]()
         for name in self.names:
             for other, fit in self.rivals(name):
@@ -358,7 +362,7 @@ class Claims:
         return found
 
     def nearly(self, groups: tuple[tuple[str, ...], ...]) -> tuple[Likeness, ...]:
-        """Look-alikes by shape, beside those that tie."""
+        """Return look-alikes by signal, without those that tie."""
         if self.known.no_cause:
             return ()
         tied = {(group[0], other) for group in groups for other in group[1:]}
@@ -369,7 +373,7 @@ class Claims:
         return tuple(one for key, one in (late | found | late).items() if key not in tied)
 
     def parameters(self) -> dict[str, Estimate]:
-        """Values of the model's parameters where they were calibrated beside the effects."""
+        """Return the values of the model's parameters, if they were calibrated."""
         h, model = self.best.hypothesis, self.data.model
         if h.spread == 0 or h.shift is None:
             return {}

@@ -1,23 +1,25 @@
-"""Evidence proposes, the ruler decides: which hypothesis is claimed, what each cause is worth.
+"""Model selection: evidence proposes hypotheses, held-out predictions decide which is claimed.
 
-The likeliest hypothesis can be wrong in ways that evidence does not see. Noise that may be
-coloured, or parameters that may move, explain a lasting effect away that predictions a second ahead
-still miss. A further effect takes up what is left somewhere and predicts no better. Values that one
-trial alone determines make predictions of the others worse. Far from the floor, likelihoods are
-those of a wrong model, and thousands of nats are no certainty. So the likeliest ones, and the
-likeliest of every other structure of noise, are held against the `ruler`:
+The likeliest hypothesis can be wrong in ways that its evidence does not show. Coloured noise or
+free parameters can absorb a persistent effect that predictions a second ahead still miss. A further
+effect can fit the residual somewhere without better predictions. Values determined by one trial can
+make predictions of the others worse. Far above the noise floor, likelihoods are those of a wrong
+model, and even thousands of nats are not conclusive. So the likeliest hypotheses, and the likeliest
+under every other noise structure, are compared by the `ruler`:
 
-    a rival takes the place of the likeliest only where it predicts clearly better
-    a cause without which predictions are as good, within their scatter, is dropped; a further
-    effect that is beyond doubt, where white noise is all that is left, only if they gain nothing
-    an effect that a parameter's shift undoes is dropped: the parameter alone does both
-    one without a mechanism that a single motion shows is dropped, however often that was repeated
-    what is left then must be likelier than none by itself
-    what predicts no better than the crude model is not claimed at all
-    a likely effect that was dropped is doubtful: seen in too few trials, maybe
+    1. A rival replaces the likeliest hypothesis only if it predicts clearly better.
+    2. A cause is dropped if predictions without it are as good within their scatter. A further
+       effect with very high evidence, beside white innovations only, is dropped only if predictions
+       gain nothing.
+    3. An effect that a parameter's shift undoes is dropped; the parameter alone describes both.
+    4. An effect without a mechanism that a single motion shows is dropped, however often the motion
+       was repeated.
+    5. The remaining effects must be likelier than none.
+    6. A hypothesis that predicts no better than the crude model is not claimed.
+    7. A likely effect that was dropped is reported as doubtful; perhaps too few trials show it.
 
-A cause is an effect or the calibration of the model's own parameters. Its credit is what is lost
-without it, the others fitted again.
+A cause is an effect or the calibration of the model's own parameters. Its credit is the loss of
+accuracy without it, with the others fitted again.
 """
 
 from __future__ import annotations
@@ -41,19 +43,19 @@ from grounded.effects import ParamFamily
 
 CALIBRATION = "calibration"
 RIVALS = 8  # likeliest hypotheses that are measured
-LEAST = 0.01  # gain that a cause must have in one channel
-PAYS = (2.0, LEAST)  # scatters that it must gain, and that
-ALONE = (1.0, LEAST)  # the same of the only effect, or of calibration, that is beyond doubt
-SURE = 8.0  # nats, odds of 3,000 to 1, from which an effect is likely beyond doubt
-WHITE = 0.9  # of a nat is believed where what is left is white noise
-BETTER = (2.0, 0.05)  # the same for a rival to take the place of a likelier hypothesis
-OVERRULES = (3.0, 0.1)  # and for a claim that is likely under another noise only
-SLIGHT = 0.02  # of what all causes gain, adopted ones too: less in each channel is not named
-AMOUNTS = 0.1  # of what the likeliest gains: what a rival has to gain beyond it
-FAR = 1.5  # of that, in logs of errors (to a quarter): more asks no more of another noise's claim
-LIKELY = 10.0  # nats from which a dropped effect is mentioned
-HARDLY = 0.1  # of its own prior: a parameter that is off by less is as it was given
-REFIT = 12  # iterations after a cause was taken out
+LEAST = 0.01  # smallest log gain of a cause in its best channel
+PAYS = (2.0, LEAST)  # scatters and log gain that a cause must reach
+ALONE = (1.0, LEAST)  # the same for a single effect, or calibration, with evidence above SURE
+SURE = 8.0  # nats (odds of 3,000 to 1) above which an effect counts as certain by evidence
+WHITE = 0.9  # tempering factor above which the innovations count as white
+BETTER = (2.0, 0.05)  # scatters and log gain by which a less likely rival must predict better
+OVERRULES = (3.0, 0.1)  # the same for a rival that is likely under another noise structure only
+SLIGHT = 0.02  # smallest share of the total gain, in some channel, of a cause that is named
+AMOUNTS = 0.1  # a rival's advantage must be this part of what the likeliest gains,
+FAR = 1.5  # of at most this log gain (errors down to a quarter) if it has another noise structure
+LIKELY = 10.0  # nats from which a dropped effect is reported as doubtful
+HARDLY = 0.1  # fraction of a parameter's prior below which it counts as unchanged
+REFIT = 12  # iterations after a cause was removed
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,15 +64,15 @@ class Doubtful:
 
     name: str
     nats: float
-    fit: Fitted  # with it
-    repeats: int = 0  # trials that make the motion that bears it out; 0: few trials do
+    fit: Fitted  # including the effect
+    repeats: int = 0  # trials of the only motion that shows it; 0: dropped for another reason
 
 
 @dataclass(frozen=True, eq=False)
 class Decision:
-    """What is claimed: its fit, the crude model's, and the fit without each of its causes."""
+    """The claim: its fit, the crude model's fit, and the fit without each of its causes."""
 
-    search: HypothesisSearch  # under the claim's own noise, where another one overruled
+    search: HypothesisSearch  # restricted to the claim's noise structure, if that overruled
     whole: HypothesisSearch
     fit: Fitted
     crude: Fitted
@@ -79,23 +81,23 @@ class Decision:
 
     @property
     def causes(self) -> tuple[str, ...]:
-        """Effects and calibration, whatever the fit has of both."""
+        """The effects of the fit, and calibration if its parameters are free."""
         return causes(self.fit)
 
 
 def causes(fit: Fitted) -> tuple[str, ...]:
-    """What a fit explains by: its effects, and calibration where its parameters moved."""
+    """Return the effects of a fit, and "calibration" if its parameters are free."""
     return (*fit.hypothesis.names, *((CALIBRATION,) if fit.hypothesis.spread > 0 else ()))
 
 
 def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> Decision:
-    """The claim that held-out predictions bear out.
+    """Choose the hypothesis that held-out predictions support.
 
     Args:
-        search: with all hypotheses that were fitted.
+        search: holds all hypotheses that were fitted.
         best: the likeliest one.
-        ruler: of the same data.
-        most: so many effects at most.
+        ruler: measures predictions of the same data.
+        most: largest number of effects.
     """
     whole, crude = search, search.exact_null()
     white = search.tempering.factor > WHITE
@@ -115,7 +117,7 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
 
 
 def _plainest(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool) -> Fitted:
-    """The fit with frictions at their plainest where what they have more predicts no better."""
+    """Replace frictions by their plain forms if their further parameters predict no better."""
     for plain_form in plainer(search, fit) if ruler.held_out else ():
         if not _pays(search, ruler, plain_form, fit, white):
             return _plainest(search, plain_form, ruler, white)
@@ -123,10 +125,10 @@ def _plainest(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool) 
 
 
 def _own_numbers(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
-    """The fit with a parameter in the place of each effect that ties with its shift, or with all.
+    """Replace effects by shifts of the model's parameters, if these tie and predict as well.
 
-    A number that its owner calls uncertain is off sooner than the equations lack something, and so
-    is an adopted delay.
+    A parameter declared uncertain, or an adopted delay, is more probably off than an equation
+    missing.
     """
     h, score = fit.hypothesis, search.score
     params = {e.name for e in search.candidates if e.known or isinstance(e.family, ParamFamily)}
@@ -148,10 +150,10 @@ def _own_numbers(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
 
 
 def _calibrated_instead(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
-    """The fit with the model's parameters calibrated in the place of a further effect.
+    """Replace a further effect by calibration of all parameters, unless it is much likelier.
 
-    Where all of them are off by a little no single shift is as good as an effect of two numbers,
-    but together they are. So beside another cause an effect has to be likelier beyond doubt.
+    If all parameters are slightly off, no single shift equals an effect with two values, but all
+    shifts together do. So an effect beside another cause must be likelier by SURE nats.
     """
     h, score, names = fit.hypothesis, search.score, _effects(fit)
     rests = [tuple(sorted({*h.names} - {name})) for name in names if len(names) > 1]
@@ -170,9 +172,10 @@ def _calibrated_instead(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> 
 
 
 def _likelier(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted | None:
-    """Where a calibration was dropped: what is likelier than one of the effects without it, too.
+    """After calibration was dropped, find a likelier hypothesis that differs in one effect.
 
-    Which effect goes best with the others was asked beside parameters that were free to help.
+    The effects were selected while the parameters were free, so with exact parameters others may be
+    likelier.
     """
     h, names = fit.hypothesis, set(fit.hypothesis.names)
     near = [f for f in search.of_size(len(names)) if len(names - {*f.hypothesis.names}) == 1]
@@ -187,7 +190,7 @@ def _likelier(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted | N
 
 
 def _likely(search: HypothesisSearch, fit: Fitted) -> bool:
-    """Whether evidence still asks for the effects that are left: others may have carried them."""
+    """Check whether the remaining effects are still likelier than none, without dropped ones."""
     null = search.exact_null() if parametric(fit) else search.best_null()
     return not fit.hypothesis.effects or search.score(fit) > search.score(null) + CLAIM
 
@@ -195,19 +198,19 @@ def _likely(search: HypothesisSearch, fit: Fitted) -> bool:
 def _pays(
     search: HypothesisSearch, ruler: Ruler, before: Fitted, after: Fitted, white: bool
 ) -> bool:
-    """Whether predictions bear out what `after` has beyond `before`.
+    """Check whether predictions support what `after` has in addition to `before`.
 
-    A second ahead noise that has added up hides what single steps show. So where nothing but white
-    noise is left, a further effect that is likely beyond doubt, and not for one trial alone, need
-    only gain anything; so need any effect that single steps of several trials bear out, and of one
-    long log one that those of its pieces bear out by far need only not lose. Where more is left,
-    thousands of nats are no certainty.
+    Predictions a second ahead contain accumulated noise, which hides what single steps show. So
+    some effects need only a positive gain if the innovations are white: a further effect with
+    evidence above SURE that more than few trials show, and any effect that single steps of several
+    trials support. In one long log, an effect that single steps of its pieces support by
+    LARGE_GAIN need only not lose. If the innovations are not white, evidence is not enough.
     """
     gain, effects = ruler.gain(before, after), len(after.hypothesis.effects)
     sure = search.score(after) - search.score(before) > SURE
     new = set(after.hypothesis.names) - set(before.hypothesis.names)
     rest = set(after.hypothesis.names) - new
-    if new:  # `before` may be what predicts better, and not the likeliest without it
+    if new:  # `before` may have been chosen by predictions and not be the likeliest without them
         free = after.hypothesis.spread > 0
         fits = [f for f in search.fits.values() if free or f.hypothesis.spread == 0]
         less = (search.score(f) for f in fits if set(f.hypothesis.names) <= rest)
@@ -221,13 +224,13 @@ def _pays(
         return True
     if gain.mean > 0 and gain.pieces.sum() > 0:
         return borne_out(search, before, after)
-    # of one log the values without one of its pieces may predict an arm's fall no better
+    # in one log, values from all pieces but one may miss a rare motion such as an arm's fall
     alone = search.data.count == 1 and gain.mean > -gain.scatter
     return alone and borne_out(search, before, after, LARGE_GAIN)
 
 
 def _as_given(fit: Fitted, names: set[str]) -> bool:
-    """Whether all of these are parameters that are hardly off by what they are uncertain."""
+    """Check whether all of these are parameters with shifts far below their priors."""
     pairs = [(e, v) for e, v in fit.hypothesis.pairs if e.name in names]
     return all(
         isinstance(e.family, ParamFamily)
@@ -237,15 +240,15 @@ def _as_given(fit: Fitted, names: set[str]) -> bool:
 
 
 def _in_several(search: HypothesisSearch, fit: Fitted, names: set[str]) -> bool:
-    """Whether more than few trials show each of these effects of a fit."""
+    """Check whether more than few trials show each of these effects of a fit."""
     return not any(few_trials(search.data, acting(search.predictor, fit, n)) for n in names)
 
 
 def _beyond_doubt(search: HypothesisSearch, found: Fitted, rival: Fitted) -> bool:
-    """Whether steps of several trials tell a rival under the same noise from what is likelier.
+    """Check whether single steps reject a less likely rival with the same noise and freedom.
 
-    Where nothing but white noise is left: neither noise nor parameters can hide a gap from the one
-    that they don't hide from the other, and a second ahead is a coarser look at the same.
+    For white innovations only. Noise and parameters then hide nothing from one hypothesis that they
+    don't hide from the other, and predictions a second ahead are a coarser test of the same.
     """
     same = rival.noise.structure == found.noise.structure
     same = same and rival.hypothesis.spread == found.hypothesis.spread
@@ -256,7 +259,7 @@ def _beyond_doubt(search: HypothesisSearch, found: Fitted, rival: Fitted) -> boo
 def _overrules(
     ruler: Ruler, crude: Fitted, found: Fitted, rival: Fitted, *bar: float, far: float = np.inf
 ) -> bool:
-    """Whether predictions bear out a less likely hypothesis, by an amount that matters."""
+    """Check whether a less likely rival predicts better significantly and by enough."""
     more, whole = ruler.gain(found, rival), ruler.gain(crude, found).mean
     return more.beyond(*bar) and more.mean > AMOUNTS * min(whole, far)
 
@@ -264,11 +267,11 @@ def _overrules(
 def _proposed(
     search: HypothesisSearch, best: Fitted, crude: Fitted, ruler: Ruler, most: int, white: bool
 ) -> tuple[HypothesisSearch, Fitted]:
-    """The likeliest hypothesis, or one that predicts clearly better."""
+    """Return the likeliest hypothesis, or a rival that predicts clearly better, with its search."""
     if not ruler.held_out:
         return search, best
     null, score = search.best_null(), search.score
-    size = len(best.hypothesis.effects)  # a larger set would have to pay by evidence too
+    size = len(best.hypothesis.effects)  # larger sets did not pay by evidence
     rivals = [f for k in range(1, size + 1) for f in search.of_size(k) if f is not best]
     rivals = [f for f in rivals if score(f) > score(null) + CLAIM]
     rivals = sorted(rivals, key=lambda f: -score(f))[:RIVALS]
@@ -294,7 +297,11 @@ def _proposed(
 def _pruned(
     search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool
 ) -> tuple[Fitted, dict[str, Fitted], list[Doubtful]]:
-    """Without the causes that predictions don't need, the least needed first; the likely ones."""
+    """Drop the causes that predictions don't need, the least needed first.
+
+    Returns:
+        The fit, the fits without each of its causes, and the likely effects that were dropped.
+    """
     doubtful: list[Doubtful] = []
     while True:
         without = {name: fit_without(search, fit, name, ruler) for name in causes(fit)}
@@ -326,9 +333,9 @@ def _pruned(
 def _least_needed(
     search: HypothesisSearch, ruler: Ruler, without: dict[str, Fitted], name: str, idle: list[str]
 ) -> str:
-    """Of causes that can each be spared, the one without which the rest is likeliest.
+    """Return which of the causes that can be dropped leaves the likeliest rest.
 
-    Each does the others' work: unless predictions tell what is left, evidence does.
+    They can stand in for each other, so evidence decides unless predictions clearly do.
     """
     for other in idle:
         likelier = search.score(without[other]) - search.score(without[name]) > TIE
@@ -338,15 +345,15 @@ def _least_needed(
 
 
 def _effects(fit: Fitted) -> list[str]:
-    """Those that are no parameters."""
+    """Return the names of the effects that are not parameters."""
     return [e.name for e in fit.hypothesis.effects if not isinstance(e.family, ParamFamily)]
 
 
 def fit_without(search: HypothesisSearch, fit: Fitted, name: str, ruler: Ruler) -> Fitted:
-    """The same without one cause, all the rest fitted again, under the noise that it then has.
+    """Refit without one cause.
 
-    Of the likeliest of all and the likeliest under noise of the fit's own structure, the one that
-    predicts better: what another noise lets the rest do is not the cause's credit.
+    Of the likeliest fit under any noise structure and the likeliest under the fit's own, return the
+    one that predicts better: a cause gets no credit for what the rest can do under another noise.
     """
     h, own, dt = fit.hypothesis, fit.noise.structure, search.data.dt
     less = replace(h, shift=None, spread=0.0) if name == CALIBRATION else h.minus(name)
@@ -370,7 +377,7 @@ def fit_without(search: HypothesisSearch, fit: Fitted, name: str, ruler: Ruler) 
 
 
 def plain(search: HypothesisSearch, fit: Fitted) -> Fitted:
-    """The same hypothesis under white noise."""
+    """Return the same hypothesis under white noise."""
     h = fit.hypothesis
     if fit.noise.structure == Structure():
         return fit
@@ -381,10 +388,10 @@ def plain(search: HypothesisSearch, fit: Fitted) -> Fitted:
 
 
 def shares(ruler: Ruler, decision: Decision) -> dict[str, float]:
-    """The share of what predictions gain in all (log of the error) that is lost without each cause.
+    """Return the share of the total gain (in log error) that is lost without each cause.
 
-    Where causes overlap the shares add to less than 1; where they help one another, each as much
-    as it adds to the sum.
+    If causes overlap, the shares sum to less than 1. If they depend on one another, so that the
+    losses sum to more than the total gain, the shares are normalised to 1.
     """
     whole = ruler.gain(decision.crude, decision.fit).mean
     lost = {n: max(ruler.gain(f, decision.fit).mean, 0.0) for n, f in decision.without.items()}
@@ -392,5 +399,5 @@ def shares(ruler: Ruler, decision: Decision) -> dict[str, float]:
 
 
 def ordered(shares_: dict[str, float], names: Sequence[str]) -> list[str]:
-    """Names by their credit, largest first."""
+    """Return names by their credit, largest first."""
     return sorted(names, key=lambda name: -shares_.get(name, 0.0))

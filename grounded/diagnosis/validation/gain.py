@@ -1,12 +1,14 @@
-"""Gain: what one hypothesis predicts better than another, and whether that is chance.
+"""Gain in prediction accuracy of one hypothesis over another, with tests of its significance.
 
-Two hypotheses are compared by the mean logarithm of the ratio of their errors over channels and
-horizons; its scatter is the jackknife's over runs. Runs differ most in how much of an effect they
-hold: what two trials of eight show in full is 1.5 of that scatter, and would be with no noise at
-all. So the short horizons are also compared piece by piece of a second: where an effect is not
-visited they add nothing, neither gain nor scatter. And the sums are those of the runs that miss
-most: of a pendulum that once came to a halt near the top one run makes most of them, and of their
-scatter. So every trial is also asked by itself, and all count alike.
+The gain is the mean log ratio of rms errors over channels and horizons; its scatter is the
+jackknife standard error over runs. Two further tests correct weaknesses of this measure:
+
+- Runs differ in how much of an effect they contain. If two of eight trials show all of it, the gain
+  is 1.5 of its scatter even without noise. So the short horizons are also compared in pieces of a
+  second; pieces where the effect does not act add neither gain nor scatter (`again`).
+- The runs with the largest errors dominate the sums and their scatter, such as that of a pendulum
+  that once stopped near the top. So each trial's gain is also computed separately, and all trials
+  count equally (`chance`).
 """
 
 from __future__ import annotations
@@ -18,8 +20,8 @@ import numpy as np
 
 from grounded.frozen import Array
 
-AGAIN = 2.0  # scatters that a gain has without its best trial, where it was seen again
-CHANCE = 0.01  # of what trials gain by themselves, below which it is no chance
+AGAIN = 2.0  # scatters that the gain of all pieces must have without the best trial
+CHANCE = 0.01  # p-value of the gains of single trials below which they are significant
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,27 +33,27 @@ class Errors:
 
     @cached_property
     def rms(self) -> Array:
-        """By horizon and state, (K, n); NaN where nothing was measured."""
+        """Rms errors by horizon and state, (K, n); NaN where nothing was measured."""
         total, count = self.total.sum(axis=1), self.count.sum(axis=1)
         return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
 
 
 @dataclass(frozen=True)
 class Gain:
-    """What one hypothesis predicts better than another: log ratio of errors, and its scatter."""
+    """Improvement of one hypothesis over another: log ratio of errors, and its scatter."""
 
     mean: float
     scatter: float
-    largest: float  # of a single channel and horizon
-    channels: Array  # (n',) the mean over horizons by shown state
-    scatters: Array  # (n',) of these
-    pieces: Array = field(default_factory=lambda: np.zeros(0))  # (P,) gained in each, up to 1 s
-    trial: Array = field(default_factory=lambda: np.zeros(0, int))  # (P,) that it is of
-    own: Array = field(default_factory=lambda: np.zeros(0))  # (S,) what each trial gains by itself
+    largest: float  # of any channel and horizon
+    channels: Array  # (n',) mean over horizons, by shown state
+    scatters: Array  # (n',) scatter of these
+    pieces: Array = field(default_factory=lambda: np.zeros(0))  # (P,) of each piece, up to 1 s
+    trial: Array = field(default_factory=lambda: np.zeros(0, int))  # (P,) trial of each piece
+    own: Array = field(default_factory=lambda: np.zeros(0))  # (S,) of each trial separately
 
     @property
     def chance(self) -> float:
-        """That trials which gain nothing gain as much on average, each by itself (Student's t)."""
+        """One-sided p-value of the mean gain of single trials (Student's t)."""
         from scipy.special import stdtr
 
         count, spread = len(self.own), float(self.own.std(ddof=1)) if len(self.own) > 1 else 0.0
@@ -61,21 +63,22 @@ class Gain:
 
     @property
     def again(self) -> float:
-        """What pieces gain without the trial that gains most, in the scatters of their sum."""
+        """Gain of all pieces without the best trial, in scatters of their sum."""
         by = np.bincount(self.trial, self.pieces) if len(self.pieces) else np.zeros(1)
         each = self.pieces[self.trial != int(by.argmax())]
         scatter = np.sqrt(len(each) * each.var()) if len(each) > 1 else 0.0
         return float(each.sum() / scatter) if scatter > 0 else 0.0
 
     def beyond(self, scatters: float, least: float) -> bool:
-        """Whether it is more than its scatter in all."""
+        """Check whether the gain exceeds `scatters` of its scatter, and `least` in some channel."""
         return self.mean > scatters * self.scatter and self.largest > least
 
     def pays(self, scatters: float, least: float) -> bool:
-        """Whether it is worth a claim: in all, without its best trial, by trial, or in one channel.
+        """Check whether the gain supports a claim.
 
-        There by a scatter more: an effect of one channel is lost in the mean over a dozen, and in
-        their scatter.
+        It does if it is significant over all channels, in pieces without the best trial, by single
+        trials, or in one channel. The last needs one scatter more; without it, an effect on one
+        channel would be lost in the mean over a dozen channels and in their scatter.
         """
         one = (self.channels > (scatters + 1) * self.scatters) & (self.channels > least)
         again = (self.again > AGAIN or self.chance < CHANCE) and self.largest > least

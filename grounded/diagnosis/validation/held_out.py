@@ -1,9 +1,9 @@
-"""How far the noise-normalised gap shrinks on held-out trials; how utilities are predicted.
+"""Reduction of the noise-normalised gap on held-out trials, and predicted utilities.
 
-Errors a second ahead in units of what noise alone would make of them; 1 is the floor. These figures
-belong to one diagnosis, whose own estimate of the noise they are divided by; claims are decided by
-the `ruler`, in the channels' units. What matters to the search is the utility: so each trial is
-also run again from its start, and the utility of that run is compared with the real one.
+The gap is the rms of errors a second ahead, relative to the errors that noise alone would cause; 1
+is the floor. It compares only within one diagnosis, because it is divided by the noise estimated
+there. Claims are decided by the `ruler`, in the channels' units. The search needs the utility, so
+each trial is also simulated from its start, and the utility of that run compared with the real one.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from grounded.trial import Trial
 
 @dataclass(frozen=True, eq=False)
 class Shrinkage:
-    """Errors of held-out predictions (M, n) before and after, and their sizes."""
+    """Errors of held-out predictions (M, n) before and after, and what noise alone causes."""
 
     where: Horizon
     before: Array
@@ -35,23 +35,23 @@ class Shrinkage:
 
     @property
     def gap_before(self) -> float:
-        """Noise-normalised rms of the model as it is."""
+        """Noise-normalised rms error of the crude model."""
         return normalised(self.before, self.where)
 
     @property
     def gap_after(self) -> float:
-        """The same with the effects, values from the other trials."""
+        """Noise-normalised rms error with the effects, values from the other trials."""
         return normalised(self.after, self.where)
 
 
 def shrinkage(predictor: Predictor, fit: Fitted, bare: Array, where: Horizon) -> Shrinkage:
-    """Held-out errors before, from the states `bare` (L + 1, B, n), and after, from its own."""
+    """Return held-out errors of the crude model, from states `bare` (L + 1, B, n), and of a fit."""
     before = errors(predictor, Hypothesis(), bare, where)
     return Shrinkage(where, before, held_out_errors(predictor, fit, fit.states, where))
 
 
 def held_out_errors(predictor: Predictor, fit: Fitted, track: Array, where: Horizon) -> Array:
-    """Errors of each trial with values from the others, (M, n)."""
+    """Return the errors of each trial with values from the others, (M, n)."""
     data, h = predictor.data, fit.hypothesis
     if not h.effects and h.spread == 0:
         return errors(predictor, h, track, where)
@@ -68,23 +68,23 @@ def held_out_errors(predictor: Predictor, fit: Fitted, track: Array, where: Hori
 
 
 def gaps_of(predictor: Predictor, fits: Sequence[Fitted], where: Horizon) -> list[float]:
-    """The gap that each of several hypotheses leaves, held out."""
+    """Return the held-out gap that each of several fits leaves."""
     return [normalised(held_out_errors(predictor, fit, fit.states, where), where) for fit in fits]
 
 
-FAR = 1e6  # a state beyond it has diverged
+FAR = 1e6  # size of a state above which it has diverged
 
 
 @dataclass(frozen=True, eq=False)
 class Utilities:
-    """Real utilities of whole trials (S,), predicted ones before and after."""
+    """Real utilities of whole trials (S,), and predicted ones before and after."""
 
     real: Array
     before: Array
     after: Array
 
     def summary(self) -> UtilityPrediction:
-        """Rms errors; NaN where a prediction diverged or no trial was whole."""
+        """Return rms errors; NaN if a prediction diverged, defaults if no trial was whole."""
         if not len(self.real):
             return UtilityPrediction()
         before, after = (
@@ -98,16 +98,17 @@ class Utilities:
 def utility_prediction(
     predictor: Predictor, fit: Fitted, bare: Array, task: Task, trials: Sequence[Trial]
 ) -> Utilities:
-    """Real and predicted utilities of the trials that ran to the horizon.
+    """Return real and predicted utilities of the trials that ran to the horizon.
 
-    A log that goes on after it and names no candidate is no run of the task.
+    Trials without a candidate are left out if they are longer than the horizon, or if other trials
+    have a candidate: they are not runs of the task.
 
     Args:
-        predictor: the data that were made from `trials`.
+        predictor: evaluates hypotheses on the data prepared from `trials`.
         fit: the best hypothesis.
         bare: filtered states that the bare model starts from; the fit has its own.
-        task: whose reward it is.
-        trials: those of the data, in its order; of candidates alone, where there are any.
+        task: defines the reward.
+        trials: the trials of the data, in its order.
     """
     data, h = predictor.data, fit.hypothesis
     fixed = not h.effects and h.spread == 0
@@ -117,10 +118,10 @@ def utility_prediction(
     for i, trial in enumerate(trials):
         real = task.utility(trial)
         by_hand = not trial.candidate and (chosen or trial.steps > task.horizon)
-        if not np.isfinite(real) or i not in groups or by_hand:  # that is no policy's utility
+        if not np.isfinite(real) or i not in groups or by_hand:  # not the utility of a policy
             continue
         first = int(np.flatnonzero(data.trial_of == i)[0])
-        if data.time[0, first] > 0:  # the run that it began with was left out
+        if data.time[0, first] > 0:  # its first run was left out
             continue
         own = h if shifts is None else moved(data, h, shifts[groups.index(i)])
         pairs = [(Hypothesis(), bare[0, first]), (own, fit.states[0, first])]
@@ -131,7 +132,7 @@ def utility_prediction(
 
 
 def _again(predictor: Predictor, h: Hypothesis, trial: Trial, start: Array, i: int) -> Trial:
-    """The trial as a hypothesis predicts it, from its start, with its commands."""
+    """Return the trial as a hypothesis predicts it from its start, with its commands."""
     data = predictor.data
     received = predictor.received(h)[i]
     states = predictor.marched(h, start[None], received[: trial.steps, None])

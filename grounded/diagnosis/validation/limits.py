@@ -1,7 +1,7 @@
-"""What the data cannot tell, said before anything is claimed.
+"""Limits of the data, checked before anything is claimed: which effects can't be identified.
 
-A state that never moved, an input that never changed, a single trial, a handful of steps: an effect
-there may exist and can't be known, so it is not offered and the reader is told.
+If a state never moved, an input never changed, or there is a single trial or only a few steps, an
+effect may exist but can't be identified. It is not a candidate then, and a sentence says why.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ from grounded.model import Model, Param
 from grounded.trial import Trial
 
 FEW_STEPS = 30
-WEAK, UNKNOWN = 0.2, 0.6  # of its prior standard deviation: what the trials leave of it
-DEPENDS = 2.0  # times its standard deviation: that of a value, all held parameters free
-PART = 0.2  # of that variance, which a parameter makes that it depends on
-QUIETER = 100.0  # times less noise variance: what effects may yet take out of the noise
+WEAK, UNKNOWN = 0.2, 0.6  # remaining fraction of a parameter's prior standard deviation
+DEPENDS = 2.0  # a value depends on held parameters if freeing them widens it by this factor,
+PART = 0.2  # namely on those that contribute at least this part of its variance
+QUIETER = 100.0  # factor by which effects may still reduce the noise variance
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What can't be known: sentences, and whether they forbid to name a cause."""
+    """What can't be identified: sentences for the user, and whether no cause may be named."""
 
     sentences: tuple[str, ...]
     no_cause: bool
 
 
 def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
-    """What the trials are too few or too quiet for.
+    """Report what can't be identified because trials are too few or lack excitation.
 
     Args:
         data: the trials.
-        left_out: states whose sensors say no more than others do.
+        left_out: names of states whose sensors are redundant and were left out.
     """
     found, no_cause = [], False
     if data.count < 2 and len(data.valid) < PIECES:
@@ -70,17 +70,17 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
         no_cause = True
     still = constant_inputs(data)
     for name in still:
-        found.append(f"input {name} never changed, so nothing can be said of its actuator")
+        found.append(f"input {name} never changed, so effects of its actuator can't be identified")
     if len(still) == data.model.m:
         no_cause = True
     unmoved = still_states(data)
     for name in unmoved:
-        found.append(f"state {name} never moved, so nothing can be said of what acts on it")
+        found.append(f"state {name} never moved, so effects on it can't be identified")
     if data.skipped:
         slow = simulated(data.model)
-        why = "each step of a simulator takes its time" if slow else "to bound memory"
+        why = "simulator steps are slow" if slow else "to limit memory"
         used = f"{len(data.valid)} of {len(data.valid) + data.skipped} stretches of the trials"
-        found.append(f"{used} were used, those that move most: {why}")
+        found.append(f"{used} were used, those with most motion ({why})")
     names = data.model.state_names
     empty = [name for name, told in zip(names, data.told, strict=True) if not told]
     spared = {*left_out, *(names[i] for i, log in data.behind.items() if names[log] in left_out)}
@@ -92,9 +92,9 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
 
 
 def counted_once(trials: Sequence[Trial]) -> tuple[list[Trial], list[str]]:
-    """The trials without those that are another one to the last bit, and a sentence for each.
+    """Drop trials that are bit-identical to an earlier one; return the rest and a sentence each.
 
-    A copy holds no further noise: counted twice it would confirm what one run shows.
+    A copy has the same noise. If it were counted twice, it would confirm what a single run shows.
     """
     known: dict[tuple[bytes, bytes], tuple[int, Trial]] = {}
     found, said = [], []
@@ -105,13 +105,13 @@ def counted_once(trials: Sequence[Trial]) -> tuple[list[Trial], list[str]]:
             continue
         name, other = (t.id or f"trial {i + 1}" for i, t in ((k, trial), one))
         said.append(
-            f"{name} is {other} to the last bit: a copy, or no noise at all; it counts once"
+            f"{name} is bit-identical to {other} (a copy, or no noise at all): it counts once"
         )
     return found, said
 
 
 def constant_inputs(data: Data) -> list[str]:
-    """Inputs that took one value in every trial."""
+    """Return the inputs with one value in all trials."""
     names = data.model.input_names
     return [
         name
@@ -124,7 +124,7 @@ def constant_inputs(data: Data) -> list[str]:
 
 
 def switches(data: Data) -> set[str]:
-    """Inputs that were on or off and nothing else: how much one is on can't be off, only when."""
+    """Return the inputs that were only on or off, whose effects on the amplitude can't be known."""
     found = set()
     for j, name in enumerate(data.model.input_names):
         sent = [data.commands[i, :T, j] for i, T in enumerate(data.lengths)]
@@ -135,7 +135,7 @@ def switches(data: Data) -> set[str]:
 
 
 def still_states(data: Data) -> list[str]:
-    """States that had one value in every trial: to the last digit, so no sensor of them lives."""
+    """Return the states with exactly one value in all trials, so that their sensor seems dead."""
     found = []
     for i, name in enumerate(data.model.state_names):
         if i in data.hidden:
@@ -147,7 +147,7 @@ def still_states(data: Data) -> list[str]:
 
 
 def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
-    """The effects that these data could show at all."""
+    """Return the effects that these data could show."""
     still, unmoved, on_off = set(constant_inputs(data)), set(still_states(data)), switches(data)
     dead = {n for i, n in enumerate(data.model.state_names) if not data.seen[..., i].any()}
     memory = {data.model.state_names[i] for i in data.hidden}
@@ -176,16 +176,16 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
 def identifiable(
     predictor: Predictor, fit: Fitted, known: Mapping[str, Estimate] | None = None
 ) -> list[Identifiable]:
-    """How well the trials tell each uncertain parameter, all others free, under a fit's noise.
+    """Return how well the trials identify each uncertain parameter, with all others free.
 
-    The sensitivities of the predictions, whitened, are the information that the data add to the
-    priors; what is left of each prior's standard deviation is the verdict, or what a calibrated
-    value's own standard deviation is of it, where that is more.
+    The whitened sensitivities of the predictions give the Fisher information that the data add to
+    the priors. The verdict depends on the posterior standard deviation relative to the prior's. If
+    a calibrated value states a larger standard deviation, that one is used.
 
     Args:
-        predictor: of the data, all uncertain parameters free.
-        fit: beside which hypothesis.
-        known: those that were calibrated, the others held at their values.
+        predictor: evaluates hypotheses, with all uncertain parameters free.
+        fit: the hypothesis beside which they are identified, and its noise.
+        known: the parameters that were calibrated; the others were held at their values.
     """
     information, known = _information(predictor, fit), known or {}
     cov = np.linalg.inv(information + np.eye(len(information)))
@@ -208,10 +208,10 @@ def identifiable(
 
 
 def held(predictor: Predictor, fit: Fitted) -> Model:
-    """The model with those parameters as constants that even little noise would leave unknown.
+    """Return the model with parameters held constant that can't be identified even with less noise.
 
-    Of several of which only a combination is known (a mass and a gain) the one stays free that its
-    user is least sure of.
+    If only a combination of several is identifiable (a mass and a gain), the one with the widest
+    relative prior stays free.
     """
     model = predictor.data.model
     H = _information(predictor, fit) * QUIETER
@@ -230,7 +230,10 @@ def held(predictor: Predictor, fit: Fitted) -> Model:
 
 
 def _information(predictor: Predictor, fit: Fitted) -> Array:
-    """Of the uncertain parameters in units of their priors, the effects' values known, (K, K)."""
+    """Return the information on uncertain parameters in units of their priors, (K, K).
+
+    The values of the effects are marginalised.
+    """
     h, k = fit.hypothesis, len(fit.hypothesis.theta)
     columns, of_log = base_columns(predictor, replace(fit, hypothesis=replace(h, spread=1.0)))
     if columns.shape[-1] == k:
@@ -243,7 +246,7 @@ def _information(predictor: Predictor, fit: Fitted) -> Array:
 
 
 def _left(information: Array) -> Array:
-    """Standard deviations with unit priors, (K,)."""
+    """Return posterior standard deviations with unit priors, (K,)."""
     return np.sqrt(np.diag(np.linalg.inv(information + np.eye(len(information)))))
 
 

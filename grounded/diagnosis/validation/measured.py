@@ -1,7 +1,8 @@
-"""What the ruler says of a decision: the table of errors, the noise floor, credit, what is left.
+"""The decision in numbers: table of prediction errors, noise floor, credit and leftover.
 
-Whatever is claimed, what stays above the floor is stated. A flexible model's correction counts as
-left where predictions gain by it, and then nothing that it predicts is noise.
+Errors above the floor are reported as a leftover, whatever is claimed. A correction by a flexible
+regression counts as a leftover if predictions gain by it; what it predicts is not noise, so the
+floor is lowered to what it reaches.
 """
 
 from __future__ import annotations
@@ -33,20 +34,20 @@ from grounded.diagnosis.validation.split import split
 from grounded.frozen import Array
 from grounded.trial import Trial
 
-FAR = 3.0  # times the noise floor: what is left is stated whatever the doubt
-WHITE = 0.01  # chance below which what is left is not white noise
-AWAY = 30.0  # times all that was measured of a state: beyond it a prediction has run away
-COUNTS = (2.0, 0.03)  # scatters, and least gain, of a flexible correction that is stated
+FAR = 3.0  # times the noise floor, above which a leftover is stated despite any uncertainty
+WHITE = 0.01  # p-value below which the innovations are not white
+AWAY = 30.0  # times a state's measured range, above which a prediction has diverged
+COUNTS = (2.0, 0.03)  # scatters and log gain of a flexible correction that is stated
 
 
 class Measured:
-    """A decision, measured; every method is one part of the `Diagnosis`."""
+    """Measurements of a decision; every method is one part of the `Diagnosis`."""
 
     def __init__(
         self, decision: Decision, ruler: Ruler, trials: Sequence[Trial], exact: bool = False
     ) -> None:
         self.decision, self.ruler, self.trials = decision, ruler, trials
-        self.exact = exact  # every repeat was the same to the last bit: a simulator
+        self.exact = exact  # all repeats were bit-identical: a simulator
         self.search, self.best = decision.search, decision.fit
         self.predictor, self.data = self.search.predictor, self.search.data
         self.units = {n: self.data.model.states[n] for n in ruler.names}
@@ -56,17 +57,18 @@ class Measured:
         self.whiteness = self.white()
         told = [p for n, p in self.whiteness.items() if n not in self.data.between]
         self.is_white = not self.left and min(told, default=0.0) * len(told) > WHITE
-        self.floor, self.source = self.noise_floor()  # and `unsure`: of its logarithm, (K, 1)
+        self.floor, self.source = self.noise_floor()  # sets `unsure`, std of its log, (K, 1)
         self.at_most = self.source == "short horizon" and not self.is_white
 
     def rms(self, fit: Fitted) -> Array:
-        """By horizon and shown state, (K, n')."""
+        """Return the rms errors of a fit by horizon and shown state, (K, n')."""
         return np.asarray(self.ruler.errors(fit).rms[:, self.ruler.shown])
 
     def calibrated(self) -> Fitted | None:
-        """The model with its parameters fitted; as it is where that predicts no better.
+        """Return the best calibrated fit without effects, or the crude fit if that predicts better.
 
-        The likeliest, or what is left of the decision without its effect, if that predicts better.
+        Candidates are the likeliest one and the decision without its effect. None if the parameters
+        were never calibrated.
         """
         fits = [f for (_, spread, names), f in self.search.fits.items() if spread and not names]
         if not fits:
@@ -76,13 +78,14 @@ class Measured:
         return max([crude, *found], key=lambda f: self.ruler.gain(crude, f).mean)
 
     def noise_floor(self) -> tuple[Array, str]:
-        """Rms error of noise alone, by horizon and shown state, and where it is from.
+        """Return the rms error of noise alone, by horizon and shown state, and its source.
 
-        What one step leaves holds the model's error too: carried on, it is a bound (`at_most`).
-        Noise that seems coloured counts as such in channels where no flexible model finds anything.
+        Without repeats, the one-step noise is propagated by the model. It contains the error of the
+        model, so the floor is an upper bound (`at_most`). Coloured noise is taken as noise only in
+        channels in which a flexible regression finds no structure.
         """
         self.unsure = np.zeros((len(self.ruler.steps) + 1, 1))
-        if self.exact and not self.is_white:  # what is white is noise, and one trial a copy
+        if self.exact and not self.is_white:  # white innovations are noise, and the repeat a copy
             return np.zeros((len(self.ruler.steps) + 1, len(self.units))), "repeats"
         repeats = repeated(self.trials, self.data)
         scatter, source = self.ruler.scatter(self.best, repeats), "repeats"
@@ -99,18 +102,18 @@ class Measured:
         reached += [errors.rms for _, errors in self.flexible.values()]
         least = np.fmin.reduce(reached)
         if scatter is not None and np.isnan(found[-1]).all():
-            least[-1] = np.nan  # repeats are too short to tell the noise of whole trials
+            least[-1] = np.nan  # repeats are too short for the floor of whole trials
         return np.fmin(found, least)[:, self.ruler.shown], source
 
     def white(self) -> dict[str, float]:
-        """The chance that white noise leaves innovations as correlated as these, by channel."""
+        """Return the p-value of white innovations, by channel."""
         delays = delays_of(self.best.hypothesis, self.data)
         seen = self.data.seen if delays is None else delays.samples()[1]
         found = whiteness(self.best, seen)
         return {n: found[str(i)] for i, n in zip(self.ruler.shown, self.units, strict=True)}
 
     def carried(self, fit: Fitted) -> Array:
-        """What one step's noise comes to, carried on by the model, (K, n); NaN for whole trials."""
+        """Return the one-step noise propagated to each horizon, (K, n); NaN for whole trials."""
         rows = []
         for steps in self.ruler.steps:
             w = horizon(self.predictor, fit, steps * self.data.dt)
@@ -119,7 +122,7 @@ class Measured:
         return np.array([*rows, np.full_like(rows[0], np.nan)])
 
     def corrections(self) -> dict[str, tuple[Leftover, Errors]]:
-        """By channel, what a flexible model corrects where predictions gain by it."""
+        """Return, by channel, the leftovers whose correction improves predictions."""
         names, found = self.data.model.state_names, {}
         for left in self.left:
             rate = np.zeros((*left.correction.shape, len(names)))
@@ -130,7 +133,7 @@ class Measured:
         return found
 
     def prediction_error(self) -> tuple[RulerRow, ...]:
-        """The ruler's table: 0.1, 0.5, 1 s and the whole trial."""
+        """Return the table of prediction errors at 0.1, 0.5, 1 s and over the whole trial."""
         calibrated = self.calibrated()
         before = None if self.ruler.origin is None else self.ruler.outset.rms[:, self.ruler.shown]
         columns = {
@@ -169,27 +172,27 @@ class Measured:
 
     @cached_property
     def drowned(self) -> Any:
-        """Where noise alone takes a state beyond all that was measured of it, (K,), by horizon."""
+        """Horizons at which noise alone exceeds the measured range of some state, (K,) of bool."""
         reach = np.array(list(self.reach.values()))
         lost = np.any((self.floor > reach) & (reach > 0), axis=1)
-        lost[-1] = False  # of whole trials there is no floor but that of repeats
+        lost[-1] = False  # whole trials have a floor from repeats only
         return lost
 
     @cached_property
     def reach(self) -> dict[str, float]:
-        """From the least to the largest value that was measured of each shown state."""
+        """Measured range of each shown state, largest minus smallest value."""
         reach = np.ptp(self.data.filled, axis=0)
         return {n: float(reach[i]) for i, n in zip(self.ruler.shown, self.units, strict=True)}
 
     def horizons(self) -> list[tuple[int, float]]:
-        """(index, seconds) of the ruler's rows; a single step is no row unless it is 0.1 s."""
+        """Return (index, seconds) of the table's rows; a single step only if it is long enough."""
         dt, steps = self.data.dt, self.ruler.steps
         first = 0 if len(steps) < 2 or dt > 0.05 else 1
         rows = [(k, steps[k] * dt) for k in range(first, len(steps))]
         return [*rows, (len(steps), float(np.median(self.data.lengths)) * dt)]
 
     def credits(self) -> tuple[Credit, ...]:
-        """What each cause is worth, largest first."""
+        """Return the credit of each cause, largest first."""
         k = len(self.ruler.steps) - 1
         return tuple(
             Credit(
@@ -207,9 +210,9 @@ class Measured:
         )
 
     def remainders(self) -> tuple[Remainder, ...]:
-        """What is left above the floor, and what a flexible model finds that would show there.
+        """Return the leftovers: errors above the floor, and corrections that improve predictions.
 
-        Farthest above its noise first: of more than a flexible model explains it is no less left.
+        They are sorted by the ratio of error to floor, largest first, with or without a correction.
         """
         data, ruler = self.data, self.ruler
         k = int(np.flatnonzero(~self.drowned[:-1]).max(initial=0))
@@ -242,7 +245,7 @@ class Measured:
         return tuple(self.with_region(row, left) for *_, left, row in found)
 
     def with_region(self, row: Remainder, left: Leftover | None) -> Remainder:
-        """A remainder with what a flexible model says of it: the missing rate, and where."""
+        """Add the missing rate and its region, as a flexible regression finds them."""
         if left is None:
             return row
         size = left.correction**2 * self.data.valid.T
@@ -251,7 +254,7 @@ class Measured:
         return replace(row, size=left.size, unit=left.unit, evidence=left.gain, region=region)
 
     def split(self) -> dict[str, Split]:
-        """Explained, unexplained, irreducible: one step, the horizon, a whole trial."""
+        """Return explained, unexplained, irreducible parts of one step, the horizon, a trial."""
         steps, dt = self.ruler.steps, self.data.dt
         rows = {"one_step": 0, "horizon": len(steps) - 1, "whole_run": len(steps)}
         seconds = [*(k * dt for k in steps), float(np.median(self.data.lengths)) * dt]
@@ -267,14 +270,14 @@ class Measured:
         }
 
     def whole_run(self) -> dict[str, RunChange]:
-        """Errors of predictions from the beginning of each trial to its end."""
+        """Return the errors of predictions of whole trials, before and after."""
         before, after = self.rms(self.decision.crude)[-1], self.rms(self.best)[-1]
         rows = zip(self.units.items(), before, after, strict=True)
         return {n: RunChange(float(b), float(a), unit) for (n, unit), b, a in rows}
 
 
 def root_mean_square(error: Any) -> Any:
-    """Root mean square along the first axis; nan for a state that was never measured."""
+    """Return the rms along the first axis, NaN for a state that was never measured."""
     count = np.isfinite(error).sum(axis=0)
     total = np.nansum(error**2, axis=0)
     return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)

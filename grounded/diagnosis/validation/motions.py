@@ -1,21 +1,21 @@
-"""In how many motions an effect that names no mechanism is seen: trials that repeat one are one.
+"""Number of different motions in which an effect without a mechanism is seen.
 
-A wave in time, a constant, what one state adds to another's rate, a patch of ground: `Family.loose`
-fits any shape. Where all trials follow one path, whatever the model lacks is the same function of
-time in each of them, and of every state: repeats make it likelier with each trial, and trials that
-are left out are foretold by those that repeat them. None of that tells a cause. So such an effect
-is believed only as far as motions that differ bear it out: of the nats that are lost without it,
-the motion that holds most has no say.
+Families marked `Family.loose` (a wave in time, a constant, a coupling between states, a patch of
+ground) fit any shape. If all trials follow one path, any error of the model is the same function of
+time, and of every state, in each of them. Each repeat then raises the evidence of such an effect,
+and a held-out trial is predicted well by those that repeat it, but none of that identifies a cause.
+So the effect is accepted only if different motions support it: of the nats lost without it, those
+of the motion with the largest share are not counted.
 
-Two trials repeat one motion, for an effect, where what it adds to the rates is nearly the same
-function of time in both, and so is a state on which the rates may depend in another way. Compared
-are means over tenths of the trial, so that a feedback that chatters, or noise, makes no motion
-another one.
+Two trials make the same motion, for an effect, if what it adds to the rates is nearly the same
+function of time in both, and so is at least one state that the rates may depend on instead.
+Compared are means over tenths of the trial, so that noise or a chattering feedback does not make
+motions different.
 
-What is a function of time alone, a wave or a trend, adds the same to all trials, whatever they do.
-Candidates for one target move alike but for a few per cent: a function of a state that they share
-follows the wave in all of them but for as much. So there a trial's nats count by the part of its
-motion that is not that of the motion with most say.
+An effect that is a function of time alone (a wave, a trend) adds the same to all trials, whatever
+they do. Candidates for one target move alike except for a few per cent, and so does any function of
+a state that they share. So for these effects, a trial's nats are weighted by the fraction of its
+motion that differs from the motion with the largest share.
 """
 
 from __future__ import annotations
@@ -37,27 +37,30 @@ from grounded.effects.places import dynamic
 from grounded.frozen import Array
 from grounded.model import Model, Param
 
-REPEATS = 0.03  # of a signal's power: trials that differ by less are one motion
+REPEATS = 0.03  # fraction of a signal's power below which trials make the same motion
 TENTHS = 10  # stretches whose means are compared
-LENGTH = 0.2  # of a trial's steps by which another one may be longer
-KNOWN = 2.0  # standard deviations from zero of a size that is known
-HALF = 0.5  # of its say: a trial with less moves as the others do
+LENGTH = 0.2  # relative difference of the lengths of trials of one motion, at most
+KNOWN = 2.0  # standard deviations from zero from which a size is known
+HALF = 0.5  # weight below which a trial counts as the same motion
 
 
 def repeats(search: FittedHypotheses, fit: Fitted, less: Fitted, name: str) -> int:
-    """How many trials make the motion that bears an effect out, or nearly; 0: others do, too.
+    """Return the number of trials of the only motion that supports an effect.
 
     Args:
-        search: whose evidence counts.
-        fit: with the effect.
-        less: without it, the rest fitted again.
-        name: of the effect.
+        search: provides tempering and predictor.
+        fit: the fit with the effect.
+        less: the fit without it, the rest fitted again.
+        name: name of the effect.
+
+    Returns:
+        0 if other motions support it, too, or if it names a mechanism.
     """
     data, h = search.data, fit.hypothesis
     if data.count < 2 or not h.effects[h.names.index(name)].family.loose:
         return 0
     if np.bincount(data.trial_of).max() >= PIECES:
-        return 0  # a log so long makes many motions, and would do without the others
+        return 0  # a log this long contains many motions
     paths = _Paths(search.predictor, h.minus(name), h, fit.track)
     motion = paths.motions()
     lost = 0.5 * (less.rss + less.logdet - fit.rss - fit.logdet)
@@ -72,17 +75,17 @@ def repeats(search: FittedHypotheses, fit: Fitted, less: Fitted, name: str) -> i
 
 
 def of_no_size(predictor: Predictor, fit: Fitted, trial_of: Array) -> list[str]:
-    """The effects of a fit that may as well be nothing, or lie where nobody was.
+    """Return the effects of a fit whose size is not known, or patches that no trial visited.
 
-    No size of it is known to KNOWN deviations. Of a wave of half a period what it adds where
-    something was measured is known, what it is is not; of two falls what grows with time is told by
-    how both ended. The size of a patch of ground hangs on its place: it counts where a trial came
-    within a radius of that. Parameters have priors of their own.
+    The size is not known if no coefficient differs from zero by KNOWN standard deviations. (Of a
+    wave of half a period, the sum in the measured range is known, its coefficients are not.) The
+    size of a patch of ground depends on its place, so it counts if a trial came within a radius of
+    it. Parameters are exempt, since they have priors.
 
     Args:
-        predictor: of the data of the fit.
-        fit: with the effects.
-        trial_of: what each run is left out with (B,), for the scatter between them.
+        predictor: evaluates hypotheses on the data of the fit.
+        fit: the fit with the effects.
+        trial_of: fold of each run (B,), for the scatter between them.
     """
     found, sizes, at = [], dict[str, list[int]](), 0
     for effect, values in fit.hypothesis.pairs:
@@ -99,7 +102,7 @@ def of_no_size(predictor: Predictor, fit: Fitted, trial_of: Array) -> list[str]:
 
 
 def _visited(data: Data, values: Mapping[str, float]) -> bool:
-    """Whether a trial came within a radius of a place (x0, y0, ...)."""
+    """Check whether a trial came within a radius of a place (x0, y0, ...)."""
     names = data.model.state_names
     where = [name for name in names if f"{name}0" in values]
     own = data.filled[:, [names.index(name) for name in where]]
@@ -110,22 +113,23 @@ def _visited(data: Data, values: Mapping[str, float]) -> bool:
 def without_others(
     predictor: Predictor, track: Array, adopted: Collection[str], library: Library
 ) -> Model:
-    """The model with the numbers of adopted effects as constants that one motion can't tell.
+    """Return the model with the values of adopted effects held that one motion can't determine.
 
-    Those without a mechanism, where all trials make one motion: other trials have told them.
+    These are effects without a mechanism, if all trials make the same motion for them. Their
+    values were found from other trials.
 
     Args:
-        predictor: of the data.
-        track: of the states (L + 1, B, n).
-        adopted: names of effects whose numbers are parameters.
-        library: that has them.
+        predictor: evaluates hypotheses on the data.
+        track: states (L + 1, B, n).
+        adopted: names of the adopted effects, whose values are parameters of the model.
+        library: source of the effects.
     """
     data, model, held = predictor.data, predictor.data.model, set[str]()
     for name in adopted if data.count > 1 else ():
         of, _, target = name.partition(":")
         family = library.family(of)
         if not family.loose or target not in family.targets(model):
-            continue  # of what has it already: two sensors that were late as one are so no more
+            continue  # not applicable any more, as a common delay once one sensor has another one
         effect = library.effect(name, model, data.scales)
         own = {q.name: param_name(name, q.name) for q in effect.quantities}
         if not all(p in model.params for p in own.values()):
@@ -139,17 +143,17 @@ def without_others(
 
 
 def how_many(predictor: Predictor) -> int:
-    """In how many motions that differ the trials were made."""
+    """Return the number of different motions of the trials."""
     return 1 + int(motions(predictor, Hypothesis(), Hypothesis(), predictor.data.y).max())
 
 
 def motions(predictor: Predictor, less: Hypothesis, h: Hypothesis, track: Array) -> Any:
-    """Which motion each trial makes, (S,) of int, for what `h` adds to `less` along a track."""
+    """Return the motion of each trial, (S,) of int, for what `h` adds to `less` along a track."""
     return _Paths(predictor, less, h, track).motions()
 
 
 class _Paths:
-    """What `h` adds to `less` along each trial, and the states there on which rates may depend."""
+    """What `h` adds to `less` along each trial, and the states that rates may depend on."""
 
     def __init__(self, predictor: Predictor, less: Hypothesis, h: Hypothesis, track: Array) -> None:
         data, x = predictor.data, track[:-1]
@@ -158,13 +162,13 @@ class _Paths:
         self.power = [float(_power(one, none=0.0)) for one in self.signal]
         means = np.concatenate([_tenths(one) for one in self.states])
         seen = np.isfinite(means).any(axis=0)
-        self.spread = np.full(len(seen), np.nan)  # of what nobody measures
+        self.spread = np.full(len(seen), np.nan)  # NaN where not measured
         self.spread[seen] = np.nanvar(means[:, seen], axis=0)
         self.moves = np.zeros(len(seen), bool)
         self.moves[seen] = self.spread[seen] > 1e-9 * np.nanmean(means[:, seen] ** 2, axis=0)
 
     def motions(self) -> Any:
-        """Which motion each trial makes, (S,) of int."""
+        """Return the motion of each trial, (S,) of int."""
         led, found = list[int](), np.zeros(len(self.signal), int)
         for i in range(len(found)):
             leader = next((k for k, j in enumerate(led) if self.same(i, j)), len(led))
@@ -173,13 +177,13 @@ class _Paths:
         return found
 
     def same(self, i: int, j: int) -> bool:
-        """Whether two trials repeat one motion."""
+        """Check whether two trials make the same motion."""
         acts = _power(self._between(self.signal, i, j))
         alike = acts <= REPEATS * (self.power[i] + self.power[j])
         return bool(alike and self.apart(i, j) <= REPEATS)
 
     def apart(self, i: int, j: int) -> float:
-        """By which part of its power two trials differ in the state that differs least, 0 to 1."""
+        """Return by which fraction of its power the most similar state of two trials differs."""
         length, other = len(self.signal[i]), len(self.signal[j])
         if max(length, other) > (1 + LENGTH) * min(length, other) or not self.moves.any():
             return 1.0
@@ -187,13 +191,13 @@ class _Paths:
         return float(min((0.5 * moved / self.spread[self.moves]).min(), 1.0))
 
     def _between(self, each: list[Array], i: int, j: int) -> Array:
-        """What two trials differ by, over as many steps as both have, in means over tenths."""
+        """Return the difference of two trials over their common steps, in means over tenths."""
         steps = min(len(self.signal[i]), len(self.signal[j]))
         return _tenths(each[i][:steps]) - _tenths(each[j][:steps])
 
 
 def _by_trial(data: Data, values: Array) -> list[Array]:
-    """Values by step (L, B, n), of each trial (T, n); NaN where a run was left out."""
+    """Return values by step (L, B, n) as one array (T, n) per trial; NaN in runs left out."""
     flat = np.full((int(data.lengths.sum()), values.shape[-1]), np.nan)
     there = data.valid > 0
     flat[data.step_at[there]] = values.swapaxes(0, 1)[there]
@@ -201,7 +205,7 @@ def _by_trial(data: Data, values: Array) -> list[Array]:
 
 
 def _states(data: Data) -> list[Array]:
-    """Of each trial (T + 1, n) the states on which a rate may depend, and that some sensor has."""
+    """Return, per trial (T + 1, n), the measured states that a rate may depend on."""
     names = data.model.state_names
     known = [names.index(n) for n in dynamic(data.model) if n in names]
     seen = [i for i in known if data.seen[..., i].any() and i not in data.hidden]
@@ -209,7 +213,7 @@ def _states(data: Data) -> list[Array]:
 
 
 def _power(values: Array, axis: int | None = None, none: float = np.inf) -> Any:
-    """The mean square of what is known; `none` where nothing is, as of a trial left out."""
+    """Return the mean square of finite values; `none` if there are none."""
     known = np.isfinite(values)
     count = known.sum(axis=axis)
     total = (np.where(known, values, 0.0) ** 2).sum(axis=axis)
@@ -217,6 +221,6 @@ def _power(values: Array, axis: int | None = None, none: float = np.inf) -> Any:
 
 
 def _tenths(values: Array) -> Array:
-    """Means over stretches of time, (TENTHS, n) of (T, n)."""
+    """Return means over stretches of time, (TENTHS, n) of (T, n)."""
     parts = np.array_split(values, min(TENTHS, len(values)))
     return np.stack([part.mean(axis=0) for part in parts])

@@ -1,10 +1,10 @@
-"""Where the gap lies: how wrong the model's predictions are, by channel, time and region.
+"""Where the gap is: prediction errors relative to noise, by channel, time and region.
 
-Predictions start at the filtered state and run on with the recorded commands; their errors after a
-second are compared with what noise alone would make of them (the filter's own covariance, carried
-on): 1.0 is the floor, what is above it can be explained. What the best hypothesis, or a flexible
-one, explains of the innovations is laid out by channel, by time and by the half-space of a state or
-an input that holds most of it in the least time.
+Predictions start at the filtered state and run open loop with the recorded commands. Their errors
+after a second are divided by the standard deviation that noise alone would cause (the filter's
+covariance, propagated): 1.0 is the floor, anything above it could be explained. The gain of the
+best hypothesis, or of a flexible regression, is broken down by channel, by time and by region. A
+region is a half-space of one state or input with a large share of the gain in little of the time.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ MOST_STARTS = 400
 
 @dataclass(frozen=True, eq=False)
 class Horizon:
-    """Predictions over one horizon: where they start, what noise alone makes of their errors.
+    """Predictions over one horizon: their starts, and the errors that noise alone causes.
 
-    at: (M,) step of the run; run: (M,); spread: (M, n) standard deviation from noise alone.
+    at: (M,) step within the run; run: (M,); spread: (M, n) standard deviation from noise alone.
     """
 
     steps: int
@@ -44,12 +44,12 @@ class Horizon:
 
 
 def horizon(predictor: Predictor, fit: Fitted, seconds: float) -> Horizon:
-    """Starting points spread over all runs, and the floor under their errors.
+    """Choose starting points in all runs and compute the noise floor of their predictions.
 
     Args:
-        predictor: the data.
-        fit: the best hypothesis: its noise is the floor.
-        seconds: how far; shorter where runs are.
+        predictor: evaluates hypotheses on the data.
+        fit: the best hypothesis, whose noise gives the floor.
+        seconds: the horizon; shorter if the runs are.
     """
     data = predictor.data
     B = len(data.valid)
@@ -66,9 +66,9 @@ def horizon(predictor: Predictor, fit: Fitted, seconds: float) -> Horizon:
 
 
 def _spread(predictor: Predictor, fit: Fitted, at: Any, run: Any, steps: int) -> Array:
-    """Standard deviation that noise alone gives the log `steps` after the moments (M,), (M, n).
+    """Return the standard deviation of the log from noise alone, `steps` ahead of (M,), (M, n).
 
-    With its outliers, as the errors that are compared with it have them.
+    Outliers are included, because the errors compared with it contain them.
     """
     data, fit = predictor.data, replace(fit, noise=fit.noise.plain)
     noise = fit.noise
@@ -77,12 +77,12 @@ def _spread(predictor: Predictor, fit: Fitted, at: Any, run: Any, steps: int) ->
     R, Q = np.broadcast_to(noise.measurement(L), (L + 1, B, n)), g.system.Q
     wide, N = g.k.shape[2:]
     P = g.posterior[np.maximum(at - 1, 0), run]
-    P[:, wide:], P[:, :, wide:] = 0.0, 0.0  # of the noise's colour nothing is known by then
+    P[:, wide:], P[:, :, wide:] = 0.0, 0.0  # coloured noise: start from its stationary variance
     k = np.arange(wide, wide + n if wide < N else wide)
     P[:, k, k] = noise.start(1)[0] if wide < N else 0.0
     delayed = {} if delays is None else dict(zip(delays.channel, delays.whole, strict=True))
-    # what a delayed channel shows at the horizon is that much nearer; what lies before the moment
-    # has been filtered already, and this is more than its error
+    # a delayed channel shows a state from before the horizon; if even from before the start, that
+    # state is filtered already, and this variance is an upper bound
     found = {i: P[:, i, i] for i, whole in delayed.items() if whole >= steps}
     for j in range(steps):
         A, q = g.system.A[at + j, run], Q[at + j, run]
@@ -96,12 +96,12 @@ def _spread(predictor: Predictor, fit: Fitted, at: Any, run: Any, steps: int) ->
 
 
 def errors(predictor: Predictor, h: Hypothesis, track: Array, where: Horizon) -> Array:
-    """Y - prediction at the horizon, (M, n); NaN where nothing was measured."""
+    """Return measurement minus prediction at the horizon, (M, n); NaN where not measured."""
     data = predictor.data
     x = track[where.at, where.run]
     u, t = predictor.inputs(h), data.time
     delays = delays_of(h, data)
-    oldest = 0 if delays is None else delays.oldest  # what delayed sensors may still show
+    oldest = 0 if delays is None else delays.oldest  # oldest state that delayed sensors may show
     path = [track[np.maximum(where.at - j, 0), where.run] for j in range(oldest, -1, -1)]
     advance = stepper(predictor, h)
     for j in range(where.steps):
@@ -116,15 +116,15 @@ def errors(predictor: Predictor, h: Hypothesis, track: Array, where: Horizon) ->
 
 
 def normalised(error: Array, where: Horizon) -> float:
-    """Root mean square of errors in units of what noise alone makes."""
+    """Return the rms of errors relative to those from noise alone."""
     return float(np.sqrt(np.nanmean((error / where.spread) ** 2)))
 
 
 def explained(predictor: Predictor, null: Hypothesis, best: Fitted) -> Array:
-    """What `best` gains over the bare model at every step and channel, (L, B, n) [nats].
+    """Return the gain of `best` over the bare model at every step and channel, (L, B, n) [nats].
 
-    Both are filtered with the noise of `best`: the bare model's innovations would hide the gap in a
-    larger noise.
+    Both are filtered with the noise of `best`. The bare model's own noise estimate is larger and
+    would hide the gap.
     """
     data = predictor.data
     g = filter_of(predictor, best)
@@ -140,7 +140,7 @@ def explained(predictor: Predictor, null: Hypothesis, best: Fitted) -> Array:
 
 
 def by_time(gain: Array, data: Data, parts: int = 8) -> list[TimeShare]:
-    """Shares of the gap over equal parts of the trial's duration."""
+    """Return the shares of the gap in equal parts of the trial's duration."""
     whole = max(float(np.maximum(gain.sum(), 1e-12)), 1e-12)
     end = float(data.time.max()) + data.dt
     edges = np.linspace(0, end, parts + 1)
@@ -153,7 +153,7 @@ def by_time(gain: Array, data: Data, parts: int = 8) -> list[TimeShare]:
 
 
 def by_region(gain: Array, predictor: Predictor, fit: Fitted, most: int = 3) -> list[Region]:
-    """Half-spaces of a state or an input that hold most of the gap in little of the time."""
+    """Return the half-spaces of a state or an input with most of the gap in little of the time."""
     data = predictor.data
     model = data.model
     signals: list[tuple[str, Array]] = []
@@ -175,10 +175,10 @@ def by_region(gain: Array, predictor: Predictor, fit: Fitted, most: int = 3) -> 
 
 
 def _stump(name: str, signal: Array, gain: Array, valid: Any, whole: float) -> Region | None:
-    """The best threshold of one signal, of its value or its size."""
+    """Return the best half-space of one signal, by its value or its magnitude, or None."""
     best: Region | None = None
     margin = 0.1
-    nothing = 1e-3 * float(signal[valid].std())  # a level that is zero but for rounding
+    nothing = 1e-3 * float(signal[valid].std())  # levels below it are shown as zero
     forms: list[tuple[str, Callable[[Array], Array]]] = [(name, lambda v: v)]
     if float(signal.min()) < 0 < float(signal.max()):
         forms.append((f"|{name}|", np.abs))

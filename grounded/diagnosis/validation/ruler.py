@@ -1,17 +1,15 @@
-"""The ruler: how wrong held-out open-loop predictions are, in the units of each channel.
+"""The ruler: rms errors of held-out open-loop predictions, in the unit of each channel.
 
-From many moments of the log, and from the beginning of each trial, a hypothesis runs on with the
-commands that were sent and sees nothing more of the log. Its errors 0.1, 0.5 and 1 s later, and
-over whole trials, are what an engineer would measure; values come from the other trials, or from
-the other pieces of one long log. The noise that a diagnosis estimates has no part in them, so they
-compare between hypotheses, models and days.
+From many moments of the log, and from the start of each trial, a hypothesis is simulated with the
+recorded commands and without further measurements. Its errors are taken 0.1, 0.5 and 1 s later and
+over whole trials. Its values come from the other trials, or from the other pieces of one long log.
+The errors do not depend on the noise that a diagnosis estimates, so they can be compared between
+hypotheses, models and diagnoses. Two hypotheses are compared by `gain`.
 
-Two hypotheses are compared by what one gains (`gain`).
-
-No model predicts better than the noise floor. Where a manoeuvre was repeated, by a candidate or by
-commands that are the same, predictions of the repeats miss by the same model error and by different
-noise: the scatter among them is the floor. Else it comes from the short horizon: what one step
-leaves, as white noise, carried on by the model.
+No model predicts better than the noise floor. If a manoeuvre was repeated (same candidate or same
+commands), predictions of the repeats share the model's error and differ in noise, so the scatter
+among their errors is the floor. Otherwise the one-step residual is taken as white noise and
+propagated by the model to each horizon.
 """
 
 from __future__ import annotations
@@ -35,26 +33,27 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 SECONDS = (0.1, 0.5, 1.0)
-MOST_STARTS, FEWER_STARTS = 400, 75  # the fewer of a simulator, whose steps are slow
-MOST_WHOLE = 8  # trials that are predicted from beginning to end
-WHOLE_STEPS = 4000  # of them together, where that leaves LEAST_WHOLE
+MOST_STARTS, FEWER_STARTS = 400, 75  # the second applies to a simulator, whose steps are slow
+MOST_WHOLE = 8  # most trials that are predicted from start to end
+WHOLE_STEPS = 4000  # most steps of these together, unless that leaves fewer than LEAST_WHOLE
 LEAST_WHOLE = 3
-FINE = 2e-3  # of a channel's spread: errors below it do not matter
-SLIGHT = 1e-2  # nor below this part of the crude model's, or of the spread where that is less
-ODD = 10.0  # times the error of the best repeat: a trial that misses more is none
-MOMENTS = 20  # at which repeats are compared
-AS_LONG = 1.25  # times as long as repeats: whole trials that their scatter says something of
-ALIKE = 0.02  # of a command's spread: how much commands of repeats may differ, rms
+FINE = 2e-3  # fraction of a channel's spread below which errors are negligible,
+SLIGHT = 1e-2  # and the same fraction of the crude model's error, or of the spread if smaller
+ODD = 10.0  # a trial that misses more than this times the best repeat is not a repeat
+MOMENTS = 20  # most moments at which repeats are compared
+AS_LONG = 1.25  # whole trials up to this times as long as the repeats have their floor
+ALIKE = 0.02  # most rms difference of repeated commands, as a fraction of their spread
 
 
-MOST_LEFT_OUT = 1 / 3  # of all steps: without more, the rest would have to extrapolate
+MOST_LEFT_OUT = 1 / 3  # of all steps: leaving out more would make the rest extrapolate
 MOST_FOLDS = 20
 
 
 def folds(data: Data) -> Any:
-    """What each run is held out with, (B,): its trial; of one that holds most, piece by piece.
+    """Return the fold of each run, (B,), which is held out together.
 
-    Of very many trials several together: the rest tells as much without them.
+    A fold is a trial. A trial with a large share of all steps is held out in pieces (its runs), and
+    several trials together form a fold if there are very many.
     """
     share = data.lengths[data.trial_of] / data.lengths.sum()
     whole = data.trial_of * min(data.count, MOST_FOLDS) // data.count
@@ -62,7 +61,7 @@ def folds(data: Data) -> Any:
 
 
 class Ruler:
-    """Errors of fitted hypotheses on one set of trials."""
+    """Held-out errors of fitted hypotheses on one set of trials."""
 
     def __init__(self, predictor: Predictor, origin: Task | None = None) -> None:
         self.predictor, self.data, self.origin = predictor, predictor.data, origin
@@ -77,14 +76,14 @@ class Ruler:
         self.state0 = np.cumsum([0, *(data.lengths + 1)])[:-1]  # of each trial, flat
         self.step0 = np.cumsum([0, *data.lengths])[:-1]
         count = -(-data.valid.sum(axis=1).astype(int) // self.steps[-1])
-        self.piece0 = np.cumsum([0, *np.maximum(count, 1)])  # the first of each run, and the end
+        self.piece0 = np.cumsum([0, *np.maximum(count, 1)])  # first piece of each run, and the end
         self.run_of = np.repeat(np.arange(len(count)), np.diff(self.piece0))
         self.fine_whole = self.fine  # over whole trials
         self._measured: dict[int, tuple[Fitted, Errors]] = {}
 
     @cached_property
     def starts(self) -> tuple[Any, Any]:
-        """(step within the run, run) of each moment that is predicted from, (M,) each."""
+        """Step within the run, and run, of each moment that predictions start from, (M,) each."""
         data, least = self.data, self.steps[0]
         lengths = data.valid.sum(axis=1).astype(int)
         first = data.step_at[:, 0] - self.step0[data.trial_of]
@@ -98,7 +97,7 @@ class Ruler:
 
     @cached_property
     def wholes(self) -> Any:
-        """The first runs of the trials that are predicted whole."""
+        """The first runs of the trials that are predicted from start to end."""
         data = self.data
         first = np.flatnonzero(data.step_at[:, 0] == self.step0[data.trial_of])
         most = int(np.clip(WHOLE_STEPS // data.lengths.max(), LEAST_WHOLE, MOST_WHOLE))
@@ -106,22 +105,22 @@ class Ruler:
 
     @cached_property
     def fine(self) -> Array:
-        """Error of each state below which nothing matters, (n,)."""
+        """Error of each state below which differences are negligible, (n,)."""
         return np.asarray(np.maximum(FINE * self.data.filled.std(axis=0), 1e-12))
 
     def beside(self, crude: Fitted) -> None:
-        """What matters from now on is measured by what the crude model missed at the outset."""
+        """Set negligible errors relative to those of the crude model at the outset."""
         self.outset = self.errors(crude) if self.origin is None else self._origin(crude)
         missed, spread = np.nan_to_num(self.outset.rms), self.data.filled.std(axis=0)
         self.fine_whole = np.maximum(self.fine, SLIGHT * np.minimum(missed.max(axis=0), spread))
         self.fine = np.maximum(self.fine, SLIGHT * np.minimum(missed[:-1].max(axis=0), spread))
 
     def since_outset(self, fit: Fitted) -> float:
-        """What a hypothesis predicts better than the model did before anything was adopted."""
+        """Return the mean gain of a hypothesis over the model before anything was adopted."""
         return self.compared(self.outset, self.errors(fit)).mean
 
     def _origin(self, crude: Fitted) -> Errors:
-        """Errors of the model before effects were adopted, whose states are the first of these."""
+        """Return errors of the model before effects were adopted; its states are the first n."""
         assert self.origin is not None
         model, n = self.origin.model, self.origin.model.n
         states, latency = self.data.states[:, :n], self.origin.latency
@@ -134,11 +133,11 @@ class Ruler:
 
     @property
     def measured(self) -> list[tuple[Fitted, Errors]]:
-        """All hypotheses that were measured so far."""
+        """All fits measured so far, with their errors."""
         return list(self._measured.values())
 
     def errors(self, fit: Fitted) -> Errors:
-        """Held-out errors of a hypothesis, from its own filtered states."""
+        """Return the held-out errors of a hypothesis, starting from its own filtered states."""
         if id(fit) not in self._measured:
             self._measured[id(fit)] = fit, self._errors(fit)
         return self._measured[id(fit)][1]
@@ -166,7 +165,10 @@ class Ruler:
         added: Array | None = None,
         whole: bool = True,
     ) -> None:
-        """The errors of all runs, each of its hypothesis; `added` to every step within a run."""
+        """Add the errors of all runs, each with its hypothesis, to `found`.
+
+        `added` (L, B, n) is added to every step within a run.
+        """
         at, run = self.starts
         piece = self.piece0[run] + (at - 1) // self.steps[-1]
         error = missed(self.predictor, each, of_run[run], track, at, run, self.steps[-1], added)
@@ -185,7 +187,7 @@ class Ruler:
             found.count[-1, self.piece0[run]] += np.isfinite(square).sum(axis=0)
 
     def doubt(self, fit: Fitted) -> Array:
-        """Scatter of the logarithm of each rms error, the jackknife's over runs, (K, n')."""
+        """Return the jackknife standard error of each log rms error, over runs, (K, n')."""
         found = self.errors(fit)
         total, count = (self.by_run(a[..., self.shown]) for a in (found.total, found.count))
         left = [a.sum(axis=1, keepdims=True) - a for a in (total, count)]
@@ -194,18 +196,18 @@ class Ruler:
         return np.asarray(np.sqrt((B - 1) * each.var(axis=1) if B > 1 else each[:, 0] * 0 + np.inf))
 
     def gain(self, before: Fitted, after: Fitted) -> Gain:
-        """What `after` predicts better than `before`."""
+        """Return the gain of `after` over `before`."""
         return self.compared(self.errors(before), self.errors(after))
 
     def corrected(self, fit: Fitted, rate: Array) -> tuple[Gain, Errors]:
-        """What a fit would gain by a rate (L, B, n) [unit/s] added along its log; its errors."""
+        """Return the gain of adding a rate (L, B, n) [unit/s] along the log, and the new errors."""
         plain, other, of_run = self._none(), self._none(), np.zeros(len(self.data.valid), int)
         for found, added in ((plain, None), (other, rate * self.data.dt)):
             self._add(found, [fit.hypothesis], of_run, fit.states, added, whole=False)
         return self.compared(plain, other), other
 
     def compared(self, before: Errors, after: Errors) -> Gain:
-        """The same of errors."""
+        """Return the gain of one set of errors over another."""
         a, b = (errors.total[..., self.shown] for errors in (before, after))
         count = before.count[..., self.shown].sum(axis=1, keepdims=True)
         seen, least = count > 0, count * self._matters()[:, None] ** 2 + 1e-300
@@ -232,19 +234,19 @@ class Ruler:
         )
 
     def _matters(self) -> Array:
-        """Error below which nothing matters, by horizon and shown state, (K, n')."""
+        """Return the error below which differences are negligible, (K, n')."""
         short, whole = self.fine[self.shown], self.fine_whole[self.shown]
         return np.stack([*[short] * len(self.steps), whole])
 
     def _pieces(self, before: Errors, after: Errors) -> Array:
-        """What each piece gains (P,), beside what `after` misses on average: no piece rules."""
+        """Return the gain of each piece (P,), damped by the mean error so that none dominates."""
         a, b, n = (e[:-1][..., self.shown] for e in (before.total, after.total, before.count))
         all_n = np.maximum(n.sum(axis=1, keepdims=True), 1)
         usual = n * (b.sum(axis=1, keepdims=True) / all_n + self.fine[self.shown] ** 2) + 1e-300
         return np.asarray((n / all_n * np.log((a + usual) / (b + usual))).sum(axis=(0, 2)))
 
     def _by_trial(self, before: Errors, after: Errors) -> Array:
-        """What each trial gains by itself, the mean over channels and horizons, (S,)."""
+        """Return the gain of each trial separately, the mean over channels and horizons, (S,)."""
         trials = [self.data.trial_of == i for i in self.data.used]
         runs = [self.by_run(e[..., self.shown]) for e in (before.total, after.total, before.count)]
         a, b, n = (np.stack([e[:, own].sum(axis=1) for own in trials]) for e in runs)
@@ -253,16 +255,20 @@ class Ruler:
         return np.asarray(each.sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1))
 
     def by_run(self, pieces: Array) -> Array:
-        """Sums of pieces (K, P, n) by run (K, B, n)."""
+        """Return the sums of pieces (K, P, n) by run (K, B, n)."""
         return np.asarray(np.add.reduceat(pieces, self.piece0[:-1], axis=1))
 
     # -- the floor ----------------------------------------------------------------------------
 
     def scatter(self, fit: Fitted, repeats: Sequence[Sequence[int]]) -> tuple[Array, Array] | None:
-        """Rms error that repeats leave around their mean, (K, n), and how sure it is; None without.
+        """Return the noise floor from repeats: the scatter of their errors about their mean.
 
-        Sure to that standard deviation of its logarithm, (K,): two repeats of 4 s tell what noise
-        does in a second eight times. Of whole trials they say nothing where those are longer.
+        The number of independent samples is the number of repeats times the number of horizons that
+        fit into one: two repeats of 4 s sample the noise over a second about eight times.
+
+        Returns:
+            The rms floor (K, n), NaN for whole trials if these are longer than the repeats, and the
+            standard deviation of its logarithm (K,). None without repeats.
         """
         data, h = self.data, fit.hypothesis
         first = np.flatnonzero(data.step_at[:, 0] == self.step0[data.trial_of])
@@ -298,9 +304,9 @@ class Ruler:
         return found, 1 / np.sqrt(2 * np.maximum(often, 0.5))
 
     def _alike(self, h: Hypothesis, track: Array, runs: Any) -> Any:
-        """The runs that noise alone may tell apart; the rest repeat nothing.
+        """Return the runs that are repeats, without those whose one-step errors are far larger.
 
-        Their errors hold that scatter, so the best of them can't be predicted much better than it.
+        The errors of true repeats differ by noise only, so none can be far above the smallest.
         """
         own = []
         for run in runs:
@@ -314,16 +320,16 @@ class Ruler:
         if not own:
             return runs
         least = np.fmin.reduce(own) + self.fine[self._watched]
-        return runs[[not (one > ODD * least).any() for one in own]]  # what one lacks tells nothing
+        return runs[[not (one > ODD * least).any() for one in own]]  # NaN compares as False
 
     @property
     def _watched(self) -> list[int]:
-        """The shown states that are measured at all."""
+        """The shown states that have a measurement."""
         return [i for i in self.shown if self.data.seen[..., i].any()]
 
 
 def _jackknife(each: Array) -> Array:
-    """Scatter of a mean from the means without each run, (B, ...) -> (...)."""
+    """Return the jackknife standard error from the means without each run, (B, ...) -> (...)."""
     B = len(each)
     if B < 2:
         return np.full(each.shape[1:], np.inf)
@@ -331,11 +337,11 @@ def _jackknife(each: Array) -> Array:
 
 
 def repeated(trials: Sequence[Trial], data: Data) -> list[list[int]]:
-    """Groups of trials that repeat a manoeuvre, as indices: of one candidate, or commanded alike.
+    """Return groups of trials, as indices, with the same candidate or nearly the same commands.
 
     Args:
-        trials: those of the data, in its order.
-        data: prepared from them.
+        trials: the trials of the data, in its order.
+        data: the data prepared from them.
     """
     groups: list[list[int]] = []
     scale = np.maximum(

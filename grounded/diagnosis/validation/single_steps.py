@@ -1,11 +1,11 @@
-"""Whether several trials bear an effect out step by step: the finest ruler where noise is white.
+"""Leave-one-trial-out test of an effect by one-step likelihoods.
 
-A second ahead the noise of many steps has added up, and values of parameters that move beside an
-effect are off by chance in all trials alike, which no scatter from trial to trial shows. Where
-nothing but white noise is left, one step's prediction, weighed by the filter, is all that there is
-to know. So each trial is left out in turn: do the others by themselves claim the effect? Both are
-asked under the noise of the fit with the effect: without it noise grows for what a single trial
-shows, and all the others would seem to gain.
+Predictions a second ahead contain the accumulated noise of many steps. Also, errors of parameters
+fitted beside an effect are common to all trials and do not show in the scatter between them. If the
+innovations are white, the likelihood of single steps contains all information. So each trial is
+left out in turn, and the others alone must claim the effect. Both hypotheses use the noise of the
+fit with the effect. With its own noise, the fit without the effect would have a larger variance
+because of a single trial, and all the other trials would appear to gain.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.validation.ruler import folds
 from grounded.frozen import Array
 
-SAME_SAMPLES = 1e-6  # of a likelihood: what a delayed sensor's first samples add is more
+SAME_SAMPLES = 1e-6  # relative difference of the constants of two log-likelihoods on the same data
 
 
 def borne_out(
     search: FittedHypotheses, before: Fitted, after: Fitted, least: float = CLAIM
 ) -> bool:
-    """Whether trials would claim `after` rather than `before` without any one of them.
+    """Check whether the trials claim `after` over `before` even without any single one of them.
 
-    least: by more than so many nats.
+    least: nats by which it must be likelier.
     """
     paid = search.paid(after.hypothesis) - search.paid(before.hypothesis)
     nats = search.tempering.factor * left_out(search.predictor, before, after)
@@ -39,12 +39,12 @@ def borne_out(
 
 
 def left_out(predictor: Predictor, before: Fitted, after: Fitted) -> Array:
-    """By how much the other trials are likelier under `after`, each left out in turn, (S,) [nats].
+    """Return the gain in log-likelihood of all trials but one, for each one left out, (S,) [nats].
 
     Args:
-        predictor: the data.
+        predictor: evaluates hypotheses on the data.
         before: a fit.
-        after: another one; nothing is gained where its samples are not the same.
+        after: another fit. The gain is zero if it uses other samples (a different sensor delay).
     """
     apart = folds(predictor.data)
     start = (_beside(before.hypothesis, after.hypothesis), after.noise, after.track)
@@ -55,14 +55,14 @@ def left_out(predictor: Predictor, before: Fitted, after: Fitted) -> Array:
 
 
 def _beside(h: Hypothesis, other: Hypothesis) -> Hypothesis:
-    """A hypothesis with another's values, where that has them: one trial alone bends its own."""
+    """Return a hypothesis with the values of another for common effects, against single trials."""
     known = dict(zip(other.names, other.values, strict=True))
     values = tuple(known.get(n, v) for n, v in zip(h.names, h.values, strict=True))
     return replace(h, values=values, shift=other.shift if h.spread > 0 else h.shift)
 
 
 def _of_others(predictor: Predictor, fit: Fitted, apart: Any) -> Array:
-    """Log-likelihood of all trials but each, at their own values, but for a constant, (S,)."""
+    """Return the log-likelihood of all trials but one, at their own values, up to a constant."""
     pull, prior, found = fit.prior_pull(predictor.data), np.diag(fit.prior), []
     for trial in np.unique(apart):
         rest = apart != trial
@@ -74,5 +74,5 @@ def _of_others(predictor: Predictor, fit: Fitted, apart: Any) -> Array:
 
 
 def _constant(fit: Fitted) -> float:
-    """What the samples that are counted add to a log-likelihood, whatever is predicted."""
+    """Return the part of the log-likelihood that depends only on which samples are counted."""
     return fit.loglik + 0.5 * float(fit.rss.sum() + fit.logdet.sum())

@@ -1,10 +1,10 @@
-"""What the prediction error is made of: explained, unexplained, irreducible.
+"""Split of the mean squared prediction error into explained, unexplained and irreducible parts.
 
-    mean e^2 of the crude model  =  explained    what the diagnosis takes away on held-out trials
+    mean e^2 of the crude model  =  explained    what the diagnosis removes on held-out trials
                                  +  unexplained  what it leaves above the noise
-                                 +  irreducible  the noise floor: no model predicts it
+                                 +  irreducible  the noise floor, which no model predicts
 
-All three are read off the `ruler`.
+All three come from the errors of the `ruler`.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from grounded.frozen import Array
 
 
 def shares(before: Array, after: Array, floor: Array) -> Array:
-    """explained, unexplained, irreducible: the shares of each mean squared error, (3, ...).
+    """Return the explained, unexplained and irreducible shares of mean squared errors, (3, ...).
 
     Args:
-        before: of the crude model.
-        after: as diagnosed.
-        floor: what no model predicts.
+        before: mean squared errors of the crude model.
+        after: those of the diagnosed model.
+        floor: those of noise alone.
     """
     after = np.minimum(after, before)
     floor = np.minimum(floor, after)
@@ -37,15 +37,15 @@ def split(
     source: str,
     unsure: float = 0.0,
 ) -> Split:
-    """The parts of the error at one horizon.
+    """Return the parts of the error at one horizon.
 
     Args:
         horizon_s: how far ahead [s].
-        units: of the channels, in order.
+        units: {channel: unit}, in order.
         before: rms error of the crude model (n,).
-        after: as diagnosed (n,).
-        floor: of noise alone (n,); NaN where it is not known.
-        source: what the floor is from.
+        after: rms error of the diagnosed model (n,).
+        floor: rms error of noise alone (n,); NaN where it is not known.
+        source: how the floor was determined.
         unsure: standard deviation of the floor's logarithm.
     """
     unknown = np.isnan(floor) & ~np.isnan(before)

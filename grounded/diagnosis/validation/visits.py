@@ -1,7 +1,7 @@
-"""Where an effect acts: how much in each step, and whether few trials show it.
+"""How strongly an effect acts in each step, and whether only few trials show it.
 
-An effect of one trial is borne out by no other, however likely it is: nothing says that it was not
-that trial which was odd.
+An effect that acts in a single trial is not supported by any other, however likely it is: that
+trial may simply have been unusual.
 """
 
 from __future__ import annotations
@@ -13,27 +13,27 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.frozen import Array
 
-MOST = 0.8  # of all that it does, which few trials hold
-FEW = 4  # one of so many trials
-ALIKE = 0.5  # of what it does in their steps: where others hold as much, no place shows it
-MEMORY = 1e-2  # of a memory's spread: what counts as noise there, where there is none
+MOST = 0.8  # fraction of its action that few trials must hold
+FEW = 4  # few means at most one of this many trials
+ALIKE = 0.5  # if the other trials have more than this part of their action per step: not special
+MEMORY = 1e-2  # fraction of a memory state's spread that stands in for its noise, which is zero
 
 
 def acting(predictor: Predictor, fit: Fitted, name: str) -> Array:
-    """How much an effect does in each step, squared, in units of the noise, (L, B)."""
+    """Return the squared change of each step by an effect, relative to the noise, (L, B)."""
     data, h, x = predictor.data, fit.hypothesis, fit.track
     less = h.minus(name)
     moved = data.model.difference(predictor.next(less, x[:-1]), predictor.next(h, x[:-1]))
     shown = np.zeros_like(x) + predictor.offset(h, x) - predictor.offset(less, x)
     log_q, log_r = fit.noise.log_q.copy(), fit.noise.log_r.copy()
-    for i in data.hidden:  # no noise disturbs it, and by none nothing can be divided
+    for i in data.hidden:  # its noise is zero, by which nothing can be divided
         log_q[i] = log_r[i] = 2 * np.log(MEMORY * data.scales.spread(data.model.state_names[i]))
     square = moved**2 / np.exp(log_q) + shown[1:] ** 2 / np.exp(log_r)
     return np.asarray(square.sum(axis=-1) * data.valid.T)
 
 
 def few_trials(data: Data, acts: Array) -> int:
-    """In how many trials it acts, where those are few and special; else 0."""
+    """Return the number of trials in which an effect acts, if those are few and special; else 0."""
     by = np.bincount(data.trial_of, acts.sum(axis=0), data.count)
     steps = np.bincount(data.trial_of, data.valid.sum(axis=1), data.count)
     order = np.argsort(-by)
