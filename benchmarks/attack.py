@@ -1,7 +1,7 @@
-"""Attacks on files, folders and commands, each for a time; a table of what was tried and broke.
+"""Run attacks on files, folders and commands and print what was tried and what broke.
 
 Run by hand, in a clone: python benchmarks/attack.py [--seconds 60] [--seed 0] [--only NAME].
-The seconds are those of each attack. Ends with 1 if anything broke.
+The seconds are for each attack. Exits with 1 if anything broke.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 
 
 def main() -> None:
-    """Prints a row an attack, and what broke."""
+    """Print a row for each attack, and what broke."""
     from attacks import ATTACKS, KINDS, apart
 
     parser = argparse.ArgumentParser(description=__doc__)

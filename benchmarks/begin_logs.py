@@ -1,7 +1,7 @@
-"""What `init --from` makes of every log in a folder, as the table of docs/log-reference.md.
+"""Run `init --from` on every log in a folder; print the table of docs/log-reference.md.
 
-Run by hand, in a clone: python benchmarks/begin_logs.py FOLDER. A signal is found with its reasons,
-asked for where it is unsure (its guess and its rivals are offered), or nothing in the log fits.
+Run by hand, in a clone: python benchmarks/begin_logs.py FOLDER. A signal is found, with reasons,
+or asked for if unsure (with a guess and its rivals), or nothing in the log fits.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from grounded_trials.starting.begin import begin
 
 
 def main() -> None:
-    """Prints a row a log."""
+    """Print a row for each log."""
     top = Path(sys.argv[1])
     print("| log | kind | found | asked: guess (rivals) | nothing fits |\n|---|---|---|---|---|")
     for path in sorted(p for p in top.rglob("*") if p.suffix in (".npz", ".mcap", ".db3", ".csv")):
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def named(guesses: Sequence[Guess]) -> str:
-    """Names with the ends of their paths."""
+    """Return names with the ends of their paths."""
     rivals = [f" ({len(g.others)})" if g.others else "" for g in guesses]
     texts = [f"{g.name} `{g.path[-28:] or '?'}`" for g in guesses]
     return ", ".join(text + more for text, more in zip(texts, rivals, strict=True))

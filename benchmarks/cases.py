@@ -3,7 +3,7 @@
     car       n = 6 + 2 previous inputs, m = 2, H = 200: 10 s on a circle at 20 Hz
     aircraft  n = 12 + 4, m = 4, H = 3000: the 60 s figure-8 of section 5.1 at 50 Hz
 
-No limits on the inputs (plain DDP peers have none). Everybody starts from the same rollout.
+Inputs have no limits (plain DDP peers have none). All solvers start from the same rollout.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class BenchmarkCase:
     z: np.ndarray
 
     def save(self, folder: Path) -> Path:
-        """The case as arrays, for the peers."""
+        """Save the case as arrays, for the peers."""
         p = self.problem
         path = folder / f"{self.name}.npz"
         np.savez(
@@ -42,7 +42,7 @@ class BenchmarkCase:
 
 
 def cases(names=("car", "aircraft")) -> list[BenchmarkCase]:
-    """Both problems with their starts."""
+    """Return both problems with their starts."""
     found = []
     for name in names:
         if name == "car":

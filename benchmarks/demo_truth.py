@@ -1,12 +1,12 @@
-"""What a car demo's gap is made of, by its declared truth: an ablation beside the diagnosis.
+"""Split a car demo's gap by its declared differences: an ablation to compare with the diagnosis.
 
     python benchmarks/demo_truth.py FOLDER ...
 
-Each FOLDER is what `grounded demo car-turn` (car-circle, car-figure8) left. Its trials are
-predicted open loop, as the diagnosis' ruler does it, by the true car and by true cars that lack one
-of their declared differences from the crude model (`grounded.experiments.real_car`). Credit is what
-the predictions lose without it, of what all of them gain together, as in a diagnosis; the rest is
-not fitted again.
+Each FOLDER was made by `grounded demo car-turn` (car-circle, car-figure8). Its trials are predicted
+open loop, as by the diagnosis' ruler, with the true car and with true cars that lack one of the
+declared differences from the crude model (`grounded.experiments.real_car`). Credit is what the
+predictions lose without a difference, as a share of what they gain from all, as in a diagnosis;
+the rest is not fitted again.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ CAUSES = {  # what is taken out of the true car
 
 
 def true_car(without=()):
-    """The declared car as a model, less some of its differences; its latency [s]."""
+    """Return the declared car without some of its differences, and its latency [s]."""
     car = real_car({k: v for k, v in CALIBRATION.items() if k not in without})
     gone = {name: 0.0 for name in UNMODELLED if name in without}
     latency = dict.fromkeys(LATENCY, 0.1) if "latency" in without else LATENCY
@@ -42,7 +42,7 @@ def true_car(without=()):
 
 
 def missed(model, latency, task, trials):
-    """Rms errors (horizons, n) of open-loop predictions from logged states; the spread (n,)."""
+    """Return rms errors (horizons, n) of open-loop predictions, and the spread (n,)."""
     data = prepare(model, trials, latency, task.past)
     predictor = Predictor(data)
     u, longest = predictor.received(Hypothesis()), round(AHEAD[-1] / data.dt)
@@ -59,7 +59,7 @@ def missed(model, latency, task, trials):
 
 
 def ablation(workspace):
-    """Credit of each declared difference, largest first."""
+    """Return the credit of each declared difference, largest first."""
     task, trials = workspace.task, diagnosable(workspace)
     crude, spread = missed(task.model, task.latency, task, trials)
     fine = np.maximum(2e-3 * spread, 1e-2 * np.minimum(crude.max(axis=0), spread))

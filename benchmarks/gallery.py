@@ -1,11 +1,10 @@
-"""The pictures of docs/gallery.md: the page of every example, of a crash and of a MuJoCo model.
+"""Draw docs/gallery.md's pictures: the page of every example, a crash and a MuJoCo model.
 
     python benchmarks/gallery.py docs            all of them, 3 minutes of CPU
     python benchmarks/gallery.py docs arm crash  some
 
-Each picture shows one page twice: light, 1000 px wide, and dark, 390 px, a phone's. It needs the
-extras `report` and, for the arm, `mujoco`; Debian's chromium and chromium-driver; Pillow, which
-comes with `png`.
+Each picture shows one page twice: light, 1000 px wide, and dark, 390 px (a phone). Needs the extras
+`report`, `png` (for Pillow) and, for the arm, `mujoco`, and Debian's chromium and chromium-driver.
 """
 
 from __future__ import annotations
@@ -118,13 +117,13 @@ noise = {noise}
 
 
 def smooth(t: np.ndarray, end: float) -> np.ndarray:
-    """From 0 to `end` and at rest at both ends (minimum jerk)."""
+    """Go from 0 to `end`, at rest at both ends (minimum jerk)."""
     u = np.clip(t / t[-1], 0.0, 1.0)
     return np.asarray(end * (10 * u**3 - 15 * u**4 + 6 * u**5))
 
 
 def arm(folder: Path) -> None:
-    """A two-link arm of MuJoCo, whose real forearm is heavier and whose joints are stiffer."""
+    """Make a two-link MuJoCo arm whose real forearm is heavier and joints are stiffer."""
     (folder / "arm.xml").write_text(ARM.format(mass=0.6, damping=0.1))
     (folder / "real.xml").write_text(ARM.format(mass=0.9, damping=0.4))
     (folder / "model.py").write_text(ARM_MODEL.format(file="arm.xml", more=""))
@@ -143,7 +142,7 @@ def arm(folder: Path) -> None:
 
 
 def crash(folder: Path) -> None:
-    """A quadrotor whose model is ignorant of the motors' lag, so that runs end on the ground."""
+    """Make a quadrotor whose model lacks the motors' lag, so that runs end on the ground."""
     (folder / "model.py").write_text(QUADROTOR.format(mass=1.0, **CRUDE))
     (folder / "real.py").write_text(QUADROTOR.format(mass=1.2, **REAL))
     t = 0.05 * np.arange(81)
@@ -160,7 +159,7 @@ def crash(folder: Path) -> None:
 
 
 def write(folder: Path, columns: dict[str, np.ndarray], task: dict[str, object]) -> None:
-    """target.csv and grounded.toml."""
+    """Write target.csv and grounded.toml."""
     rows = zip(*columns.values(), strict=True)
     lines = [",".join(columns), *(",".join(f"{v:.6f}" for v in row) for row in rows)]
     (folder / "target.csv").write_text("\n".join(lines) + "\n")
@@ -173,7 +172,7 @@ MADE = {"arm": arm, "crash": crash}
 
 
 def page_of(name: str, place: Path) -> Path:
-    """Learns, diagnoses and reports."""
+    """Learn, diagnose and write the report."""
     folder = place / name
     if name in DEMOS:
         ours("demo", name, "--dir", str(folder))
@@ -187,7 +186,7 @@ def page_of(name: str, place: Path) -> Path:
 
 
 def ours(*words: str) -> None:
-    """Runs a command of grounded's."""
+    """Run a grounded command."""
     done = subprocess.run(
         [sys.executable, "-m", "grounded_cli.main", *words], capture_output=True, text=True
     )
@@ -196,7 +195,7 @@ def ours(*words: str) -> None:
 
 
 def picture(path: Path, section: str) -> bytes:
-    """A page at a desk and on a phone in the dark, side by side, in few colours.
+    """Draw a page, light on a desktop beside dark on a phone, in few colours.
 
     Args:
         path: of the page.
@@ -225,7 +224,7 @@ def picture(path: Path, section: str) -> bytes:
 
 
 def main() -> None:
-    """Draws what is asked for."""
+    """Draw the pictures that were asked for."""
     place, *names = sys.argv[1:] or ["docs"]
     with tempfile.TemporaryDirectory() as folder:
         for name in names or [*DEMOS, *MADE]:

@@ -1,4 +1,4 @@
-"""What `fit` and `diagnose` cost on as much data as people bring: CPU seconds and memory, by hand.
+"""Measure CPU time and memory of `fit` and `diagnose` on long logs; run by hand.
 
     python benchmarks/long_logs.py              all parts, each in a process of its own
     python benchmarks/long_logs.py cars flights
@@ -7,9 +7,8 @@
     cars      diagnose, 8 trials of 200 steps         flights   4 flights of 3,000 steps
     hundred   diagnose, 100 car trials of 1,000 steps
 
-The systems are those of the blind challenge, with its noise: both inputs of the car lag by
-0.15 s, the aircraft's elevator is a fifth weaker, parameters are off by 5 %. A ratio
-compares with the budget.
+The systems are those of the blind challenge, with its noise: both inputs of the car lag by 0.15 s,
+the aircraft's elevator is a fifth weaker, parameters are off by 5 %. Ratios are to the budget.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ BUDGET = {
 
 
 def driving(steps, seed=1):
-    """One log of a car like the model's, every parameter off by up to 20 %."""
+    """Make one log of a car with every parameter off by up to 20 %."""
     from grounded.experiments.driving import hands
     from grounded.experiments.fit_car import true_car
     from grounded.models.car import model
@@ -50,7 +49,7 @@ def driving(steps, seed=1):
 
 
 def runs(name, trials, steps, seed=1):
-    """A case of the challenge with much data: the car lags, the aircraft has a weaker elevator."""
+    """Make a challenge case with much data: a lagging car, or a weaker elevator."""
     from grounded.challenge import cases, systems
     from grounded.trial import Trial
 
@@ -94,7 +93,7 @@ def runs(name, trials, steps, seed=1):
 
 
 def drive():
-    """The worst of the fitted values in its own standard deviations."""
+    """Return the error of the worst fitted value in its own standard deviations."""
     from grounded.fit import fit
 
     model, trials, truth = driving(36_000)
@@ -106,7 +105,7 @@ def drive():
 
 
 def diagnosed(name, trials, steps):
-    """What is claimed, and the verdict."""
+    """Return what is claimed, and the verdict."""
     from grounded.challenge.score import task_of
     from grounded.diagnosis.diagnose import diagnose
 
@@ -124,7 +123,7 @@ PARTS = {
 
 
 def one(part):
-    """Runs a part here and prints its row."""
+    """Run a part in this process and print its row."""
     begin, said = PARTS[part]()
     seconds = time.process_time() - begin
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

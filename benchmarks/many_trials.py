@@ -1,12 +1,11 @@
-"""What the commands cost in a workspace of 10,000 trials: CPU seconds and memory, by hand.
+"""Measure CPU time and memory of the commands in a workspace of 10,000 trials; run by hand.
 
     python benchmarks/many_trials.py [--trials 10000] [--candidates 2500] [--folder DIR]
 
-The workspace is the example car-turn after a search that went on and on: each candidate gains a
-little, is handed out and run four times with the noise of a real car. The folder is kept where it
-is named, and used again. Each row is a process of its own; the first one makes the index.
-`million` ingests one trial of 1,000,000 steps into an empty workspace. A ratio compares with the
-budget.
+The workspace is the example car-turn after a very long search: each candidate gains a little, is
+handed out and run four times with the noise of a real car. A named folder is kept and used again.
+Each row is a process of its own; the first one makes the index. `million` ingests one trial of
+1,000,000 steps into an empty workspace. Ratios are to the budget.
 """
 
 from __future__ import annotations
@@ -31,12 +30,12 @@ BUDGET = {"status": 1, "propose": 1, "ingest": 1, "report --html": 5, "million":
 NOISE, LEFT, SEED = 1e-4, 0.2, 7  # [m, m/s, rad]; of the first error, after the last candidate
 
 ENVIRONMENT = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-ENVIRONMENT.pop("PYTHONDONTWRITEBYTECODE", None)  # as people have it: modules are compiled once
+ENVIRONMENT.pop("PYTHONDONTWRITEBYTECODE", None)  # as for users: modules are compiled once
 ENVIRONMENT["PYTHONPYCACHEPREFIX"] = str(Path(tempfile.gettempdir()) / "many-trials-bytecode")
 
 
 def made(folder, trials, candidates):
-    """A workspace that searched for years."""
+    """Make the workspace."""
     if (folder / "grounded.toml").exists():
         return
     w = Workspace.create(folder, example="car-turn")
@@ -95,7 +94,7 @@ def keep(folder, letter, number, data, suffix):
 
 
 def long_log(folder, steps=1_000_000):
-    """A trial of so many steps, which ran no candidate."""
+    """Write a trial of so many steps that ran no candidate."""
     if not (folder / "grounded.toml").exists():
         w = Workspace.create(folder, example="pendulum")
         rng = np.random.default_rng(SEED)
@@ -115,7 +114,7 @@ def long_log(folder, steps=1_000_000):
 
 
 def timed(name, *command):
-    """Runs a command and prints its row."""
+    """Run a command and print its row."""
     code = "from grounded_cli.start import main; main()"
     process = subprocess.Popen(
         [sys.executable, "-c", code, *command],

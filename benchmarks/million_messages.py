@@ -1,4 +1,4 @@
-"""A million nav_msgs/Odometry messages to arrays: CPU seconds, against decoders one by one.
+"""Time the reading of a million nav_msgs/Odometry messages, beside message-by-message decoders.
 
 Run by hand: python benchmarks/million_messages.py [COUNT]. Peers are optional (rosbags,
 mcap-ros2-support); they read a twentieth of the messages and are scaled up.
@@ -42,7 +42,7 @@ PATHS = {
 
 
 def write(path: Path, count: int, *, chunked: bool) -> None:
-    """An Odometry message a millisecond, with a stamp and two frame names."""
+    """Write an Odometry message a millisecond, with a stamp and two frame names."""
     rest = struct.pack("<85d", *range(85))
     kind = CompressionType.ZSTD if chunked else CompressionType.NONE
     with path.open("wb") as stream:
@@ -58,7 +58,7 @@ def write(path: Path, count: int, *, chunked: bool) -> None:
 
 
 def one_by_one(path: Path) -> None:
-    """The decoder of the mcap project."""
+    """Read with the decoder of the mcap project."""
     from mcap_ros2.decoder import DecoderFactory
 
     with path.open("rb") as stream:
@@ -67,7 +67,7 @@ def one_by_one(path: Path) -> None:
 
 
 def with_rosbags(path: Path) -> None:
-    """The rosbags package."""
+    """Read with the rosbags package."""
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -77,7 +77,7 @@ def with_rosbags(path: Path) -> None:
 
 
 def main() -> None:
-    """Prints a line a reader."""
+    """Print a line for each reader."""
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000
     with tempfile.TemporaryDirectory() as folder:
         for chunked in (True, False):

@@ -1,6 +1,6 @@
 """CasADi: multiple shooting, exact sparse derivatives in its virtual machine, IPOPT or fatrop.
 
-The z of each node includes the previous input, as everywhere in the benchmark.
+The z of each node includes the previous input, as in the whole benchmark.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Crocoddyl: DDP in C++, the model in NumPy (its Python interface), derivatives differenced.
 
-Also its C++ backward pass by itself, which no model can make faster.
+Also times its C++ backward pass alone, which does not depend on the model's speed.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ STEP = 6e-6
 
 
 def step(x, u):
-    """Batched: columns are samples."""
+    """Step a batch; columns are samples."""
     return np.array(rk4(case.rate, list(x), list(u), case.p, case.dt))
 
 
 class Node(crocoddyl.ActionModelAbstract):
-    """z = [x, previous u]."""
+    """A node with z = [x, previous u]."""
 
     def __init__(self, t):
         super().__init__(crocoddyl.StateVector(n + m), m if t < case.H else 0)

@@ -1,4 +1,4 @@
-"""What a peer's script gets: a case's arrays, its model as the same functions, a way to report.
+"""Helpers of the peers' scripts: a case's arrays, its model, and how to report.
 
 The aircraft is `grounded.models.aircraft`; the car is `grounded.models.car` without its stall and
 its braking, so that every solver sees smooth functions.
@@ -17,14 +17,14 @@ import numpy as np
 
 from grounded.models import aircraft, car
 
-CLOSE = 1e-4  # a solver is done when its cost is this near to the best known, relatively
+CLOSE = 1e-4  # relative distance from the best known cost at which a solver is done
 
 
 def load(xp: ModuleType) -> SimpleNamespace:
-    """The case named on the command line: argv[1] the file, argv[2] the best cost.
+    """Load the case of the command line: argv[1] is the file, argv[2] the best cost.
 
     Args:
-        xp: whose functions its model calls.
+        xp: the module whose functions the model calls.
     """
     data = dict(np.load(sys.argv[1]))
     case = SimpleNamespace(**data, best=float(sys.argv[2]))
@@ -37,12 +37,12 @@ def load(xp: ModuleType) -> SimpleNamespace:
 
 
 def reached(case: SimpleNamespace, cost: float) -> bool:
-    """Whether a cost counts as the best known."""
+    """Check whether a cost counts as the best known."""
     return cost <= case.best * (1 + CLOSE)
 
 
 def fastest(function: Callable[[], object], repeats: int) -> float:
-    """Least CPU seconds of a few calls."""
+    """Return the least CPU seconds of a few calls."""
     times = []
     for _ in range(repeats):
         start = time.process_time()
@@ -52,7 +52,7 @@ def fastest(function: Callable[[], object], repeats: int) -> float:
 
 
 def report(**values: object) -> None:
-    """One JSON line on stdout."""
+    """Print one JSON line on stdout."""
     print(json.dumps(values))
 
 
@@ -83,7 +83,7 @@ MODELS = {
 
 
 def rate_of(name, xp):
-    """A model's ds/dt on lists x, u, p of numbers, arrays or symbols; its `np` means xp."""
+    """Return a model's ds/dt on lists x, u, p of numbers, arrays or symbols; its `np` is xp."""
     model = MODELS[name]
     model.derivative.__globals__["np"] = xp
 
@@ -100,7 +100,7 @@ def rate_of(name, xp):
 
 
 def rk4(rate, x, u, p, dt):
-    """One Runge-Kutta step of lists."""
+    """Take one Runge-Kutta step with lists."""
 
     def moved(k, h):
         return [a + h * b for a, b in zip(x, k, strict=True)]

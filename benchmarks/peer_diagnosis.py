@@ -1,20 +1,20 @@
-"""The diagnosis beside what others offer for a model's error, on the challenge's blind cases.
+"""Compare the diagnosis with other methods for a model's error, on blind challenge cases.
 
     python benchmarks/peer_diagnosis.py --cases 30 --seed S [--systems own,kinked,mujoco] [--json F]
 
-All get the same trials and the same crude model, and are judged on two further trials that none of
-them saw: rms error 1 s ahead, open loop, the geometric mean over channels, over that of the crude
-model with the true effects at their true values (the oracle). The peers are helped: they regress
-what the crude model leaves of five steps, on features of which each true law is close to one.
+All methods get the same trials and the same crude model, and are judged on two further trials: rms
+error 1 s ahead, open loop, the geometric mean over channels, divided by that of the crude model
+with the true effects at their true values (the oracle). The peers are helped: they regress the
+crude model's residual over five steps on features, and each true law is close to one of these.
 
 grounded    the diagnosis
-pysindy     STLSQ of PySINDy, its threshold by leaving trials out
-sysidentpy  FROLS of SysIdentPy, terms by its information criterion
+pysindy     STLSQ of PySINDy, its threshold chosen on held-out trials
+sysidentpy  FROLS of SysIdentPy, terms chosen by its information criterion
 parameters  the model's parameters alone, by maximum likelihood (`grounded.fit`)
 boosting    gradient boosting of scikit-learn; names nothing
 
-Needs the extra `peers`; a library that is missing is left out with a word. A name is "first" if it
-is the true effect, of the "same kind" if it acts alike at the same place, else wrong.
+Needs the extra `peers`; missing libraries are skipped with a note. A name is "first" if it is the
+true effect, of the "same kind" if it acts alike at the same place, else "wrong".
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Log:
 
 
 def features(log, x, u, change):
-    """(..., k) and their names: (kind, index)."""
+    """Return features (..., k) and their names: (kind, index)."""
     names, columns = [("1", 0)], [np.ones(x.shape[:-1])]
     own = (log.step(x, u) - x) / log.data.dt
     size = np.maximum(np.abs(log.y).reshape(-1, x.shape[-1]).max(axis=0), 1e-9)
@@ -79,7 +79,7 @@ def features(log, x, u, change):
 
 
 def regression(log):
-    """Features and missing rates of pieces, by trial: (S, P, k), (S, P, n), names."""
+    """Return features and missing rates of pieces: (S, P, k), (S, P, n), names."""
     T = log.u.shape[1]
     at = np.arange(0, T - PIECE, PIECE)
     x, total = log.y[:, at], 0.0
@@ -91,7 +91,7 @@ def regression(log):
 
 
 def errors(log, advance, offset=lambda x: 0.0, received=None):
-    """Rms error AHEAD seconds on, by channel (n,)."""
+    """Return the rms error AHEAD seconds ahead by channel (n,)."""
     u = log.u if received is None else received[:, : log.u.shape[1]]
     steps = max(1, round(AHEAD / log.data.dt))
     at = np.arange(0, log.u.shape[1] - steps, EVERY)
@@ -104,7 +104,7 @@ def errors(log, advance, offset=lambda x: 0.0, received=None):
 
 
 def hypothesis_errors(case, pairs, parameters):
-    """Errors of the crude model with effects (name, values) and other parameters."""
+    """Return errors of the crude model with effects (name, values) and other parameters."""
     known = case.model.with_values(parameters)
     log = Log(case, case.fresh)
     inside = Log(type("Other", (), {"model": known, "latency": case.latency}), case.fresh)
@@ -145,7 +145,7 @@ def by_parameters(case, log):
 
 
 def linear(case, log, solve):
-    """A sparse regression: solve(features (S, P, k), target (S, P)) -> coefficients (k,)."""
+    """Fit a sparse regression: solve(features (S, P, k), target (S, P)) -> coefficients (k,)."""
     F, R, names = regression(log)
     size = np.maximum(F.std(axis=(0, 1)), 1e-9)
     size[0], scale = 1.0, np.maximum(R.std(axis=(0, 1)), 1e-12)
@@ -250,7 +250,7 @@ METHODS = {
 
 
 def marked(case, named):
-    """How a first name compares with the truth."""
+    """Return how a first name compares with the truth."""
     truth = case.label["effects"][0]["effect"]
     family, _, target = truth.partition(":")
     if not named:
@@ -279,7 +279,7 @@ def marked(case, named):
 
 
 def measured(case, methods):
-    """One case: by method its mark, error over the oracle's, CPU seconds."""
+    """Measure one case: by method the mark, the error over the oracle's, CPU seconds."""
     log, row = Log(case, case.trials), {}
     truth = case.label["effects"]
     shift = {
@@ -305,7 +305,7 @@ def measured(case, methods):
 
 
 def table(rows):
-    """The rows as a Markdown table."""
+    """Return the rows as a Markdown table."""
     lines = [
         "| method | first | same kind | wrong | nothing | error over the oracle's, median | CPU s |"
     ]
@@ -321,7 +321,7 @@ def table(rows):
 
 
 def main():
-    """Makes the cases, runs everybody, prints the table."""
+    """Make the cases, run all methods, print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", type=int, default=30)
     parser.add_argument("--seed", type=int, required=True)

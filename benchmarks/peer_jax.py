@@ -1,4 +1,4 @@
-"""JAX: the same DDP written with scans and jitted by the user, 64 bit: a yardstick, no package."""
+"""JAX: the same DDP written with scans and jitted, 64 bit; a reference, not a package."""
 
 from __future__ import annotations
 

@@ -1,13 +1,13 @@
-"""The diagnosis on logs of real machines whose authors published what a crude model lacks.
+"""Diagnose logs of real machines whose authors published what a crude model lacks.
 
     python benchmarks/real_data.py [NAME ...] [--json FILE]
 
-For each: the published cause, what is named, and held-out open-loop errors in units: crude,
-calibrated, as diagnosed, noise floor, beside the best model that was made by hand (SOURCE.md of
-each folder of ../shared/data; its split of the runs and its resampling are not quite ours). Models
-and logs are those of tests/support/real_systems.py. Tuned on: EMPS, SERVO, DART_*. Kept back: BAM_*
-(volts in; in BAM_KP goal, gain and torque_enable; that the w of BAM_QW is a mean was found on it)
-and the double pendulum (ACROBOT, SYSID).
+Prints for each the published cause, what is named, and held-out open-loop errors in units (crude,
+calibrated, as diagnosed, noise floor) beside those of the best model made by hand (SOURCE.md of
+each folder of ../shared/data, with a slightly different split and resampling). Models and logs are
+those of tests/support/real_systems.py. The diagnosis was developed on EMPS, SERVO and DART_*; BAM_*
+(input: volts; in BAM_KP goal, gain and torque_enable) and the double pendulum (ACROBOT, SYSID) were
+held out, except that the w of BAM_QW was found to be a mean on it.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ PUBLISHED["BAM_QW"] = PUBLISHED["BAM_KP"] = PUBLISHED["BAM_Q"]
 
 
 def placed(found, families):
-    """Where a published cause stands: its place among the named, or in a group that ties."""
+    """Return the place of a published cause among the named ones, or in a tied group."""
     named = [c.of for c in found.credit if c.of != "calibration"]
     for place, effect in enumerate(named, 1):
         if effect.partition(":")[0] in families:
@@ -81,7 +81,7 @@ def placed(found, families):
 
 
 def told(name, found, seconds):
-    """A system's lines."""
+    """Return the lines about one system."""
     cause, families, best = PUBLISHED[name]
     print(f"\n{name}: published: {cause}; {placed(found, families)}; {seconds:.0f} s")
     print(f"  {found.kind}: {found.sentence}")
@@ -99,7 +99,7 @@ def told(name, found, seconds):
 
 
 def main():
-    """Runs the named systems, all by default."""
+    """Run the named systems, all by default."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(PUBLISHED))
     parser.add_argument("--json", type=Path, help="write all documents there")

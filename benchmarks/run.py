@@ -1,12 +1,14 @@
-"""The engine against its peers: ratios in one run, by hand.
+"""Compare the solver with its peers, as time ratios within one run; run by hand.
 
     python -m venv /tmp/peers && /tmp/peers/bin/pip install numpy casadi crocoddyl jax
     python benchmarks/run.py --peers /tmp/peers/bin/python
 
 Every solver gets the same problem (cases.py), the same start, and has to reach the best known cost
 to a part in 10^4. Times are CPU times of the solve alone, least of several; building a problem,
-tracing and compiling are told apart. trajax is not in the registry: its place is taken by the same
-algorithm written in JAX. Parts: solve, horizon, size, swarm, memory, process; all by default.
+tracing and compiling are listed separately. trajax is not in the registry; the same algorithm
+written in JAX stands in for it.
+
+Parts: solve, horizon, size, swarm, memory, process; all by default.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ PEERS = ("crocoddyl", "casadi", "jax")
 
 
 def cpu(function, repeats=20):
-    """Least CPU seconds of a few calls."""
+    """Return the least CPU seconds of a few calls."""
     from peer_data import fastest
 
     return fastest(function, repeats)
@@ -46,9 +48,9 @@ def our_solve(case, iterations, tolerance=0.0):
 
 
 def our_row(case):
-    """Our time, iterations and cost; an iteration is one linearisation, sweep and rollout.
+    """Return our time, iterations and cost; an iteration is linearisation, sweep and rollout.
 
-    It is measured inside a solve: what that takes beyond its first rollout and its last sweep.
+    An iteration is timed inside a solve, without the first rollout and the last sweep.
     """
     from peer_data import CLOSE
 
@@ -72,7 +74,7 @@ def our_row(case):
 
 
 def peer_rows(case, best, python, folder, fatrop):
-    """What each peer prints, or why it printed nothing."""
+    """Return what each peer prints, or why it printed nothing."""
     path = case.save(folder)
     calls = [[peer] for peer in PEERS] + ([["casadi", "fatrop"]] if fatrop else [])
     for peer, *extra in calls:
@@ -118,10 +120,10 @@ def show(row, ours):
 
 
 def stretched(problem, H):
-    """Straight flight for H steps, two metres higher: the same problem at any length.
+    """Make the same problem at any length: straight flight for H steps, two metres higher.
 
-    Returns it with the inputs and gains of an LQR that holds the trimmed flight: from there a full
-    step is taken in every iteration, so that every H does the same work a step.
+    Returns it with the inputs and gains of an LQR that holds the trimmed flight. From there every
+    iteration takes a full step, so that the work per step is the same for every H.
     """
     n, m = problem.system.n, problem.system.m
     start, u = problem.start, np.tile(problem.past, (H, 1))
@@ -155,7 +157,7 @@ def horizon_part(options):
 
 
 def network(n, m=4, H=300):
-    """A chain of n coupled states as a problem."""
+    """Return a problem with a chain of n coupled states."""
     from grounded.compile import Problem, system_of
 
     rng = np.random.default_rng(n)
@@ -227,7 +229,7 @@ def memory_part(options):
 
 
 def spent(command, environment):
-    """CPU seconds of a process and its children."""
+    """Return the CPU seconds of a process and its children."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run(command, env=environment, check=True, capture_output=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -235,10 +237,10 @@ def spent(command, environment):
 
 
 def process_part(options):
-    """Whole processes: `grounded propose` on the aircraft, cold and warm, and importing.
+    """Time whole processes: `grounded propose` on the aircraft, cold and warm, and importing.
 
-    Cold: no kernel in the cache. Python's own compiled modules are there in every case, as they are
-    once a package was installed.
+    Cold: no kernel in the cache. Python's own compiled modules are always there, as after the
+    installation of a package.
     """
     python = sys.executable
     with tempfile.TemporaryDirectory() as folder:

@@ -1,8 +1,8 @@
-"""Generates the site's reference: a page for every room, from its docstrings (a hook of MkDocs).
+"""Generate the site's API reference from docstrings, one page per package folder (a MkDocs hook).
 
-A room is a folder with an `__init__.py`. Its page opens with what the room is for and in which
-order to read it, then shows the public names of each of its modules. Rooms are found, not listed: a
-new one has its page at once.
+A room is a folder with an `__init__.py`. Its page shows the docstring of the room, which says what
+it is for and in which order to read it, then the public names of each of its modules. Rooms are
+found on the disk, so a new one needs no entry here.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ TITLES = {
 
 
 def rooms(package: str) -> list[str]:
-    """The rooms of a package by their import names, the package itself first."""
+    """Return the import names of a package's rooms, the package itself first."""
     source = SOURCES[package]
     folders = sorted(path.parent for path in (source / package).rglob("__init__.py"))
     return [".".join(folder.relative_to(source).parts) for folder in folders]
 
 
 def modules(room: str) -> list[str]:
-    """The public modules of a room by their import names."""
+    """Return the import names of a room's public modules."""
     folder = SOURCES[room.partition(".")[0]].joinpath(*room.split("."))
     stems = sorted(path.stem for path in folder.glob("*.py"))
     return [f"{room}.{stem}" for stem in stems if not stem.startswith("_")]
 
 
 def purpose(room: str) -> str:
-    """What the docstring of a room says; its lines `name   what it is` become a list."""
+    """Return a room's docstring as Markdown; turn its lines `name   what it is` into a list."""
     text = inspect.getdoc(import_module(room)) or ""
     listed = re.sub(r"^([\w./]+(?:, [\w./]+)*) {2,}(.+)$", r"- `\1`: \2", text, flags=re.M)
     return re.sub(r"^(?!- )(.+)\n(?=- )", r"\1\n\n", listed, flags=re.M)
 
 
 def door(package: str) -> list[str]:
-    """The names that a package hands out, a line each, linked to where they are defined."""
+    """Return a list of the names in a package's `__all__`, linked to their definitions."""
     found = import_module(package)
     lines = []
     for name in getattr(found, "__all__", ()):
@@ -60,17 +60,17 @@ def door(package: str) -> list[str]:
 
 
 def page(room: str) -> str:
-    """The page of a room in Markdown, for mkdocstrings to fill in."""
+    """Return the page of a room in Markdown, for mkdocstrings to fill in."""
     opening = [f"# {TITLES.get(room, room)}", purpose(room)]
     front = door(room) if room in SOURCES else []
     return "\n\n".join(opening + front + [f"::: {module}" for module in modules(room)]) + "\n"
 
 
 class PlainMaths(Extension):
-    """Leaves x_t and [W][m] alone: they are indices and shapes, not emphasis and links."""
+    """Keep x_t and [W][m] as text: they are indices and shapes, not emphasis and links."""
 
     def extendMarkdown(self, md: Markdown) -> None:
-        """Takes such text for itself, after code and before links and emphasis."""
+        """Match such text after code and before links and emphasis."""
         for name, pattern, priority in (
             ("shapes", r"((?:\[[^\]\[.`]*\] ?){2,})", 189.5),
             ("underscores", "(_)", 65),
@@ -79,7 +79,7 @@ class PlainMaths(Extension):
 
 
 def on_config(config: Any) -> Any:
-    """Adds the reference to the navigation."""
+    """Add the reference to the navigation."""
     config.markdown_extensions.append(PlainMaths())
     for package in SOURCES:
         pages = [{room: f"reference/{room}.md"} for room in rooms(package)]
@@ -88,7 +88,7 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Adds the pages themselves."""
+    """Add the generated pages."""
     for package in SOURCES:
         for room in rooms(package):
             files.append(File.generated(config, f"reference/{room}.md", content=page(room)))

@@ -1,7 +1,7 @@
 """python -m benchmarks.foreign [--only NAME] [--json] [--optimum] [--adopt TRIALS] [--list].
 
-Needs mujoco, jsbsim, commonroad-vehicle-models; the set-ups of a simulator that is missing are
-left out with a word.
+Needs mujoco, jsbsim, commonroad-vehicle-models; set-ups of a missing simulator are skipped with a
+note.
 """
 
 from __future__ import annotations

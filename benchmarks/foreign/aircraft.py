@@ -1,8 +1,8 @@
 """A Cessna 172 in JSBSim, and a crude model with eight states.
 
 The simulator has engine, propeller, sideslip, flaps and 6 degrees of freedom. The crude model flies
-at constant speed and knows no sideslip: a roll rate with a lag, a short period, and a turn that is
-coordinated after a second. Its numbers are a third off what the simulator's step responses show.
+at constant speed without sideslip: a roll rate with a lag, a short period, and a turn that is
+coordinated after a second. Its numbers are a third off those of the simulator's step responses.
 Inputs are deflections (of 1) from the trim, elevator positive nose down, as in JSBSim.
 """
 
@@ -39,7 +39,7 @@ class Cessna:
         self.jsbsim, self.wind = jsbsim, wind
 
     def reset(self) -> None:
-        """A new aircraft each time: a trim that starts from another one differs in the digits."""
+        """Make a new aircraft; a trim that starts from a used one differs in its last digits."""
         self.jsbsim.FGJSBBase().debug_lvl = 0
         f = self.f = self.jsbsim.FGFDMExec(str(Path(self.jsbsim.__file__).parent))  # its data
         f.set_debug_level(0)
@@ -67,7 +67,7 @@ class Cessna:
 
 
 def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
-    """ds/dt."""
+    """Return ds/dt."""
     turn = s.q * np.sin(s.phi) + s.r * np.cos(s.phi)
     coordinated = G / p.v * np.sin(s.phi)
     incidence = s.alpha - TRIM
@@ -108,7 +108,7 @@ def model() -> Model:
 
 
 def task() -> Task:
-    """A turn of 30 degrees in 9 s at constant height, and 3 s of straight flight."""
+    """Return the task: a turn of 30 degrees in 9 s at constant height, 3 s of straight flight."""
     dt, H, crude = 0.1, 120, model()
     t = dt * np.arange(H + 1)
     psi = minimum_jerk(np.zeros(1), np.array([np.radians(30)]), (t - 0.5) / 9.0)[:, 0]

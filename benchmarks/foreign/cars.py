@@ -1,7 +1,7 @@
 """Two cars of CommonRoad, the single-track drift model and the 29-state multi-body model.
 
-The crude model is the kinematic bicycle: no slip, no tyres. A change of lane at a speed at which it
-takes the lateral acceleration that the set-up names.
+The crude model is the kinematic bicycle: no slip, no tyres. The task is a lane change at the speed
+that takes the lateral acceleration named by the set-up.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class CommonRoad:
         self.x = np.array(self.start, dtype=float)
 
     def measure(self) -> np.ndarray:
-        """delta, v, x, y, psi."""
+        """Return delta, v, x, y, psi."""
         return self.x[[2, 3, 0, 1, 4]]
 
     def advance(self, u: np.ndarray) -> None:
@@ -59,7 +59,7 @@ class CommonRoad:
 
 
 def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
-    """ds/dt of a bicycle without slip, about its rear axle."""
+    """Return ds/dt of a bicycle without slip, about its rear axle."""
     return {
         "delta": a.steering_rate,
         "v": a.acceleration,
@@ -82,12 +82,12 @@ def model() -> Model:
 
 
 def speed_of(acceleration: float) -> float:
-    """The speed [m/s] at which a change of lane over 26 m takes that lateral acceleration."""
+    """Return the speed [m/s] at which a lane change over 26 m takes that lateral acceleration."""
     return 26.0 / float(np.sqrt(TIME_FACTOR * WIDTH / acceleration))
 
 
 def task(acceleration: float) -> Task:
-    """The change of lane and a second of driving on."""
+    """Return the task: the lane change, then a second of straight driving."""
     dt, speed = 0.05, speed_of(acceleration)
     H = round((26.0 / speed + 1.0) / dt)
     t = dt * np.arange(H + 1)

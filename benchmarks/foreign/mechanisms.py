@@ -1,9 +1,8 @@
 """Mechanisms in MuJoCo, and the crude models that plan for them.
 
 The crude models of the cart-pole and the two-link arm are their equations of motion in plain NumPy
-(`grounded.models`), with the simulator's own masses and lengths: what a set-up withholds is all
-that differs. The seven-joint arm is planned in MuJoCo itself, the pushed block in a quasi-static
-model.
+(`grounded.models`), with the simulator's masses and lengths, so that only what a set-up withholds
+differs. The seven-joint arm is planned in MuJoCo itself, the pushed block in a quasi-static model.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from grounded.task import Task
 
 
 class MujocoRobot:
-    """MuJoCo, stepped as its users do: it keeps its warm start, its time and its contacts."""
+    """MuJoCo, stepped as users do: it keeps its warm start, its time and its contacts."""
 
     def __init__(self, xml: str, start: np.ndarray, columns: list[int] | None = None) -> None:
         import mujoco
@@ -47,7 +46,7 @@ class MujocoRobot:
 
 
 def mujoco_setup(task: Task, xml: str, delay: float = 0.0) -> tuple[Robot, Task]:
-    """The robot of an XML, and the task planned in the same XML."""
+    """Return the robot of an XML, and the task planned in the same XML."""
     from grounded.adapters import mujoco
 
     truth = with_true_model(task, mujoco.model(xml), delay)
@@ -72,7 +71,7 @@ CART_TASKS = {  # steps, limit [N], weights
 
 
 def cart_task(kind: str) -> Task:
-    """From hanging to upright at the origin: every column of the target is given.
+    """Return the task from hanging to upright at the origin, with every target column given.
 
     "gentle" is solved from the first guess; "smooth" has a first guess from which 100 iterations
     are not enough, though zero inputs are a good start; "hasty" has many local optima.
@@ -104,7 +103,7 @@ def arm_task() -> Task:
 
 
 def holding(model: Model, q: np.ndarray) -> np.ndarray:
-    """Torques that hold an arm still: tau at which the accelerations vanish (linear in tau)."""
+    """Return the torques that hold an arm still (accelerations are linear in them)."""
     n, m = model.n, model.m
     x = np.append(q, np.zeros(n - m))[None]
     at = lambda u: model.system.step(x, u[None], model.values, 0.005)[0, m:]  # noqa: E731
@@ -122,7 +121,7 @@ TORQUES = np.array([176.0, 176.0, 110.0, 110.0, 110.0, 40.0, 40.0])
 
 
 def arm7_xml(payload: float = 0.1, friction: float = 0.0, timestep: float = 0.005) -> str:
-    """A chain of seven links with alternating axes, masses and lengths about an iiwa's."""
+    """Return a chain of seven links with alternating axes, masses and lengths about an iiwa's."""
     body = end = ""
     for i, (axis, offset, mass) in enumerate(LINKS, start=1):
         body += (
@@ -189,7 +188,7 @@ HALF, RADIUS, GAP = 0.05, 0.02, 0.07
 
 
 def push_dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
-    """ds/dt of quasi-static pushing by the left face: what overlaps moves away, and turns."""
+    """Return ds/dt of quasi-static pushing by the left face; overlap moves and turns the block."""
     cos, sin = np.cos(s.byaw), np.sin(s.byaw)
     dx, dy = s.px - GAP - s.bx, s.py - s.by
     ahead, aside = cos * dx + sin * dy, cos * dy - sin * dx
@@ -215,7 +214,7 @@ def push_model() -> Model:
 
 
 def push_task() -> Task:
-    """Forward by 0.3 m with a turn of a quarter radian, in 2.5 s."""
+    """Return the task: forward by 0.3 m with a turn of a quarter radian, in 2.5 s."""
     t = 0.05 * np.arange(61)
     block = minimum_jerk(np.zeros(3), np.array([0.3, 0.04, 0.25]), t / 2.5)
     return task_of(
@@ -231,7 +230,7 @@ def push_task() -> Task:
 
 
 def push_setup(task: Task, mass: float = 0.5) -> tuple[Robot, Task]:
-    """The block in MuJoCo; its velocities and the pusher's are not measured."""
+    """Return the block in MuJoCo; its velocities and the pusher's are not measured."""
     from grounded.adapters import mujoco
 
     xml = BLOCK.format(mass=mass)

@@ -1,9 +1,9 @@
-"""What was possible: the best run of the simulator itself that anybody found.
+"""The best known run of the simulator itself, as the optimum of a set-up.
 
-Three candidates: what the search ends with; DDP in the simulator as a Model, where it is one; and
-each of these polished by Gauss-Newton on the robot, whose derivatives by the feed-forward are
-differenced: one run for every input of every step, the gains of the policy kept. The best of them
-counts. It costs thousands of runs, so it is computed once and kept in optima.json:
+Candidates are the end of the search, DDP with the simulator as a Model (if it can be one), and each
+of these polished by Gauss-Newton on the robot. The derivatives by the feed-forward are differences:
+one run for every input of every step, with the policy's gains kept. The best candidate counts. This
+takes thousands of runs, so it is computed once and kept in optima.json:
 
     python -m benchmarks.foreign --optimum [--only NAME]
 """
@@ -34,12 +34,12 @@ LOST = 1e3  # residual of every step after a run has ended early
 
 
 def known() -> dict[str, dict[str, object]]:
-    """Utility and origin of each set-up's optimum, as far as computed."""
+    """Return utility and origin of the optima computed so far."""
     return json.loads(FILE.read_text()) if FILE.is_file() else {}
 
 
 def remember(name: str, utility: float, origin: str) -> None:
-    """Keeps the better of the known optimum and this one."""
+    """Keep the better of the known optimum and this one."""
     found = known()
     if name not in found or utility > found[name]["utility"]:
         found[name] = {"utility": utility, "from": origin}
@@ -47,7 +47,7 @@ def remember(name: str, utility: float, origin: str) -> None:
 
 
 def optimum(setup: Setup, say=lambda line: None) -> tuple[float, str]:
-    """The best utility found with the simulator's own derivatives, and how."""
+    """Return the best utility found with the simulator's own derivatives, and how."""
     standing = learn(setup.task, setup.run, SearchOptions()).standing
     best = standing.incumbent
     starts = {} if best is None else {"the search": best.candidate.policy}
@@ -69,9 +69,9 @@ def optimum(setup: Setup, say=lambda line: None) -> tuple[float, str]:
 
 
 def planned(task: Task) -> list[np.ndarray]:
-    """Inputs (H, m) of the best two plans in the crude model, from many starts.
+    """Return inputs (H, m) of the best two plans in the crude model, from many starts.
 
-    Beside the first policy: held inputs, and held inputs with smooth random changes. The crude
+    Starts are the first policy, held inputs, and held inputs with smooth random changes. The crude
     model is compiled, so a solve takes milliseconds.
     """
     rng, H = np.random.default_rng(0), task.horizon
@@ -90,14 +90,14 @@ def planned(task: Task) -> list[np.ndarray]:
 
 
 def narrowed(setup: Setup, solved: ddp.Result) -> Policy:
-    """The policy of a solve in the simulator, over what the robot measures."""
+    """Return the policy of a solve in the simulator, reduced to the measured states."""
     policy, model = setup.truth.policy(solved.u, solved.K, solved.z[:-1]), setup.task.model
     angles = tuple(bool(a) for a in model.angle_mask)
     return policy.laid_out(model.state_names, angles, policy.depths)
 
 
 def polish(setup: Setup, policy: Policy) -> tuple[Policy, float]:
-    """Gauss-Newton (Levenberg-Marquardt) on the robot's own runs, by the feed-forward."""
+    """Improve the feed-forward by Gauss-Newton (Levenberg-Marquardt) on the robot's runs."""
     task = setup.task
     v = np.array(policy.feedforward)
     best = task.utility(setup.real(policy, 0))
@@ -127,7 +127,7 @@ def polish(setup: Setup, policy: Policy) -> tuple[Policy, float]:
 
 
 def residual(setup: Setup, policy: Policy, v: np.ndarray) -> np.ndarray:
-    """The square roots of every penalty of a run: utility = -|residual|^2."""
+    """Return the square roots of a run's penalties: utility = -|residual|^2."""
     trial: Trial = setup.real(replace(policy, feedforward=v), 0)
     task, reward, T = setup.task, setup.task.reward, trial.steps
     error = np.nan_to_num(task.model.difference(trial.states, task.target[: T + 1]))

@@ -1,7 +1,7 @@
-"""A policy runs in a simulator and comes back as a Trial: what every robot here has in common.
+"""Run a policy in a simulator and return a Trial; shared by all robots here.
 
-A simulator is three functions, `reset()`, `measure()` and `advance(u)`, the last one over one
-simulation step. The loop is a robot's: measure, ask the policy, send, wait. A transport delay is a
+A simulator has `reset()`, `measure()` and `advance(u)`, which advances one simulation step. The
+loop is a robot's: measure, ask the policy, send, wait. A transport delay is a
 queue of whole simulation steps between the policy and the simulator.
 """
 
@@ -27,13 +27,13 @@ class Simulator(Protocol):
     timestep: float  # [s]
 
     def reset(self) -> None:
-        """Back to the start state."""
+        """Return to the start state."""
 
     def measure(self) -> np.ndarray:
-        """The measured states (n,); not finite once it has failed."""
+        """Return the measured states (n,), not finite after a failure."""
 
     def advance(self, u: np.ndarray) -> None:
-        """One simulation step with the inputs (m,)."""
+        """Advance one simulation step with the inputs (m,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Robot:
     delay: float = 0.0
 
     def run(self, policy: Policy) -> Trial:
-        """One run; it ends early when a measured state is not finite, or absurdly large."""
+        """Run once; end early if a measured state is not finite or absurdly large."""
         sim, H = self.simulator, policy.horizon
         steps = round(policy.dt / sim.timestep)
         assert abs(steps * sim.timestep - policy.dt) < 1e-9 * policy.dt, "dt is no whole multiple"
@@ -77,9 +77,9 @@ class Robot:
 
 
 def with_true_model(task: Task, model: Model, delay: float = 0.0) -> Task:
-    """The same task planned in the simulator itself; its first states are the task's.
+    """Return the same task planned in the simulator itself; its first states are the task's.
 
-    States that the crude model has no name for (activations) start at zero and are not judged.
+    States that the crude model lacks (activations) start at zero and have no weight.
     """
     more = model.n - task.model.n
     nothing, free = np.zeros(more), np.full(more, np.inf)
@@ -113,7 +113,7 @@ def task_of(
     change: float | list[float] = 0.0,
     past: np.ndarray | None = None,
 ) -> Task:
-    """A Task from weights by name and symmetric limits of the inputs."""
+    """Return a Task from weights by name and symmetric limits of the inputs."""
     terminal = terminal or {}
     return Task(
         model=model,
@@ -133,6 +133,6 @@ def task_of(
 
 
 def minimum_jerk(start: np.ndarray, end: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """From rest to rest; part (H + 1,) of the way in time, clipped to [0, 1]."""
+    """Return a minimum-jerk path, rest to rest, at time fractions (H + 1,) clipped to [0, 1]."""
     s = np.clip(part, 0.0, 1.0)[:, None]
     return start + (end - start) * (10 * s**3 - 15 * s**4 + 6 * s**5)

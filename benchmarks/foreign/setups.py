@@ -1,4 +1,4 @@
-"""The set-ups by name: a task with the crude model, and the robot that differs from it."""
+"""The set-ups by name: a task with the crude model, and a robot that differs from it."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class Setup:
     truth: Task | None = None
 
     def run(self, candidate: Candidate) -> Trial:
-        """The candidate, run once on the robot."""
+        """Run the candidate once on the robot."""
         return self.robot.run(candidate.policy)
 
     def real(self, policy: Policy, run: int) -> Trial:
-        """A policy on the robot; every run is the same (`grounded.experiments.baselines`)."""
+        """Run a policy on the robot; every run is the same (`grounded.experiments.baselines`)."""
         return self.robot.run(policy)
 
 
@@ -100,6 +100,6 @@ SETUPS: dict[str, tuple[Callable[..., Setup], str, dict[str, object]]] = {
 
 
 def setup(name: str) -> Setup:
-    """The set-up of that name."""
+    """Return the set-up of that name."""
     make, withheld, what = SETUPS[name]
     return make(name, withheld, **what)

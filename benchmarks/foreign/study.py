@@ -1,8 +1,8 @@
-"""What the search reaches on a set-up, beside refit-and-replan and iterative learning control.
+"""Run the search, refit-and-replan and iterative learning control on a set-up.
 
-Trials to a share of the gap count from the first trial, the model's own policy (where that one
-failed: from a run with the inputs held). A utility within half a per cent of the optimum counts as
-all of the gap, because with nothing withheld there is none.
+The gap is counted from the first trial, the model's own policy, or from a run with the inputs held
+if that failed. A utility within half a per cent of the optimum counts as all of the gap, because
+with nothing withheld there is no gap.
 """
 
 from __future__ import annotations
@@ -64,17 +64,17 @@ class Row:
     sentence: str
 
     def to_json(self) -> dict[str, object]:
-        """The row by name."""
+        """Return the row's values by name."""
         return asdict(self)
 
 
 class OutOfTime(BaseException):
-    """A method took longer than PATIENCE; no `except Exception` on the way may keep it."""
+    """A method took longer than PATIENCE; not an Exception, so that no handler catches it."""
 
 
 @contextmanager
 def patience(seconds: float) -> Iterator[None]:
-    """Raises OutOfTime inside the block after so many seconds of CPU time."""
+    """Raise OutOfTime inside the block after so many seconds of CPU time."""
 
     def late(*_: object) -> None:
         raise OutOfTime
@@ -89,7 +89,7 @@ def patience(seconds: float) -> Iterator[None]:
 
 
 def measured(setup: Setup) -> Row:
-    """The search, refit-and-replan and ILC on one set-up."""
+    """Run the search, refit-and-replan and ILC on one set-up."""
     utilities: list[float] = []
 
     def run(candidate: Candidate) -> Trial:
@@ -126,7 +126,7 @@ def measured(setup: Setup) -> Row:
 
 
 def adopting(setup: Setup, after: int) -> str:
-    """The search, with what a diagnosis of the first `after` trials claims adopted; as a line."""
+    """Run the search, adopting what a diagnosis of `after` trials claims; return a table line."""
     task, options = setup.task, SearchOptions()
     candidates: list[Candidate] = []
     trials: list[Trial] = []
@@ -153,7 +153,7 @@ def adopting(setup: Setup, after: int) -> str:
 
 
 def other(setup: Setup, method: Callable[[Setup, SearchOptions], list[Kept]]) -> Other:
-    """The best utility that another method had, and after how many trials."""
+    """Return another method's best utility, and after how many trials it came."""
     utilities: list[float] = []
 
     def counted(policy: Policy) -> Trial:
@@ -184,7 +184,7 @@ class _Counted:
 
 
 def trials_to(setup: Setup, utilities: list[float], best: float | None) -> tuple[int | None, ...]:
-    """The trial at which each share of the gap was first closed; None where it never was."""
+    """Return the trial at which each share of the gap was first closed, or None."""
     if best is None or not utilities:
         return (None,) * len(SHARES)
     base = utilities[0]
@@ -198,12 +198,12 @@ def trials_to(setup: Setup, utilities: list[float], best: float | None) -> tuple
 
 
 def held(setup: Setup) -> Policy:
-    """The inputs as they were before the start."""
+    """Return a policy that holds the inputs from before the start."""
     return setup.task.policy(np.tile(setup.task.past, (setup.task.horizon, 1)), None, None)
 
 
 def table(rows: list[Row]) -> str:
-    """The rows as a Markdown table."""
+    """Return the rows as a Markdown table."""
 
     def number(value: float | None) -> str:
         return "-" if value is None else f"{value:.4g}"

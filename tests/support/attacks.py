@@ -1,8 +1,9 @@
-"""Attacks on files, folders and commands: what was tried, how often, and what broke.
+"""Attacks on files, folders and commands, which count what was tried and what broke.
 
-Each attack takes a random generator and a time, goes on until the time is over (once at least), and
-returns a `Tally`. Broken is: a wrong number without a word, an exception that is no sentence, more
-than 10 s, more than 1 GB. `benchmarks/attack.py` runs them all; test_attacks a little of each.
+Each attack takes a random generator and a time, runs until the time is over (at least once) and
+returns a `Tally`. A break is a wrong number without a warning, an exception that is not one
+sentence, more than 10 s or more than 1 GB. `benchmarks/attack.py` runs all attacks; test_attacks
+runs a few tries of each.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ from reliability import MEMORY, a_candidate, a_trial
 from workspaces import CONFIG, MODEL, make
 
 HANG_S = 10.0
-LONGEST = 60  # [s of CPU] of a command: other processes may have the cores
+LONGEST = 60  # [s of CPU] for a command; other processes may use the cores
 KINDS = ("silent", "traceback", "hang", "memory")
 
 
 @dataclass
 class Tally:
-    """How often something was tried, and what broke, a sentence each."""
+    """The number of tries, and a sentence about each break."""
 
     tries: int = 0
     broken: dict[str, list[str]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
@@ -68,7 +69,7 @@ class Hang(BaseException):
 
 @contextmanager
 def trying(tally: Tally, what: str) -> Iterator[None]:
-    """One try in this process: refusals are well, everything else that is raised is not."""
+    """Run one try in this process; a refusal is fine, any other exception counts as a break."""
 
     def stop(*_: object) -> None:
         raise Hang
@@ -94,7 +95,7 @@ def trying(tally: Tally, what: str) -> Iterator[None]:
 
 
 def command(tally: Tally, what: str, *words: object) -> int:
-    """A command in this process; its exit code, or -1."""
+    """Run a command in this process and return its exit code, or -1."""
     code = -1
     with trying(tally, what):
         done = grounded(*words)
@@ -108,7 +109,7 @@ def command(tally: Tally, what: str, *words: object) -> int:
 
 
 def during(seconds: float) -> Iterator[int]:
-    """Numbers from 0, until the time is over; one at least."""
+    """Yield numbers from 0 until the time is over, at least one."""
     end, number = time.monotonic() + seconds, 0
     while number == 0 or time.monotonic() < end:
         yield number
@@ -121,7 +122,7 @@ Records = list[tuple[int, bytes]]
 
 
 def taken_apart(data: bytes) -> Records:
-    """Records of a file or of a chunk."""
+    """Return the records of a file or of a chunk."""
     found, pos = [], 0
     while pos < len(data):
         opcode, length = struct.unpack_from("<BQ", data, pos)
@@ -135,7 +136,7 @@ def put_together(records: Records) -> bytes:
 
 
 def _rewritten(body: bytes, rng: random.Random, change: Callable[[Records], None]) -> bytes:
-    """An uncompressed chunk with other records, and a checksum that fits."""
+    """Return an uncompressed chunk with other records and a matching checksum."""
     length = struct.unpack_from("<I", body, 28)[0]
     inner = taken_apart(body[40 + length :])
     change(inner)
@@ -145,7 +146,7 @@ def _rewritten(body: bytes, rng: random.Random, change: Callable[[Records], None
 
 
 def mutated(source: bytes, rng: random.Random) -> tuple[str, bytes]:
-    """A file whose checksums fit and whose records don't: what was done, and the file."""
+    """Return what was changed and a file with valid checksums but invalid records."""
     records = taken_apart(source[8:-8])
     chunks = [i for i, (opcode, _) in enumerate(records) if opcode == 6]
     name = rng.choice(sorted(_MUTATIONS))
@@ -168,7 +169,7 @@ def mutated(source: bytes, rng: random.Random) -> tuple[str, bytes]:
 
 
 def _numbers(records: Records, rng: random.Random) -> None:
-    """A field of a head: an id, a time, a length."""
+    """Change a field of a record's head: an id, a time, a length."""
     i = rng.randrange(len(records))
     opcode, body = records[i]
     heads = {3: (0, 6), 4: (0, 8), 5: (0, 22), 6: (0, 40), 9: (0, 20), 12: (0, 4), 1: (0, 4)}
@@ -196,13 +197,13 @@ def _swapped(records: Records, rng: random.Random) -> None:
 
 def _shorter(records: Records, rng: random.Random) -> None:
     i = rng.randrange(len(records))
-    if records[i][0] != 5:  # a message cut after a field is another: what is absent is 0 there
+    if records[i][0] != 5:  # a message cut after a field is still valid: absent fields are 0
         records[i] = (records[i][0], records[i][1][: rng.randrange(len(records[i][1]) + 1)])
 
 
 def _longer(records: Records, rng: random.Random) -> None:
     i = rng.randrange(len(records))
-    if records[i][0] != 5:  # a message's end is its own: another number there is another message
+    if records[i][0] != 5:  # the end of a message has no structure: other numbers there are valid
         records[i] = (records[i][0], records[i][1] + rng.randbytes(rng.randint(1, 40)))
 
 
@@ -229,7 +230,7 @@ _MUTATIONS: dict[str, Callable[[Records, random.Random], None]] = {
 
 
 def mutants(rng: random.Random, seconds: float) -> Tally:
-    """Mutated trials and candidates, read, inspected and recovered."""
+    """Read, inspect and recover mutated trials and candidates."""
     tally = Tally()
     trial = a_trial(12)
     policy, candidate = a_candidate()
@@ -258,7 +259,7 @@ def mutants(rng: random.Random, seconds: float) -> Tally:
 
 
 def _compare(tally: Tally, what: str, data: bytes) -> None:
-    """A trial that is read must have the states and inputs that were written."""
+    """Check that a trial has the states and inputs that were written."""
     trial, (back, _, _) = a_trial(12), read_trial(data)
     steps = len(back.states)
     same = np.array_equal(back.states, trial.states[:steps])
@@ -305,7 +306,7 @@ def fuzzed_toml(rng: random.Random) -> str:
 
 
 def fuzzed_model(rng: random.Random) -> str:
-    """model.py with an expression replaced, a line less, or a line cut."""
+    """Return model.py with an expression replaced, a line removed, or a line cut."""
     lines = MODEL.splitlines()
     i = rng.choice([k for k, line in enumerate(lines) if line.strip()])
     how = rng.randrange(4)
@@ -339,7 +340,7 @@ FUZZES = (("config", fuzzed_toml), ("model", fuzzed_model), ("target", fuzzed_ta
 
 
 def configurations(rng: random.Random, seconds: float) -> Tally:
-    """Mutated grounded.toml, model.py and target.csv: `propose`, `status` and `run`."""
+    """Run `propose`, `status` and `run` on mutated grounded.toml, model.py and target.csv."""
     tally = Tally()
     with tempfile.TemporaryDirectory(dir=MEMORY) as folder:
         for k in during(seconds):
@@ -379,7 +380,7 @@ WRITING: tuple[tuple[str, ...], ...] = (
 
 
 def prepared(folder: Path) -> tuple[Path, str]:
-    """A workspace with three trials, a candidate that waits, and a run that was not ingested."""
+    """Make a workspace with three trials, a waiting candidate and a run not yet ingested."""
     where = folder / "w"
     make(where)
     for words in (["learn", "--trials", "3"], ["propose"], ["run"]):
@@ -389,7 +390,7 @@ def prepared(folder: Path) -> tuple[Path, str]:
 
 
 def words_of(command: tuple[str, ...], where: Path, run: str) -> list[str]:
-    """The words to run a writing command in a workspace."""
+    """Return the arguments that run a writing command in a workspace."""
     told = [
         run.replace("/prepared/", f"/{where.parent.name}/") if w == "RUN" else w for w in command
     ]
@@ -400,7 +401,7 @@ def words_of(command: tuple[str, ...], where: Path, run: str) -> list[str]:
 
 
 def _proved(tally: Tally, what: str, where: Path, before: set[str]) -> None:
-    """After an attack: every stored file is whole, and none is gone."""
+    """Check after an attack that every stored file is intact and none is missing."""
     kept = {path.name for path in (where / "trials").glob("*.mcap")}
     if before - kept:
         tally.add("silent", f"{what}: {before - kept} gone")
@@ -412,7 +413,7 @@ def _proved(tally: Tally, what: str, where: Path, before: set[str]) -> None:
 
 
 def _starved(words: list[str], how: Callable[[], None] | None = None, kill: float = 0) -> str:
-    """Runs a command with limits, or kills it after a time; what is wrong with its end."""
+    """Run a command with limits, or kill it after a time; return what is wrong with its end."""
 
     def limited() -> None:
         resource.setrlimit(resource.RLIMIT_CPU, (LONGEST, LONGEST))
@@ -445,7 +446,7 @@ def _kind(wrong: str) -> str:
 def _attacked(
     rng: random.Random, seconds: float, attack: Callable[[Tally, list[str], str], None]
 ) -> Tally:
-    """Attacks each writing command in a copy of a workspace; repeats it alone; proves the copy."""
+    """Attack each writing command in a copy of a workspace, repeat it alone, verify the copy."""
     tally = Tally()
     with tempfile.TemporaryDirectory() as folder:
         base = Path(folder, "prepared")
@@ -470,7 +471,7 @@ def _attacked(
 
 
 def kills(rng: random.Random, seconds: float) -> Tally:
-    """Every writing command killed (-9) at a random moment, and run again."""
+    """Kill every writing command (-9) at a random moment and run it again."""
 
     def attack(tally: Tally, words: list[str], what: str) -> None:
         if wrong := _starved(words, kill=rng.uniform(0.1, 2.0)):
@@ -480,7 +481,7 @@ def kills(rng: random.Random, seconds: float) -> Tally:
 
 
 def short_writes(rng: random.Random, seconds: float) -> Tally:
-    """Every writing command on a disk where no file may grow beyond a few bytes or kilobytes."""
+    """Run every writing command with file sizes limited to a few bytes or kilobytes."""
 
     def attack(tally: Tally, words: list[str], what: str) -> None:
         size = rng.choice((0, 10, 100, 1000, 3000, 8000, 20_000, 60_000))
@@ -496,7 +497,7 @@ def short_writes(rng: random.Random, seconds: float) -> Tally:
 
 
 def crowds(rng: random.Random, seconds: float) -> Tally:
-    """Six commands at once in one workspace, of all kinds, and `verify` afterwards."""
+    """Run six commands of all kinds at once in one workspace, then `verify`."""
     tally = Tally()
     with tempfile.TemporaryDirectory() as folder:
         base = Path(folder, "prepared")
@@ -532,10 +533,10 @@ READING = (("status",), ("propose",))
 
 
 def flips(rng: random.Random, seconds: float) -> Tally:
-    """One bit of any file of a workspace: a command ends well, and `verify` finds it.
+    """Flip one bit of any file of a workspace: commands end well, and `verify` finds it.
 
-    Texts that are the user's to edit (grounded.toml, model.py, target.csv) carry no checksum: of
-    them a traceback alone counts. Results of a study are there as they were, or not at all.
+    Files that the user edits (grounded.toml, model.py, target.csv) have no checksum, so only a
+    traceback counts as a break there. Results of a study are unchanged or gone.
     """
     tally = Tally()
     results = {f"seed {k}": {"utility": -1.5 + k, "errors": [0.25, float("inf")]} for k in range(3)}
@@ -588,7 +589,7 @@ def flips(rng: random.Random, seconds: float) -> Tally:
 
 
 def bombs(rng: random.Random, seconds: float) -> Tally:
-    """Every small file that asks for much: read, inspected, recovered."""
+    """Read, inspect and recover every small file that asks for much memory or time."""
     tally = Tally()
     names = list(BOMBS)
     rng.shuffle(names)
@@ -620,7 +621,7 @@ ATTACKS: dict[str, tuple[str, Callable[[random.Random, float], Tally]]] = {
 
 
 def apart(name: str, seed: int, seconds: float) -> Tally:
-    """An attack in a process of its own, so that its memory is its own."""
+    """Run an attack in its own process, so that its memory is measured alone."""
     read, write = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -639,7 +640,7 @@ def apart(name: str, seed: int, seconds: float) -> Tally:
     os.waitpid(pid, 0)
     if not data:
         raise RuntimeError(f"the attack {name} itself failed")
-    found = pickle.loads(data)  # of our own child
+    found = pickle.loads(data)  # written by our own child process
     assert isinstance(found, Tally)
     return found
 

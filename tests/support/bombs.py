@@ -1,6 +1,6 @@
-"""Small files that ask for gigabytes or for hours, each of one kind; see `BOMBS`.
+"""Small files whose reading would take gigabytes or hours, one of each kind; see `BOMBS`.
 
-`bomb(name, folder)` writes one and says which number of it to read.
+`bomb(name, folder)` writes one and returns it with the path of the number to read.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def log(
     compression: CompressionType = CompressionType.ZSTD,
     chunk: int = 2**20,
 ) -> bytes:
-    """A log of one topic, /t."""
+    """Return a log with one topic, /t."""
     stream = io.BytesIO()
     writer = Writer(stream, chunk_size=chunk, compression=compression)
     writer.start("ros2")
@@ -70,7 +70,7 @@ def _objects_json() -> Iterable[bytes]:
 
 
 def _texts_in_a_list(count: int, messages: int) -> Iterable[bytes]:
-    """A list of texts of unequal size in front of the number that is read."""
+    """Return messages with a list of texts of unequal size before the number that is read."""
     item = struct.pack("<I3sx", 3, b"ab\0")
     body = b"\0\1\0\0" + struct.pack("<I", count) + item * count
     body += bytes(-(len(body) - 4) % 8) + struct.pack("<d", 1.0)
@@ -92,7 +92,7 @@ def _protobuf(messages: Iterable[bytes]) -> bytes:
 
 
 def _zeros(compression: str, count: int, size: int) -> bytes:
-    """Chunks that hold one record of zeros of a type that nobody knows."""
+    """Return chunks that hold one record of zeros, of an unknown type."""
     import lz4.frame
     import zstandard
 
@@ -111,7 +111,7 @@ def _tiny_messages(count: int) -> bytes:
 
 
 def _chunks(count: int) -> bytes:
-    """A chunk a message, without compression."""
+    """Return a log with one uncompressed chunk per message."""
     body = b"\0\1\0\0" + struct.pack("<d", 1.0)
     none = CompressionType.NONE
     return ros("float64 x", (body for _ in range(count)), compression=none, chunk=1)
@@ -124,7 +124,7 @@ def _trial(steps: int, dt: float) -> bytes:
 
 
 def _ranges(count: int, messages: int) -> bytes:
-    """Arrays of a fixed length, of which a path takes all."""
+    """Return arrays of a fixed length that a path takes whole."""
     return ros(f"float64[{count}] x", (b"\0\1\0\0" + bytes(8 * count) for _ in range(messages)))
 
 
@@ -180,7 +180,7 @@ def _attachments() -> bytes:
 
 
 def _gaps() -> bytes:
-    """Sound records with a byte between them that is none: for `recover`."""
+    """Return valid records with a stray byte between them, for `recover`."""
     record = struct.pack("<BQ", 12, 8) + bytes(8)
     return MAGIC + (record * 4 + b"\xff" * 3) * 30_000
 
@@ -231,7 +231,7 @@ LONG: dict[str, tuple[Callable[[], bytes], str]] = {  # a minute each: with the 
 
 
 def bomb(name: str, folder: Path) -> tuple[Path, str]:
-    """Writes a bomb; the file and the path to read in it."""
+    """Write a bomb; return the file and the path to read in it."""
     build, text = (BOMBS | LONG)[name]
     path = folder / "bomb.mcap"
     path.write_bytes(build())
@@ -240,7 +240,7 @@ def bomb(name: str, folder: Path) -> tuple[Path, str]:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a command did, and what it took."""
+    """How a command ended, and the time and memory that it took."""
 
     exit: int  # negative: the signal that ended it
     cpu_s: float
@@ -250,9 +250,9 @@ class Cost:
 
     @property
     def wrong(self) -> str:
-        """Why this is no clean end, "" where it is: no traceback, 500 MB, and in time.
+        """Return why this is not a clean end, or "": no traceback, under 500 MB, and in time.
 
-        In time is what a budget allows (3 s, and 1 s a MB) and 4 s to start and to end.
+        The time allowed is the budget (3 s, and 1 s per MB) and 4 s to start and end.
         """
         if "Traceback" in self.text or self.exit not in (0, 1, 3):
             return f"exit {self.exit}: {self.text[-300:]}"
@@ -289,7 +289,7 @@ except GroundedError as error:
 def measured(
     words: Sequence[str], code: str = _CLI, timeout_s: float = 600, env: Mapping[str, str] = {}
 ) -> Cost:
-    """Runs `grounded WORDS` (or other code) in a process and measures it; the clock says little."""
+    """Run `grounded WORDS` (or other code) in a process and measure its CPU time and memory."""
     with tempfile.TemporaryDirectory() as folder:
         output, peak = Path(folder, "output"), Path(folder, "peak")
         with output.open("wb") as out:
@@ -308,7 +308,7 @@ def measured(
 
 
 def explode(name: str, folder: Path) -> dict[str, Cost]:
-    """Reads, inspects and recovers a bomb; it is built in a process of its own."""
+    """Read, inspect and recover a bomb that is built in its own process."""
     here = Path(__file__).parent
     make = (
         f"sys.path.insert(0, {str(here)!r})\nfrom bombs import bomb\n"
@@ -329,7 +329,7 @@ def explode(name: str, folder: Path) -> dict[str, Cost]:
 
 
 def main() -> None:
-    """Prints a line a bomb: python tests/support/bombs.py [NAME ...]"""
+    """Print a line for each bomb: python tests/support/bombs.py [NAME ...]"""
     for name in BOMBS | LONG:
         if sys.argv[1:] and not any(re.search(word, name) for word in sys.argv[1:]):
             continue

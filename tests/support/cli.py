@@ -1,4 +1,4 @@
-"""The command line for tests: in this process, or as one of its own."""
+"""Run the command line in tests, in this process or as one of its own."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Done:
-    """What a command left: exit code, data and narration."""
+    """The result of a command: exit code, stdout and stderr."""
 
     code: int
     out: str
@@ -24,7 +24,7 @@ class Done:
 
     @property
     def json(self) -> Any:
-        """stdout as one strict JSON document."""
+        """Return stdout parsed as one strict JSON document."""
         return json.loads(self.out, parse_constant=_no_constant)
 
 
@@ -33,7 +33,7 @@ def _no_constant(name: str) -> Any:
 
 
 def grounded(*args: object) -> Done:
-    """Runs `grounded ARGS` in this process."""
+    """Run `grounded ARGS` in this process."""
     from grounded_cli import main as module
 
     out, err = io.StringIO(), io.StringIO()
@@ -52,7 +52,7 @@ COMMAND = [sys.executable, "-c", "from grounded_cli.main import main; main()"]
 
 
 def process(*args: object, cwd: Path | None = None, **env: str) -> Done:
-    """Runs `grounded ARGS` as a process."""
+    """Run `grounded ARGS` as a process."""
     done = subprocess.run(
         [*COMMAND, *map(str, args)],
         capture_output=True,
@@ -66,6 +66,6 @@ def process(*args: object, cwd: Path | None = None, **env: str) -> Done:
 
 
 def plain(text: str) -> str:
-    """A text without the -C DIR of the commands that it names, each in one piece."""
+    """Remove -C DIR from the commands in a text, and join commands broken over lines."""
     text = re.sub(r" \\\n +", " ", text)
     return re.sub(r"grounded\s+-C\s+\S+\s+", "grounded ", text)

@@ -1,8 +1,8 @@
-"""Whether what a filter claims is true, of simulated trials whose states are known.
+"""Check whether a filter's covariances are right, on simulated trials with known states.
 
     NIS   e_t' S_t^-1 e_t / ny         mean 1 if the innovations are as large as claimed
     NEES  (x - xhat)' P^-1 (x - xhat) / n    mean 1 if the states are as uncertain as claimed
-    whiteness   correlation of neighbouring whitened innovations, 0 if nothing predictable is left
+    whiteness   correlation of neighbouring whitened innovations, 0 if they are white
 
 Each mean is compared with the 95 % band that independent draws would give (chi squared; Bar-Shalom,
 Li & Kirubarajan 2001, ch. 5). States within a trial are correlated, so NEES is judged by trials.
@@ -28,10 +28,10 @@ def merged(
     *,
     resolution: float = 1e-6,
 ) -> Record:
-    """A record whose states live at the instants of measurements AND of commands.
+    """Merge measurements and commands into one record with states at the times of both.
 
-    For a camera and a controller of different rates; instants closer than `resolution` [s] are one.
-    The commands act exactly when they were sent, up to their latency.
+    For a camera and a controller of different rates; times closer than `resolution` [s] are merged.
+    Commands act exactly when they were sent, plus their latency.
 
     Args:
         times: of the measurements [s], (N,).
@@ -51,7 +51,7 @@ def merged(
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """Means with the bands in which 95 % of consistent filters lie; NaN where not known."""
+    """Means with the bands in which 95 % of consistent filters lie; NaN if unknown."""
 
     nis: float
     nis_band: tuple[float, float]
@@ -62,7 +62,7 @@ class Consistency:
 
     @property
     def consistent(self) -> bool:
-        """All that is known lies in its band."""
+        """Whether every known mean lies in its band."""
         bands = (self.nis_band, self.lag_one_band, self.nees_band)
         pairs = zip((self.nis, self.lag_one, self.nees), bands, strict=True)
         return all(low <= value <= high for value, (low, high) in pairs if np.isfinite(value))
@@ -73,7 +73,7 @@ def consistency(
     truth: Sequence[Array] | None = None,
     states: Sequence[int] | None = None,
 ) -> Consistency:
-    """Judges filtered trials.
+    """Compute the consistency of filtered trials.
 
     Args:
         estimated: of `smooth_trials` with `forward` (NEES without it too).

@@ -1,4 +1,4 @@
-"""Jobs for tests: module-level, importable by workers."""
+"""Jobs for tests, at module level so that workers can import them."""
 
 import os
 import time

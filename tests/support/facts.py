@@ -1,4 +1,4 @@
-"""What a message must hold, however it is worded: names, numbers, the key that is meant."""
+"""Check the facts in a message (names, numbers, keys), whatever its wording."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import re
 
 
 def holding(*facts: object) -> str:
-    """A pattern for `pytest.raises(match=...)`: all of these as whole words, in any order."""
+    """Return a pattern for `pytest.raises(match=...)`: all these whole words, in any order."""
     return "(?s)" + "".join(rf"(?=.*{_word(str(fact))})" for fact in facts)
 
 
 def holds(text: str, *facts: object) -> bool:
-    """Whether a text has all of these as whole words."""
+    """Check whether a text has all of these as whole words."""
     return re.match(holding(*facts), text) is not None
 
 

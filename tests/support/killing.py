@@ -1,9 +1,9 @@
-"""Runs `grounded` commands and kills them at random moments; a process of its own, see test_kill.
+"""Run `grounded` commands and kill them at random moments, in a separate process for test_kill.
 
     python killing.py SEED KILLS LONGEST_S WORKSPACE COMMAND...
 
-Forks after everything is imported, so that the moments fall into the work and not into start-up.
-Prints how many of the runs were killed; the last run is left alone.
+Forks after everything is imported, so that kills hit the work and not the start-up. Prints how
+many runs were killed; the last run is not.
 """
 
 import os

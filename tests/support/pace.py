@@ -1,4 +1,4 @@
-"""The pace of the machine that runs the tests: a limit of seconds means nothing without it."""
+"""The current speed of the test machine, by which time limits are scaled."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ _TURNS, _REFERENCE = 1_000_000, 0.08  # [s] of CPU on the machine on which the l
 
 
 def slowness() -> float:
-    """How many times as long this machine takes now for plain Python as the reference, at least 1.
+    """Return how many times slower than the reference this machine runs plain Python, at least 1.
 
-    Shared machines run at a third of their speed for hours; a limit is multiplied by this, so that
-    a test tells that the code grew slower and not that the neighbours are busy.
+    Shared machines may run at a third of their speed for hours. Limits are multiplied by this, so
+    that a test fails if the code is slower and not if the machine is busy.
     """
     began, total = time.process_time(), 0
     for i in range(_TURNS):

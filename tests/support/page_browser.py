@@ -31,7 +31,7 @@ FLAGS = [
 
 
 def unpacked(value: dict[str, Any]) -> np.ndarray:
-    """The numbers of a packed array."""
+    """Return the numbers of a packed array."""
     raw = np.frombuffer(base64.b64decode(value["bdata"]), "<" + value["dtype"]).astype(float)
     if value["dtype"] != "u2":
         return raw
@@ -39,7 +39,7 @@ def unpacked(value: dict[str, Any]) -> np.ndarray:
 
 
 def missing() -> str:
-    """Why there is no browser here, or ""."""
+    """Return why no browser can be used here, or ""."""
     for program in ("chromium", "chromedriver"):
         if shutil.which(program) is None:
             return f"{program} is not installed (apt-get install chromium chromium-driver)"
@@ -57,7 +57,7 @@ class Browser:
         _call("POST", f"{self._at}/url", {"url": path.resolve().as_uri()})
 
     def resize(self, width: int, height: int) -> None:
-        """The size of the page itself, whatever the window's smallest size is."""
+        """Set the size of the page itself, whatever the smallest window size."""
         metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.devtools("Emulation.setDeviceMetricsOverride", metrics)
 
@@ -70,11 +70,11 @@ class Browser:
         return _call("POST", f"{self._at}/goog/cdp/execute", body)
 
     def run(self, script: str, *args: Any) -> Any:
-        """The value of a function's body in the page."""
+        """Run a function body in the page and return its value."""
         return _call("POST", f"{self._at}/execute/sync", {"script": script, "args": list(args)})
 
     def point(self, selector: str, x: float, y: float) -> None:
-        """Moves the mouse to a fraction of an element's width and height."""
+        """Move the mouse to a fraction of an element's width and height."""
         place = self.run(
             "const e = document.querySelector(arguments[0]); e.scrollIntoView({block: 'center'});"
             "const b = e.getBoundingClientRect(); return [b.left, b.top, b.width, b.height];",
@@ -86,7 +86,7 @@ class Browser:
         _call("POST", f"{self._at}/actions", {"actions": [{**mouse, "actions": [move]}]})
 
     def drag(self, identity: str, start: float, end: float) -> None:
-        """Draws a box over a part of a plot's width."""
+        """Drag a box over a part of a plot's width."""
         self.point(f"#{identity}", start, 0.4)
         x, y, width, height = self.run(
             "const b = document.getElementById(arguments[0]).getBoundingClientRect();"
@@ -103,7 +103,7 @@ class Browser:
         time.sleep(0.5)
 
     def click(self, selector: str) -> None:
-        """Presses and releases the mouse in the middle of an element."""
+        """Press and release the mouse in the middle of an element."""
         self.point(selector, 0.5, 0.5)
         left, top, width, height = self.run(
             "const b = document.querySelector(arguments[0]).getBoundingClientRect();"
@@ -116,7 +116,7 @@ class Browser:
         time.sleep(0.2)
 
     def key(self, identity: str, key: str) -> None:
-        """Types a key while a plot has the focus."""
+        """Press a key while a plot has the focus."""
         self.run("document.getElementById(arguments[0]).focus()", identity)
         typed = {"key": key} | ({"text": key} if len(key) == 1 else {})
         for kind in ("keyDown", "keyUp"):
@@ -124,13 +124,13 @@ class Browser:
         time.sleep(0.3)
 
     def tab(self) -> None:
-        """Presses the tabulator where the focus is."""
+        """Press Tab."""
         typed = {"key": "Tab", "code": "Tab", "windowsVirtualKeyCode": 9}
         for kind in ("rawKeyDown", "keyUp"):
             self.devtools("Input.dispatchKeyEvent", {"type": kind, **typed})
 
     def draw_all(self) -> None:
-        """Scrolls through the page, so that every panel comes into view, and back."""
+        """Scroll through the page and back, so that every panel is drawn."""
         self.run("document.querySelectorAll('details').forEach(d => { d.open = true; })")
         for y in range(0, self.run("return document.documentElement.scrollHeight"), 800):
             self.run("window.scrollTo(0, arguments[0])", y)
@@ -142,14 +142,14 @@ class Browser:
         self.run("window.scrollTo(0, 0)")
 
     def errors(self) -> list[str]:
-        """What the console has logged as an error or a warning."""
+        """Return the errors and warnings of the console."""
         lines = _call("POST", f"{self._at}/se/log", {"type": "browser"})
         return [line["message"] for line in lines if line["level"] in ("SEVERE", "WARNING")]
 
 
 @contextmanager
 def browser() -> Iterator[Browser]:
-    """A browser with an empty profile, ended afterwards."""
+    """Yield a browser with an empty profile; quit it afterwards."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

@@ -1,4 +1,4 @@
-"""Message paths applied to decoded Python objects, one at a time: the slow, obvious way."""
+"""A slow reference for message paths, applied to decoded Python objects one by one."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def field(value: Any, name: str) -> Any:
 
 
 def follow(value: Any, path: MessagePath) -> list[float]:
-    """All numbers that the path finds in one message."""
+    """Return all numbers that the path finds in one message."""
     values = [value]
     for step in path.steps:
         found: list[Any] = []

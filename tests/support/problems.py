@@ -1,4 +1,4 @@
-"""Known-answer problems: small models, and tasks whose solution is known in closed form."""
+"""Small models, and tasks whose solution is known in closed form."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ SPECS: dict[str, dict[str, Any]] = {
 
 
 def system(name: str, make=system_of, kind: str = "derivative", integrator: str = "rk4"):
-    """The System of a named model and its parameter values (k,)."""
+    """Return the System of a named model and its parameter values (k,)."""
     spec = SPECS[name]
     made = make(
         spec["function"],
@@ -78,7 +78,7 @@ def system(name: str, make=system_of, kind: str = "derivative", integrator: str 
 
 
 def problem(name: str, horizon: int = 40, seed: int = 0, make=system_of, **changes: Any) -> Problem:
-    """A tracking problem with random weights, targets and bias for a named model."""
+    """Return a tracking problem with random weights, targets and bias for a named model."""
     rng = np.random.default_rng(seed)
     sys, p = system(name, make)
     n, m, H = sys.n, sys.m, horizon
@@ -104,7 +104,7 @@ def problem(name: str, horizon: int = 40, seed: int = 0, make=system_of, **chang
 
 
 def linear_least_squares(problem: Problem):
-    """(M, r) with J(u) = |M u - r|^2 for a problem whose dynamics are linear: by superposition."""
+    """Return (M, r) with J(u) = |M u - r|^2 of a problem with linear dynamics, by superposition."""
     H, m = problem.horizon, problem.system.m
 
     def residuals(u):

@@ -1,6 +1,6 @@
-"""Real systems whose authors published what a crude model of them lacks (../shared/data).
+"""Real systems whose authors published what their crude model lacks (../shared/data).
 
-Each is a model as a user would write it, in a file, and the trials that its log holds.
+Each has a model, as a user would write it in model.py, and the trials of its log.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from shared_data import data
 
 @dataclass(frozen=True)
 class RealSystem:
-    """`text` is a model.py; `read` gives the trials."""
+    """A system: `text` is its model.py, `read` returns its trials."""
 
     text: str
     read: Callable[[], list[Trial]]
 
     @property
     def model(self) -> Model:
-        """What the text defines."""
+        """The model that the text defines."""
         module = ModuleType("model")
         exec(self.text, module.__dict__)
         return module.model
@@ -100,7 +100,7 @@ def _dart_steps() -> list[Trial]:
 
 
 def _resampled(t: np.ndarray, values: np.ndarray, dt: float, hold: bool = False) -> np.ndarray:
-    """Columns at every dt, linear between rows, or held."""
+    """Resample columns at every dt, linearly or held."""
     at = np.arange(t[0], t[-1], dt)
     if hold:
         return values[np.searchsorted(t, at, side="right") - 1]
@@ -108,7 +108,7 @@ def _resampled(t: np.ndarray, values: np.ndarray, dt: float, hold: bool = False)
 
 
 def _bam(speed: bool) -> Callable[[], list[Trial]]:
-    """Motor volts in; runs whose torque was never switched off."""
+    """Read the runs with motor volts as input whose torque was never switched off."""
 
     def read() -> list[Trial]:
         log = np.load(data("bam_xl330_servo", "bam_xl330_pendulum.npz"))
@@ -130,7 +130,7 @@ def _bam(speed: bool) -> Callable[[], list[Trial]]:
 
 
 def _bam_servo() -> list[Trial]:
-    """All runs as the servo was told: goal, its gain kp, whether its torque is on."""
+    """Read all runs with the servo's commands as inputs: goal, gain kp, torque_enable."""
     log = np.load(data("bam_xl330_servo", "bam_xl330_pendulum.npz"))
     about = json.loads(data("bam_xl330_servo", "runs.json").read_text())
     trials = []
@@ -173,7 +173,7 @@ model = Model(
     _emps,
 )
 
-# A servo that goes where it is told within a few hundredths of a second; 50 Hz.
+# A servo that reaches its command within a few hundredths of a second; 50 Hz.
 SERVO = RealSystem(
     """from grounded import Model, Param
 

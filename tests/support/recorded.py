@@ -1,4 +1,4 @@
-"""A cart with feedback and noisy sensors, recorded as a table by somebody who begins early."""
+"""A cart with feedback and noisy sensors, recorded as a table that begins before the run."""
 
 import numpy as np
 
@@ -25,9 +25,9 @@ def record(
     late=0,
     noise=(0.002, 0.01),
 ):
-    """Runs a policy on the model, with a load the policy fights, and logs all of it as a table.
+    """Run a policy on the model against a load, and log everything as a table.
 
-    `late`: rows by which the program and the log get the position late. `noise`: of x [m], v [m/s].
+    `late`: rows by which program and log receive the position late. `noise`: of x [m], v [m/s].
     """
     model, dt, rng = w.task.model, policy.dt, np.random.default_rng(seed)
     z, force, rows, sent = np.array(w.task.start, float), 0.0, [], policy.past.copy()
@@ -54,7 +54,7 @@ def record(
 
 
 def follow(policy, step, state, past):
-    """One command of a policy, from its published law."""
+    """Compute one command of a policy from its documented law."""
     if policy.gain is None:
         return policy.feedforward[step]
     z = np.concatenate([state, past[: policy.gain.shape[2] - len(state)]])
@@ -64,7 +64,7 @@ def follow(policy, step, state, past):
 
 
 def waiting(folder, config=LOGGED):
-    """A workspace that waits for c0002; c0001 was run."""
+    """Make a workspace that waits for c0002, after c0001 was run."""
     w = Workspace(make(folder / "w", config=config).folder)
     w.ingest(record(w, folder / "first.csv", w.propose().candidate.policy, 0.0, seed=9))
     w.propose()

@@ -1,7 +1,7 @@
-"""What was tried against the files and the store, how often, and what was lost.
+"""Torture tests of files and store, which count tries and losses.
 
-Run `python tests/support/reliability.py` for the full counts of docs/reliability.md; the tests run
-the same functions with smaller ones. Each returns (tries, failures): a failure is a wrong number, a
+`python tests/support/reliability.py` makes the full counts of docs/reliability.md; the tests run
+the same functions with fewer tries. Each returns (tries, failures). A failure is a wrong number, a
 traceback, an acknowledged file that is gone, or a store that does not verify.
 """
 
@@ -30,7 +30,7 @@ from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
 from grounded_trials.store.store import Store
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 
-MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None  # where syncing costs nothing
+MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None  # where syncing is free
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def a_candidate() -> tuple[Policy, bytes]:
 
 
 def damaged(source: bytes, flips: bool, stride: int = 1) -> list[tuple[str, bytes]]:
-    """Every truncation, or every single-bit flip (`stride` leaves some out)."""
+    """Yield every truncation or every single-bit flip (`stride` skips some)."""
     if not flips:
         return [(f"cut at {i}", source[:i]) for i in range(0, len(source), stride)]
     cases = []
@@ -77,7 +77,7 @@ def damaged(source: bytes, flips: bool, stride: int = 1) -> list[tuple[str, byte
 
 
 def read_damaged(flips: bool, stride: int = 1) -> Outcome:
-    """A damaged trial or candidate is refused with a message, always."""
+    """Check that a damaged trial or candidate is always refused with a message."""
     trial = trial_bytes(a_trial(), {"iteration": "1"}, b"a policy")
     tries, failures = 0, []
     for source, read in ((trial, read_trial), (a_candidate()[1], read_candidate)):
@@ -96,7 +96,7 @@ def read_damaged(flips: bool, stride: int = 1) -> Outcome:
 
 
 def recover_damaged(flips: bool, stride: int = 1) -> Outcome:
-    """What recover saves of a damaged trial is right; it never calls a loss complete."""
+    """Check that `recover` saves only right numbers and never calls a loss complete."""
     trial = a_trial(12)
     source = trial_bytes(trial, {}, b"a policy")
     failures, saved = [], 0
@@ -168,7 +168,7 @@ def _all(store: Store) -> set[bytes]:
 
 
 def kills(count: int, seed: int = 0) -> Outcome:
-    """kill -9 at a random moment while files are being added, again and again."""
+    """Kill (-9) a process at random moments while it adds files, again and again."""
     rng = random.Random(seed)
     failures: list[str] = []
     acknowledged: set[int] = set()
@@ -196,7 +196,7 @@ def kills(count: int, seed: int = 0) -> Outcome:
 
 
 def concurrent(processes: int = 24, contents: int = 12) -> Outcome:
-    """Many processes add few files: each file is kept once, each process is told so."""
+    """Add few files from many processes: each file is stored once, each process succeeds."""
     code = (
         "import random, sys\nfrom grounded_trials.store.store import Store\n"
         "i = int(sys.argv[2]); rng = random.Random(i)\n"
@@ -243,7 +243,7 @@ def run_add(folder: str, size: int, user: str = "", **options: object) -> tuple[
 
 
 def judge(folder: str, returncode: int, output: str, says: str) -> list[str]:
-    """After a failed add: one clear message, nothing stored, nothing left behind."""
+    """Check after a failed add: one clear message, nothing stored, nothing left behind."""
     failures = []
     if returncode != 1 or "Traceback" in output or says not in output:
         failures.append(f"exit {returncode}: {output[-300:]}")
@@ -254,7 +254,7 @@ def judge(folder: str, returncode: int, output: str, says: str) -> list[str]:
 
 
 def full_disk() -> Outcome | None:
-    """A disk that is full, of several sizes; None where none can be mounted."""
+    """Add to full disks of several sizes; return None if none can be mounted."""
     folder = tempfile.mkdtemp()
     options = "size=300k"
     if subprocess.run(["mount", "-t", "tmpfs", "-o", options, "none", folder]).returncode:
@@ -274,7 +274,7 @@ def full_disk() -> Outcome | None:
 
 
 def size_limit() -> Outcome:
-    """A write that ends early, after any number of bytes."""
+    """Let writes end early, after any number of bytes."""
     limits = range(0, 200_000, 20_011)
     failures = []
     for limit in limits:
@@ -290,7 +290,7 @@ def size_limit() -> Outcome:
 
 
 def read_only() -> Outcome:
-    """A folder that may not be written; as root, by another user."""
+    """Add to a folder without write permission; as root, as another user."""
     base = Path(tempfile.mkdtemp())
     base.chmod(0o755)
     failures = []
@@ -336,7 +336,7 @@ print("added")
 
 
 def system_calls() -> list[tuple[str, int]]:
-    """Each system call that adding a file makes: its name, and which one of that name it is."""
+    """Return each system call of adding a file: its name, and its number among those."""
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder, "log")
         store = Path(folder, "store")
@@ -359,7 +359,7 @@ def system_calls() -> list[tuple[str, int]]:
 
 
 def fault_injection(stride: int = 1) -> Outcome | None:
-    """At each system call of an add: an error, and a kill; None without strace."""
+    """Fail and kill an add at each of its system calls; return None without strace."""
     if shutil.which("strace") is None:
         return None
     failures, tries = [], 0
@@ -391,7 +391,7 @@ def fault_injection(stride: int = 1) -> Outcome | None:
 
 
 def verify_flips(stride: int = 1) -> Outcome:
-    """`verify` finds any flipped bit in any stored byte."""
+    """Check that `verify` finds a flipped bit in any stored byte."""
     source = trial_bytes(a_trial(), {})
     failures, tries = [], 0
     with tempfile.TemporaryDirectory(dir=MEMORY) as folder:

@@ -1,4 +1,4 @@
-"""Workspaces that have something to report, learnt once for all tests that only look."""
+"""Workspaces with results to report, made once for all tests that only read them."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ DIAGNOSIS: dict[str, Any] = {
 
 @pytest.fixture(scope="session")
 def cart(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cart that has learnt and was diagnosed; tests look, or copy it."""
+    """A workspace of a cart, learnt and diagnosed; tests read it or copy it."""
     folder = tmp_path_factory.mktemp("reported") / "cart"
     make(folder)
     assert grounded("-C", folder, "learn").code == 0
@@ -97,7 +97,7 @@ def cart(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def car(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An RC car after three trials, not diagnosed."""
+    """A workspace of an RC car after three trials, not diagnosed."""
     folder = tmp_path_factory.mktemp("reported") / "car"
     make(folder, "car-turn")
     assert grounded("-C", folder, "learn", "--trials", 3).code == 0
@@ -105,13 +105,13 @@ def car(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def copied(workspace: Path, to: Path) -> Path:
-    """A copy that a test may damage."""
+    """Copy a workspace, for tests that change it."""
     shutil.copytree(workspace, to)
     return to
 
 
 def damage(folder: Path, pattern: str) -> Path:
-    """Flips a byte in the middle of the only file that fits the pattern."""
+    """Flip a byte in the middle of the only file that fits the pattern."""
     (path,) = folder.glob(pattern)
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF
@@ -121,7 +121,7 @@ def damage(folder: Path, pattern: str) -> Path:
 
 
 def many_flights(trials: int = 50) -> Findings:
-    """Findings of the aircraft's figure-8, 3000 steps a trial, noisy, without any file."""
+    """Return findings of the aircraft's noisy figure-8, 3000 steps a trial, without files."""
     task = flight_task(aircraft.model)
     rng = np.random.default_rng(0)
     H, n, m = task.horizon, task.model.n, task.model.m

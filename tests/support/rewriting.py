@@ -1,4 +1,4 @@
-"""Files of ours written again with other contents, sound in themselves."""
+"""Rewrite grounded's files with other contents and valid checksums."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from grounded_trials.formats.mcap_writer import CopyWriter
 
 
 def with_metadata(source: bytes, key: str, value: str | None) -> bytes:
-    """The same file, sound in itself, with one entry changed: a stranger's, or a mistake."""
+    """Rewrite a file with one metadata entry changed and valid checksums."""
     stream = io.BytesIO()
     copy = CopyWriter(stream, Header("", "grounded"), compressed=False)
     schemas: dict[int, Schema] = {}

@@ -1,4 +1,4 @@
-"""ROS 2 bags of a car and an arm, written by rosbags, as somebody else's robot records them."""
+"""Write ROS 2 bags of foreign robots (car, rover, arm, crane) with rosbags."""
 
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -72,7 +72,10 @@ def bag(folder, topics, messages, storage=StoragePlugin.SQLITE3):
 
 
 def car_bag(folder, storage=StoragePlugin.SQLITE3, seen=""):
-    """A car with a wheelbase of 0.32 m, driven in curves for 8 s; `seen`: a topic of its pose."""
+    """Write a bag of a car with a wheelbase of 0.32 m, driven in curves for 8 s.
+
+    `seen` is a topic of its pose.
+    """
     topics = {
         "/odom": "nav_msgs/msg/Odometry",
         "/drive": "ackermann_msgs/msg/AckermannDriveStamped",
@@ -98,7 +101,7 @@ def car_bag(folder, storage=StoragePlugin.SQLITE3, seen=""):
 
 
 def rover_bag(folder):
-    """A robot on two wheels in a warehouse; its commands begin a little before its odometry."""
+    """Write a bag of a two-wheeled robot whose commands begin a little before its odometry."""
     topics = {
         "/cmd_vel": "geometry_msgs/msg/Twist",
         "/odom": "nav_msgs/msg/Odometry",
@@ -136,7 +139,7 @@ def arm_bag(folder, scale=1.0):
 def commanded_arm_bag(
     folder, order=("shoulder", "elbow"), goals=True, seed=0, measured_torques=False
 ):
-    """A vertical arm whose JointState is in the order of the alphabet, its commands without names.
+    """Write a bag of a vertical arm: JointState in alphabetical order, commands without names.
 
     Args:
         folder: of the bag.
@@ -175,7 +178,7 @@ def commanded_arm_bag(
 
 
 def _arm_acceleration(q, w, u):
-    """Of two links of 0.35 and 0.3 m, 2 and 1.2 kg, from hanging down, with viscous friction."""
+    """Return accelerations of two links (0.35 and 0.3 m, 2 and 1.2 kg) with viscous friction."""
     h, own = 0.0546 * np.cos(q[1]), 0.0303
     turning = 0.0546 * np.sin(q[1])
     fall = 1.53 * np.sin(q[0] + q[1])

@@ -1,4 +1,4 @@
-"""Where the project's shared real data lie; tests that need them skip where they are missing."""
+"""The folder of the project's shared real data; tests that need it skip without it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small models and tasks on which the loop runs in milliseconds, and real systems that differ."""
+"""Small models and tasks on which the loop runs in milliseconds, and differing real systems."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def rover_dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
 
 
 def branching_step(s: Any, a: Any, p: Any, dt: float) -> dict[str, Any]:
-    """A black box: a Python `if` on the state, which no tracer follows."""
+    """Step with a Python `if` on the state, which no tracer can follow."""
     pull = -p.k * s.x if s.x > 0 else -2 * p.k * s.x
     v = s.v + dt * (a.force + pull)
     return {"x": s.x + dt * v, "v": v}
@@ -58,7 +58,7 @@ black_box = Model(
 
 
 def cart_task(**changes: Any) -> Task:
-    """Two seconds: one metre forth, from rest to rest."""
+    """Return a task of two seconds: one metre forward, from rest to rest."""
     t = np.linspace(0.0, 1.0, 41)
     x = 10 * t**3 - 15 * t**4 + 6 * t**5
     fields: dict[str, Any] = {
@@ -75,7 +75,7 @@ def cart_task(**changes: Any) -> Task:
 
 
 def rover_task(**changes: Any) -> Task:
-    """Once around a circle and a half: the heading passes pi and 2 pi."""
+    """Return a task of one and a half circles: the heading passes pi and 2 pi."""
     t = 0.05 * np.arange(61)
     psi = 3.0 * t
     target = np.column_stack([np.sin(psi) / 3, (1 - np.cos(psi)) / 3, psi])
@@ -96,12 +96,12 @@ def rover_task(**changes: Any) -> Task:
 
 
 def other(model: Model, factor: float = 1.2) -> Model:
-    """The same robot with every parameter off by a factor: a real system."""
+    """Return the same robot as a real system, every parameter scaled by a factor."""
     return model.with_values({k: factor * v.value for k, v in model.params.items()})
 
 
 def drive(task: Task, plant: Plant, candidate: Candidate, seed: int = 0) -> Trial:
-    """One run of a candidate from the task's start."""
+    """Run a candidate once from the task's start."""
     start = dict(zip(task.model.state_names, map(float, task.start), strict=True))
     trial = plant.run(candidate.policy, start, np.random.default_rng(seed))
     return replace(trial, candidate=candidate.id, id=f"t-{candidate.id}-{seed}")

@@ -54,7 +54,7 @@ model = "real.py"
 
 
 def make(folder: Path, example: str = "cart", **files: str) -> Folder:
-    """A workspace; `files` replaces texts: config, model, real, target."""
+    """Make a workspace; `files` replaces its config, model, real or target text."""
     if example in EXAMPLES:
         write_example(folder, example)
     else:
