@@ -48,7 +48,7 @@ def main():
 
 
 def by_hand(seconds):
-    """Return the control interval and a function of (t, state): the inputs at t, None at the end."""
+    """Return dt and a function of (t, state) that gives the inputs at t, None at the end."""
 
     def action(t, state):
         if t > seconds:

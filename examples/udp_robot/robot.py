@@ -25,7 +25,7 @@ def main():
     """Run until stopped."""
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--loss", type=float, default=0.02, help="share of packets that are lost")
-    options.add_argument("--jitter", type=float, default=0.004, help="largest delay of a packet [s]")
+    options.add_argument("--jitter", type=float, default=0.004, help="largest send delay [s]")
     options.add_argument("--seed", type=int, default=0)
     chosen = options.parse_args()
     luck = random.Random(chosen.seed)
