@@ -1,11 +1,11 @@
-"""Drives the robot: by hand along a sine, or a candidate by the one-file runner.
+"""Drive the robot: by hand along a sine, or a candidate with the one-file runner.
 
     python drive.py --manual 20 BAG          20 s of driving, recorded
     python drive.py CANDIDATE TRIAL          what `grounded run` calls
 
-The loop runs at the candidate's own rate on the state that came last, however late; a lost packet
-means that the state is older, never that the loop waits. Where the computer stops it for longer
-than a step, the last command holds meanwhile. Ctrl-C sends the kill command.
+The loop runs at the candidate's own rate on the latest state, however old. It never waits for a
+lost packet. If the computer stops the loop for longer than a step, the last command is held.
+Ctrl-C sends the kill command.
 """
 
 import json
@@ -24,7 +24,7 @@ HERE = Path(__file__).parent
 
 
 def main():
-    """Records, drives, and hands the recording over."""
+    """Record, drive, and copy the recording to where the caller wants it."""
     manual = sys.argv[1] == "--manual"
     seconds = float(sys.argv[2]) if manual else 0.0
     target = Path(sys.argv[-1])
@@ -35,7 +35,7 @@ def main():
             [sys.executable, HERE / "record.py", bag], stdout=subprocess.PIPE, text=True
         )
         try:
-            recorder.stdout.readline()  # it listens
+            recorder.stdout.readline()  # wait until it listens
             drive(*steer)
         finally:
             recorder.terminate()
@@ -48,7 +48,7 @@ def main():
 
 
 def by_hand(seconds):
-    """The control interval, and what a person would do at time t, None at the end."""
+    """Return dt and a function of (t, state) that gives the inputs at t, None at the end."""
 
     def action(t, state):
         if t > seconds:
@@ -59,7 +59,7 @@ def by_hand(seconds):
 
 
 def by_candidate(candidate, room):
-    """The same of a candidate, exported with its runner as one would for the robot."""
+    """Return the same for a candidate, exported with its runner as for a real robot."""
     identity = candidate.stem
     words = ["export", identity, "--runner", "-o", str(room / "policy.npz")]
     workspace = str(candidate.parents[1])
@@ -80,7 +80,7 @@ def by_candidate(candidate, room):
 
 
 def drive(dt, action):
-    """The loop: reset, wait for a state, then act until `action` says that it is over."""
+    """Reset, wait for a state, then send commands until `action` returns None."""
     line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     line.bind((HOST, DRIVER))
     line.setblocking(False)
@@ -100,7 +100,7 @@ def drive(dt, action):
                 break
             send(line, {"t": now, "steering": float(found[0]), "speed": float(found[1])})
             late = max(0.0, time.time() - now - dt)
-            now += dt * (1 + late // dt)  # steps that were missed are not made up for
+            now += dt * (1 + late // dt)  # missed steps are skipped
             time.sleep(max(0.0, now - time.time()))
         send(line, {"t": now, "steering": 0.0, "speed": 0.0})
         time.sleep(0.1)
@@ -112,7 +112,7 @@ def drive(dt, action):
 
 
 def newest(line, state):
-    """The state that came last, `state` where none did."""
+    """Return the latest state received, or `state` if there is none."""
     while True:
         try:
             state = json.loads(line.recv(4096))
@@ -121,7 +121,7 @@ def newest(line, state):
 
 
 def send(line, command):
-    """To the robot; commands to the recorder as well."""
+    """Send a command to the robot, and to the recorder unless it is a reset or kill."""
     packet = json.dumps(command).encode()
     for port in (COMMANDS, RECORDER) if "speed" in command else (COMMANDS,):
         line.sendto(packet, (HOST, port))

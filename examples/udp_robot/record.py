@@ -1,4 +1,4 @@
-"""An independent logger: writes what robot and driver say into a ROS 2 bag, until SIGTERM.
+"""An independent logger: write the packets of robot and driver into a ROS 2 bag, until SIGTERM.
 
     python record.py BAG
 
@@ -24,7 +24,7 @@ T = STORE.types
 
 
 def main():
-    """Records until it is told to stop."""
+    """Record until SIGTERM."""
     on = [True]
     signal.signal(signal.SIGTERM, lambda *_: on.clear())
     line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -49,7 +49,7 @@ def main():
 
 
 def messages(said):
-    """The ROS messages of a packet."""
+    """Yield the ROS messages of a packet, each with its topic."""
     t = round(said["t"] * 1e9)
     stamp = T["builtin_interfaces/msg/Time"](sec=t // 10**9, nanosec=t % 10**9)
     header = T["std_msgs/msg/Header"](stamp=stamp, frame_id="map")
@@ -80,7 +80,7 @@ def messages(said):
 
 
 def twist(forward, turn):
-    """A velocity along x and about z."""
+    """Return a Twist: a velocity along x and a rate about z."""
     zero = {"x": 0.0, "y": 0.0, "z": 0.0}
     linear = geometry("Vector3", **(zero | {"x": float(forward)}))
     return geometry(
@@ -89,7 +89,7 @@ def twist(forward, turn):
 
 
 def geometry(kind, **parts):
-    """A message of geometry_msgs."""
+    """Return a message of geometry_msgs."""
     return T[f"geometry_msgs/msg/{kind}"](**parts)
 
 

@@ -1,13 +1,13 @@
 """A robot in another process: a small car behind UDP, with jitter, lost packets, a kill switch.
 
-It stands in for hardware: nothing of grounded is imported, and what it is like inside (a lag, a
-dead zone of the motor, a steering that is off centre) is not what the crude model says.
+It stands in for hardware: it does not import grounded, and its dynamics (a lag, a dead zone of the
+motor, an off-centre steering) differ from the crude model.
 
     python robot.py [--loss 0.02] [--jitter 0.004] [--seed 0]
 
 It listens on COMMANDS for JSON: {"steering": rad, "speed": m/s}, {"kill": true}, {"reset": true}.
 It sends its state to DRIVER and RECORDER at 50 Hz: t, x, y, psi, v, and whether it was killed. It
-stops by itself when it hears nothing for 0.25 s; once killed it stays where it is until reset.
+stops when it receives nothing for 0.25 s; once killed it stays where it is until reset.
 """
 
 import argparse
@@ -22,10 +22,10 @@ HOST, RATE, STEP, WATCHDOG = "127.0.0.1", 50.0, 0.005, 0.25
 
 
 def main():
-    """Runs until it is stopped."""
+    """Run until stopped."""
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--loss", type=float, default=0.02, help="share of packets that are lost")
-    options.add_argument("--jitter", type=float, default=0.004, help="of the sending times [s]")
+    options.add_argument("--jitter", type=float, default=0.004, help="largest send delay [s]")
     options.add_argument("--seed", type=int, default=0)
     chosen = options.parse_args()
     luck = random.Random(chosen.seed)
@@ -45,7 +45,7 @@ def main():
         car.move(STEP)
         if now >= send:
             send += 1 / RATE
-            if time.time() - now > 1 / RATE:  # its computer was stopped: what it saw is old
+            if time.time() - now > 1 / RATE:  # the computer was stopped: this state is old
                 now += STEP
                 continue
             packet = json.dumps({"t": now, **car.state(luck)}).encode()
@@ -58,7 +58,7 @@ def main():
 
 
 def received(line):
-    """The commands that have come in; what is no JSON object is dropped."""
+    """Yield the received commands; drop what is not a JSON object."""
     while True:
         try:
             found = json.loads(line.recv(4096))
@@ -71,7 +71,7 @@ def received(line):
 
 
 class Car:
-    """What the car is really like."""
+    """The true dynamics of the car."""
 
     def __init__(self):
         self.x = self.y = self.psi = self.v = 0.0
@@ -79,7 +79,7 @@ class Car:
         self.killed = False
 
     def obey(self, command):
-        """Takes a command; a kill holds until a reset."""
+        """Apply a command; a kill holds until a reset."""
         if command.get("kill"):
             self.killed = True
         elif command.get("reset"):
@@ -89,7 +89,7 @@ class Car:
             self.speed = min(max(float(command.get("speed", 0)), 0.0), 3.0)
 
     def move(self, dt):
-        """One step of the truth."""
+        """Integrate one step."""
         wanted = 0.0 if self.killed or self.speed < 0.15 else 0.85 * self.speed
         self.v += dt * (wanted - self.v) / (0.08 if self.killed else 0.3)
         self.psi += dt * self.v * math.tan(self.steering + 0.03) / 0.27
@@ -97,7 +97,7 @@ class Car:
         self.y += dt * self.v * math.sin(self.psi)
 
     def state(self, luck):
-        """What its sensors say."""
+        """Return what the sensors measure."""
         return {
             "x": self.x + luck.gauss(0, 0.002),
             "y": self.y + luck.gauss(0, 0.002),
