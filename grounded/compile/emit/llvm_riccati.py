@@ -56,7 +56,7 @@ class _Sweep:
     def __init__(self, f: Writer, d: Dynamics, layout: Layout, width: int) -> None:
         self.f, self.layout, self.width, self.words = f, layout, width, Words(f, SWEEP)
         m, nz = layout.m, layout.nz
-        self.P, self.C = padded(nz), padded(nz + m)
+        self.P, self.C = padded(nz, width), padded(nz + m, width)
         self.cut = pieces(self.P, width)
         self.along = Linearised(f, d, layout, width, self.words)
         self.V, self.v = f.room(self.P * self.P), f.room(self.P)
