@@ -257,9 +257,7 @@ class _Sweep:
     def _add(self, F: str, stride: int, op: str) -> None:
         """V += F'K, v += F'k, or -=, for rows F_j."""
         f, m, P = self.f, self.layout.m, self.P
-        K = {
-            (j, at): f.load(self.K, j * P + at, size) for j in range(m) for at, size in self.cut
-        }
+        K = {(j, at): f.load(self.K, j * P + at, size) for j in range(m) for at, size in self.cut}
         for at, size in self.cut:
             v = f.load(self.v, at, size)
             for j in range(m):

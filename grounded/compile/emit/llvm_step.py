@@ -205,9 +205,7 @@ class StepWriter:
                 f.store(splat(0.0, w), rates, at, w)
                 f.store(f.load_all("@chain_diagonal", rate, w), out, at, w)
 
-    def _chain(
-        self, body: Body, steps: tuple[str, str], stage: str, rates: str, out: str
-    ) -> None:
+    def _chain(self, body: Body, steps: tuple[str, str], stage: str, rates: str, out: str) -> None:
         """K = f_x T + own takes the place of the K before, column by column; A += b dt K."""
         f, d, w = self.f, self.d, self.width
         c_dt, b_dt = steps
