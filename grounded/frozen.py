@@ -1,4 +1,4 @@
-"""Read-only arrays for frozen dataclasses, checks of user input, and wrapped angles."""
+"""Read-only arrays for frozen dataclasses, checks of input, medians and wrapped angles."""
 
 from __future__ import annotations
 
@@ -41,6 +41,13 @@ def positive(what: str, value: Any) -> None:
     """
     if not isinstance(value, (int, float, np.number)) or not (np.isfinite(value) and value > 0):
         raise GroundedError(f"{what} must be a positive number of seconds, got {value!r:.60}")
+
+
+def median(values: Array) -> Array:
+    """Return the median over the first axis, like `np.median`, which imports numpy.ma (8 ms)."""
+    ordered = np.sort(values, axis=0)
+    middle = ordered[[(len(values) - 1) // 2, len(values) // 2]].mean(axis=0)
+    return np.where(np.isnan(ordered[-1]), np.nan, middle)
 
 
 def wrapped(d: Array, angles: ArrayLike) -> Array:

@@ -160,8 +160,10 @@ def _steps(task: Task, x: Array, known: NDArray[np.bool_]) -> LeastSquares:
     def jacobian(w: Array, rows: Rows) -> Array:
         state, u = split(w, rows)
         f_x, f_u = problem.system.linearise(state, u, *settings)
-        J = np.concatenate([f_x[:, :, free] - np.eye(n)[:, free], f_u], axis=2)
-        return np.asarray(J * weight[:, None])
+        J = np.concatenate([f_x[:, :, free], f_u], axis=2)
+        J[:, :, : len(free)] -= np.eye(n)[:, free]
+        J *= weight[:, None]
+        return J
 
     rate = np.diff(x, axis=0)[:, known] / problem.dt
     nowhere = np.full(len(free), np.inf)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from grounded.frozen import Array
+from grounded.frozen import Array, median
 from grounded.search.candidate import Tried
 from grounded.task import Task
 
@@ -23,7 +25,7 @@ def limit_cycle(tried: Tried, task: Task) -> bool:
     range_ = np.minimum(np.ptp(made.predicted_inputs, axis=0), task.high - task.low)
     for trial in tried.trials:
         off = trial.inputs - made.predicted_inputs[: trial.steps]
-        sizes = np.maximum(range_, np.abs(np.median(off, axis=0)))
+        sizes = np.maximum(range_, np.abs(median(off)))
         if any(_swings(off[:, i], size) >= SWINGS for i, size in enumerate(sizes) if range_[i] > 0):
             return True
     return False
@@ -48,10 +50,10 @@ def jumps(inputs: Array, range_: Array) -> Array:
 
 def _swings(values: Array, size: float) -> int:
     """Count how often a signal reverses and moves by `size` or more."""
-    found, way, last = 0, 0.0, values[0]
-    for value in values:
+    found, way, last = 0, 0.0, float(values[0])
+    for value in values.tolist():  # Python's own numbers: three times as fast
         if (value - last) * way > 0:
             last = value
         elif abs(value - last) >= size:
-            found, way, last = found + 1, np.sign(value - last), value
+            found, way, last = found + 1, math.copysign(1.0, value - last), value
     return found

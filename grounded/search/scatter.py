@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.frozen import Array
+from grounded.frozen import Array, median
 from grounded.policy import Policy
 from grounded.search.candidate import Tried
 from grounded.task import Task
@@ -91,7 +91,7 @@ def white_noise(states: Array) -> Array:
         for j, column in enumerate(np.abs(np.diff(states, n=order, axis=0)).T):
             known = column[np.isfinite(column)]
             white = MEDIAN * math.sqrt(math.comb(2 * order, order))
-            found[j] = min(found[j], np.median(known) / white if len(known) else np.inf)
+            found[j] = min(found[j], median(known) / white if len(known) else np.inf)
     return np.where(np.isfinite(found), found, 0.0)
 
 

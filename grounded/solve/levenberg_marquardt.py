@@ -79,8 +79,9 @@ def _step(r: Array, J: Array, damping: Array) -> Array:
     usable: NDArray[np.bool_] = np.asarray(
         np.isfinite(J).all(axis=(1, 2)) & np.isfinite(r).all(axis=1)
     )
-    J = np.where(usable[:, None, None], J, 0.0)
-    r = np.where(usable[:, None], r, 0.0)
+    if not usable.all():
+        J = np.where(usable[:, None, None], J, 0.0)
+        r = np.where(usable[:, None], r, 0.0)
     normal = J.swapaxes(1, 2) @ J
     index = np.arange(J.shape[2])
     diagonal = normal[:, index, index] + 1e-9

@@ -144,8 +144,7 @@ class Lanes:
         f, w = self.f, self.width
         low = f.compare("olt", x, self.const(-708.0), w)
         high = f.compare("ogt", x, self.const(709.78), w)
-        inside = f.select(low, self.const(0.0), f.select(high, self.const(0.0), x, w), w)
-        scaled = f.select(high, self.const(math.inf), self.exp_within(inside), w)
+        scaled = f.select(high, self.const(math.inf), self.exp_within(x), w)  # or what it may be
         return f.select(low, self.const(0.0), scaled, w)
 
     def exp_within(self, x: str) -> str:
@@ -175,8 +174,7 @@ class Lanes:
         steep = f.compare("ogt", ay, ax, w)
         left = self._is_set(self._bitwise("lshr", self._bits(x), 63))
         far = self._both(self._beyond_eighth(ay, ax), self._beyond_eighth(ax, ay))
-        small, large = f.select(steep, ax, ay, w), f.select(steep, ay, ax, w)
-        core = self._small_angle(small, large, far)
+        core = self._small_angle(ay, ax, steep, far)
         base, turn = self._octant(far, steep, left)
         angle = f.fma(turn, core, base, w)
         signed = self._bitwise("and", self._bits(y), -(1 << 63))
@@ -191,12 +189,17 @@ class Lanes:
         f, w = self.f, self.width
         return f.compare("ogt", y, f.mul(x, self.const(math.tan(math.pi / 8)), w), w)
 
-    def _small_angle(self, y: str, x: str, far: str) -> str:
-        """The angle of (x, y) for 0 <= y <= x, less pi/4 if it is far from 0; one division."""
-        f, w, zero = self.f, self.width, self.const(0.0)
-        below = f.select(f.compare("oeq", x, zero, w), self.const(1.0), x, w)
-        below = f.select(far, f.add(y, x, w), below, w)
-        t = f.div(f.select(far, f.sub(y, x, w), y, w), below, w)
+    def _small_angle(self, y: str, x: str, steep: str, far: str) -> str:
+        """The angle of (x, y) to the nearer axis, less pi/4 if it is far from it; one division.
+
+        x and y >= 0. What is divided in each case is there before it is known which case it is.
+        """
+        f, w, total = self.f, self.width, self.f.add(x, y, self.width)
+        nowhere = f.compare("oeq", total, self.const(0.0), w)
+        less = f.neg(f.call("fabs", [f.sub(y, x, w)], w), w)
+        small, large = f.select(steep, x, y, w), f.select(steep, y, x, w)
+        large = f.select(nowhere, self.const(1.0), large, w)
+        t = f.div(f.select(far, less, small, w), f.select(far, total, large, w), w)
         z = f.mul(t, t, w)
         return f.fma(f.mul(t, z, w), self.polynomial(z, ATAN), t, w)
 

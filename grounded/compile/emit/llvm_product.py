@@ -20,9 +20,13 @@ Row = Callable[[int | str], str]  # loads (a piece of) row r of a matrix
 UNROLLED = 400  # entries of the Jacobian whose products are written out; more are a loop
 
 
-def padded(size: int) -> int:
-    """Rows are multiples of four doubles."""
-    return -(-size // 4) * 4
+def padded(size: int, width: int = 4) -> int:
+    """Rows are multiples of four doubles; what lies between them, of a vector.
+
+    A vector that begins in one cache line and ends in the next costs two accesses.
+    """
+    lanes = width if size > 4 else 4
+    return -(-size // lanes) * lanes
 
 
 def pieces(size: int, width: int) -> list[tuple[int, int]]:
@@ -60,11 +64,10 @@ def _transpose_rows(f: Writer, source: str, target: str, size: tuple[int, int], 
     """`count` rows of M to as many columns of T, in blocks of four by four."""
     P, C = size
     for r in range(0, P, 4):
-        columns = _transpose_block(f, [f.load(source, i * P + r, 4) for i in range(4)])
-        for four in range(4, count, 4):
-            more = _transpose_block(f, [f.load(source, (four + i) * P + r, 4) for i in range(4)])
-            columns = [_beside(f, a, b) for a, b in zip(columns, more, strict=True)]
-        for i, column in enumerate(columns):
+        rows = [f.load(source, i * P + r, 4) for i in range(count)]
+        if count > 4:  # blocks side by side are transposed at once
+            rows = [_beside(f, a, b) for a, b in zip(rows[:4], rows[4:], strict=True)]
+        for i, column in enumerate(_transpose_block(f, rows, count)):
             f.store(column, target, (r + i) * C, count)
 
 
@@ -85,13 +88,15 @@ def symmetric(f: Writer, V: str, P: int) -> None:
             f.store(row, above, r * P, 4)
 
 
-def _transpose_block(f: Writer, a: list[str]) -> list[str]:
-    """Columns of four rows of four."""
-    kind = vector(4)
+def _transpose_block(f: Writer, a: list[str], size: int = 4) -> list[str]:
+    """Columns of four rows of four; of two such blocks side by side where `size` is 8."""
+    kind = vector(size)
 
     def shuffled(a: str, b: str, *lanes: int) -> str:
-        inside = ", ".join(f"i32 {i}" for i in lanes)
-        return f.emit(f"shufflevector {kind} {a}, {kind} {b}, <4 x i32> <{inside}>")
+        """Lanes of a, from 4 on of b, in each block."""
+        places = (i % 4 + i // 4 * size + block for block in range(0, size, 4) for i in lanes)
+        inside = ", ".join(f"i32 {i}" for i in places)
+        return f.emit(f"shufflevector {kind} {a}, {kind} {b}, <{size} x i32> <{inside}>")
 
     lo = [shuffled(a[i], a[i + 1], 0, 4, 2, 6) for i in (0, 2)]
     hi = [shuffled(a[i], a[i + 1], 1, 5, 3, 7) for i in (0, 2)]

@@ -56,7 +56,7 @@ class _Sweep:
     def __init__(self, f: Writer, d: Dynamics, layout: Layout, width: int) -> None:
         self.f, self.layout, self.width, self.words = f, layout, width, Words(f, SWEEP)
         m, nz = layout.m, layout.nz
-        self.P, self.C = padded(nz), padded(nz + m)
+        self.P, self.C = padded(nz, width), padded(nz + m, width)
         self.cut = pieces(self.P, width)
         self.along = Linearised(f, d, layout, width, self.words)
         self.V, self.v = f.room(self.P * self.P), f.room(self.P)
@@ -257,17 +257,18 @@ class _Sweep:
     def _add(self, F: str, stride: int, op: str) -> None:
         """V += F'K, v += F'k, or -=, for rows F_j."""
         f, m, P = self.f, self.layout.m, self.P
+        K = {(j, at): f.load(self.K, j * P + at, size) for j in range(m) for at, size in self.cut}
         for at, size in self.cut:
-            K = [f.load(self.K, j * P + at, size) for j in range(m)]
             v = f.load(self.v, at, size)
             for j in range(m):
                 k = f.load_all(self.k, j, size)
                 v = f.op(op, v, f.mul(k, f.load(F, j * stride + at, size), size), size)
             f.store(v, self.v, at, size)
-            with f.loop(self.layout.nz) as c:
-                place = f.integer("add", f.integer("mul", c, P), at)
-                row, column = f.load(self.V, place, size), f.at(F, c)
-                for j in range(m):
-                    product = f.mul(f.load_all(column, j * stride, size), K[j], size)
-                    row = f.op(op, row, product, size)
-                f.store(row, self.V, place, size)
+        with f.loop(self.layout.nz) as c:
+            start, column = f.at(self.V, f.integer("mul", c, P)), f.at(F, c)
+            factors = [f.load_all(column, j * stride, self.cut[0][1]) for j in range(m)]
+            for at, size in self.cut:
+                row = f.load(start, at, size)
+                for j, factor in enumerate(factors):
+                    row = f.op(op, row, f.mul(factor, K[j, at], size), size)
+                f.store(row, start, at, size)

@@ -154,8 +154,8 @@ class StepWriter:
             following.append(x)
         return following
 
-    def _rates(self, stage: str) -> tuple[Body, str]:
-        """One stage: k = f(x + c dt k), next += b dt k; next starts at zero."""
+    def _rates(self, stage: str) -> tuple[Body, str, str]:
+        """One stage: k = f(x + c dt k), next += b dt k; next starts at zero. With c dt, b dt."""
         f, d, w = self.f, self.d, self.width
         dt = f.load(self.table, DT)
         c, b = (f.mul(dt, f.load(name, stage)) for name in ("@stage_c", "@stage_b"))
@@ -167,7 +167,7 @@ class StepWriter:
         for i, value in enumerate(body.values(d.outputs)):
             f.store(value, self.k, i * w, w)
             f.store(f.fma(b, value, f.load(self.next, i * w, w), w), self.next, i * w, w)
-        return body, c
+        return body, c, b
 
     def jacobian(self, out: str) -> None:
         """From x and u to next, and the values of the Jacobian's places to out, [places][W]."""
@@ -178,67 +178,64 @@ class StepWriter:
             for e, value in enumerate(body.values([d.entries[p] for p in d.places])):
                 f.store(value, out, e * w, w)
             return
-        rates = f.room((len(d.stages) + 1) * len(d.rates) * w)  # K of each stage, after zeros
+        looped, size = d.products > UNROLLED, len(d.rates) * w
+        rates = f.room((2 if looped else 1) * size)  # K of the stage, and of the one before
         self._start([*d.outputs, *d.entries.values()])
-        if d.products > UNROLLED:
-            with f.loop(len(d.rates)) as rate:
-                f.store(splat(0.0, w), rates, f.integer("mul", rate, w), w)
+        if looped:
+            self._begin_loops(rates, out)
         with f.loop(len(d.stages)) as stage:
-            body, c_dt = self._rates(stage)
-            old = f.at(rates, f.integer("mul", stage, len(d.rates) * w))
-            new = f.at(old, len(d.rates) * w)
-            if d.products > UNROLLED:
-                self._looped_chain(body, c_dt, old, new)
+            body, c_dt, b_dt = self._rates(stage)
+            if looped:
+                odd = f.integer("and", stage, 1)
+                old = f.at(rates, f.integer("mul", odd, size))
+                new = f.at(rates, f.integer("mul", f.integer("xor", odd, 1), size))
+                self._looped_chain(body, (c_dt, b_dt), (old, new), out)
             else:
-                self._chain(body, c_dt, stage, old, new)
+                self._chain(body, (c_dt, b_dt), stage, rates, out)
         self._finish()
-        self._sum_of_stages(rates, out)
-
-    def _sum_of_stages(self, rates: str, out: str) -> None:
-        """A = I + dt sum of b_i K_i."""
-        f, d, w = self.f, self.d, self.width
-        if d.rates:  # a loop runs at least once: not for rates that depend on nothing
-            dt = f.load(self.table, DT)
-            weights = [f.spread(f.mul(dt, number(b)), w) for _, b in d.stages]
-            with f.loop(len(d.rates)) as rate:
-                total, at = f.load_all("@chain_diagonal", rate, w), f.integer("mul", rate, w)
-                for i, b in enumerate(weights):
-                    K = f.load(f.at(rates, (i + 1) * len(d.rates) * w), at, w)
-                    total = f.fma(b, K, total, w)
-                f.store(total, out, at, w)
         for e in range(len(d.rates), len(d.places)):
             f.store(splat(1.0, w), out, e * w, w)
 
-    def _chain(self, body: Body, c_dt: str, stage: str, old: str, new: str) -> None:
-        """K = f_x T + own into new."""
+    def _begin_loops(self, rates: str, out: str) -> None:
+        """No K yet, and A = I."""
         f, d, w = self.f, self.d, self.width
+        if d.rates:  # a loop runs at least once: not for rates that depend on nothing
+            with f.loop(len(d.rates)) as rate:
+                at = f.integer("mul", rate, w)
+                f.store(splat(0.0, w), rates, at, w)
+                f.store(f.load_all("@chain_diagonal", rate, w), out, at, w)
+
+    def _chain(self, body: Body, steps: tuple[str, str], stage: str, rates: str, out: str) -> None:
+        """K = f_x T + own takes the place of the K before, column by column; A += b dt K."""
+        f, d, w = self.f, self.d, self.width
+        c_dt, b_dt = steps
         own = {at: body.value(i) for at, i in d.entries.items()}
         slot = {at: e * w for e, at in enumerate(d.rates)}
         with f.when(f.emit(f"icmp eq i64 {stage}, 0")):  # nothing to chain with yet
-            for at in d.rates:
-                f.store(own.get(at, splat(0.0, w)), new, slot[at], w)
+            for (r, c), e in slot.items():
+                value = own.get((r, c), splat(0.0, w))
+                f.store(value, rates, e, w)
+                f.store(f.fma(b_dt, value, splat(float(r == c), w), w), out, e, w)
         if len(d.stages) == 1:
             return
         with f.when(f.emit(f"icmp ne i64 {stage}, 0")):
             scaled = {at: f.mul(c_dt, v, w) for at, v in own.items() if at[1] < d.n}
-            for block in _blocks(d):
-                values = {at: own[at] for at in block if at in own}
-                for s in range(d.n):
-                    before: dict[int, str] = {}
-                    for r, c in block:
-                        if s not in d.rates[r, c]:
-                            continue
-                        if c not in before:
-                            before[c] = f.load(old, slot[s, c], w)
-                        known, last = scaled[r, s], values.get((r, c))
-                        term = (known, before[c])
-                        values[r, c] = f.fma(*term, last, w) if last else f.mul(*term, w)
-                for at, value in values.items():
-                    f.store(value, new, slot[at], w)
+            for column in _columns(d):
+                before = {at[0]: f.load(rates, slot[at], w) for at in column}
+                for at in column:
+                    value = own.get(at, "")
+                    for s in d.rates[at]:
+                        term = scaled[at[0], s], before[s]
+                        value = f.fma(*term, value, w) if value else f.mul(*term, w)
+                    f.store(value, rates, slot[at], w)
+                    f.store(f.fma(b_dt, value, f.load(out, slot[at], w), w), out, slot[at], w)
 
-    def _looped_chain(self, body: Body, c_dt: str, old: str, new: str) -> None:
+    def _looped_chain(
+        self, body: Body, steps: tuple[str, str], buffers: tuple[str, str], out: str
+    ) -> None:
         """The same sums for large models: small code that runs through tables of indices."""
         f, d, w = self.f, self.d, self.width
+        (c_dt, b_dt), (old, new) = steps, buffers
         own = f.room((len(d.entries) + 1) * w)  # the last is zero
         for e, value in enumerate(body.values(list(d.entries.values()))):
             f.store(value, own, e * w, w)
@@ -252,16 +249,17 @@ class StepWriter:
                 right = f.integer("mul", f.index("@chain_right", q), w)
                 total.set(f.fma(f.load(own, left, w), f.load(old, right, w), total.value, w))
             mine = f.load(own, f.integer("mul", f.index("@chain_own", rate), w), w)
-            value = f.fma(c_dt, total.result, mine, w)
-            f.store(value, new, f.integer("mul", rate, w), w)
+            value, at = f.fma(c_dt, total.result, mine, w), f.integer("mul", rate, w)
+            f.store(value, new, at, w)
+            f.store(f.fma(b_dt, value, f.load(out, at, w), w), out, at, w)
 
 
-def _blocks(d: Dynamics) -> list[list[Place]]:
-    """Places in blocks of two rows and four columns, which share what they read."""
-    blocks: dict[Place, list[Place]] = {}
+def _columns(d: Dynamics) -> list[list[Place]]:
+    """Places column by column: what a column of K becomes depends on that column alone."""
+    columns: dict[int, list[Place]] = {}
     for r, c in d.rates:
-        blocks.setdefault((r // 2, c // 4), []).append((r, c))
-    return list(blocks.values())
+        columns.setdefault(c, []).append((r, c))
+    return list(columns.values())
 
 
 def _chain_tables(d: Dynamics) -> str:
