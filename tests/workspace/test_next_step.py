@@ -130,7 +130,7 @@ def test_adopting_says_of_what_its_std_stopped_what_to_widen(cart, tmp_path):
     mass = {"value": 1.3, "std": 0.02, "interval": [1.26, 1.34], "unit": "kg", "stopped": "prior"}
     diagnosed(folder, parameters={"mass": mass})
     done = grounded("-C", folder, "adopt", "viscous_friction:v")
-    assert holds(" ".join(done.err.split()), "mass went as far as its std", "widen its std")
+    assert holds(" ".join(done.err.split()), "mass moved as far as its std", "widen its std")
     assert grounded("-C", folder, "adopt", "--undo").code == 0
     diagnosed(folder, parameters={"mass": {**mass, "stopped": ""}})
     assert "std" not in grounded("-C", folder, "adopt", "viscous_friction:v").err
