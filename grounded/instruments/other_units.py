@@ -225,4 +225,4 @@ def described(model: Model, i: int, factor: float) -> str:
     prefix = PREFIXES.get(factor, "") if base in SINGLE else ""
     unit = f" (in {prefix}{base}{'/' * bool(per)}{per})" if prefix else ""
     text = f"{size:g} times too {'large' if factor > 1 else 'small'}{unit}"
-    return f"{name} looks {text}, which [log.state.{name}] scale = {1 / factor:g} would correct"
+    return f"{name} looks {text}, corrected by [log.state.{name}] scale = {1 / factor:g}"

@@ -254,7 +254,7 @@ def test_a_position_that_counts_the_other_way_beside_a_right_velocity_is_named_a
     with pytest.raises(GroundedError) as refused:
         gr.diagnose(ball(), trials)
     said = str(refused.value)
-    assert "x looks turned" in said and "[log.state.x]" in said and "[log.state.v]" not in said
+    assert "x looks logged" in said and "[log.state.x]" in said and "[log.state.v]" not in said
 
 
 @pytest.mark.parametrize("gain", [-1.0, 0.0, 0.3])
