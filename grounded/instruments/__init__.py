@@ -1,8 +1,8 @@
-"""Instruments, judged from their own signals before any physics: late, scaled, stuck, in degrees.
+"""Checks of the sensors and commands in a log, before any physics is identified from it.
 
-Read `preflight` first: it looks at trials and a model's kinematics, states each `Finding`, and
-gives the trials with what can be corrected corrected. `single` judges one signal at a time,
-`kinematics` a position against its velocity and a heading against the way that was travelled,
-`mismatch` a position against all that its rate is made of (`rows`), `lag` measures how late one
-signal is behind another.
+Delays, scales, wrong units and signs, stuck or dead signals. Read `preflight` first: it checks
+trials against the model's kinematics, returns a `Finding` for each fault, and corrects the trials
+where that is certain. `single` checks one signal at a time, `kinematics` a position against its
+velocity and a heading against the course travelled, `mismatch` a position against every state that
+its rate depends on (`rows`). `lag` measures the delay between two signals.
 """

@@ -1,19 +1,21 @@
-"""Clocks that differ: stamps of another pace, and two clocks that were put together wrongly.
+"""Clock faults: time stamps that run at a wrong rate, and states and commands on different clocks.
 
-A clock that runs at half speed halves all derivatives. Told sensor by sensor that is a wrong scale
-of each; where two or more agree, and none contradicts, it is the clock (`told_by_the_clock`).
+A clock that runs at half speed halves all derivatives. Sensor by sensor this looks like a scale
+error of each. If two or more scales agree and none contradicts, the clock is to blame
+(`told_by_the_clock`).
 
-States that answer commands before they are sent have another clock: no physics does that. A run of
-a feedback controller looks like it, though: its commands follow the states, so what will be sent
-tells how the motion goes on; a friction or a back-EMF that the model lacks makes the robot quicker
-than the model as well. So the model predicts a quarter of a second ahead with the commands as they
-are logged and with commands of later, both times calibrated (`short_runs`) and without what is
-linear in the states, which a friction would be. The later ones are believed where they do about
-what the model says and leave much less than whatever the commands up to then may do: by the model
-with a delay, gains, parameters or a quicker actuator (commands ahead by their own slope), and by
-any law that is linear in them. A smooth motion foretells its own commands, so that such a law
-follows it as well as the commands of later do; of a short one it follows nearly all. Less than
-EARLY_S is not looked for: that little an actuator's crude lag may make.
+States that respond before their command is sent are on another clock, since no physics does that.
+Two other causes look similar. Under feedback the commands follow the states, so future commands
+help to predict the motion. Friction or back-EMF missing from the model makes the robot quicker than
+the model. The model therefore predicts a quarter of a second ahead, once with the commands as
+logged and once with commands from later. Both predictions are calibrated (`short_runs`), and
+everything linear in the states, as friction would be, is projected out. The later commands are
+accepted if they act about as the model says and leave a much smaller error than the commands up to
+that time can explain. Those may act through the model with a delay, gains, other parameters or a
+quicker actuator (commands extrapolated by their own slope), or through any law that is linear in
+them. In a smooth motion past commands predict future ones, so such a law explains it just as well;
+in a short log it explains nearly everything. Offsets below EARLY_S are ignored: an actuator lag
+that is too large in the model can cause them.
 """
 
 from __future__ import annotations
@@ -32,28 +34,28 @@ from grounded.model import Model
 from grounded.result import listed
 from grounded.trial import Trial
 
-EARLY_S, REACH_S, GRID_S = 0.1, 1.0, 0.05  # [s] the least and the most that is looked for, and how
-ALIKE = 0.1  # of the factor: how nearly the ratios agree
-CHORD_S = 0.5  # over which a way is measured: noise lengthens short ones
-LEAST_M = 1.0  # chords' lengths of the speed's own: less was not driven
-PART = 0.25  # of a trial, at most
-HINT, CLEAR = 0.5, 0.8  # [nats] by which later commands must lower the errors: as it is, calibrated
-HALF = 0.5  # of the error of one state at least
-LIKE = 4.0  # times what the model says, or a part of it: what gain an input may have
-LEADS = (0.1, 0.3)  # [s] by which commands are ahead of themselves, by their slope
-DIFFERENCE_S = 0.04  # half of that over which a velocity without a sensor is a difference
-STARTS = 120  # samples that are predicted from
+EARLY_S, REACH_S, GRID_S = 0.1, 1.0, 0.05  # [s] smallest and largest shift tried; coarse spacing
+ALIKE = 0.1  # relative tolerance within which the ratios agree
+CHORD_S = 0.5  # [s] chord over which distance is measured: noise lengthens shorter ones
+LEAST_M = 1.0  # shorter distances (by positions or by the speed) tell nothing
+PART = 0.25  # of a trial: the largest shift tried
+HINT, CLEAR = 0.5, 0.8  # [nats] least reduction of the errors: uncalibrated, calibrated
+HALF = 0.5  # the error of at least one state must fall to this share
+LIKE = 4.0  # an input's gain must be within this factor of the model's
+LEADS = (0.1, 0.3)  # [s] lead times of commands extrapolated by their slope
+DIFFERENCE_S = 0.04  # [s] half the span of the difference that replaces an unmeasured velocity
+STARTS = 120  # samples to predict from
 
 
 @dataclass(frozen=True)
 class Early:
-    """What answers too early in a trial.
+    """By how much the states of a trial respond too early, and the evidence.
 
     Args:
-        seconds: by how much, to a step or so.
-        state: the one that is then predicted better by most.
-        logged: its rms error a quarter of a second ahead, as it is logged, in its unit.
-        mended: the same with the commands of so much later.
+        seconds: the shift, to about one step.
+        state: the state whose prediction improves most with the later commands.
+        logged: its rms error a quarter of a second ahead with the log as it is, in its unit.
+        mended: the same with the later commands.
     """
 
     seconds: float
@@ -63,15 +65,15 @@ class Early:
 
 
 def judge_clocks(model: Model, trials: Sequence[Trial], hidden: Sequence[str] = ()) -> None:
-    """Stops at trials whose states answer commands before they are sent.
+    """Raise an error if states respond to commands before they are sent.
 
     Args:
         model: however crude.
         trials: of its states and inputs.
-        hidden: states that no sensor has.
+        hidden: states without a sensor.
 
     Raises:
-        GroundedError: with the state, the seconds and what mends them.
+        GroundedError: naming the state, the seconds and the correction.
     """
     shown = [i for i, name in enumerate(model.state_names) if name not in hidden]
     each = [answers_early(model, one, shown) for one in trials]
@@ -84,34 +86,34 @@ def judge_clocks(model: Model, trials: Sequence[Trial], hidden: Sequence[str] = 
 
 
 def one_clock(model: Model, shown: Sequence[int], early: Early) -> str:
-    """What to do about it."""
+    """Return the instruction that corrects the clocks."""
     tables = listed(f"[log.state.{model.state_names[i]}]" for i in shown)
     return (
-        f"Take {early.seconds:.3g} s off delay_s in {tables} (delay_s = -{early.seconds:.3g} where "
-        "none is given), or put the commands' stamps right"
+        f"Subtract {early.seconds:.3g} s from delay_s in {tables} (delay_s = -{early.seconds:.3g} "
+        "where none is set), or correct the commands' time stamps"
     )
 
 
 def too_soon(model: Model, early: Early) -> str:
-    """What is wrong and how it is known, one clause."""
+    """Return one clause: what is wrong, and the evidence."""
     name = model.state_names[early.state]
     unit = model.states[name]
     sent = list(model.input_names)
     return (
         f"{name} moves about {early.seconds:.3g} s before {listed(sent)} "
-        f"ask{'s' * (len(sent) == 1)} for it: the clocks of states and commands differ (with "
-        f"commands of so much later the model misses {name} by {early.mended:.2g} rather than "
-        f"{early.logged:.2g}{'' if unit == '1' else f' {unit}'} 0.25 s ahead)"
+        f"command{'s' * (len(sent) == 1)} it: the clocks of states and commands differ (with "
+        f"commands from that much later, the model's error of {name} 0.25 s ahead is "
+        f"{early.mended:.2g} instead of {early.logged:.2g}{'' if unit == '1' else f' {unit}'})"
     )
 
 
 def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | None:
-    """By how much the states of a trial are ahead of its commands; None where they are not.
+    """Return by how much the states of a trial lead its commands; None if they do not.
 
     Args:
         model: however crude.
         trial: of its states and inputs.
-        shown: states that a sensor has.
+        shown: indices of the states with a sensor.
     """
     trial = trial.until(trial.known_steps)
     reach = min(round(REACH_S / trial.dt), int(PART * trial.steps))
@@ -138,7 +140,7 @@ def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | N
         fits = {k: _as_told(later(k), ones) for k in near}
         k = min(fits, key=lambda k: fits[k].score)
         if fits[k].score > logged.still().score - CLEAR:
-            return None  # commands tell nothing
+            return None  # the commands explain nothing
         causal = [
             logged.best([ones, np.zeros(model.m)]),
             logged.whatever_commands_do().best([ones]),
@@ -157,21 +159,24 @@ def _known(trial: Trial, shown: Sequence[int]) -> list[int]:
 
 
 def _as_told(ahead: Ahead, ones: Array) -> Fit:
-    """The best fit in which commands do about what the model says, by gains or parameters."""
+    """Return the best fit whose input gains are near the model's, or else fixed at 1."""
     free = ahead.best([ones])
     if ((free.gains > 1 / LIKE) & (free.gains < LIKE)).all():
         return free
-    return ahead.best([ones], free=False)  # a mass may hide what a gain does
+    return ahead.best([ones], free=False)  # a wrong mass may take the place of the gain
 
 
 def _moved(trial: Trial, k: int, reach: int) -> Trial:
-    """The trial with the commands of k steps later, always of the same states."""
+    """Return the trial with commands from k steps later; the states are the same for all k."""
     steps = trial.steps - reach
     return replace(trial, states=trial.states[: steps + 1], inputs=trial.inputs[k : k + steps])
 
 
 def _quicker(model: Model, trial: Trial, reach: int, known: Sequence[int]) -> list[Fit]:
-    """Fits with commands that are ahead by their own slope up to now: of a model that is slow."""
+    """Return fits with commands extrapolated by their past slope, as for an actuator lag too large.
+
+    These are causal explanations that compete with the later commands.
+    """
     sent = trial.inputs
     slope = np.diff(sent, axis=0, prepend=sent[:1]) / trial.dt
     ahead = [replace(trial, inputs=sent + lead * slope) for lead in LEADS]
@@ -180,7 +185,7 @@ def _quicker(model: Model, trial: Trial, reach: int, known: Sequence[int]) -> li
 
 
 def _with_differences(model: Model, trial: Trial, known: list[int]) -> tuple[Trial, list[int]]:
-    """With velocities that no sensor has as differences of their positions, over both sides."""
+    """Fill in unmeasured velocities by central differences of their positions."""
     states, w = np.array(trial.states), max(1, round(DIFFERENCE_S / trial.dt))
     found = list(known)
     for one in integrals(model):
@@ -195,13 +200,13 @@ def _with_differences(model: Model, trial: Trial, known: list[int]) -> tuple[Tri
 def told_by_the_clock(
     model: Model, trials: Sequence[Trial], found: Sequence[Finding], refuted: Set[str]
 ) -> list[Finding]:
-    """The findings, with one of the clock in place of several scales that it explains.
+    """Replace several scale findings by one of the clock, if that explains them all.
 
     Args:
-        model: whose roles name the position and the speed.
+        model: its roles name the position and the speed.
         trials: real ones.
-        found: of each sensor.
-        refuted: effects that two sensors which agree rule out, `sensor_scale:w` among them.
+        found: the findings of all sensors.
+        refuted: effects ruled out by two sensors that agree, such as `sensor_scale:w`.
     """
     rates = [one for one in found if one.kind == "scale" and not one.corrected]
     ratios = [one.scale for one in rates]
@@ -214,9 +219,9 @@ def told_by_the_clock(
         return list(found)
     names = "+".join(one.signal for one in rates)
     text = (
-        f"the clock, not a sensor: every rate is {pace:.3g} times that of its position over the "
-        f"stamps, so a second of them is {1 / pace:.3g} s of the run: correct the stamps, times "
-        f"{1 / pace:.3g}, and take the logs in again"
+        f"the clock is wrong, not a sensor: every rate is {pace:.3g} times the derivative of its "
+        f"position by the time stamps, so one second of stamps is {1 / pace:.3g} s of the run: "
+        f"multiply the stamps by {1 / pace:.3g} and ingest the logs again"
     )
     at = min(found.index(one) for one in rates)
     rest = [one for one in found if one not in rates]
@@ -224,7 +229,7 @@ def told_by_the_clock(
 
 
 def _speed_over_way(model: Model, trials: Sequence[Trial]) -> float | None:
-    """The speed that is shown over that of the way in the plane; None where nothing shows both."""
+    """Return the measured speed over that from the positions; None unless both are measured."""
     position, speed = model.roles.get("position", ()), model.roles.get("speed")
     if len(position) < 2 or not isinstance(speed, str):
         return None

@@ -1,11 +1,11 @@
-"""Whether a velocity's log is off by a constant: the way that its position went says so.
+"""Detect a constant bias of a logged velocity by comparing it with its position.
 
-Over a stretch of T seconds a mean velocity is the way over the time, whatever the physics is:
+Over a stretch of T seconds the mean velocity is the distance over the time, whatever the physics:
 
     mean of c y_w  -  (y_q(T) - y_q(0)) / T  =  c b + k (y_q(T) - y_q(0)) / T + noise
 
-for a constant b of the velocity's sensor and a scale k of either. Both are fitted over stretches of
-all trials, whose scatter about the line is their uncertainty.
+with a bias b of the velocity's sensor and a scale error k of either sensor. Both are fitted over
+stretches of all trials; the scatter about the line gives their uncertainty.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from grounded.instruments.kinematics import Integral, pieces
 from grounded.model import Model
 from grounded.trial import Trial
 
-STRETCHES = 24  # of all trials, at least
-SHORTEST = 4  # steps of one
-SURE = 5.0  # standard deviations of a constant that is found
-NONE = 3.0  # of one that may be none
-LARGE = 0.01  # of the velocity's rms: a constant that is stated
-FINE = 0.02  # of that: what SURE standard deviations must be below to say that there is none
+STRETCHES = 24  # least number of stretches over all trials
+SHORTEST = 4  # steps in the shortest stretch
+SURE = 5.0  # standard deviations above which a bias is found
+NONE = 3.0  # standard deviations below which it may be zero
+LARGE = 0.01  # of the velocity's rms: the smallest bias reported
+FINE = 0.02  # of the velocity's rms: SURE standard deviations must be below it to rule a bias out
 
 
 @dataclass(frozen=True)
 class Constant:
-    """By how much a velocity's log is more than its position's rate, and beside what.
+    """The bias of a logged velocity against the rate of its position.
 
     Args:
-        value: in the velocity's unit.
+        value: the bias, in the velocity's unit; positive if the velocity is too large.
         std: its standard deviation.
-        rms: of the velocity.
+        rms: rms of the velocity itself.
     """
 
     value: float
@@ -44,17 +44,17 @@ class Constant:
 
     @property
     def found(self) -> bool:
-        """Whether something is there, and matters."""
+        """Whether the bias is significant and large enough to report."""
         return abs(self.value) > max(SURE * self.std, LARGE * self.rms)
 
     @property
     def refuted(self) -> bool:
-        """Whether nothing is there, as far as these trials tell, and they would tell."""
+        """Whether the trials rule a bias out: none is seen, and one would have been."""
         return abs(self.value) < NONE * self.std and SURE * self.std < FINE * self.rms
 
 
 def constant_of(model: Model, relation: Integral, trials: Sequence[Trial]) -> Constant | None:
-    """What a velocity's log is off by, beside its position's; None where too little was seen."""
+    """Return the bias of a logged velocity against its position; None with too little data."""
     dt, whole = trials[0].dt, list(pieces(trials, (relation.i, relation.j)))
     steps = sum(len(piece) - 1 for piece in whole)
     rows: list[tuple[float, float, int]] = []

@@ -1,9 +1,9 @@
-"""A velocity whose sensor shows nothing: one value, or noise, while its position moves otherwise.
+"""Dead velocity sensors: a constant or mere noise while the position moves.
 
-The wrong column, a gyro that was not switched on or that of another axis: taken for a measurement,
-it makes the robot turn without turning, and any effect that holds it still explains it. Noise is
-what is far smaller than the rate of the position and has none of its shape, however late: a wrong
-unit or sign keeps the shape.
+Causes are a wrong column, a gyro that is off, or one of another axis. Taken as a measurement, such
+a signal contradicts the motion, and any effect that suppresses the motion would seem to explain it.
+A signal counts as noise if it is far smaller than the rate of the position and does not correlate
+with it at any delay; a wrong unit or sign would keep the correlation.
 """
 
 from __future__ import annotations
@@ -19,18 +19,22 @@ from grounded.instruments.other_units import unusable
 from grounded.model import Model
 from grounded.trial import Trial
 
-LEAST = 20  # samples that are one value
-MOVED, SHARE = 20.0, 0.1  # standard deviations of the position's noise, and of all that it moves
-WINDOWS = 40  # of a piece, in each of which the way is compared
-SHAPE = 0.5  # coherence from which two ways have a shape in common
-LATE_S = 0.5  # [s] that a sensor may be late
+LEAST = 20  # fewest samples
+MOVED, SHARE = 20.0, 0.1  # least motion: standard deviations of its noise, and share of its range
+WINDOWS = 40  # windows of a piece over which displacements are compared
+SHAPE = 0.5  # correlation above which two displacements have the same shape
+LATE_S = 0.5  # [s] largest sensor delay considered
 
 
 @dataclass(frozen=True)
 class Dead:
-    """State j stays at a value while state i moves by so much more than it says.
+    """A velocity (state j of the relation) that does not show the motion of its position (state i).
 
-    `noise`: or scatters about it by so much, without a trace of that motion.
+    Args:
+        relation: between position and velocity.
+        value: the velocity's constant value, or its mean.
+        moved: how far the position moves beyond what that value says, in its unit.
+        noise: standard deviation about `value`, of a velocity that shows only noise; else 0.
     """
 
     relation: Integral
@@ -39,13 +43,13 @@ class Dead:
     noise: float = 0.0
 
     def told(self, model: Model, where: str = "") -> str:
-        """One clause, after the velocity's name."""
+        """Return a clause that continues a sentence after the velocity's name."""
         i, j = self.relation.i, self.relation.j
         (q, of_q), unit = list(model.states.items())[i], list(model.states.values())[j]
         while_ = f"while {q} moves by {self.moved:.3g} {of_q}"
         if self.noise:
             return (
-                f"shows nothing but noise of {self.noise:.2g} {unit} about {self.value:.4g}{where},"
+                f"shows only noise of {self.noise:.2g} {unit} around {self.value:.4g}{where},"
                 f" {while_}"
             )
         return f"stays at {self.value:.4g} {unit}{where}, {while_}"
@@ -54,12 +58,12 @@ class Dead:
 def dead_rates(
     model: Model, trial: Trial, relations: Sequence[Integral] | None = None
 ) -> list[Dead]:
-    """The velocities of a trial whose sensors show nothing.
+    """Return the velocities of a trial whose sensors are dead.
 
     Args:
-        model: however crude: only which state is another's rate is read off it.
+        model: however crude; used only for which state is the rate of which.
         trial: with this model's states.
-        relations: of the model, where they are known.
+        relations: `integrals(model)`, if already computed.
     """
     found = []
     for relation in integrals(model) if relations is None else relations:
@@ -82,12 +86,12 @@ def dead_rates(
 
 
 def _noise(position: Array) -> float:
-    """The standard deviation of a position's white noise, by its second differences."""
+    """Return the standard deviation of a position's white noise, from its second differences."""
     return float(np.std(np.diff(position, n=2)) / np.sqrt(6))
 
 
 def _noise_alone(model: Model, trial: Trial, relation: Integral) -> list[Dead]:
-    """The velocity, if it shows neither the size nor the shape of its position's motion."""
+    """Return the velocity if it has neither the size nor the shape of its position's motion."""
     if not relation.exact:
         return []
     angle, told = [model.angle_mask[relation.i]], []
@@ -100,7 +104,7 @@ def _noise_alone(model: Model, trial: Trial, relation: Integral) -> list[Dead]:
         moved = np.diff(piece[:, 0])[:, None]
         wrapped(moved, angle)
         if turns and np.abs(moved).max() > np.pi / 2:
-            return []  # degrees, or too few samples a turn: what jumps of a turn left is no motion
+            return []  # degrees, or too few samples per turn to unwrap the angle
         way = np.concatenate([[0.0], np.cumsum(moved[:, 0])])
         a, b = (s[k:] - s[:-k] for s in (way, said))
         noise = _noise(way)
@@ -112,7 +116,7 @@ def _noise_alone(model: Model, trial: Trial, relation: Integral) -> list[Dead]:
 
 
 def _alike(a: Array, b: Array, most: int) -> float:
-    """The largest correlation of two signals, either of them late by up to so many samples."""
+    """Return the largest correlation of two signals, either delayed by up to `most` samples."""
     best = 0.0
     for late in range(-min(most, len(a) // 2), min(most, len(a) // 2) + 1):
         x, y = (a[late:], b[: len(b) - late]) if late >= 0 else (a[:late], b[-late:])
@@ -125,10 +129,10 @@ def _alike(a: Array, b: Array, most: int) -> float:
 def judge_dead(
     model: Model, trials: Sequence[Trial], shown: Sequence[int]
 ) -> list[tuple[int, Dead]]:
-    """Where a velocity's sensor shows nothing: (which trial, what).
+    """Return the dead velocity sensors, each with the index of its trial.
 
     Raises:
-        GroundedError: for a velocity that no trial shows.
+        GroundedError: for a velocity whose sensor is dead in every trial.
     """
     relations = [r for r in integrals(model) if {r.i, r.j} <= set(shown)]
     found = [(k, one) for k, t in enumerate(trials) for one in dead_rates(model, t, relations)]
@@ -137,11 +141,11 @@ def judge_dead(
         if len(of_it) == len(trials):
             name = model.state_names[j]
             mend = (
-                f"Check the path of [log.state.{name}], or leave that table out and estimate "
+                f"Check the path in [log.state.{name}], or delete that table and estimate "
                 f"{name} ([estimate])"
             )
             noisy = any(one.noise for _, one in of_it)
-            why = "it is another's signal, or its sensor is off" if noisy else ""
-            clause = f"{name} {of_it[0][1].told(model)}: {why or 'its sensor shows nothing'}"
+            why = "it is another signal, or its sensor is off" if noisy else ""
+            clause = f"{name} {of_it[0][1].told(model)}: {why or 'its sensor shows no motion'}"
             raise unusable(trials, [k for k, _ in of_it], clause, mend)
     return found

@@ -1,4 +1,4 @@
-"""Finding: one thing that an instrument does, in the units in which a person would mend it."""
+"""Finding: one fault of a sensor or command, with the values needed to correct it."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ from dataclasses import dataclass, field
 from grounded.result import Document
 
 DEGREES = 57.29577951308232  # in a radian
-RPM = 9.549296585513721  # turns a minute in a radian a second
-ALIKE = 0.02  # of a factor, to be taken for a unit's
+RPM = 9.549296585513721  # revolutions per minute in one radian per second
+ALIKE = 0.02  # relative tolerance within which a factor counts as that of a unit
 
 
 @dataclass(frozen=True, eq=False)
 class Finding(Document):
-    """What was found of one signal, and whether the trials were corrected for it.
+    """A fault of one signal, and whether the trials were corrected for it.
 
     Args:
         signal: a state or an input, or several joined by "+".
-        finding: one clause.
+        finding: one clause that continues a sentence after the signal's name.
         kind: delay, lag, smoothed, scale, sign, degrees, wrapped, offset, stuck, held, dropout,
             missing, quantised, saturated, beyond (its limits), constant, copy or mismatch (with
             others).
-        delay_s: how late the signal is [s].
-        std_s: standard deviation of that.
-        scale: what the signal shows, over what it should.
-        share: of the samples that are concerned, 0 to 1.
-        corrected: the physics was judged on corrected trials.
-        log: key and value for the signal's [log] table that correct it in the logs too.
-        advice: what to change instead where no [log] reads the trials.
+        delay_s: delay of the signal [s].
+        std_s: standard deviation of the delay [s].
+        scale: measured value over true value.
+        share: share of the samples affected, 0 to 1.
+        corrected: whether the trials were corrected before the physics was identified.
+        log: key and value for the signal's [log] table that correct the logs as well.
+        advice: what to change in the log itself, where no key of [log] corrects it.
     """
 
     signal: str
@@ -53,24 +53,24 @@ def put_right(
     std_s: float = float("nan"),
     scale: float = 1.0,
 ) -> Finding:
-    """A finding that the trials were corrected for."""
+    """Return a finding for which the trials were corrected."""
     return Finding(name, text, kind, delay_s, std_s, scale, corrected=True, log=log)
 
 
 def filters_of(findings: Iterable[Finding]) -> dict[str, float]:
-    """Time constants of the sensors that filter and were corrected for, by state [s]."""
+    """Return the time constants of corrected sensor filters by state [s]."""
     return {f.signal: f.delay_s for f in findings if f.corrected and f.kind == "lag"}
 
 
 def in_the_log(findings: Iterable[Finding]) -> list[Finding]:
-    """Those of columns that are in degrees, or turned: put right here, and nowhere else."""
+    """Return the corrected findings of degrees and signs: the logs themselves are still wrong."""
     return [one for one in findings if one.corrected and one.kind in ("degrees", "sign")]
 
 
 def late_effects(findings: Iterable[Finding]) -> dict[str, dict[str, float]]:
-    """The filters and delays of sensors that were found and corrected, as effects by name.
+    """Return the sensor filters and delays that were found and corrected, as effects by name.
 
-    The physics was judged without them; a controller feeds back what comes through them.
+    The physics was identified without them, but a feedback controller sees the delayed signals.
     """
     found = {}
     for one in findings:
@@ -82,25 +82,25 @@ def late_effects(findings: Iterable[Finding]) -> dict[str, dict[str, float]]:
 
 
 def a_mean(name: str, position: str, over: float) -> Finding:
-    """A finding of a velocity that was left out: its position's difference over a time [s]."""
-    text = f"shows a mean over {over:.2g} s, as a difference of {position} does; left out here: "
-    return Finding(name, f"{text}{position} says as much", "smoothed", corrected=True)
+    """Return the finding of a velocity that is a difference of its position over a time [s]."""
+    text = f"is a mean over {over:.2g} s, as from differences of {position}; not used here: "
+    return Finding(name, f"{text}it adds nothing to {position}", "smoothed", corrected=True)
 
 
 def in_degrees(name: str, unit: str) -> Finding:
-    """A finding of a signal that was put into radians."""
+    """Return the finding of a signal that was converted from degrees to radians."""
     text, log = f"is in degrees, not in {unit}", f"scale = {1 / DEGREES:.8g}"
     return put_right(name, text, "degrees", log, scale=DEGREES)
 
 
 def scaled(name: str, position: str, size: float, unit: str) -> Finding:
-    """A finding of a velocity that shows `size` times the rate of its position."""
+    """Return the finding of a velocity that is `size` times the rate of its position."""
     text = f"shows {100 * size:.3g} % of the rate of {position}"
     if unit == "rad/s" and abs(size / RPM - 1) < ALIKE:
-        mend = f"if so, [log] scale = {1 / RPM:.8g}"
-        text = f"{text}, 60 / (2 pi) times it: it looks to be in rpm; {mend}"
+        mend = f"if so, set [log] scale = {1 / RPM:.8g}"
+        text = f"{text}, 60 / (2 pi) times it: it is probably in rpm; {mend}"
     elif unit == "rad/s" and abs(size * RPM - 1) < ALIKE:
-        text = f"{text}, 2 pi / 60 times it: it looks to have been taken for rpm, and converted"
+        text = f"{text}, 2 pi / 60 times it: it was probably converted from rpm by mistake"
     else:
         text = f"{text}; either may be wrong"
     return Finding(name, text, "scale", scale=size)

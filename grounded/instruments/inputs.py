@@ -1,7 +1,7 @@
-"""Commands: copies of one another, conditions of a trial, at their limits and beyond.
+"""Checks of commands: copies of one another, constant within a trial, at or beyond their limits.
 
-Where a log goes beyond, the limits are too narrow: limits that were read off one log are those of
-that drive, not of the robot. A plan keeps to them.
+If logged commands exceed the limits, the limits are too narrow: limits taken from one log are those
+of that run, not of the robot. Plans stay within them.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from grounded.model import Model
 from grounded.task import Task
 from grounded.trial import Trial
 
-OFTEN = 0.1  # of the time
-COPY = 0.99  # coherence of two inputs that are one: two motors of one vehicle have 0.96
-FAR = 20.0  # times a limit
-OVER = 1.03  # of full scale: the most that something in percent, or in counts, shows
-ROUNDED = 0.01  # of the largest command: so much beyond a limit is a matter of digits
+OFTEN = 0.1  # share of the time above which it is reported
+COPY = 0.99  # coherence of two identical inputs: two motors of one vehicle have 0.96
+FAR = 20.0  # times the limit: a value in percent exceeds it by more
+OVER = 1.03  # of full scale: the largest value seen of a signal in percent or counts
+ROUNDED = 0.01  # of the largest command: an excess below this is rounding
 
 
 def beyond_limits(task: Task, inputs: Array) -> Array:
-    """By how much each command (T, m) is beyond its limits, in its unit; 0 where it is not.
+    """Return by how much each command (T, m) exceeds its limits, in its unit; 0 inside them.
 
     Args:
-        task: whose limits hold.
-        inputs: the commands (T, m) of a log; NaN counts for nothing.
+        task: with the limits.
+        inputs: the commands (T, m) of a log; NaN counts as 0.
     """
     inputs = np.nan_to_num(inputs)
     excess = np.maximum(task.low - inputs, inputs - task.high)
@@ -38,13 +38,13 @@ def beyond_limits(task: Task, inputs: Array) -> Array:
 
 
 def judge_limits(task: Task, inputs: Array) -> Iterator[Finding]:
-    """Of commands (T, m) that are beyond their limits or at them for much of the time."""
+    """Yield a finding for each command (T, m) that is often beyond or at its limits."""
     past = beyond_limits(task, inputs) > 0
     at = ((inputs <= task.low) | (inputs >= task.high)) & ~past
     for j, name in enumerate(task.model.input_names):
         share = float(past[:, j].mean())
         if share > OFTEN:
-            mend = in_percent(task, inputs, j) or "widen [limits] if the robot may get that"
+            mend = in_percent(task, inputs, j) or "widen [limits] if the robot allows it"
             text = (
                 f"beyond its limits, {limits_of(task, j)}, {100 * share:.0f} % of the time "
                 f"({span(inputs[:, j])}): {mend}"
@@ -57,10 +57,10 @@ def judge_limits(task: Task, inputs: Array) -> Iterator[Finding]:
 
 
 def in_percent(task: Task, inputs: Array, j: int) -> str:
-    """What to do where a pure number seems to be logged in percent; "" where it doesn't.
+    """Return advice for a dimensionless input that seems to be logged in percent; "" otherwise.
 
     Args:
-        task: whose limits hold.
+        task: with the limits.
         inputs: the commands (T, m) of a log.
         j: the input.
     """
@@ -69,22 +69,22 @@ def in_percent(task: Task, inputs: Array, j: int) -> str:
     limit = float(max(abs(task.low[j]), abs(task.high[j])))
     if unit != "1" or not FAR * limit < most <= 100 * OVER:
         return ""
-    return f"in percent? then [log.input.{name}] scale = 0.01, times what is there"
+    return f"is it in percent? then multiply scale in [log.input.{name}] by 0.01"
 
 
 def limits_of(task: Task, j: int) -> str:
-    """`0 to 1.17 m/s`."""
+    """Return an input's limits as text, such as `0 to 1.17 m/s`."""
     unit = task.model.inputs[task.model.input_names[j]]
     return f"{span(np.array([task.low[j], task.high[j]]))}{'' if unit == '1' else f' {unit}'}"
 
 
 def span(values: Array) -> str:
-    """`-1.2 to 2.15`, the lowest to the highest of all values."""
+    """Return the range of all values as text, such as `-1.2 to 2.15`."""
     return f"{np.nanmin(values):.4g} to {np.nanmax(values):.4g}"
 
 
 def judge_inputs(subject: Task | Model, trials: Sequence[Trial]) -> Iterator[Finding]:
-    """Of commands: copies of one another, at their limits or beyond, conditions of a trial."""
+    """Yield the findings of commands: copies, limits, inputs that are constant in each trial."""
     names = trials[0].input_names
     columns = [[trial.inputs[:, j] for trial in trials] for j in range(len(names))]
     fixed = [all(np.ptp(x) == 0 for x in some) for some in columns]
@@ -105,7 +105,7 @@ def judge_inputs(subject: Task | Model, trials: Sequence[Trial]) -> Iterator[Fin
 
 
 def _copy(first: str, second: str, lag: Lag) -> Finding:
-    """Two inputs that are one signal, one perhaps later: a command and what was measured of it."""
+    """Return the finding of two inputs with one signal, perhaps a command and its measurement."""
     if lag.delay < 0:
         first, second = second, first
     d = abs(lag.delay)

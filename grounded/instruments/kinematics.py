@@ -1,11 +1,11 @@
-"""What must hold between sensors whatever the physics is: read off the model, not off names.
+"""Kinematic relations between sensors that hold whatever the physics, derived from the model.
 
     a state whose rate is c times another state        q' = c w
-    two states whose rates turn with a third           (x', y') = R(psi) (v_x, v_y)
+    two states whose rates rotate with a third         (x', y') = R(psi) (v_x, v_y)
 
-The first ties an angle to its angular velocity: how late, of which sign, in which unit. The second
-ties a heading and a speed to the way that was travelled; a side slip or a slipping wheel acts there
-too, so that only what no physics does is put right: a mirrored heading, one in degrees.
+The first relates an angle to its angular velocity and shows delays, signs and units. The second
+relates a heading and a speed to the course travelled. Side slip and wheel slip act there as well,
+so only errors that no physics causes are corrected: a mirrored heading, or one in degrees.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from grounded.instruments.lag import SURE, Lag, lag_between
 from grounded.model import Model
 from grounded.trial import Trial, stretches
 
-SHORT = 1e-6  # [s], a step that shows the rates
-FAST = 0.2  # of the largest speed: below it a course means little
-OWN = 200  # logged samples that show how a model's own position follows its velocity
-COPIED = 1e-3  # of a velocity: digits of a log, less than any sensor of its own differs by
-AGREE = 0.9  # length of the mean of unit vectors that point the same way
-TURNED_AWAY = np.deg2rad(20)  # what no side slip makes
-OFF = 0.03  # of a scale, beyond both of its brackets
-SAME_WAY = 0.95  # of a speed and the way: below it something drifts or slips
+SHORT = 1e-6  # [s] time step from which the rates are computed
+FAST = 0.2  # of the largest speed: below it the course is too noisy
+OWN = 200  # logged samples from which the model's own lag is computed
+COPIED = 1e-3  # of a velocity: rounding of a log; a separate sensor would differ by more
+AGREE = 0.9  # length of the mean unit vector above which directions agree
+TURNED_AWAY = np.deg2rad(20)  # more than any side slip causes
+OFF = 0.03  # scale error that is reported, beyond both of its bounds
+SAME_WAY = 0.95  # coherence of speed and distance: below it something drifts or slips
 
 
 @dataclass(frozen=True)
 class Integral:
-    """The rate of state i is c times state j; `exact`: by the model itself, not by roles."""
+    """The rate of state i is c times state j; `exact` if the model says so, not only its roles."""
 
     i: int
     j: int
@@ -45,7 +45,10 @@ class Integral:
 
 
 def integrals(model: Model) -> list[Integral]:
-    """A position and its velocity, an angle and its rate; a carried heading rate as well."""
+    """Return the pairs of position and velocity, and of angle and rate, of a model.
+
+    A heading rate that the model only carries along is included, with `exact` false.
+    """
     names = model.state_names
     found = [
         Integral(names.index(name), names.index(other), c)
@@ -56,9 +59,10 @@ def integrals(model: Model) -> list[Integral]:
 
 
 def logged_behind(model: Model, shown: Sequence[int]) -> list[tuple[Integral, bool]]:
-    """The same between logs, where adopted effects keep the true values of late ones as memory.
+    """Return the relations between logged states whose true values are in memory states.
 
-    Each with whether both are late.
+    Adopted sensor effects (delays, filters) keep the true value of a state as memory. Each relation
+    comes with whether both of its states are delayed.
     """
     names = model.state_names
     memory = [name for i, name in enumerate(names) if i not in shown]
@@ -72,7 +76,7 @@ def logged_behind(model: Model, shown: Sequence[int]) -> list[tuple[Integral, bo
 
 
 def lag_of(model: Model, relation: Integral, trials: Sequence[Trial]) -> Lag | None:
-    """How a logged velocity stands to the rate of its logged position."""
+    """Return delay and scale of a logged velocity against the rate of its logged position."""
     dt, pairs = trials[0].dt, []
     for piece in pieces(trials, (relation.i, relation.j)):
         moved = np.diff(piece[:, 0])[:, None]
@@ -83,10 +87,10 @@ def lag_of(model: Model, relation: Integral, trials: Sequence[Trial]) -> Lag | N
 
 
 def own_lag(model: Model, relation: Integral, trials: Sequence[Trial]) -> float:
-    """How late a model itself has a velocity behind its position's rate [s], from logged samples.
+    """Return the delay of a velocity behind its position's rate in the model itself [s].
 
-    A simulator's steps move a position by the velocity before or after them: half of such a step,
-    which no sensor makes.
+    It is evaluated at logged samples. A simulator that moves a position by the velocity before or
+    after a step has a lag of half a step, which is not a sensor's.
     """
     dt, (i, j, c) = trials[0].dt, (relation.i, relation.j, relation.c)
     x = np.concatenate([trial.states[:-1] for trial in trials])
@@ -95,7 +99,7 @@ def own_lag(model: Model, relation: Integral, trials: Sequence[Trial]) -> float:
     at = np.flatnonzero(known)[:: max(1, int(known.sum()) // OWN)]
     if not len(at):
         return 0.0
-    before = np.nan_to_num(x[at], nan=0.0)  # what no sensor shows
+    before = np.nan_to_num(x[at], nan=0.0)  # states without a sensor
     after = model.system.step(before, u[at], model.values, dt)
     changed = c * (after[:, j] - before[:, j])
     moved = model.difference(after, before)[:, i] / dt - c * (after[:, j] + before[:, j]) / 2
@@ -105,9 +109,9 @@ def own_lag(model: Model, relation: Integral, trials: Sequence[Trial]) -> float:
 
 
 def differenced(model: Model, relation: Integral, trials: Sequence[Trial]) -> bool:
-    """Whether the velocity was computed from its position's samples: its change over a step.
+    """Check whether the velocity is the difference of its position's samples over one step.
 
-    Not where the model itself moves the position by just that velocity.
+    False where the model itself moves the position by exactly that velocity.
     """
     dt, rests, sizes = trials[0].dt, np.zeros(2), np.zeros(2)
     for piece in pieces(trials, (relation.i, relation.j)):
@@ -125,12 +129,12 @@ def differenced(model: Model, relation: Integral, trials: Sequence[Trial]) -> bo
 
 
 def over_steps(w: Array) -> Array:
-    """The mean of w (T,) over each step but the first and the last (T - 3,), by cubics."""
+    """Return the mean of w (T,) over each step but the first and the last (T - 3,), by cubics."""
     return (13 * (w[1:-2] + w[2:-1]) - w[:-3] - w[3:]) / 24
 
 
 def pieces(trials: Sequence[Trial], columns: Sequence[int]) -> Iterator[Array]:
-    """Stretches (T, columns) of the states without gaps."""
+    """Yield the stretches (T, columns) of the states that have no gaps."""
     for trial in trials:
         some = trial.states[:, list(columns)]
         good = np.isfinite(some).all(axis=1)
@@ -139,7 +143,7 @@ def pieces(trials: Sequence[Trial], columns: Sequence[int]) -> Iterator[Array]:
 
 @dataclass(frozen=True)
 class Turned:
-    """The rates of states i and j turn with the heading k; their size is that of `speed`."""
+    """The rates of states i and j rotate with heading k; their size depends on states `speed`."""
 
     i: int
     j: int
@@ -148,7 +152,7 @@ class Turned:
 
 
 def turned(model: Model) -> Turned | None:
-    """The plane in which a model moves; None where it has none."""
+    """Return the plane in which a model moves; None if it has none."""
     (x, u), n = places.samples(model, 8), model.n
     short = places.probe(model, SHORT)
     f_x, f_u = model.system.linearise(x, u, model.values, short)
@@ -173,14 +177,14 @@ def _near(a: Array, b: Array) -> bool:
 
 @dataclass(frozen=True)
 class Course:
-    """The course that was travelled against the model's, from logged states.
+    """The course travelled, compared with the model's course from logged heading and speed.
 
     Args:
-        agrees: 0 to 1, how well they point the same way but for a constant angle.
+        agrees: agreement of the directions apart from a constant angle, 0 to 1.
         offset: that angle [rad].
-        mirrored: how well they agree with the heading's sign changed.
-        degrees: how well they agree with the heading taken for degrees.
-        speed: how the model's speed stands to the travelled one.
+        mirrored: the agreement with the sign of the heading reversed.
+        degrees: the agreement with the heading interpreted as degrees.
+        speed: delay and scale of the model's speed against the speed travelled.
     """
 
     agrees: float
@@ -191,7 +195,11 @@ class Course:
 
 
 def course(model: Model, relation: Turned, trials: Sequence[Trial]) -> Course | None:
-    """How the logged positions move, and how the logged heading and speed say they do."""
+    """Compare how the logged positions move with what the logged heading and speed imply.
+
+    Returns:
+        None if too few samples move fast enough.
+    """
     dt, columns, short = trials[0].dt, range(model.n), places.probe(model, SHORT)
     xy = [relation.i, relation.j]
     ways = [(one, np.diff(one[:, xy], axis=0) / dt) for one in pieces(trials, columns)]
@@ -204,7 +212,7 @@ def course(model: Model, relation: Turned, trials: Sequence[Trial]) -> Course | 
         return None
 
     def said(factor: float) -> list[Array]:
-        """The model's velocity at the middle of each step, the heading times a factor."""
+        """Return the model's velocity at the middle of each step, the heading times a factor."""
         found = []
         for piece, _ in ways:
             middle = 0.5 * (piece[1:] + piece[:-1])
@@ -238,7 +246,13 @@ def course(model: Model, relation: Turned, trials: Sequence[Trial]) -> Course | 
 def travelled(
     model: Model, trials: Sequence[Trial], shown: Sequence[int]
 ) -> tuple[Turned, Course] | None:
-    """The plane in which a model moves, and the course there; None without sensors for it."""
+    """Return the plane in which a model moves, and the course there; None without sensors for it.
+
+    Args:
+        model: however crude.
+        trials: of this model's states.
+        shown: indices of the states with a sensor.
+    """
     relation = turned(model)
     if relation is None or not {relation.i, relation.j, relation.k} <= set(shown):
         return None
@@ -247,21 +261,24 @@ def travelled(
 
 
 def judge_speed(model: Model, relation: Turned, lag: Lag | None, dt: float) -> Iterator[Finding]:
-    """A late or wrong speed: slipping wheels and drifts do it too, so physics has to judge.
+    """Yield findings of a delayed or wrongly scaled speed.
+
+    They are not corrected: wheel slip and drift look the same, so the identification decides.
 
     Args:
-        model: whose plane it is.
-        relation: of a body that also moves sideways nothing is said: its noises don't add to zero.
-        lag: of the speed behind the way, see `Course.speed`.
-        dt: [s].
+        model: with this plane.
+        relation: the plane; a body that also moves sideways is skipped, since noise biases the
+            length of its velocity.
+        lag: of the speed behind the motion, see `Course.speed`.
+        dt: time step [s].
     """
     if lag is None or lag.coherence < SAME_WAY or lag.sign < 0 or len(relation.speed) != 1:
         return
     where = "+".join(model.state_names[i] for i in (relation.i, relation.j))
     d, name = float(abs(lag.delay)), model.state_names[relation.speed[0]]
     if d > max(SURE * lag.std, 0.5 * dt):
-        text = f"{d:.3g} s {'later' if lag.delay > 0 else 'earlier'} than {where} move"
+        text = f"{d:.3g} s {'later' if lag.delay > 0 else 'earlier'} than the motion of {where}"
         yield Finding(name, text, "delay", float(lag.delay), lag.std)
     if lag.off(OFF):
-        text = f"shows {100 * lag.scale:.3g} % of the speed of {where}: a sensor, or slip"
+        text = f"shows {100 * lag.scale:.3g} % of the speed of {where}: a sensor error, or slip"
         yield Finding(name, text, "scale", scale=lag.scale)

@@ -1,13 +1,14 @@
-"""How late one signal is behind another that shows the same, b(t) = s a(t - d), noise in both.
+"""Estimate the delay d and scale s between two noisy signals of one quantity, b(t) = s a(t - d).
 
-Both are smoothed by the same window, b is moved by d, and d is where they differ least: noise in
-either adds the same to the difference whatever d is. The window is the one with the surest d; what
-others find instead adds to its uncertainty. The ratio of sizes only brackets s (Frisch): noise in a
-makes <a b> / <a a> too small, noise in b makes <b b> / <a b> too large. A first-order filter is
-told from a delay by a = b + tau b', where that fits better than any delay, or as well and leaves
-nothing of a difference in size: what a filter takes from fast swings passes for a scale of a delay.
-Beside a delay b may be smoothed: the mean over T has a = b - T^2 / 24 b''. Noise in b makes that T
-too short, and noise in a does nothing to it.
+Both are smoothed with the same window, b is shifted, and d is the shift with the smallest
+difference: the noise adds the same to the difference at every shift. The window with the smallest
+standard deviation of d is used; the spread over the other windows is added to it. The scale is only
+bounded from both sides (Frisch): noise in a makes <a b> / <a a> too small, noise in b makes
+<b b> / <a b> too large. A first-order filter is distinguished from a delay by a = b + tau b'. It is
+chosen if it fits better than any delay, or as well and without a difference in scale, since the
+attenuation of fast motion by a filter looks like a scale error beside a delay. Besides being
+delayed, b may be smoothed: for a mean over T, a = b - T^2 / 24 b''. Noise in b makes this T too
+short; noise in a does not affect it.
 """
 
 from __future__ import annotations
@@ -22,37 +23,37 @@ from grounded.frozen import Array
 
 Pairs = Sequence[tuple[Array, Array]]
 
-MOST = 0.3  # [s] a delay is looked for up to here, or up to FEW steps
+MOST = 0.3  # [s] the largest delay tried, or FEW steps if that is more
 FEW = 6
 WINDOWS = (1, 2, 4, 8, 16, 32, 64)  # half lengths of the smoothing window, samples
-SHORTEST = 24  # samples of a pair that counts
-CLEAR = 0.9  # of the coherence: windows below it don't count
-BLOCKS = 16  # at least: the scatter over them is the uncertainty
-SCREENED, MAYBE = 4, 0.7  # half window and correlation from which two signals may be one
-SURE = 5.0  # standard deviations of a delay that is stated
-LEAST_S = 0.0005  # [s], of it
-SAME, ROUNDED = 0.01, 0.003  # of a scale: what matters, what steps of time may make
-SURELY = 3.0  # standard deviations that it is sure by
-FILTER = 0.9  # of the misfit of a delay: below it a filter is what it is
-EVEN, PLAIN = 1.05, 1 / 3  # of it, where a scale has to be so much nearer 1 to be one
-TOLD = 0.1  # of a: with less left, b smoothed is all that there is to say of it
+SHORTEST = 24  # samples in the shortest pair used
+CLEAR = 0.9  # coherence below which a window is ignored
+BLOCKS = 16  # least number of blocks; the scatter over them gives the uncertainty
+SCREENED, MAYBE = 4, 0.7  # screening: half window, and correlation for a possible copy
+SURE = 5.0  # standard deviations above which a delay is reported
+LEAST_S = 0.0005  # [s] the smallest delay reported
+SAME, ROUNDED = 0.01, 0.003  # scale error that matters, and that discretisation may cause
+SURELY = 3.0  # standard deviations by which the scale must be certain
+FILTER = 0.9  # of the misfit of a delay: below it the signal counts as filtered
+EVEN, PLAIN = 1.05, 1 / 3  # or below EVEN, if its scale is also nearer to 1 by PLAIN
+TOLD = 0.1  # of the size of a: with a smaller remainder, smoothing explains b
 
 
 @dataclass(frozen=True)
 class Lag:
-    """b is `delay` seconds late behind a and `sign * scale` times it.
+    """b lags a by `delay` seconds and is `sign * scale` times as large.
 
     Args:
-        delay: [s], negative: early.
+        delay: [s], negative if b is early.
         std: its standard deviation [s].
-        filtered: b follows a through a first-order filter of the time constant `delay`.
+        filtered: b follows a through a first-order filter with time constant `delay`.
         sign: 1 or -1.
-        low: lower bracket of the scale.
-        high: upper bracket of the scale.
-        coherence: 0 to 1, how much of both is the same.
+        low: lower bound of the scale.
+        high: upper bound of the scale.
+        coherence: share of both signals that agrees, 0 to 1.
         scale_std: standard deviation of the scale.
-        mean: b is the mean of a over so long [s], its middle `delay` ago; 0 where none is sure.
-        slow: the scale of slow motions, by the widest window that sees enough of them.
+        mean: b is the mean of a over this time [s], centred `delay` ago; 0 if not significant.
+        slow: the scale of slow motion, from the widest window with enough samples.
     """
 
     delay: float
@@ -68,33 +69,34 @@ class Lag:
 
     @property
     def scale(self) -> float:
-        """Of b, without its sign."""
+        """Size of b over that of a, without the sign."""
         return float(np.sqrt(self.low * self.high))
 
     def off(self, by: float) -> bool:
-        """Whether the scale is off by more, of slow motions as well.
+        """Check whether the scale is off by more than `by`, for slow motion as well.
 
-        What swings a few samples a period is bent between them: its mean over a step is no scale.
+        With only a few samples per period, averaging over a step reduces a signal: that is not a
+        scale error.
         """
         slow = self.slow if np.isfinite(self.slow) else self.scale
         return min(self.low, slow) > 1 + by or max(self.high, slow) < 1 - by
 
     @property
     def one_size(self) -> bool:
-        """Whether both show the same, of one sign and one size: surely within SAME, maybe all."""
+        """Whether both have one sign and one size: within SAME for certain, and perhaps equal."""
         off, sure = max(1 - self.low, self.high - 1), SURELY * self.scale_std
         return self.sign > 0 and off < max(ROUNDED, sure) and off + sure < SAME
 
 
 def lag_between(pairs: Pairs, dt: float) -> Lag | None:
-    """How late b is behind a.
+    """Estimate the delay of b behind a, and its scale.
 
     Args:
         pairs: pieces (a, b) without gaps, (T,) each, of the same length.
-        dt: [s].
+        dt: sample time [s].
 
     Returns:
-        None where too little of both is seen.
+        None if there is too little data.
     """
     longest = max((len(a) for a, _ in pairs), default=0)
     reach = reach_of(longest, dt)
@@ -105,7 +107,7 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
         return max((one for _, one in every), key=lambda lag: lag.coherence, default=None)
     best = min((one for _, one in clear), key=lambda lag: lag.std)
     apart = float(np.median([abs(one.delay - best.delay) for _, one in clear]))
-    told = [one for p, one in clear if p.windows >= BLOCKS // 2]  # wider ones sway by chance
+    told = [one for p, one in clear if p.windows >= BLOCKS // 2]  # few windows scatter too much
     sure = bool(told) and min(told, key=lambda lag: lag.std).mean > 0
     slow = told[-1].scale if told else np.nan
     std = float(np.hypot(best.std, apart))
@@ -113,14 +115,14 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
 
 
 def reach_of(steps: int, dt: float) -> int:
-    """Samples that a signal of so many steps is moved by at most."""
+    """Return the largest shift [samples] tried for a signal of `steps` steps."""
     return max(3, min(int(np.ceil(max(MOST / dt, FEW))), steps // 8))
 
 
 def alike(signals: Array, reach: int) -> list[tuple[int, int]]:
-    """Pairs i < j of signals (T, m) that may be one, a little later or noisier, by j, then i.
+    """Return the pairs i < j of signals (T, m) that may be shifted or noisy copies, by j, then i.
 
-    By the correlations of smoothed ones, all pairs at a time; `lag_between` judges what is left.
+    A fast screening by correlations of the smoothed signals; `lag_between` decides on each pair.
     """
     T, m = signals.shape
     window = np.hanning(2 * SCREENED + 3)[1:-1]
@@ -140,7 +142,7 @@ def alike(signals: Array, reach: int) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class _Pieces:
-    """Pieces smoothed over `half`: a where b can be moved by `reach` either way, and all of b."""
+    """Pieces smoothed over `half`: all of b, and a where b can be shifted by `reach` either way."""
 
     a: list[Array]
     b: list[Array]
@@ -148,7 +150,7 @@ class _Pieces:
     half: int
 
     def moved(self, by: float) -> Array:
-        """B by so many samples later, at the samples of a (N,), without its means."""
+        """Return b from `by` samples later, at the samples of a (N,), each piece minus its mean."""
         at = self.reach + by
         if at == int(at):
             return _centred([b[int(at) : int(at) + len(a)] for a, b in self.sides])
@@ -156,14 +158,14 @@ class _Pieces:
 
     @property
     def groups(self) -> tuple[Any, Any]:
-        """Parts of the samples (N,): stretches of time, and of every trial the same stretch."""
+        """Two groupings of the samples (N,): by stretches of time, and by position in the trial."""
         lengths = [len(a) for a in self.a]
         total = np.arange(sum(lengths)) * max(BLOCKS, 2 * len(lengths)) // sum(lengths)
         return total, np.concatenate([np.arange(n) * BLOCKS // (2 * n) for n in lengths])
 
     @property
     def windows(self) -> int:
-        """Samples that no window joins."""
+        """Number of windows that do not overlap."""
         return sum(len(a) for a in self.a) // (2 * self.half + 3)
 
     @property
@@ -214,7 +216,7 @@ def _measured(pieces: _Pieces, reach: int, dt: float) -> Lag | None:
     behind = _filter(pieces, a, _dot(rest, rest), s) if d > 0 else None
     mean = _mean(pieces, a, b, d) * dt if behind is None else 0.0
     if behind is not None:
-        d, b = behind  # the size is that of what went into the filter
+        d, b = behind  # the scale is that of the filter's input
         s = _dot(a, b) / max(_dot(b, b), 1e-300)
         rest = a - s * b
     both = abs(_dot(a, b))
@@ -230,13 +232,13 @@ def _dot(a: Array, b: Array) -> float:
 
 
 def _scatter(force: Array, group: Any) -> float:
-    """Standard deviation of a sum from the scatter of its parts."""
+    """Return the standard deviation of a sum from the scatter of its parts."""
     parts = np.bincount(group, force)
     return float(np.sqrt((parts**2).sum()))
 
 
 def _filter(pieces: _Pieces, a: Array, misfit: float, scale: float) -> tuple[float, Array] | None:
-    """Tau [samples] and b + tau b' where a = s (b + tau b') fits better than a scaled delay."""
+    """Return tau [samples] and b + tau b' if a = s (b + tau b') fits better than a scaled delay."""
     b, slope = pieces.moved(0.0), 0.5 * (pieces.moved(1.0) - pieces.moved(-1.0))
     columns = np.stack([b, slope], axis=1)
     s, both = np.linalg.lstsq(columns, a, rcond=None)[0]
@@ -247,7 +249,7 @@ def _filter(pieces: _Pieces, a: Array, misfit: float, scale: float) -> tuple[flo
 
 
 def _mean(pieces: _Pieces, a: Array, b: Array, d: float) -> float:
-    """The length [samples] of the mean that b is of a, d samples ago; 0 where none is sure."""
+    """Return the length [samples] over which b averages a; 0 if it is not significant."""
     curve = pieces.moved(d + 1) - 2 * b + pieces.moved(d - 1)
     bent = curve - _dot(curve, b) / max(_dot(b, b), 1e-300) * b
     size = max(_dot(bent, bent), 1e-300)
@@ -260,7 +262,7 @@ def _mean(pieces: _Pieces, a: Array, b: Array, d: float) -> float:
 
 
 def at_samples(x: Array, at: Any) -> Array:
-    """X (T,) between its samples at places (N,), by cubics through four of them; NaN outside."""
+    """Interpolate x (T,) at fractional indices `at` (N,) by cubics; NaN outside."""
     whole = np.floor(at + 1e-9).astype(int)
     T, line = len(x), np.concatenate([[2 * x[0] - x[1]], x, [2 * x[-1] - x[-2]]])
     k = np.clip(whole, 0, T - 2)
@@ -271,12 +273,12 @@ def at_samples(x: Array, at: Any) -> Array:
 
 
 def whole_steps(steps: float) -> bool:
-    """Whether a signal is moved from sample to sample: between them its noise is smoothed."""
+    """Check whether a shift is a whole number of samples, so that it needs no interpolation."""
     return abs(steps - round(steps)) < 0.05
 
 
 def earlier(x: Array, steps: float) -> Array:
-    """X as it was so many steps later; missing at the end."""
+    """Return x shifted earlier by `steps` samples, NaN at the end."""
     at = np.arange(len(x)) + steps
     whole = round(steps)
     if whole_steps(steps):

@@ -1,12 +1,12 @@
-"""Positions that are late behind what velocities and a heading say: a GPS receiver, a camera.
+"""Detect positions that lag behind velocities and heading, as from a GPS receiver or a camera.
 
-What is late by d is off by -d S', the change of its velocity S. Other things are off along the way
-or across it as well: a slipping wheel by k S' along it, an unmodelled side slip by k S' across it,
-a point that is tracked l ahead of the modelled one by l omega across it, a body that drifts by as
-much all the time. So a delay is what is surely left beside these; and of a body whose sideways
-velocity nothing measures, along and across both have to show it. One position that is late alone
-looks half as late along and across, too: so each by itself has to show the same delay, or which of
-them it is stays for the physics to say.
+The velocity S of a position that is late by d is off by -d S'. Other causes also act along the path
+or across it: a slipping wheel by k S' along it, an unmodelled side slip by k S' across it, a
+tracked point l ahead of the modelled one by l omega across it, a drift by a constant. The delay is
+therefore estimated together with these. If the sideways velocity is not measured, the delay must
+show both along and across the path. If only one position is late, about half its delay shows in
+both directions as well, so each position must have the same delay on its own; otherwise the
+identification of the physics decides which one is late.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ from grounded.instruments.rows import Row, per_step
 from grounded.model import Model
 from grounded.trial import Trial
 
-LIKE = 0.9  # coherence from which positions move as the others say
-LEAST_STEPS = 0.5  # of a time step: less is a matter of time stamps
-AGREE, CLOSE = 2.5, 0.15  # standard deviations, or of the delay: the same
-UNSURE = 0.25  # of the delay: less sure than that tells nothing
-SMOOTH_S = 0.3  # [s], half a window, or three samples
+LIKE = 0.9  # coherence above which positions follow the other sensors
+LEAST_STEPS = 0.5  # of a time step: smaller delays may come from the time stamps
+AGREE, CLOSE = 2.5, 0.15  # standard deviations, or share of the delay: delays are equal
+UNSURE = 0.25  # of the delay: with a larger standard deviation nothing is concluded
+SMOOTH_S = 0.3  # [s] half the smoothing window, at least three samples
 
-Way = tuple[Array, Array]  # how far positions moved in each step, and as the others say (T, 2)
+Way = tuple[Array, Array]  # displacement in each step: measured, and by the other sensors (T, 2)
 
 
 @dataclass(frozen=True)
 class Late:
-    """Two positions (indices of states) that are late by one lag."""
+    """Two positions (indices of states) that are late by the same delay."""
 
     states: tuple[int, int]
     lag: Lag
 
 
 def late_positions(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> Late | None:
-    """Both positions of a plane, where they are late as one; None where nothing says so surely.
+    """Return both positions of a plane if they share a significant delay, else None.
 
     Args:
         model: however crude.
-        trials: of one time step, with what else is off put right.
-        rows: the model's kinematic ones, see `rows.kinematic_rows`.
+        trials: of one time step, already corrected for other faults.
+        rows: the model's kinematic rows, see `rows.kinematic_rows`.
     """
     plane = turned(model)
     both = [row for row in rows if plane and row.i in (plane.i, plane.j)]
@@ -69,7 +69,7 @@ def late_positions(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -
 
 
 def _apart(ways: Sequence[Way], both: Lag, dt: float) -> bool:
-    """Whether the two positions, each by itself, are surely not late by the same."""
+    """Check whether the two positions, each on its own, have significantly different delays."""
     each = [lag_between([(said[:, k], moved[:, k]) for moved, said in ways], dt) for k in (0, 1)]
     one, other = each
     if one is None or other is None:
@@ -81,13 +81,13 @@ def _apart(ways: Sequence[Way], both: Lag, dt: float) -> bool:
 def _left(
     ways: Sequence[Way], steps: float, dt: float, *, apart: bool
 ) -> list[tuple[float, float]]:
-    """What is left of a delay [s] once positions are so many steps earlier, and how sure it is.
+    """Return the delay [s] that remains after shifting positions, with its standard deviation.
 
     Args:
-        ways: of each piece.
-        steps: that they are taken to be late.
-        dt: [s].
-        apart: along the way and across it each by itself.
+        ways: displacements of each piece.
+        steps: by which the positions are shifted earlier.
+        dt: time step [s].
+        apart: estimate the delay along the path and across it separately.
     """
     h = max(3, round(SMOOTH_S / dt))
     window = np.hanning(2 * h + 3)[1:-1]

@@ -1,8 +1,8 @@
-"""Rows that disagree with their own sensors, and the one change of a log that mends them.
+"""Find kinematic rows that contradict their own sensors, and the change of a log that fixes them.
 
-In the wrong unit, sign or column a sensor breaks every row that it enters, and the right change
-mends all of them at once; another one mends some and breaks others: heading and positions tell
-degrees in r from radians in psi, by x' = u cos psi - v sin psi beside psi' = r.
+A sensor with a wrong unit, sign or column breaks every row that it enters. The right change fixes
+all of these rows at once; a wrong one fixes some and breaks others. For example x' = u cos psi -
+v sin psi together with psi' = r distinguishes degrees in r from radians in psi.
 """
 
 from __future__ import annotations
@@ -31,32 +31,32 @@ from grounded.model import Model
 from grounded.result import listed
 from grounded.trial import Trial
 
-BAD, GROSS = 0.5, 0.7  # of what should move, unexplained: looked into, and stated
-MENDED, BETTER = 0.4, 3.0  # what a change may leave of it, and times less than before
-CLOSE, ROUNDING = 2.0, 0.02  # times what the best change leaves: as good
-FOLDED = 0.8  # [rad] rms off a heading in degrees, modulo a turn; by chance it is 1.8
-TOLD = 0.8  # of the other's error: a model that explains it better
+BAD, GROSS = 0.5, 0.7  # unexplained share of the motion: examined, and reported
+MENDED, BETTER = 0.4, 3.0  # a fixed row: largest share left, and factor by which it must fall
+CLOSE, ROUNDING = 2.0, 0.02  # factor of the best change's remainder within which others are as good
+FOLDED = 0.8  # [rad] largest rms error modulo a turn, of a heading in degrees; by chance 1.8
+TOLD = 0.8  # of the other's error: below it one explanation is better
 
 
 @dataclass(frozen=True)
 class Change:
-    """What may be wrong with some states: `factor` times what they should be, or exchanged."""
+    """A possible fault: states that are `factor` times too large, or two that are exchanged."""
 
     states: tuple[int, ...]
     factor: float = 1.0
 
     @property
     def swap(self) -> bool:
-        """Two columns in each other's place."""
+        """Whether two columns are exchanged."""
         return self.factor == 1.0
 
     @property
     def corrected(self) -> bool:
-        """A sign or an angle in degrees is put right here; what else there is stops."""
+        """Whether it is corrected here: a sign or degrees. Other faults raise an error."""
         return self.factor == -1.0 or abs(self.factor / DEGREES - 1) < 1e-9
 
     def mended(self, trial: Trial) -> Trial:
-        """The trial without it."""
+        """Return the trial without this fault."""
         if not self.swap:
             return Odd(0, self.factor, self.states).mended(trial)
         x = np.array(trial.states)
@@ -66,7 +66,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Mismatch:
-    """A change that mends what is odd in some trials; `others` mend it as well."""
+    """A change that fixes the mismatch in some trials; `others` fix it equally well."""
 
     trials: tuple[int, ...]
     change: Change
@@ -76,7 +76,10 @@ class Mismatch:
 def _mending(
     model: Model, trials: Sequence[Trial], rows: Sequence[Row], shown: Sequence[int]
 ) -> list[Mismatch]:
-    """The fewest changes after which rows agree; [] where they do, or where nothing mends them."""
+    """Return the fewest changes after which all rows agree.
+
+    Empty if the rows agree already, or if no set of changes fixes all of them.
+    """
     every = [gaps(model, trial, rows) for trial in trials]
     odd = [k for k, one in enumerate(every) if any(gap.share > BAD for gap in one.values())]
     some, found = [trials[k] for k in odd], []
@@ -93,7 +96,7 @@ def _mending(
         least = CLOSE * min(left.values(), default=0.0) + ROUNDING
         best = _ranked(model, some, [c for c, one in left.items() if one <= least], shown)
         if not best:
-            return []  # part of an explanation is none
+            return []  # a partial explanation does not count
         found.append(Mismatch(tuple(odd), best[0], tuple(best[1:])))
         some, before = [best[0].mended(trial) for trial in some], choices[best[0]][1]
     return found
@@ -102,15 +105,19 @@ def _mending(
 def explained(
     model: Model, trials: Sequence[Trial], rows: Sequence[Row], shown: Sequence[int]
 ) -> list[Mismatch]:
-    """The fewest changes after which rows agree; [] where they do, or where nothing mends them.
+    """Return the fewest changes after which all rows agree.
 
-    Where a heading that is off by a constant explains as much, it is not taken for another change.
+    If a constant heading offset explains the mismatch about as well, it is preferred: the rows of
+    the two positions are then ignored.
 
     Args:
         model: however crude.
-        trials: any.
-        rows: kinematic ones, see `rows.kinematic_rows`.
-        shown: states that a sensor has.
+        trials: of this model's states.
+        rows: kinematic rows, see `rows.kinematic_rows`.
+        shown: indices of the states with a sensor.
+
+    Returns:
+        Empty if the rows agree already, or if no set of changes fixes all of them.
     """
     found, away = _mending(model, trials, rows, shown), _away(model, trials, shown)
     if not found or away is None:
@@ -134,7 +141,7 @@ def explained(
 def _away(
     model: Model, trials: Sequence[Trial], shown: Sequence[int]
 ) -> tuple[Turned, float] | None:
-    """A constant angle [rad] between a heading and the course that was travelled."""
+    """Return the constant angle [rad] between a heading and the course travelled; None if small."""
     if (away := travelled(model, trials, shown)) is None:
         return None
     relation, found = away
@@ -150,13 +157,13 @@ def _but(rows: Sequence[Row], relation: Turned) -> list[Row]:
 def _agrees(
     row: Row, before: Mapping[Row, float], after: Mapping[Row, float], bad: set[Row]
 ) -> bool:
-    """Whether a row that a change enters is mended, or no worse."""
+    """Check whether a row that a change affects is fixed, or stays good."""
     left = after.get(row, np.inf)
     return left < (min(MENDED, before[row] / BETTER) if row in bad else MENDED)
 
 
 def _pooled(every: Sequence[Mapping[Row, Gap]]) -> dict[Row, float]:
-    """The share of each row over several trials (rms)."""
+    """Return the unexplained share of each row over several trials (rms)."""
     found: dict[Row, list[float]] = {}
     for one in every:
         for row, gap in one.items():
@@ -165,7 +172,7 @@ def _pooled(every: Sequence[Mapping[Row, Gap]]) -> dict[Row, float]:
 
 
 def _changes(model: Model, bad: set[Row], rows: Sequence[Row]) -> Iterator[Change]:
-    """What may be off: one signal, all positions or all velocities of a plane, two exchanged."""
+    """Yield candidate faults: of one signal, of all positions or velocities, of two exchanged."""
     units = list(model.states.values())
     touched = sorted({i for row in bad for i in row.states})
     like = {units[row.i] for row in bad}
@@ -178,7 +185,7 @@ def _changes(model: Model, bad: set[Row], rows: Sequence[Row]) -> Iterator[Chang
     single = [(i,) for i in touched if units[i] in ("m", "m/s")]
     for group in dict.fromkeys([*single, *(g for g in (owns, speeds) if len(g) > 1)]):
         yield from (Change(group, f) for f in FACTORS)
-    for row in rows:  # a compass that turns the other way, and the gyro with it
+    for row in rows:  # a compass with the opposite sign, and the gyro as well
         if model.angle_mask[row.i] and len(row.by) == 1 and row.i in touched:
             yield Change((row.i, *row.by), -1.0)
     for pair in combinations(touched, 2):
@@ -189,7 +196,11 @@ def _changes(model: Model, bad: set[Row], rows: Sequence[Row]) -> Iterator[Chang
 def _ranked(
     model: Model, trials: Sequence[Trial], some: Sequence[Change], shown: Sequence[int]
 ) -> list[Change]:
-    """The likelier first: too large before too small, one signal before two; as the model says."""
+    """Sort changes, likeliest first.
+
+    Too large comes before too small, and one signal before several, unless the model predicts the
+    trials clearly better with another change.
+    """
     order = sorted(some, key=lambda c: (not c.factor >= 1 and c.factor != -1, len(c.states)))
     if len(order) < 2:
         return order
@@ -207,10 +218,10 @@ def _ranked(
 
 
 def stop_at(model: Model, trials: Sequence[Trial], found: Sequence[Mismatch]) -> None:
-    """Stops at lengths in another unit and at columns in each other's place.
+    """Raise an error for lengths in another unit and for exchanged columns.
 
     Raises:
-        GroundedError: with the trials, the states and what mends them in [log].
+        GroundedError: naming the trials, the states and the correction in [log].
     """
     stops = [one for one in found if not one.change.corrected]
     if not stops:
@@ -221,24 +232,24 @@ def stop_at(model: Model, trials: Sequence[Trial], found: Sequence[Mismatch]) ->
         others = tuple(c for c in others if not any(_within(c, o) for o in (first, *others)))
         texts = [_said(model, c) for c in (first, *others)]
         clauses.append(", or else ".join(texts))
-    scales = "the paths and scales in [log] (multiply a scale, 1 where none is given)"
-    said = f"positions don't move as velocities and angles say: {'; '.join(clauses)}"
+    scales = "the paths and scales in [log] (multiply the scale, 1 where none is set)"
+    said = f"positions don't move as velocities and angles imply: {'; '.join(clauses)}"
     raise unusable(trials, stops[0].trials, said, f"Correct the log, or {scales}")
 
 
 def _within(a: Change, b: Change) -> bool:
-    """Whether b is the same of more signals."""
+    """Check whether b is the same fault of more signals than a."""
     return a.factor == b.factor and set(a.states) < set(b.states)
 
 
 def stop_at_folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> None:
-    """Stops at an angle in degrees whose steps of more than pi degrees are lost.
+    """Raise an error for an angle in degrees that was unwrapped as if it were in radians.
 
-    Taken for radians as a log was resampled, 350 degrees are 350 - 56 x 2 pi: dividing the trial
-    by 57.3 mends nothing.
+    Resampled as radians, 350 degrees become 350 - 56 x 2 pi, so steps of more than pi degrees are
+    lost and dividing the trial by 57.3 does not restore them.
 
     Raises:
-        GroundedError: with the scale to take the log in with.
+        GroundedError: with the scale with which to ingest the log again.
     """
     for row in rows:
         if not model.angle_mask[row.i]:
@@ -255,9 +266,9 @@ def stop_at_folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -
         if np.sqrt((off**2).mean()) < min(FOLDED, np.sqrt((plain**2).mean()) / 2):
             name, ids = model.state_names[row.i], tuple(t.id for t in trials if t.id)
             raise GroundedError(
-                f"{name} is in degrees, and was folded as an angle in {model.states[name]} when "
-                f"it was taken in: set [log.state.{name}] scale = {1 / DEGREES:.8g} and take the "
-                "logs in again, without these",
+                f"{name} is in degrees, but was unwrapped as an angle in {model.states[name]} when "
+                f"the log was ingested: set [log.state.{name}] scale = {1 / DEGREES:.8g}, discard "
+                "these trials and ingest their logs again",
                 then=NextCommand("discard", ids) if ids else None,
             )
 
@@ -267,17 +278,19 @@ def _said(model: Model, change: Change) -> str:
     if change.swap:
         return exchanged(listed(names))
     if change.factor == -1.0:
-        return f"{listed(names)}: the sign looks wrong, scale = -1"
+        return f"{listed(names)}: the sign looks wrong, set scale = -1"
     return ", ".join(described(model, i, change.factor) for i in change.states)
 
 
 def unexplained(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> Iterator[Finding]:
-    """Of rows that most trials contradict grossly; neither q' = w nor a heading that is turned.
+    """Yield a finding for each row that most trials contradict grossly.
+
+    Rows q' = w, and positions where the heading has an offset, are reported elsewhere.
 
     Args:
         model: however crude.
-        trials: with what could be corrected corrected.
-        rows: kinematic ones.
+        trials: corrected as far as possible.
+        rows: kinematic rows.
     """
     away = _away(model, trials, range(model.n)) if rows else None
     rows = rows if away is None else _but(rows, away[0])
@@ -293,7 +306,7 @@ def unexplained(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> I
         rate = float(np.median([gap.rate for gap in some]))
         what = listed(by)
         text = (
-            f"does not move as {what} {'say' if len(by) > 1 else 'says'} (its change is off by "
-            f"{rate:.3g} {model.states[name]} a second): check units, axes, signs"
+            f"does not move as {what} {'imply' if len(by) > 1 else 'implies'} (its rate is off by "
+            f"{rate:.3g} {model.states[name]} per second): check units, axes and signs"
         )
         yield Finding(name, text, "mismatch")

@@ -1,12 +1,12 @@
-"""Mistakes of a log that only the model can tell: exchanged commands, percent, a turned sensor.
+"""Log faults that only the model reveals: exchanged commands, commands in percent, sensor signs.
 
-Positions and velocities are held against one another without any physics (`swapped`,
-`other_units`). Commands can't be: the log of a robot whose wheels are exchanged is as good as any,
-it only turns the other way. So the model predicts each trial as it is logged and with the log
-changed, and both times what a plain calibration can do is done (`short_runs`): a model that is
-merely crude gains nothing by the change, a mistaken log gains most of what its commands do. The
-same tells two joints that are exchanged with their velocities, which agree with each other, and a
-sensor that counts the other way than the model.
+Positions and velocities are compared without any physics (`swapped`, `other_units`). Commands can't
+be: if a robot's two wheel commands are exchanged, its log is consistent, and the robot just turns
+the other way. The model therefore predicts each trial with the log as it is and with the log
+changed, calibrated in both cases (`short_runs`). If the model is only crude, the change does not
+help; if the log is wrong, the change explains most of what the commands do. The same method finds
+two joints that are exchanged together with their velocities, and sensors whose sign is opposite to
+the model's.
 """
 
 from __future__ import annotations
@@ -29,33 +29,33 @@ from grounded.result import listed, with_unit
 from grounded.trial import Trial
 
 CLEAR = 1.0  # [nats] by which a change must lower the errors of a trial
-HALF = 0.5  # of the error of one state at least
-PART = 0.7  # the same, of a turned sensor: a wrong sign is off by twice what the right one explains
-HINT = 0.5  # [nats], of the model as it is: less is not looked into
-LIKE = 4.0  # times what the model says, or a part of it: what gain an exchanged input may have
-SEEN = 0.5  # [nats] by which commands in their own unit must do better than none
-ODD_FROM = 5.0  # [s] of log, from which two inputs may be exchanged and one turned, too
-STARTS, FEWER = 120, 40  # samples of a trial, and where many changes are asked about
-TRIALS = 4  # that are asked
-MANY = 8  # changes
-MOST = 10  # states of which all mirror images are tried
+HALF = 0.5  # the error of at least one state must fall to this share
+PART = 0.7  # the same for a sensor's sign: a wrong sign doubles what the right one explains
+HINT = 0.5  # [nats] of the uncalibrated model: smaller changes are not examined
+LIKE = 4.0  # the gain of an exchanged input must be within this factor of the model's
+SEEN = 0.5  # [nats] by which commands in their unit must do better than no commands
+ODD_FROM = 5.0  # [s] of log needed to find two inputs exchanged and one with the wrong sign
+STARTS, FEWER = 120, 40  # samples of a trial to predict from; the latter with many changes
+TRIALS = 4  # trials examined
+MANY = 8  # number of changes from which on FEWER is used
+MOST = 10  # largest number of states for which all mirror images are tried
 PARTS = {"%": (0.01, "parts of 1"), "deg": (1 / DEGREES, "rad"), "deg/s": (1 / DEGREES, "rad/s")}
 WHOLE = {100.0: "percent", 255.0: "counts of 8 bits", 1000.0: "thousandths"}  # full scale
-OPENED = 0.05  # of full scale: the least that the largest command of a log reaches (at most OVER)
+OPENED = 0.05  # of full scale: least value of the largest command in a log (at most OVER)
 ANGULAR, LENGTHS = ("rad", "rad/s"), ("m", "m/s")
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """What may be wrong with a log.
+    """A possible fault of a log.
 
     Args:
-        states: pairs of states, each in the other's column.
-        turned: states that are logged with the other sign, a position with its velocity.
-        inputs: two that are, or all that are in another unit.
-        factor: how many times too large these are, below 1 too small; 1 for an exchange.
-        unit: what that is, in words.
-        signs: of exchanged inputs, once they are back.
+        states: pairs of exchanged states.
+        turned: states logged with the opposite sign, a position together with its velocity.
+        inputs: two exchanged inputs, or all inputs in another unit.
+        factor: how many times too large the inputs are, below 1 too small; 1 for an exchange.
+        unit: the unit that the inputs seem to be in, in words.
+        signs: of exchanged inputs after the exchange is undone.
     """
 
     states: tuple[tuple[int, int], ...] = ()
@@ -67,11 +67,11 @@ class Mistake:
 
     @property
     def swap(self) -> bool:
-        """Two columns in each other's place, or of the other sign: no other unit."""
+        """Whether it is an exchange or a sign, rather than another unit."""
         return self.factor == 1.0
 
     def mended(self, trial: Trial) -> Trial:
-        """The trial without it, but for signs."""
+        """Return the trial without this fault; `signs` are not undone."""
         x, u = np.array(trial.states), np.array(trial.inputs)
         for pair in self.states:
             x[:, pair] = x[:, pair[::-1]]
@@ -85,14 +85,14 @@ class Mistake:
 
 @dataclass(frozen=True)
 class Told:
-    """A mistake, what it makes of a state's error, and others that mend as much.
+    """The likeliest fault of a log, the evidence, and other faults that explain it as well.
 
     Args:
-        mistake: the likeliest.
-        state: the one that the model then predicts better by most.
+        mistake: the likeliest fault.
+        state: the state whose prediction improves most without the fault.
         logged: its rms error a quarter of a second ahead with the log as it is, in its unit.
-        mended: the same without the mistake.
-        others: that nothing tells from it.
+        mended: the same without the fault.
+        others: faults that the data can't distinguish from it.
     """
 
     mistake: Mistake
@@ -103,12 +103,12 @@ class Told:
 
 
 def mistaken(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Told | None:
-    """The mistake of all logs that some trials show and none contradicts.
+    """Return the fault that some trials show and none contradicts; None if there is none.
 
     Args:
         model: however crude.
         trials: of its states and inputs.
-        shown: states that a sensor has.
+        shown: indices of the states with a sensor.
     """
     changes = [*_exchanges(model, shown), *_turned(model, shown), *_units(model, trials)]
     some = range(0, len(trials), max(1, -(-len(trials) // TRIALS)))
@@ -130,10 +130,10 @@ def mistaken(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Tol
 
 
 def as_logged(model: Model, told: Told, findings: Sequence[Finding]) -> Told:
-    """The same without states that other instruments had turned: as they are logged they are right.
+    """Remove the states whose sign other checks had already reversed: the log has them right.
 
-    Of a position and a velocity that disagree in sign one is turned to agree; that it was the other
-    one only the model tells.
+    If a position and a velocity disagree in sign, one of them is reversed to agree. Only the model
+    shows that it was the other one.
     """
     done = {f.signal for f in findings if f.kind == "sign" and f.corrected}
     left = tuple(i for i in told.mistake.turned if model.state_names[i] not in done)
@@ -146,16 +146,16 @@ def judge_commands(
     hidden: Sequence[str] = (),
     findings: Sequence[Finding] = (),
 ) -> None:
-    """Stops at trials with commands, or joints, that the model says are mistaken.
+    """Raise an error if the model shows that commands or joints in the logs are wrong.
 
     Args:
         model: however crude.
-        trials: with what other instruments do put right, see `preflight`.
-        hidden: states that no sensor has.
-        findings: of the other instruments.
+        trials: already corrected for other faults, see `preflight`.
+        hidden: states without a sensor.
+        findings: of the other checks.
 
     Raises:
-        GroundedError: with the signals and what mends them.
+        GroundedError: naming the signals and the correction.
     """
     shown = [i for i, name in enumerate(model.state_names) if name not in hidden]
     told = mistaken(model, trials, shown)
@@ -166,25 +166,25 @@ def judge_commands(
 
 
 def mended_by(model: Model, told: Told) -> str:
-    """What to do about it."""
+    """Return the instruction that corrects the fault."""
     if turned := told.mistake.turned:
         tables = listed(f"[log.state.{model.state_names[i]}]" for i in turned)
         return (
-            f"Turn the sign in {tables} (scale = -1 where none is given) and in the robot's "
+            f"Reverse the sign in {tables} (scale = -1 where none is set) and in the robot's "
             "program; or in the model, if the log is right"
         )
     if told.mistake.swap:
         return "Correct the log, or the paths in [log]; or the model, if the log is right"
     tables = listed(f"[log.input.{model.input_names[j]}]" for j in told.mistake.inputs)
     by = f"{1 / told.mistake.factor:.6g}"
-    limits = "as well" if told.mistake.factor > 1 else "if they were read from the log"
-    return f"Multiply the scale in {tables} by {by} (1 where none is given), and [limits] {limits}"
+    limits = "as well" if told.mistake.factor > 1 else "if they were taken from the log"
+    return f"Multiply the scale in {tables} by {by} (1 where none is set), and [limits] {limits}"
 
 
 def described(model: Model, told: Told) -> str:
-    """What is wrong and how it is known, one clause."""
+    """Return one clause: what is wrong, and the evidence."""
     unit = model.states[model.state_names[told.state]]
-    error = with_unit(f"{told.mended:.2g} rather than {told.logged:.2g}", unit)
+    error = with_unit(f"{told.mended:.2g} instead of {told.logged:.2g}", unit)
     proof = f"misses {model.state_names[told.state]} by {error} 0.25 s ahead"
     if not told.mistake.swap:
         names = listed(model.input_names[j] for j in told.mistake.inputs)
@@ -198,33 +198,33 @@ def described(model: Model, told: Told) -> str:
         )
     said, *others = (_named(model, one) for one in (told.mistake, *told.others))
     text = said + "".join(f" (or {other})" for other in others)
-    text = f"{text}: only the other way round does the model predict what the robot does ({proof})"
+    text = f"{text}: only with that undone does the model predict the robot's motion ({proof})"
     mirror = _mirrored(model, told.mistake)
     if mirror:
         names = ", ".join(mirror[:-1]) + " and " * (len(mirror) > 1) + mirror[-1]
-        text += f"; {names} of the other sign would do the same"
+        text += f"; the opposite sign of {names} would have the same effect"
     return text
 
 
 def _named(model: Model, mistake: Mistake) -> str:
     if turned := mistake.turned:
         some = listed(model.state_names[i] for i in turned)
-        return f"{some} look{'s' * (len(turned) == 1)} turned, logged with the other sign"
+        return f"{some} look{'s' * (len(turned) == 1)} logged with the opposite sign"
     if mistake.inputs:
         a, b = (model.input_names[j] for j in mistake.inputs)
         signed = zip(mistake.inputs, mistake.signs, strict=True)
         odd = [model.input_names[j] for j, sign in signed if sign < 0]
-        said = f"{a} and {b}" + f", with the sign of {listed(odd)}," * bool(odd)
+        said = f"{a} and {b}" + f", with the sign of {listed(odd)} reversed," * bool(odd)
     else:
         said = ", ".join(listed(model.state_names[i] for i in pair) for pair in mistake.states)
     return f"the columns of {said} look exchanged"
 
 
 def _exchanges(model: Model, shown: Sequence[int]) -> Iterator[Mistake]:
-    """Pairs of inputs, and of positions with their velocities; in unlike units, too.
+    """Yield exchanges of two inputs, and of two positions together with their velocities.
 
-    A Twist's commands are in m/s and rad/s; a log whose trolley and whose load are exchanged has
-    each position with its own velocity, and no name that says what they measure.
+    Pairs with different units are included: the commands of a Twist are in m/s and rad/s, and a
+    crane's trolley and load may be exchanged.
     """
     for pair in combinations(range(model.m), 2):
         yield Mistake(inputs=pair)
@@ -235,7 +235,7 @@ def _exchanges(model: Model, shown: Sequence[int]) -> Iterator[Mistake]:
 
 
 def _turned(model: Model, shown: Sequence[int]) -> Iterator[Mistake]:
-    """Each state with the one that it is the rate of, or whose rate it is: a sensor turns both."""
+    """Yield sign faults: of each position with its velocity, and of each other state alone."""
     pairs = [(r.i, r.j) for r in integrals(model) if r.exact and {r.i, r.j} <= set(shown)]
     alone = [(i,) for i in shown if not any(i in pair for pair in pairs)]
     for group in sorted((*pairs, *alone)):
@@ -243,7 +243,10 @@ def _turned(model: Model, shown: Sequence[int]) -> Iterator[Mistake]:
 
 
 def _units(model: Model, trials: Sequence[Trial]) -> Iterator[Mistake]:
-    """Other units of all inputs of one unit; of a pure number by the largest that was sent."""
+    """Yield other units for all inputs that share a unit.
+
+    For dimensionless inputs the largest command suggests the unit.
+    """
     if not trials:
         return
     units = list(model.inputs.values())
@@ -273,7 +276,10 @@ def _each(
     changes: Sequence[Mistake],
     starts: int,
 ) -> Iterator[tuple[Mistake, tuple[Fit, Fit] | None]]:
-    """Of each change that a trial tells of: the fits as logged and mended; None where as logged."""
+    """Yield each change on which a trial is informative, with the fits as logged and as changed.
+
+    None in place of the fits if the log is better as it is.
+    """
     known = [i for i in shown if np.isfinite(trial.states[:, i]).any()]
     logged = Ahead(model, trial, known, starts)
     if not logged.enough or not np.isfinite(trial.inputs).all():
@@ -294,7 +300,7 @@ def _each(
 def _compared(
     model: Model, logged: Ahead, mended: Ahead, change: Mistake
 ) -> tuple[Fit, Fit] | None:
-    """Both calibrated; None where the change is not clearly better then."""
+    """Return both calibrated fits; None if the change is not clearly better after calibration."""
     signed, still = _signed(model, change), mended.still().score
     after = mended.best([min(signed, key=lambda gains: mended.plain(gains).score)])
     if not _plausible(change, after) or after.score > still - (CLEAR if change.swap else SEEN):
@@ -302,7 +308,7 @@ def _compared(
     before = logged.best(signed[:1], free=False)
     if not change.swap:
         after = mended.best(signed[:1], free=False)
-        seen = change.factor < 1 or before.score > still + CLEAR  # too small, they do nothing
+        seen = change.factor < 1 or before.score > still + CLEAR  # too small has no effect
         return (before, after) if seen and _better(change, before, after) else None
     if _better(change, before, after):
         before = logged.best([*signed, *_odd_signs(model, change), np.zeros(model.m)])
@@ -315,7 +321,7 @@ def _better(change: Mistake, before: Fit, after: Fit) -> bool:
 
 
 def _plausible(change: Mistake, fit: Fit) -> bool:
-    """Whether inputs do about what the model says, once the log is mended; a sign may be odd."""
+    """Check whether the changed log has input gains near the model's; one sign may differ."""
     gains = fit.gains[list(change.inputs)]
     sized = (np.abs(gains) > 1 / LIKE) & (np.abs(gains) < LIKE)
     positive = (gains > 0).any() if change.swap else (gains > 0).all()
@@ -327,7 +333,7 @@ def _signs(change: Mistake, fit: Fit) -> tuple[float, ...]:
 
 
 def _signed(model: Model, change: Mistake) -> list[Array]:
-    """Gains to begin with: as the model has them, and one of two exchanged inputs turned round."""
+    """Return initial gains: the model's, and those with one exchanged input's sign reversed."""
     found = [np.ones(model.m)]
     for j in change.inputs if change.swap else ():
         found.append(np.where(np.arange(model.m) == j, -1.0, 1.0))
@@ -335,7 +341,7 @@ def _signed(model: Model, change: Mistake) -> list[Array]:
 
 
 def _odd_signs(model: Model, change: Mistake) -> list[Array]:
-    """Signs of the inputs with which a log may be explained as it is: all turned, or one."""
+    """Return input signs that may explain the unchanged log: all reversed, or one."""
     if not (change.inputs or change.turned):
         return []
     one = [np.where(np.arange(model.m) == j, -1.0, 1.0) for j in range(model.m)]
@@ -343,10 +349,10 @@ def _odd_signs(model: Model, change: Mistake) -> list[Array]:
 
 
 def _best(found: Mapping[Mistake, Mapping[int, tuple[Fit, Fit]]]) -> Told:
-    """The change that leaves least, with those that leave nearly as little.
+    """Return the change with the smallest remaining error, with those that are nearly as good.
 
-    Of these an exchange comes first: it is one mistake of [log], where a sensor that counts the
-    other way than the model says has the robot's program wrong as well.
+    Among these an exchange comes first. It is one mistake in [log], while a wrong sign of a sensor
+    would be in the robot's program as well.
     """
     most = max(len(fits) for fits in found.values())
     left = {
@@ -364,7 +370,7 @@ def _best(found: Mapping[Mistake, Mapping[int, tuple[Fit, Fit]]]) -> Told:
 
 
 def _mirrored(model: Model, mistake: Mistake) -> tuple[str, ...]:
-    """States whose other sign is the same to the model as two exchanged inputs; () for none."""
+    """Return states whose sign reversal the model can't tell from the exchange; () if none."""
     if not mistake.inputs or model.n > MOST or min(mistake.signs, default=1.0) < 0:
         return ()
     (x, u), dt = places.samples(model, 8), places.probe(model, 0.01)

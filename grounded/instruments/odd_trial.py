@@ -1,12 +1,12 @@
-"""A whole trial in other units than the rest: degrees for radians, milliseconds for seconds.
+"""Find trials in other units than the rest: degrees for radians, milliseconds for seconds.
 
-Where one state of a trial is in degrees, or its stamps are in milliseconds, the rate of a position
-is a constant times what the velocity says; which of the two is off, the sizes in sound trials say.
-Where all angles and their rates are in degrees they agree with each other: then commands as large
-as in other trials seem to move the body tens of times as far, the model misses that by tens of
-times as much, and divided by 57.3 by as much as the rest. Commands in thousandths are tens of times
-smaller than in other trials, and the model predicts what the body does with thousand times as much,
-neither with a third of that nor with three times.
+If one state of a trial is in degrees, or its stamps are in milliseconds, the rate of a position is
+a constant multiple of the velocity; the sizes in sound trials show which of the two is off. If all
+angles and their rates are in degrees, they agree with each other. Commands of the usual size then
+seem to move the body tens of times as far, and the model's error is tens of times as large; divided
+by 57.3 it is as in the other trials. Commands in thousandths are tens of times smaller than in
+other trials, and the model predicts the motion with a thousand times as much, but not with a third
+or three times of that.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from grounded.trial import Trial
 
 AHEAD = 0.25  # [s]
 STARTS = 200
-LARGE = 20.0  # times what the others do
-SIMILAR = 3.0
-BETTER = 0.9  # of the error with commands as they are, or a third, or three times as large
-STAMPS = 1000.0
-NEAR = 0.1  # relative, of these factors
-TOGETHER = 0.95  # cosine of what a position moves and its velocity says, over the best window
-TURNS = (2 * np.pi, 360.0)  # by which a wrapped angle jumps
-LIKE = 10.0  # times as large, or as small: beside what corrected signals may be
-MANY = 8  # trials that tell enough
+LARGE = 20.0  # times as large as in other trials
+SIMILAR = 3.0  # within this factor sizes count as similar
+BETTER = 0.9  # of the error with the commands as logged, or a third or three times the corrected
+STAMPS = 1000.0  # factor between time stamps in milliseconds and in seconds
+NEAR = 0.1  # relative tolerance of these factors
+TOGETHER = 0.95  # cosine between displacements by position and by velocity, in the best window
+TURNS = (2 * np.pi, 360.0)  # jumps of a wrapped angle
+LIKE = 10.0  # factor within which corrected commands must match those of other trials
+MANY = 8  # number of trials examined
 LEAST = 8  # windows that a trial must hold
-FAR = 1e9
+FAR = 1e9  # bound on predicted states
 
 Ratios = Sequence[tuple[Integral, float]]  # of a trial's positions, see `ratios_of`
 
 
 @dataclass(frozen=True)
 class Odd:
-    """Signals of trial number `trial` that are `factor` times what they are in the others."""
+    """Signals of trial number `trial` that are `factor` times as large as in the other trials."""
 
     trial: int
     factor: float
@@ -50,7 +50,7 @@ class Odd:
     inputs: tuple[int, ...] = ()
 
     def mended(self, trial: Trial) -> Trial:
-        """The trial in the unit of the others."""
+        """Return the trial in the unit of the others."""
         x, u = np.array(trial.states), np.array(trial.inputs)
         x[:, self.states] /= self.factor
         u[:, self.inputs] /= self.factor
@@ -64,16 +64,16 @@ class Odd:
 def odd_states(
     model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios], shown: Sequence[int]
 ) -> Iterator[Odd]:
-    """Trials with states in degrees that are in radians in another trial, or divided like degrees.
+    """Yield trials with states off by the factor between degrees and radians, either way.
 
     Args:
         model: however crude.
         trials: several.
-        ratios: of each.
-        shown: states that a sensor has, in every trial.
+        ratios: of each trial, see `ratios_of`.
+        shown: indices of the states with a sensor in every trial.
 
     Yields:
-        A trial and its states, all of one factor.
+        A trial and its states that share a factor.
     """
     units = list(model.states.values())
     angular = [i for i in shown if units[i] == "rad" or units[i].startswith("rad/")]
@@ -101,7 +101,7 @@ def odd_states(
 
 
 def _one_state(trials: Sequence[Trial], ratios: Sequence[Ratios], k: int) -> list[Odd]:
-    """The states of a trial that are in degrees, or divided so, beside a rate or a position."""
+    """Return the states of a trial that are off by 57.3 against their rate or position."""
     found = []
     for at, (relation, ratio) in enumerate(ratios[k]):
         factor = next((f for f in (DEGREES, 1 / DEGREES) if abs(ratio / f - 1) < NEAR), None)
@@ -113,7 +113,7 @@ def _one_state(trials: Sequence[Trial], ratios: Sequence[Ratios], k: int) -> lis
             if len(one) == len(ratios[k]) and 1 / SIMILAR < one[at][1] < SIMILAR
         ]
         choice = [Odd(k, factor, (relation.i,)), Odd(k, 1 / factor, (relation.j,))]
-        choice.sort(key=lambda odd: -odd.factor)  # degrees, where no other trial tells
+        choice.sort(key=lambda odd: -odd.factor)  # degrees, if no other trial shows which
         if sound:
             pair = [relation.i, relation.j]
             usual = np.median([spread(t, pair) for t in sound], axis=0)
@@ -126,24 +126,27 @@ def _one_state(trials: Sequence[Trial], ratios: Sequence[Ratios], k: int) -> lis
 
 
 def spread(trial: Trial, some: Sequence[int]) -> Array:
-    """Standard deviations of some states (len(some),), in their units."""
+    """Return the standard deviations of some states (len(some),), in their units."""
     return np.asarray(np.nanstd(trial.states[:, some], axis=0) + 1e-300)
 
 
-PREDICTED = 1.0  # of what the signals do: an error below that predicts them
-FULL_TURNS = 4 * np.pi  # [rad] that an angle spans: degrees, or wheels, or a heading
-SOON = 0.1  # [s] ahead: a body that a model lacks much of goes its own way later
-CONCORDANT, PLAINLY = 0.1, 1.5  # concordance, and times that with other factors
-WHOLE = 0.3  # concordance of each angle with what its rate says
+PREDICTED = 1.0  # error relative to the motion, below which a prediction is informative
+FULL_TURNS = 4 * np.pi  # [rad] range of an angle that suggests degrees (or a wheel, or a heading)
+SOON = 0.1  # [s] horizon: a very crude model soon diverges
+CONCORDANT, PLAINLY = 0.1, 1.5  # least concordance, and factor by which it must exceed others
+WHOLE = 0.3  # least concordance of each angle with the motion by its rate
 
 
 def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Odd]:
-    """Of each trial the signals that are in degrees in all of them, by what the model makes of it.
+    """Return the signals that are in degrees in all trials, one `Odd` per trial; else [].
+
+    They are found by the model: dividing by 57.3 must at least halve its errors, and factors far
+    from that must not do better.
 
     Args:
-        model: whose errors fall below half where they are divided by 57.3, not far from that.
-        trials: any.
-        shown: states that a sensor has, in every trial.
+        model: however crude.
+        trials: of this model's states.
+        shown: indices of the states with a sensor in every trial.
     """
     units, inputs = list(model.states.values()), list(model.inputs.values())
     angles = tuple(i for i in shown if units[i] == "rad")
@@ -163,7 +166,7 @@ def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) 
         return []
     best = choices[int(np.nanargmin(errors))]
     mended, own = left(best), left(replace(best, factor=1.0))
-    judges = mended < PREDICTED  # a trial that no model predicts tells nothing
+    judges = mended < PREDICTED  # a trial that the model can't predict is not informative
     near = [left(replace(best, factor=f * DEGREES)) for f in (1 / LIKE, LIKE)]
     told = judges.any() and all(
         np.median(mended[judges] / other[judges]) < 1 for other in (own / 2, *near)
@@ -177,11 +180,12 @@ def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) 
 def _turning_as_degrees(
     model: Model, trials: Sequence[Trial], shown: Sequence[int], odd: Odd
 ) -> bool:
-    """Whether angles beyond full turns turn as a model says that is crude, were they degrees.
+    """Check whether angles that span full turns follow the model if they are taken as degrees.
 
-    A payload and friction that a model lacks can make its errors larger than all that moves. Still
-    what it predicts goes with what happened, and is about as large, of no angles but the right
-    ones: sines of others are noise, and pushes on them are too weak, or too strong.
+    An unmodelled payload or friction can make the model's errors larger than the motion. Even then
+    its predictions correlate with the motion, and have about its size, only if the unit is right:
+    with a wrong unit the sines of the angles are noise, and the effect of inputs on them is far too
+    weak or too strong.
     """
     units = list(model.states.values())
     angles = [i for i in odd.states if units[i] == "rad"]
@@ -198,7 +202,7 @@ def _turning_as_degrees(
         return float(np.median([_concordance(model, t, shown, some) for t in mended]))
 
     own = [concord(DEGREES, [i]) for i in going if i in angles]
-    if min(own, default=0.0) < WHOLE:  # one that its rate does not move is not in its unit
+    if min(own, default=0.0) < WHOLE:  # an angle that does not follow its rate is in another unit
         return False
     mended = concord(DEGREES)
     others = [concord(factor) for factor in (1.0, DEGREES / LIKE, DEGREES * LIKE)]
@@ -206,7 +210,7 @@ def _turning_as_degrees(
 
 
 def _concordance(model: Model, trial: Trial, shown: Sequence[int], some: Sequence[int]) -> float:
-    """Of what the states `some` do in a moment with what is predicted (Lin 1989), their mean."""
+    """Return the mean concordance (Lin 1989) of predicted and logged changes of some states."""
     if not some or (ahead := predicted(model, trial, shown, SOON)) is None:
         return 0.0
     start, x, logged = ahead
@@ -216,15 +220,15 @@ def _concordance(model: Model, trial: Trial, shown: Sequence[int], some: Sequenc
 
 
 def odd_commands(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Iterator[Odd]:
-    """Trials with an input in thousandths, or in degrees, of its unit in other trials.
+    """Yield trials with an input off by 1000 or 57.3 against the other trials.
 
     Args:
         model: however crude.
         trials: several, their states in the model's units.
-        shown: states that a sensor has, in every trial.
+        shown: indices of the states with a sensor in every trial.
 
     Yields:
-        A trial and an input.
+        A trial and one of its inputs.
     """
     if len(trials) < 2 or not shown:
         return
@@ -254,7 +258,18 @@ def odd_commands(model: Model, trials: Sequence[Trial], shown: Sequence[int]) ->
 def missed(
     model: Model, trial: Trial, some: Sequence[int], shown: Sequence[int], unit: Array | float = 1.0
 ) -> float:
-    """Rms error of predictions a quarter of a second ahead, of the states `some` together."""
+    """Return the rms error of predictions a quarter of a second ahead, over the states `some`.
+
+    Args:
+        model: that predicts.
+        trial: of this model's states.
+        some: indices of the states that count.
+        shown: indices of the states with a sensor.
+        unit: divides the error of each state.
+
+    Returns:
+        NaN if too little of the trial is known.
+    """
     if (ahead := predicted(model, trial, shown)) is None:
         return float("nan")
     _, x, logged = ahead
@@ -264,13 +279,21 @@ def missed(
 def predicted(
     model: Model, trial: Trial, shown: Sequence[int], horizon: float = AHEAD
 ) -> tuple[Array, Array, Array] | None:
-    """Logged states (N, n), what the model makes of them by a horizon [s], those logged then.
+    """Predict a trial by a horizon [s] ahead, from many of its samples.
 
-    None where too little is known. States that are not `shown` are taken for 0.
+    Args:
+        model: that predicts.
+        trial: of this model's states.
+        shown: indices of the states with a sensor; the others are taken as 0.
+        horizon: [s].
+
+    Returns:
+        The states (N, n) logged at the start, those predicted, and those logged at the horizon;
+        None if too little is known.
     """
     steps = max(1, round(horizon / trial.dt))
     logged = np.array(trial.states)
-    logged[:, [i for i in range(model.n) if i not in shown]] = 0.0  # nobody knows
+    logged[:, [i for i in range(model.n) if i not in shown]] = 0.0  # unknown
     good = np.asarray(np.isfinite(logged).all(axis=1))
     at = np.flatnonzero(good[:-steps] & good[steps:])
     if len(at) < 5:
@@ -284,18 +307,18 @@ def predicted(
 
 
 def judge_stamps(model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios]) -> None:
-    """Stops at a trial whose stamps are in milliseconds, or were taken for such.
+    """Raise an error if a trial's stamps are in milliseconds, or were read as milliseconds.
 
-    Where all positions are lengths they may be in mm as well: the stamps it is then only where they
-    and their velocities are as large as in sound trials.
+    If all positions are lengths, they may be in mm instead. Then the stamps are blamed only if
+    positions and velocities are as large as in sound trials.
 
     Args:
         model: however crude.
-        trials: any.
-        ratios: of each.
+        trials: of this model's states.
+        ratios: of each trial, see `ratios_of`.
 
     Raises:
-        GroundedError: with the trial, a state and the factor.
+        GroundedError: naming the trial, a state and the factor.
     """
     for k, (trial, every) in enumerate(zip(trials, ratios, strict=True)):
         if (found := slow_or_fast(model, every)) is None:
@@ -313,16 +336,16 @@ def judge_stamps(model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios]
         name = trial.id or f"number {k + 1}"
         raise GroundedError(
             f"trial {name}: {q} moves {ratio:.3g} times as fast as {w} says, so the "
-            "stamps of its log are in another unit (milliseconds, not seconds): correct "
-            "them and take it in again, without this one",
+            "stamps of its log are in another unit (milliseconds instead of seconds): "
+            "correct them, discard this trial and ingest the log again",
             then=NextCommand("discard", (trial.id,)) if trial.id else None,
         )
 
 
 def slow_or_fast(model: Model, every: Ratios) -> tuple[Integral, float] | None:
-    """A position that moves a thousand times as fast as it should, or as slowly, as all do.
+    """Return a position and its ratio if all positions move 1000 times too fast or too slowly.
 
-    One whose unit is not m is taken if there is one.
+    A position whose unit is not m is preferred.
     """
     found = [one for one in every if one[0].exact]
     for factor in (STAMPS, 1 / STAMPS):
@@ -333,19 +356,22 @@ def slow_or_fast(model: Model, every: Ratios) -> tuple[Integral, float] | None:
 
 
 def _sound(every: Ratios) -> bool:
-    """Whether positions move as their velocities say."""
+    """Check whether positions move as their velocities imply."""
     found = [ratio for relation, ratio in every if relation.exact]
     return bool(found) and all(1 / SIMILAR < ratio < SIMILAR for ratio in found)
 
 
 def ratios_of(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Ratios]:
-    """Of each trial, the rate of each position over what its velocity says; 1 where they differ."""
+    """Return for each trial the rate of each position over its velocity.
+
+    The ratio is 1 where the two do not correlate, and no ratio can be given.
+    """
     relations = [one for one in integrals(model) if {one.i, one.j} <= set(shown)]
     return [_ratios(relations, trial) for trial in trials]
 
 
 def _ratios(relations: Sequence[Integral], trial: Trial) -> Ratios:
-    """Over the window in which they agree best: a position's noise is small beside a long way."""
+    """Return the ratios over the window with the best agreement; longer ones suppress noise."""
     found = []
     for relation in relations:
         some = [
@@ -366,7 +392,7 @@ def _ratios(relations: Sequence[Integral], trial: Trial) -> Ratios:
 
 
 def _unturned(q: Array) -> Array:
-    """Without the jumps of a wrapped angle."""
+    """Remove the jumps of a wrapped angle."""
     steps = np.diff(q)
     for turn in TURNS:
         jumps = np.abs(np.abs(steps) - turn) < 0.1 * turn
@@ -376,5 +402,5 @@ def _unturned(q: Array) -> Array:
 
 
 def size_of(x: Array) -> float:
-    """Root mean square of what is known of x, of any shape; 0 where it is empty."""
+    """Return the root mean square of x, of any shape, ignoring NaN; 0 if it is empty."""
     return float(np.sqrt(np.nanmean(x**2))) if x.size else 0.0

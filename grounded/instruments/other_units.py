@@ -1,9 +1,10 @@
-"""A position in mm beside a velocity in m/s: their ratio is a unit's, which no physics makes.
+"""Detect positions and velocities in units that don't match, such as mm beside m/s.
 
-Which of the two is off can't be read off them. Where trials in the model's units are among the
-others, sizes there tell it; else what the model makes of the velocity with either mended; else the
-larger is taken first, since logs have mm rather than km. What is found is never put right here: a
-sensor's factor of a thousand belongs into [log], where feedback and utilities see it too.
+Their ratio is then a power of ten that no physics causes. Which of the two is off does not follow
+from the ratio. It follows from the sizes in other trials that are in the model's units; without
+such trials, from how well the model predicts the velocity with either one corrected; otherwise the
+larger is named first, since logs are more often in mm than in km. Nothing is corrected here: the
+factor belongs in [log], where feedback and utilities use it too.
 """
 
 from __future__ import annotations
@@ -33,13 +34,13 @@ from grounded.instruments.odd_trial import (
 from grounded.model import Model
 from grounded.trial import Trial
 
-MILLION = STAMPS**2  # mm for m, multiplied by a thousand once more
-FACTORS = (MILLION, STAMPS, 100.0, 0.01, 1 / STAMPS, 1 / MILLION)  # rates by velocities
-MEND = "Multiply the scale in [log] (1 where none is given), or correct the log"
-TOLD = 0.5  # of how far a velocity changes, and of the other's error: a model that explains it
-ALIKE = 30.0  # times as large, or as small, as a crude model makes a change
+MILLION = STAMPS**2  # mm for m, and multiplied by a thousand instead of divided
+FACTORS = (MILLION, STAMPS, 100.0, 0.01, 1 / STAMPS, 1 / MILLION)  # position rate over velocity
+MEND = "Multiply the scale in [log] (1 where none is set), or correct the log"
+TOLD = 0.5  # of the velocity's change, and of the other's error: below it the model explains it
+ALIKE = 30.0  # factor within which a crude model predicts the size of a change
 PREFIXES = {1000.0: "m", 100.0: "c"}
-SINGLE = ("m", "rad", "V", "A", "N")  # units that are written with a prefix
+SINGLE = ("m", "rad", "V", "A", "N")  # units that take a prefix
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class _Off:
 
     @property
     def choices(self) -> tuple[Odd, Odd]:
-        """What may be off, the larger first."""
+        """The two possible faults, too large before too small."""
         k, i, j = self.trials[0], self.relation.i, self.relation.j
         both = Odd(k, self.factor, (i,)), Odd(k, 1 / self.factor, (j,))
         return both if self.factor > 1 else (both[1], both[0])
@@ -62,16 +63,17 @@ class _Off:
 def judge_units(
     model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios], shown: Sequence[int]
 ) -> None:
-    """Stops at a position and a velocity of which one is a hundred or a thousand times too large.
+    """Raise an error if a position or a velocity is a hundred or a thousand times too large.
 
     Args:
         model: however crude.
-        trials: any.
-        ratios: of each, see `odd_trial.ratios_of`.
-        shown: states that a sensor has.
+        trials: of this model's states.
+        ratios: of each trial, see `odd_trial.ratios_of`.
+        shown: indices of the states with a sensor.
 
     Raises:
-        GroundedError: with the trials, the states, what may be off and the scale that mends it.
+        GroundedError: naming the trials, the states, the likely fault and the scale that corrects
+            it.
     """
     found = list(_found(ratios))
     if not found:
@@ -82,12 +84,12 @@ def judge_units(
 
 
 def units_apart(model: Model, trial: Trial, shown: Sequence[int]) -> list[str]:
-    """What one trial says of that by itself, a clause for each position and velocity.
+    """Return a clause for each position and velocity of one trial whose units don't match.
 
     Args:
         model: however crude.
         trial: without gaps.
-        shown: states that a sensor has.
+        shown: indices of the states with a sensor.
     """
     ratios = ratios_of(model, [trial], shown)
     found = list(_found(ratios))
@@ -95,26 +97,26 @@ def units_apart(model: Model, trial: Trial, shown: Sequence[int]) -> list[str]:
 
 
 def unusable(trials: Sequence[Trial], odd: Sequence[int], clauses: str, mend: str) -> GroundedError:
-    """That nothing can be said before some trials are taken in again, and the command for it.
+    """Return the error that some trials must be corrected and ingested again, with its command.
 
     Args:
         trials: all of them.
-        odd: the numbers of those that are concerned.
-        clauses: what is wrong there.
-        mend: what to do about it, before the log is taken in again.
+        odd: indices of those affected.
+        clauses: what is wrong with them.
+        mend: what to do before the log is ingested again.
     """
     names = [trials[k].id or f"number {k + 1}" for k in odd]
     one, every = len(odd) == 1, len(odd) == len(trials) > 1
     where = "in every trial" if every else f"in trial{'s' * (not one)} {', '.join(names)}"
     return GroundedError(
-        f"{where} {clauses}. {mend}, and take it in again, without "
-        f"{'this one' if one else 'these'}",
+        f"{where} {clauses}. {mend}; then discard {'this trial' if one else 'these trials'} and "
+        "ingest the log again",
         then=NextCommand("discard", tuple(names)) if trials[0].id else None,
     )
 
 
 def _found(ratios: Sequence[Ratios]) -> Iterator[_Off]:
-    """Each relation and factor, with the trials that have it."""
+    """Yield each relation and factor, with the trials that have it."""
     relations = {relation for every in ratios for relation, _ in every if relation.exact}
     for relation in sorted(relations, key=lambda r: (r.i, r.j)):
         known = {k: dict(every).get(relation, np.nan) for k, every in enumerate(ratios)}
@@ -133,7 +135,7 @@ def _clause(
     found: Sequence[_Off],
     shown: Sequence[int],
 ) -> str:
-    """What is seen, what it looks like, and what else it may be."""
+    """Return one clause: the ratio, the likeliest fault, and other possible ones."""
     names = model.state_names
     ratio = dict(ratios[one.trials[0]])[one.relation]
     first, second = _ranked(model, trials, one, found, shown)
@@ -144,8 +146,8 @@ def _clause(
     if not (one.sound or _clear(model, trials[one.trials[0]], one, shown, first, second)):
         text += f", or else {described(model, second.states[0], second.factor)}"
         if slow_or_fast(model, ratios[one.trials[0]]) is not None:
-            text += ", or the stamps are in milliseconds" if one.factor < 1 else ""
-            text += ", or the stamps were taken for milliseconds" if one.factor > 1 else ""
+            text += ", or the time stamps are in milliseconds" if one.factor < 1 else ""
+            text += ", or the time stamps were taken for milliseconds" if one.factor > 1 else ""
     return text
 
 
@@ -156,7 +158,7 @@ def _ranked(
     found: Sequence[_Off],
     shown: Sequence[int],
 ) -> tuple[Odd, Odd]:
-    """What may be off, the likelier first."""
+    """Return the two possible faults, likeliest first."""
     a, b = one.choices
     pair = [one.relation.i, one.relation.j]
     odd = trials[one.trials[0]]
@@ -165,7 +167,7 @@ def _ranked(
         strange = [np.abs(np.log(spread(c.mended(odd), pair) / usual)).sum() for c in (a, b)]
         return (a, b) if strange[0] <= strange[1] else (b, a)
     votes = [sum(c.states[0] in (r.relation.i, r.relation.j) for r in found) for c in (a, b)]
-    if votes[0] != votes[1]:  # a velocity that is the position of another
+    if votes[0] != votes[1]:  # a velocity that is the position of another relation
         return (a, b) if votes[0] > votes[1] else (b, a)
     swap = _explains(model, odd, one, shown, b, a) or _clear(model, odd, one, shown, b, a)
     return (b, a) if swap else (a, b)
@@ -174,7 +176,7 @@ def _ranked(
 def _explains(
     model: Model, trial: Trial, one: _Off, shown: Sequence[int], first: Odd, second: Odd
 ) -> bool:
-    """Whether the model explains the velocity with the first mended, and not with the second."""
+    """Check whether the model predicts the velocity with the first corrected, not the second."""
     j = one.relation.j
     a, b = (_unexplained(model, odd.mended(trial), j, shown) for odd in (first, second))
     return a < TOLD and a < TOLD * b
@@ -183,10 +185,10 @@ def _explains(
 def _clear(
     model: Model, trial: Trial, one: _Off, shown: Sequence[int], first: Odd, second: Odd
 ) -> bool:
-    """Whether the model says which of the two it is: of factors that no common unit is apart by.
+    """Check whether the model clearly favours the first fault; only for factors beyond 1000.
 
-    It explains the velocity with the first mended. Or, however crude, it makes about as large a
-    change of it as was logged, and one that is not comparable with the second mended in its place.
+    Either it predicts the velocity with the first one corrected; or, however crude, it predicts a
+    change of about the logged size then, and of a quite different size with the second corrected.
     """
     if max(one.factor, 1 / one.factor) <= STAMPS:
         return False
@@ -197,7 +199,7 @@ def _clear(
 
 
 def _off_by(model: Model, trial: Trial, j: int, shown: Sequence[int]) -> float:
-    """How many times too large, or too small, a model's change of a velocity is."""
+    """Return the factor (1 or more) by which a model's change of a velocity is off in size."""
     if (ahead := predicted(model, trial, shown)) is None:
         return float("nan")
     start, then, logged = ahead
@@ -208,7 +210,7 @@ def _off_by(model: Model, trial: Trial, j: int, shown: Sequence[int]) -> float:
 
 
 def _unexplained(model: Model, trial: Trial, j: int, shown: Sequence[int]) -> float:
-    """What the model misses a velocity by, over how far that changes meanwhile."""
+    """Return the model's prediction error of a velocity, relative to how far that changes."""
     steps = max(1, round(AHEAD / trial.dt))
     x: Array = trial.states[:, j]
     change = size_of(x[steps:] - x[:-steps])
@@ -216,11 +218,11 @@ def _unexplained(model: Model, trial: Trial, j: int, shown: Sequence[int]) -> fl
 
 
 def described(model: Model, i: int, factor: float) -> str:
-    """One state as it seems to be logged, `factor` times too large, and the scale for it."""
+    """Return a clause on a state that looks `factor` times too large, with the scale to set."""
     name = model.state_names[i]
     size = max(factor, 1 / factor)
     base, _, per = model.states[name].partition("/")
     prefix = PREFIXES.get(factor, "") if base in SINGLE else ""
     unit = f" (in {prefix}{base}{'/' * bool(per)}{per})" if prefix else ""
     text = f"{size:g} times too {'large' if factor > 1 else 'small'}{unit}"
-    return f"{name} looks {text}, [log.state.{name}] scale = {1 / factor:g}"
+    return f"{name} looks {text}, corrected by [log.state.{name}] scale = {1 / factor:g}"

@@ -1,23 +1,23 @@
-"""START HERE: the instruments, from their own signals alone, before any physics is judged.
+"""START HERE: check sensors and commands from their signals, before any physics is identified.
 
-odd_trial     a whole trial in other units than the rest
-clocks        one pace of the stamps behind several rates that are off, states that answer early
+odd_trial     a trial in other units than the rest
+clocks        stamps at a wrong rate behind several scale errors; states that respond too early
 other_units   a position in mm beside a velocity in m/s
-swapped       two columns of a trial in each other's place
-way           speeds in the axes of positions or in knots, a compass's heading
-mismatch      a position that doesn't move as velocities and angles say
-single        each state by itself
-dead          a velocity that stays at one value while its position moves
-constant      a velocity that is off by a constant, against the way of its position
-kinematics    velocities against the rates of their positions, courses against headings
-late_position both positions of a plane behind what velocities and a heading say
-mistaken      commands in each other's place, or in percent, once the rest is put right
-inputs        copies of one another, at their limits or beyond, constant within each trial
+swapped       two exchanged columns
+way           speeds in world axes or in knots, compass headings
+mismatch      a position that doesn't move as velocities and angles imply
+single        each state on its own
+dead          a velocity that shows nothing while its position moves
+constant      a velocity with a constant bias against its position
+kinematics    velocities against the rates of their positions, headings against courses
+late_position both positions of a plane later than velocities and heading
+mistaken      commands exchanged or in percent, checked after the rest is corrected
+inputs        copies of one another, at or beyond their limits, constant within each trial
 
-What is certain from sensors alone is put right in the trials that the diagnosis then takes: a late
-signal is moved, a wrong sign or unit undone, samples that show nothing become missing ones; what a
-sensor filters, the diagnosis' own filter knows (`Preflight.filters`). What
-could be physics as well, a scale a few percent off, a slipping wheel, is stated and left alone.
+Faults that are certain from the sensors alone are corrected in the trials passed on to the
+diagnosis: a delayed signal is shifted, a wrong sign or unit undone, invalid samples become missing.
+The filter of a sensor is passed on to the diagnosis' own filter (`Preflight.filters`). What physics
+could cause as well, such as a scale error of a few percent or wheel slip, is only reported.
 """
 
 from __future__ import annotations
@@ -81,34 +81,34 @@ from grounded.model import Model
 from grounded.task import Task
 from grounded.trial import Trial
 
-LEAST_STEPS = 0.1  # of a time step: less is a matter of time stamps
-ALIKE = 0.9  # coherence from which two sensors are compared at all
-UNIT = 0.1  # relative, from which a scale is taken for one of degrees
-SMOOTH = 2.0  # time steps: a velocity that is a mean over less still tells when something happens
+LEAST_STEPS = 0.1  # of a time step: smaller delays may come from the time stamps
+ALIKE = 0.9  # coherence above which two sensors are compared
+UNIT = 0.1  # relative tolerance within which a scale counts as that of degrees
+SMOOTH = 2.0  # time steps: a velocity averaged over less still resolves the motion
 
 
 @dataclass(frozen=True, eq=False)
 class Preflight:
-    """What was found of the instruments, and the trials without what could be corrected."""
+    """The findings of all checks, and the corrected trials."""
 
     findings: tuple[Finding, ...]
     trials: tuple[Trial, ...]
-    in_step: frozenset[str] = frozenset()  # states whose sensors were seen to show one moment
-    refuted: frozenset[str] = frozenset()  # effects that would part two sensors that agree
+    in_step: frozenset[str] = frozenset()  # states whose sensors are seen to be synchronous
+    refuted: frozenset[str] = frozenset()  # effects ruled out because two sensors agree
 
     @property
     def filters(self) -> dict[str, float]:
-        """Time constants of the sensors that filter, by state [s]."""
+        """Time constants of filtering sensors by state [s]."""
         return filters_of(self.findings)
 
     @property
     def left_out(self) -> frozenset[str]:
-        """States whose sensors say no more than others do."""
+        """States whose sensors add nothing to others."""
         return frozenset(f.signal for f in self.findings if f.kind == "smoothed")
 
     @property
     def settled(self) -> frozenset[str]:
-        """Sensor effects that can't be blamed any more, by name: corrected, or refuted."""
+        """Names of the sensor effects that are already corrected or ruled out."""
         mended = {f.signal for f in self.findings if f.corrected and f.kind in ("delay", "lag")}
         return self.refuted | frozenset(
             f"{family}:{name}"
@@ -120,12 +120,15 @@ class Preflight:
 def preflight(
     subject: Task | Model, trials: Sequence[Trial], hidden: Sequence[str] = ()
 ) -> Preflight:
-    """Judges the instruments of trials that fit the model.
+    """Check the sensors and commands of trials, and correct what is certain.
 
     Args:
-        subject: the model, whose kinematics tie sensors together; of a task also the limits.
-        trials: real ones, of one time grid.
-        hidden: states that no sensor has.
+        subject: the model, whose kinematics relate the sensors; a task adds the input limits.
+        trials: real ones, of one time grid; unchanged if they don't fit the model.
+        hidden: states without a sensor.
+
+    Raises:
+        GroundedError: for logs that can't be used, with the correction.
     """
     model = subject.model if isinstance(subject, Task) else subject
     names = (model.state_names, model.input_names)
@@ -156,7 +159,7 @@ def preflight(
 
 
 class _Bench:
-    """Trials that are corrected finding by finding."""
+    """Trials that are corrected step by step, one finding after the other."""
 
     def __init__(self, model: Model, trials: list[Trial], hidden: set[str]) -> None:
         self.model, self.trials = model, trials
@@ -172,14 +175,18 @@ class _Bench:
         return [trial.states[:, i] for trial in self.trials]
 
     def put(self, i: int, columns: Sequence[Array]) -> None:
-        """The trials with other samples of one state."""
+        """Replace the samples of one state in all trials."""
         for k, (trial, x) in enumerate(zip(self.trials, columns, strict=True)):
             states = np.array(trial.states)
             states[:, i] = x
             self.trials[k] = replace(trial, states=states)
 
     def mismatched(self) -> Iterator[Finding]:
-        """Of signs and degrees by rows of several sensors; stops at other units and exchanges."""
+        """Correct signs and degrees by rows of several sensors.
+
+        Raises:
+            GroundedError: for other units and for exchanged columns.
+        """
         found = explained(self.model, self.trials, self.rows, self.shown)
         stop_at(self.model, self.trials, found)
         if not found:
@@ -188,7 +195,7 @@ class _Bench:
             yield from self.without(one)
 
     def without(self, one: Mismatch) -> Iterator[Finding]:
-        """With a sign or degrees put right."""
+        """Correct a sign or degrees, and yield the findings."""
         for k in one.trials:
             self.trials[k] = one.change.mended(self.trials[k])
         ids = [self.trials[k].id or f"number {k + 1}" for k in one.trials]
@@ -201,11 +208,11 @@ class _Bench:
                 log = f"scale = {1 / DEGREES:.8g}" * (not where)
                 yield put_right(name, text, "degrees", log, scale=DEGREES)
             else:
-                text = f"has the wrong sign{where}: only so do positions move as the others say"
+                text = f"has the wrong sign{where}: with the other one positions fit velocities"
                 yield put_right(name, text, "sign", "scale = -1" * (not where), scale=-1.0)
 
     def dead(self) -> Iterator[Finding]:
-        """With the samples of velocities that show nothing missing."""
+        """Remove the samples of dead velocity sensors."""
         for k, one in judge_dead(self.model, self.trials, self.shown):
             states = np.array(self.trials[k].states)
             states[:, one.relation.j] = np.nan
@@ -215,7 +222,7 @@ class _Bench:
             yield Finding(name, one.told(self.model, where), "stuck", corrected=True)
 
     def odd(self, ratios: Sequence[Ratios]) -> Iterator[Finding]:
-        """Of trials that are in other units than the rest, as a whole or in one signal."""
+        """Convert trials that are in other units than the rest, as a whole or in one signal."""
         shown = [i for i in self.shown if all(np.isfinite(x).any() for x in self.column(i))]
         for odd in list(odd_states(self.model, self.trials, ratios, shown)):
             yield from self.in_unit(odd)
@@ -227,11 +234,11 @@ class _Bench:
             yield from self.in_unit(odd)
 
     def in_unit(self, odd: Odd) -> Iterator[Finding]:
-        """With one trial in the unit of the others; no line for the table of all logs."""
+        """Convert one trial to the unit of the others; it concerns no key of [log]."""
         trial = self.trials[odd.trial]
         self.trials[odd.trial] = odd.mended(trial)
         where = f"in trial {trial.id or f'number {odd.trial + 1}'}"
-        text = f"is in degrees {where}, in radians in others"
+        text = f"is in degrees {where}, in radians in the others"
         if abs(odd.factor / DEGREES - 1) > UNIT or odd.inputs:
             size = f"{max(odd.factor, 1 / odd.factor):.4g} times too"
             text = f"is {size} {'large' if odd.factor > 1 else 'small'} {where}"
@@ -241,12 +248,12 @@ class _Bench:
             yield put_right(name, text, kind, "", scale=odd.factor)
 
     def named(self, odd: Odd) -> list[tuple[str, str]]:
-        """Names and units of its signals."""
+        """Return names and units of the signals."""
         states, inputs = list(self.model.states.items()), list(self.model.inputs.items())
         return [states[i] for i in odd.states] + [inputs[j] for j in odd.inputs]
 
     def singles(self) -> Iterator[Finding]:
-        """Of each sensor by itself."""
+        """Check each sensor on its own."""
         for i in self.shown:
             signal = signal_of(self.model, self.trials, i, self.shown)
             findings, after = judge_signal(signal)
@@ -255,7 +262,7 @@ class _Bench:
             yield from findings
 
     def pairs(self) -> Iterator[Finding]:
-        """Of each position with its velocity."""
+        """Check each position against its velocity."""
         for relation in integrals(self.model):
             if relation.i not in self.shown or relation.j not in self.shown:
                 continue
@@ -271,7 +278,7 @@ class _Bench:
             if relation.exact and over > 0:
                 yield self.smoothed(relation, over)
 
-        for relation, both in logged_behind(self.model, self.shown):  # how late is adopted
+        for relation, both in logged_behind(self.model, self.shown):  # their delay is adopted
             lag, q = lag_of(self.model, relation, self.trials), self.model.state_names[relation.i]
             clear = lag if lag is not None and lag.coherence > ALIKE else None
             if clear and both and clear.filtered and clear.delay > 0:
@@ -280,10 +287,10 @@ class _Bench:
                 yield self.smoothed(relation, clear.mean)
 
     def unit(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
-        """Sign and unit, which are put right; a scale, which may be either sensor's."""
+        """Correct sign and unit; report a scale, which may be that of either sensor."""
         q, w = (self.model.state_names[k] for k in (relation.i, relation.j))
         if lag.sign < 0 and self.turns_away(relation.i):
-            text = f"turns the other way than {w} says and than the course that is travelled"
+            text = f"turns in the opposite direction to {w} and to the course travelled"
             yield self.turned_round(relation.i, text)
         elif lag.sign < 0:
             yield self.turned_round(relation.j, f"has the opposite sign of the rate of {q}")
@@ -297,46 +304,46 @@ class _Bench:
             self.refuted |= {f"sensor_scale:{w}", f"sensor_scale:{q}", f"rate_gain:{q}"}
 
     def turns_away(self, i: int) -> bool:
-        """Whether the course that is travelled agrees with a heading of the other sign."""
+        """Check whether the course travelled agrees with the heading only if its sign reverses."""
         plane = travelled(self.model, self.trials, self.shown)
         return plane is not None and plane[0].k == i and plane[1].agrees < AGREE < plane[1].mirrored
 
     def turned_round(self, i: int, text: str) -> Finding:
-        """With the sign of state i changed."""
+        """Reverse the sign of state i."""
         self.put(i, [-x for x in self.column(i)])
         return put_right(self.model.state_names[i], text, "sign", "scale = -1", scale=-1.0)
 
     def from_degrees(self, i: int) -> Finding:
-        """With state i in radians."""
+        """Convert state i from degrees to radians."""
         self.put(i, [x / DEGREES for x in self.column(i)])
         name = self.model.state_names[i]
         return in_degrees(name, self.model.states[name])
 
     def late(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
-        """A delay that is not the model's own: no sensor is early, so it is the later one's."""
+        """Correct a delay beyond the model's own; the later sensor has it, since none is early."""
         d, least = float(abs(lag.delay)), max(LEAST_STEPS * self.dt, LEAST_S)
         own = own_lag(self.model, relation, self.trials) if relation.exact else 0.0
         beyond = max(min(own, 0.0) - lag.delay, lag.delay - max(own, 0.0))
         q, w = (self.model.state_names[k] for k in (relation.i, relation.j))
-        if beyond + SURE * lag.std < least:  # neither can be late alone by what counts
+        if beyond + SURE * lag.std < least:  # neither can have a relevant delay of its own
             self.in_step |= {q, w}
         if beyond < max(SURE * lag.std, least):
             return
         i, name, other = (relation.i, q, f"{w} says")
         if lag.delay > 0:
             i, name, other = (relation.j, w, f"the derivative of {q}")
-        if i == relation.i and not relation.exact:  # a disturbed heading looks late as well
+        if i == relation.i and not relation.exact:  # a disturbed heading also looks late
             yield Finding(name, f"{d:.3g} s later than {other}", "delay", d, lag.std)
         else:
             yield self.in_time(i, lag, other)
 
     def in_time(self, i: int, lag: Lag, other: str) -> Finding:
-        """With state i as it was; what is filtered stays: moved, it is too small where it's quick.
+        """Undo the delay of state i. A filtered state is only reported: a shift can't restore it.
 
         Args:
             i: the state.
-            lag: how late it is, of either sign.
-            other: what it is late behind, in words.
+            lag: its delay, of either sign.
+            other: what it lags behind, in words.
         """
         d, name = float(abs(lag.delay)), self.model.state_names[i]
         if lag.filtered:
@@ -347,10 +354,10 @@ class _Bench:
         return put_right(name, text, "delay", log, delay_s=d, std_s=lag.std)
 
     def smoothed(self, relation: Integral, over: float) -> Finding:
-        """Without a velocity that is a mean over a time [s]: a difference of its position.
+        """Drop a velocity that is a mean over a time [s], as a difference of its position is.
 
-        It says no more than the position does, and where something stops it is wrong as long;
-        moved back by half a step it is a mean over two, and an arm's delay was 1.7 ms off.
+        It adds nothing to the position, and around a stop it is wrong for that time. Shifted back
+        by half a step it becomes a mean over two, which made an arm's delay wrong by 1.7 ms.
         """
         q, w = (self.model.state_names[k] for k in (relation.i, relation.j))
         self.put(relation.j, [np.full_like(x, np.nan) for x in self.column(relation.j)])
@@ -358,16 +365,16 @@ class _Bench:
         return a_mean(w, q, over)
 
     def positions(self) -> Iterator[Finding]:
-        """Of both positions of a plane that are late together."""
+        """Correct both positions of a plane that share a delay."""
         late = late_positions(self.model, self.trials, self.rows)
         if late is not None:
             for i in late.states:
-                yield self.in_time(i, late.lag, "velocities and angles say")
+                yield self.in_time(i, late.lag, "the motion by velocities and angles")
 
     def constant(self, relation: Integral) -> Iterator[Finding]:
-        """A constant between the two: of the velocity's sensor, or a drift of the position.
+        """Report a constant bias: of the velocity's sensor, or a drift of the position.
 
-        Where there is none neither can be blamed: together they would cancel.
+        If there is none, both causes are ruled out, since only together could they cancel.
         """
         found = constant_of(self.model, relation, self.trials)
         q, w = (self.model.state_names[k] for k in (relation.i, relation.j))
@@ -378,19 +385,19 @@ class _Bench:
         elif found.found:
             unit, more = self.model.states[w], "more" if found.value > 0 else "less"
             text = f"shows {abs(found.value):.3g} {unit} {more} than the rate of {q} throughout"
-            yield Finding(w, f"{text}; a sensor, or {q} drifts", "offset")
+            yield Finding(w, f"{text}: a sensor bias, or {q} drifts", "offset")
 
     def plane(self) -> Iterator[Finding]:
-        """Of a heading and a speed with the way that was travelled."""
+        """Check a heading and a speed against the course travelled."""
         plane = travelled(self.model, self.trials, self.shown)
         if plane is None:
             return
         relation, found = plane
         of = (self.model, relation.k, self.trials)
         where = "+".join(self.model.state_names[i] for i in (relation.i, relation.j))
-        way = f"the course that {where} travel"
+        way = f"the course given by {where}"
         if found.agrees < AGREE < found.mirrored:
-            yield self.turned_round(relation.k, f"turns the other way than {way}")
+            yield self.turned_round(relation.k, f"turns in the opposite direction to {way}")
         elif found.agrees < AGREE < found.degrees and not rate_agrees(*of):
             yield self.from_degrees(relation.k)
         elif found.agrees > AGREE and abs(found.offset) > TURNED_AWAY:

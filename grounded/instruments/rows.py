@@ -1,9 +1,9 @@
-"""Rows of a model that no physics touches: how a state moves, from other sensors alone.
+"""Kinematic rows of a model: states whose rate follows from other sensors, whatever the physics.
 
-A kinematic row is a state whose modelled rate is made of logged velocities, turned by logged angles
-or not at all: x' = u cos psi - v sin psi, psi' = r. Neither an input nor an uncertain parameter
-enters it but as a constant (a current). What it says of stretches of a log is compared with how far
-its own sensor moved.
+The rate of such a state consists of logged velocities, possibly rotated by logged angles:
+x' = u cos psi - v sin psi, psi' = r. No input or uncertain parameter enters it, except as a
+constant (a current). The displacement that a row predicts over stretches of a log is compared with
+that of its own sensor.
 """
 
 from __future__ import annotations
@@ -19,33 +19,33 @@ from grounded.instruments.kinematics import SHORT, integrals, pieces
 from grounded.model import Model
 from grounded.trial import Trial
 
-STRETCH = 0.3  # [s], of the shortest stretches
+STRETCH = 0.3  # [s] shortest stretch
 LEAST = 8  # stretches that a trial must hold
-NOISE = 0.3  # of what moves over a stretch: with more it tells nothing
-SMALL = 1e-4  # of a rate, or of its largest slope: none
+NOISE = 0.3  # noise relative to the displacement over a stretch, above which a row is ignored
+SMALL = 1e-4  # of a rate, or of its largest derivative: treated as zero
 
 
 @dataclass(frozen=True)
 class Row:
-    """The rate of state i is made of the states `by` alone."""
+    """The rate of state i depends on the states `by` alone."""
 
     i: int
     by: tuple[int, ...]
 
     @property
     def states(self) -> frozenset[int]:
-        """All that it ties together."""
+        """All states that the row relates."""
         return frozenset((self.i, *self.by))
 
 
 @dataclass(frozen=True)
 class Gap:
-    """How a row and its own sensor differ.
+    """The difference between a row's prediction and its own sensor.
 
     Args:
-        share: rms of the difference, over how far the state moves or should, or those of its unit.
+        share: rms of the difference, relative to how far the state (or others of its unit) moves.
         varying: the same without a constant difference.
-        rate: that difference over the length of a stretch [unit/s].
+        rate: rms of the difference per time [unit/s].
     """
 
     share: float
@@ -54,11 +54,11 @@ class Gap:
 
 
 def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
-    """The rows of a model whose states all have sensors.
+    """Return the kinematic rows of a model whose states all have sensors.
 
     Args:
-        model: any; a simulator that can't make a short step has no such rows.
-        shown: states that a sensor has.
+        model: any; a simulator that can't take a short step has no such rows.
+        shown: indices of the states with a sensor.
     """
     dt = places.probe(model, SHORT)
     if dt > SHORT:
@@ -84,10 +84,10 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
 
 
 def unheld(model: Model, trials: Sequence[Trial]) -> tuple[str, ...]:
-    """The logged states that no other sensor can be held against: of them nothing is known.
+    """Return the logged states that can't be checked against any other sensor.
 
     Args:
-        model: whose kinematics tie sensors together.
+        model: whose kinematics relate sensors.
         trials: of this model's states.
     """
     shown = [i for i in range(model.n) if any(np.isfinite(t.states[:, i]).any() for t in trials)]
@@ -97,21 +97,21 @@ def unheld(model: Model, trials: Sequence[Trial]) -> tuple[str, ...]:
 
 
 def tied(rows: Sequence[Row]) -> list[Row]:
-    """Rows of three states and more, and those of two that share one with them.
+    """Return the rows of three or more states, and those of two that share a state with them.
 
-    What is off of a position and its velocity, and nothing else, two rows of one state can't tell.
+    A position and its velocity alone don't show which of the two is wrong.
     """
     several = frozenset[int]().union(*(row.states for row in rows if len(row.by) > 1))
     return [row for row in rows if row.states & several]
 
 
 def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:
-    """Of each row, over the stretches over which it agrees best; nothing where noise hides it.
+    """Return the gap of each row, over the stretch length at which it agrees best.
 
     Args:
-        model: whose rows they are.
+        model: with these rows.
         trial: with this model's states.
-        rows: of the model.
+        rows: of the model; those hidden by noise are missing from the result.
     """
     known = [row for row in rows if _known(trial, row)]
     each = per_step(model, trial, known)
@@ -134,7 +134,10 @@ def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:
 def _over(
     model: Model, rows: Sequence[Row], far: Array, told: Array, noise: Array, length: float
 ) -> list[tuple[Row, Gap]]:
-    """Of each row, over stretches of one length [s]; beside others it may hardly move."""
+    """Return the gap of each row over stretches of one length [s].
+
+    It is relative to the motion of all states of the same unit: a row's own may hardly move.
+    """
     units = list(model.states.values())
     moved, said, off = _size(far), _size(told), _size(far - told)
     varying = np.std(far - told, axis=0)
@@ -151,12 +154,15 @@ def _over(
 
 
 def per_step(model: Model, trial: Trial, rows: Sequence[Row]) -> list[tuple[Array, Array]]:
-    """How far rows' states move in each step (T - 1, n), and as the others say, by pieces.
+    """Return for each piece the displacements per step: measured, and predicted by the rows.
 
     Args:
-        model: whose rows they are.
-        trial: with this model's states; a piece has no gaps in what the rows tie together.
-        rows: columns of other states say nothing.
+        model: with these rows.
+        trial: with this model's states; a piece has no gaps in the states that the rows relate.
+        rows: of the model.
+
+    Returns:
+        Two arrays (T - 1, n) per piece; only the columns of the rows' states are meaningful.
     """
     some, found = sorted(frozenset[int]().union(*(row.states for row in rows))), []
     for piece in pieces([trial], some) if rows else ():
@@ -168,10 +174,10 @@ def per_step(model: Model, trial: Trial, rows: Sequence[Row]) -> list[tuple[Arra
 
 
 def _told(model: Model, rows: Sequence[Row], x: Array) -> Array:
-    """What rows say of the rates over each step (T - 1, n); 0 where there is none."""
+    """Return the rates over each step by the rows (T - 1, n); 0 for other states."""
     found = np.zeros((len(x) - 1, model.n))
     for row in rows:
-        alone = np.full_like(x, 0.5)  # nothing else, however large, adds to it within the step
+        alone = np.full_like(x, 0.5)  # other states must not act, however large
         alone[:, row.by] = x[:, row.by]
         rate = _rates(model, alone)[:, row.i]
         found[:, row.i] = 0.5 * (rate[1:] + rate[:-1])
@@ -179,13 +185,13 @@ def _told(model: Model, rows: Sequence[Row], x: Array) -> Array:
 
 
 def _rates(model: Model, x: Array) -> Array:
-    """The modelled rates (T, n) at states (T, n), under some input."""
+    """Return the modelled rates (T, n) at states (T, n), for a fixed input."""
     u = np.full((len(x), model.m), 0.5)
     return np.asarray((model.system.step(x, u, model.values, SHORT) - x) / SHORT)
 
 
 def _shifted(model: Model) -> list[Array]:
-    """The values of the parameters, with each uncertain one moved."""
+    """Return the parameter values with one uncertain parameter changed, for each of these."""
     found = []
     for k, one in enumerate(model.params.values()):
         if one.low is not None or one.high is not None or one.std is not None:

@@ -1,9 +1,9 @@
-"""What a model makes of one trial a quarter of a second ahead, from many of its samples at once.
+"""Calibrated predictions of one trial a quarter of a second ahead, from many samples at once.
 
-Its uncertain parameters and a gain on every input may move, all commands may be late, and a
-constant rate of each state is left out: what remains no plain calibration takes away. On request
-all that is linear in the states is left out as well (friction, back-EMF, springs that the model
-lacks), and what is linear in the commands.
+Uncertain parameters, a gain on every input and a common delay of the commands are fitted, and a
+constant rate of each state is removed. The remaining error is what no plain calibration explains.
+On request everything linear in the states (unmodelled friction, back-EMF, springs) or in the
+commands is removed as well.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from grounded.model import Model
 from grounded.rollout import each_stepped
 from grounded.trial import Trial
 
-DELAYS = (0.0, 0.05, 0.1, 0.2)  # [s], of all commands
-LEAST = 20  # samples that tell enough
-LITTLE, TINY = 1e-3, 1e-12  # of a state's spread, and in its unit: no smaller error counts
-ROUNDS, DAMPING, SLOPE = 5, (1.0, 0.3, 0.1), 0.02
-SAME = 1e-6  # of the largest: columns that say the same
-ENOUGH = 0.01  # [nats]: a round that gains less is the last
+DELAYS = (0.0, 0.05, 0.1, 0.2)  # [s] command delays tried
+LEAST = 20  # fewest samples
+LITTLE, TINY = 1e-3, 1e-12  # smallest error that counts: of a state's spread, and in its unit
+ROUNDS, DAMPING, SLOPE = 5, (1.0, 0.3, 0.1), 0.02  # iterations, step sizes, difference step
+SAME = 1e-6  # singular values below this share of the largest count as zero
+ENOUGH = 0.01  # [nats] smallest gain of an iteration: below it the fit stops
 
 Steps = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A calibrated model on one trial.
+    """The result of calibrating a model on one trial.
 
     Args:
-        rms: of each state's error (n,), in its unit; 1 of those without a sensor.
-        gains: of each input (m,).
+        rms: rms error of each state (n,), in its unit; 1 for states without a sensor.
+        gains: gain of each input (m,).
     """
 
     rms: Array
@@ -44,7 +44,7 @@ class Fit:
 
     @property
     def score(self) -> float:
-        """The logarithms of the errors, added up [nats]: what exchanged columns don't change."""
+        """Sum of the logarithms of the errors [nats]; it is invariant to exchanged columns."""
         return float(np.log(self.rms).sum())
 
 
@@ -54,10 +54,10 @@ class Ahead:
     Args:
         model: however crude.
         trial: of its states and inputs.
-        shown: states that a sensor has.
-        starts: samples to predict from, at most.
-        delays: that all commands may have [s].
-        linear: leave out what is linear in the states predicted from, too.
+        shown: indices of the states with a sensor.
+        starts: largest number of samples to predict from.
+        delays: command delays tried [s].
+        linear: also remove errors that are linear in the initial states.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class Ahead:
         self.steps = max(1, round(AHEAD / trial.dt))
         self.delays = tuple(dict.fromkeys(round(d / trial.dt) for d in delays))
         logged = np.array(trial.states)
-        logged[:, [i for i in range(model.n) if i not in self.shown]] = 0.0  # nobody knows
+        logged[:, [i for i in range(model.n) if i not in self.shown]] = 0.0  # unknown
         good = np.asarray(np.isfinite(logged).all(axis=1))
         at = np.flatnonzero(good[: -self.steps] & good[self.steps :])
         at = at[(at >= max(self.delays)) & (at + self.steps <= len(self.sent))]
@@ -96,11 +96,11 @@ class Ahead:
 
     @property
     def enough(self) -> bool:
-        """Whether there are samples to tell anything by."""
+        """Whether there are enough samples."""
         return len(self.at) >= LEAST and bool(self.shown)
 
     def whatever_commands_do(self) -> Ahead:
-        """The same, and what is linear in the commands before and while they act is left out."""
+        """Return a copy that also removes errors linear in the past and present commands."""
         h, half = self.steps, max(1, self.steps // 2)
         sums = np.concatenate([np.zeros((1, self.model.m)), np.cumsum(self.sent, axis=0)])
         spans = [(-h, 0), (0, half)] + ([(half, h)] if half < h else [])
@@ -111,21 +111,26 @@ class Ahead:
         return other
 
     def plain(self, gains: Array) -> Fit:
-        """As the model is, with some gains (m,) of its inputs."""
+        """Return the fit of the uncalibrated model with given gains (m,) of its inputs."""
         return self._fit(self._size(self._off(gains, self.model.values, 0)[0]), gains)
 
     def still(self) -> Fit:
-        """Calibrated, with every command at its mean throughout: what commands do is missing."""
+        """Return the calibrated fit with every command at its mean: the commands have no effect."""
         mean = np.broadcast_to(self.sent.mean(axis=0), self.sent.shape)
         return self._with(mean)._fitted(np.ones(self.model.m), 0, free=False)
 
     def best(self, starts: Sequence[Array], *, free: bool = True) -> Fit:
-        """The best of the fits from several gains, each with the delay that is best for those."""
+        """Return the best fit over several initial gains, each with its best delay.
+
+        Args:
+            starts: initial gains (m,) each.
+            free: fit the gains as well as the parameters.
+        """
         fits = [self._fitted(gains, self._late(gains), free=free) for gains in starts]
         return min(fits, key=lambda fit: fit.score)
 
     def _late(self, gains: Array) -> int:
-        """Steps by which the commands, of these gains, seem to be late."""
+        """Return the command delay [steps] that fits best with these gains."""
         off = self._off(gains, self.model.values, np.array(self.delays))
         left = [float(np.log(self._size(one)).sum()) for one in off]
         return self.delays[int(np.argmin(left))]
@@ -136,13 +141,13 @@ class Ahead:
         return other
 
     def _fitted(self, gains: Array, late: int, *, free: bool) -> Fit:
-        """Gauss-Newton over gains (where free) and parameters, each state by its own error."""
+        """Fit gains (if free) and parameters by Gauss-Newton, each state weighted by its error."""
         m = self.model.m if free else 0
         prior = np.concatenate([np.zeros(m), np.ones(len(self.moving))])
         theta = np.zeros(len(prior))
 
         def off(theta: Array) -> Array:
-            """Errors (K, N, shown) of several, (K, q)."""
+            """Return the errors (K, N, shown) for several parameter vectors (K, q)."""
             moved, values = (np.tile(one, (len(theta), 1)) for one in (gains, self.model.values))
             moved[:, :m] += theta[:, :m]
             shifted = values[:, self.moving] + theta[:, m:] * self.spread
@@ -155,7 +160,7 @@ class Ahead:
             each = (off(theta + SLOPE * np.eye(len(theta))) - r) / size / SLOPE
             J, white = each.reshape(len(theta), -1).T, (r / size).ravel()
             if not (np.isfinite(J).all() and np.isfinite(white).all()):
-                break  # it runs away
+                break  # the prediction diverges
             H = J.T @ J + np.diag(prior + 1e-9 * len(white))
             step = -np.linalg.lstsq(H, J.T @ white + prior * theta, rcond=None)[0]
             for part in DAMPING:
@@ -170,9 +175,9 @@ class Ahead:
         return self._fit(size, found)
 
     def _off(self, gains: Array, values: Array, late: int | Steps) -> Array:
-        """Errors (K, N, shown) without what is left out: their means at least.
+        """Return the errors (K, N, shown) minus the removed parts, at least their means.
 
-        Of K gains (K, m), parameters (K, k), delays (K,): one of any goes with all of the others.
+        For K gains (K, m), parameters (K, k) and delays (K,); a single one is broadcast.
         """
         gains, values, late = np.atleast_2d(gains), np.atleast_2d(values), np.atleast_1d(late)
         K, N = max(len(gains), len(values), len(late)), len(self.at)
@@ -197,7 +202,7 @@ class Ahead:
 
 
 def _basis(told: Array) -> Array:
-    """An orthonormal basis (N, k) of a constant and the columns told (N, m)."""
+    """Return an orthonormal basis (N, k) of a constant and the columns `told` (N, m)."""
     told = told - told.mean(axis=0) if len(told) else told
     spread = told.std(axis=0) if len(told) else np.zeros(told.shape[1])
     own = spread > TINY

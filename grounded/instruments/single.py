@@ -1,4 +1,4 @@
-"""What one signal says of its own instrument: samples that repeat, drop out, jump or clip."""
+"""Checks of one signal on its own: samples that repeat, drop out, jump or clip."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from grounded.instruments.kinematics import integrals
 from grounded.model import Model
 from grounded.trial import Trial
 
-STUCK = 8  # samples that repeat, before a jump
-JUMP = 3.0  # times the change that follows, after them
-HELD = 0.8  # of all runs of equal samples are longer than one: the sensor is slower than the log
-COARSE = 0.7  # of the rms change from sample to sample
-CLIPPED = 0.02  # of all samples
+STUCK = 8  # equal samples before a jump
+JUMP = 3.0  # the jump, relative to the change that follows
+HELD = 0.8  # share of runs longer than one sample, above which the sensor is slower than the log
+COARSE = 0.7  # of the rms change from sample to sample: a larger quantum is reported
+CLIPPED = 0.02  # share of samples above which clipping is reported
 FULL_TURNS = (2 * np.pi, 360.0)
 
 
@@ -29,10 +29,10 @@ class Signal:
     Args:
         name: of the state.
         unit: of the state.
-        angle: its differences wrap.
+        angle: whether its differences wrap.
         columns: its samples in each trial (T + 1,), NaN where missing.
-        dt: [s].
-        rests: of a velocity: where its position stands still as it says, in each trial (T + 1,).
+        dt: time step [s].
+        rests: for a velocity, where it and its position are at rest, in each trial (T + 1,).
     """
 
     name: str
@@ -43,12 +43,12 @@ class Signal:
     rests: Sequence[Any] = ()
 
     def without(self, gone: Sequence[Any]) -> Signal:
-        """With some samples missing."""
+        """Return the signal with some samples missing."""
         pairs = zip(self.columns, gone, strict=True)
         return replace(self, columns=[np.where(g, np.nan, x) for x, g in pairs])
 
     def moving(self) -> list[Any]:
-        """Where it is not known to be at rest, in each trial (T + 1,)."""
+        """Return where it is not known to be at rest, in each trial (T + 1,)."""
         if len(self.rests):
             return [~np.asarray(rest) for rest in self.rests]
         return [np.ones(len(x), bool) for x in self.columns]
@@ -58,7 +58,7 @@ Found = tuple[Finding, Signal]
 
 
 def signal_of(model: Model, trials: Sequence[Trial], i: int, shown: Sequence[int]) -> Signal:
-    """State i of trials, of whose states `shown` have sensors."""
+    """Return state i of some trials; the states `shown` have sensors."""
     name, dt, rests = model.state_names[i], trials[0].dt, list[Any]()
     columns = [trial.states[:, i] for trial in trials]
     for one in integrals(model):
@@ -68,7 +68,7 @@ def signal_of(model: Model, trials: Sequence[Trial], i: int, shown: Sequence[int
 
 
 def judge_signal(signal: Signal) -> tuple[list[Finding], Signal]:
-    """What is found of a signal, and the signal without what could be corrected."""
+    """Return the findings of a signal, and the corrected signal."""
     findings = [one for note in (_missing, _quantised, _clipped) if (one := note(signal))]
     for look in (_wrapped, _dropouts, _held, _stuck):
         found = look(signal)
@@ -79,16 +79,17 @@ def judge_signal(signal: Signal) -> tuple[list[Finding], Signal]:
 
 
 def runs(x: Array) -> tuple[Any, Any]:
-    """Starts and lengths of runs of equal samples in x (T,); NaN equals nothing."""
+    """Return starts and lengths of the runs of equal samples in x (T,); NaN equals nothing."""
     edges = np.flatnonzero(np.concatenate([[True], np.diff(x) != 0, [True]]))
     return edges[:-1], np.diff(edges)
 
 
 def at_rest(position: Sequence[Array], velocity: Sequence[Array], dt: float) -> list[Any]:
-    """Where a position (T,) of each trial stays to the last digit, as its velocity (T,) says.
+    """Return where the position (T,) of each trial is exactly constant and its velocity agrees.
 
-    An encoder stands on one count while a joint sticks, and a filtered difference of it decays to
-    0 and stays: right data. What says in that time more than half a usual change does not rest.
+    Such data is valid: an encoder stays on one count while a joint sticks, and a filtered
+    difference of it decays to 0. It is not at rest if the velocity implies more than half of a
+    typical change of the position in that time.
     """
     usual, found = _changes(position), []
     count = float(np.median(usual)) if usual.size else 0.0
@@ -103,13 +104,13 @@ def at_rest(position: Sequence[Array], velocity: Sequence[Array], dt: float) -> 
 
 
 def _changes(columns: Sequence[Array]) -> Any:
-    """All sizes of changes from sample to sample that are not zero."""
+    """Return the sizes of all nonzero changes from sample to sample."""
     d = np.concatenate([np.abs(np.diff(x)) for x in columns])
     return d[np.isfinite(d) & (d > 0)]
 
 
 def _wrapped(s: Signal) -> Found | None:
-    """Jumps by a full turn, of radians or of degrees, in something that is in radians."""
+    """Find jumps by a full turn, in radians or degrees, in an angle that should be in radians."""
     if s.unit != "rad":
         return None
     for turn in FULL_TURNS:
@@ -137,7 +138,7 @@ def _share(gone: Sequence[Any]) -> float:
 
 
 def _dropouts(s: Signal) -> Found | None:
-    """One and the same value that the signal jumps to and back from at once."""
+    """Find a fixed value that the signal jumps to for single samples."""
     usual = _changes(s.columns)
     if usual.size < 20:
         return None
@@ -160,7 +161,7 @@ def _dropouts(s: Signal) -> Found | None:
 
 
 def _held(s: Signal) -> Found | None:
-    """Every value several times: the sensor, or its topic, is slower than the log."""
+    """Find a signal that repeats every value: the sensor or its topic is slower than the log."""
     lengths, sizes = [], _changes(s.columns)
     for x in s.columns:
         start, length = runs(x)
@@ -168,7 +169,7 @@ def _held(s: Signal) -> Found | None:
         lengths += list(length[np.isfinite(moves)])
     if len(lengths) < 20 or sizes.size == 0:
         return None
-    coarse = float(np.quantile(sizes, 0.5)) < 2.5 * float(sizes.min())  # steps of a coarse one
+    coarse = float(np.quantile(sizes, 0.5)) < 2.5 * float(sizes.min())  # coarse quantisation
     if coarse or np.mean(np.array(lengths) >= 2) < HELD:
         return None
     each = float(np.median(lengths))
@@ -177,14 +178,14 @@ def _held(s: Signal) -> Found | None:
         old = np.ones(len(x), bool)
         old[runs(x)[0]] = False
         gone.append(old & np.isfinite(x))
-    text = f"has a new value every {each * s.dt:.3g} s only, each is logged {each:g} times"
-    advice = "in a table, leave its cell empty in the rows that repeat it"
+    text = f"has a new value only every {each * s.dt:.3g} s, and each is logged {each:g} times"
+    advice = "in a table, leave its cell empty in rows that repeat a value"
     found = Finding(s.name, text, "held", share=_share(gone), corrected=True, advice=advice)
     return found, s.without(gone)
 
 
 def _stuck(s: Signal) -> Found | None:
-    """A value that stays to the last digit, and then jumps to where the signal is."""
+    """Find a value that stays exactly constant and then jumps to the true one."""
     usual = _changes(s.columns)
     if usual.size < 20:
         return None
@@ -203,12 +204,12 @@ def _stuck(s: Signal) -> Found | None:
         gone.append(flat)
     if not longest:
         return None
-    text = f"sticks to its last value, up to {longest * s.dt:.3g} s at a time, and jumps then"
+    text = f"sticks to its last value, up to {longest * s.dt:.3g} s at a time, and then jumps"
     return Finding(s.name, text, "stuck", share=_share(gone), corrected=True), s.without(gone)
 
 
 def _missing(s: Signal) -> Finding | None:
-    """Samples that are not there, though later ones are."""
+    """Find missing samples before the last one that is there."""
     last = [np.flatnonzero(np.isfinite(x))[-1:] for x in s.columns]
     gone = [~np.isfinite(x[: k[0] + 1]) for x, k in zip(s.columns, last, strict=True) if len(k)]
     if not gone:
@@ -225,7 +226,7 @@ def _missing(s: Signal) -> Finding | None:
 
 
 def quantum(columns: Sequence[Array]) -> float:
-    """The step of which all values are whole multiples; 0.0 where there is none."""
+    """Return the quantum of which all values are integer multiples; 0.0 if there is none."""
     values = np.unique(np.concatenate([x[np.isfinite(x)] for x in columns]))
     gaps = np.diff(values)
     gaps = gaps[gaps > 1e-9 * max(float(np.abs(values).max(initial=0.0)), 1e-300)]
@@ -238,7 +239,7 @@ def quantum(columns: Sequence[Array]) -> float:
 
 
 def _quantised(s: Signal) -> Finding | None:
-    """Steps that are as large as what the signal does between samples."""
+    """Find a quantisation as coarse as the changes between samples."""
     step = quantum(s.columns)
     d = np.concatenate([np.diff(x) for x in s.columns])
     rms = float(np.sqrt(np.nanmean(d**2))) if np.isfinite(d).any() else 0.0
@@ -249,7 +250,7 @@ def _quantised(s: Signal) -> Finding | None:
 
 
 def _clipped(s: Signal) -> Finding | None:
-    """The very same extreme for several samples, reached at speed, at several times."""
+    """Find an extreme value that is reached at speed and held for several samples, repeatedly."""
     values = np.concatenate([x[np.isfinite(x)] for x in s.columns])
     usual = _changes(s.columns)
     if values.size < 50 or usual.size < 20 or quantum(s.columns):
@@ -262,6 +263,6 @@ def _clipped(s: Signal) -> Finding | None:
             stays, samples = stays + int(at.sum()), samples + int(length[at].sum())
         share = samples / values.size
         if stays >= 3 and share > CLIPPED:
-            text = f"shows nothing {side} {limit:.4g} {s.unit} ({100 * share:.0f} % of the time)"
+            text = f"is clipped {side} {limit:.4g} {s.unit} ({100 * share:.0f} % of the time)"
             return Finding(s.name, text, "saturated", share=share)
     return None

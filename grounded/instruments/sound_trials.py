@@ -1,4 +1,4 @@
-"""Trials that physics may be judged on: one answer for `diagnose`, `fit` and `--instruments`."""
+"""All instrument checks in one call, as used by `diagnose`, `fit` and `--instruments`."""
 
 from __future__ import annotations
 
@@ -15,16 +15,19 @@ from grounded.trial import Trial
 def sound_trials(
     subject: Task | Model, trials: Sequence[Trial], hidden: Sequence[str] = ()
 ) -> Preflight:
-    """The instruments' findings, and the trials without what could be corrected.
+    """Run all instrument checks, and correct the trials where that is certain.
 
     Args:
-        subject: the model, whose kinematics tie sensors together; of a task also the limits.
-        trials: real ones, of one time grid; left as they are where they don't fit the model.
-        hidden: states that no sensor has.
+        subject: the model, whose kinematics relate the sensors; a task adds the input limits.
+        trials: real ones, of one time grid; unchanged if they don't fit the model.
+        hidden: states without a sensor.
+
+    Returns:
+        The findings and the corrected trials.
 
     Raises:
-        GroundedError: for logs that can't be used as they are, with what mends them: states that
-            answer commands before they are sent, exchanged columns, other units.
+        GroundedError: for logs that can't be used, with the correction: states that respond before
+            their commands are sent, exchanged columns, other units.
     """
     looked = preflight(subject, trials, hidden)
     model = subject.model if isinstance(subject, Task) else subject

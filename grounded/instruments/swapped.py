@@ -1,9 +1,8 @@
-"""Two columns of a log in each other's place: found by a position and its velocity.
+"""Detect two exchanged columns of a log by comparing positions with their velocities.
 
-As they are logged the one does not move as the other says; with two columns exchanged it does, by
-the right amount and in the right direction. No unmodelled effect does that. Joints of one manoeuvre
-move alike, so that each goes roughly as the other's velocity says: there an exchange is believed
-if it mends both.
+With the log as it is, a position does not move as its velocity implies; with two columns exchanged
+it does, in size and direction. No unmodelled effect causes that. Joints may move so much alike that
+each roughly follows the other's velocity; then an exchange must improve both.
 """
 
 from __future__ import annotations
@@ -20,9 +19,9 @@ from grounded.instruments.kinematics import Integral, integrals, over_steps, pie
 from grounded.model import Model
 from grounded.trial import Trial
 
-BROKEN, WHOLE = 0.8, 0.97  # cosine of what a position moves and its velocity says
-SIZED = 1.25  # times by which the two may differ in size, where they are whole
-CLEARLY, ROUNDING = 4.0, 1e-9  # times what the best exchange leaves of 1 - cosine: as good
+BROKEN, WHOLE = 0.8, 0.97  # cosine of displacements by position and velocity: bad, and good
+SIZED = 1.25  # factor within which the two sizes agree
+CLEARLY, ROUNDING = 4.0, 1e-9  # factor of the best 1 - cosine within which others are as good
 LEAST = 8  # windows that a trial must hold
 
 
@@ -32,13 +31,13 @@ def swapped_columns(
     shown: Sequence[int] | None = None,
     relations: Sequence[Integral] | None = None,
 ) -> str:
-    """The signals of a trial that stand in each other's column, `x and v`; "" where none do.
+    """Return the names of two exchanged signals of a trial, such as `x and v`; "" if none are.
 
     Args:
-        model: however crude: only which state is another's rate is read off it.
+        model: however crude; used only for which state is the rate of which.
         trial: with this model's states and inputs.
-        shown: states that a sensor has; None: all that are known in the trial.
-        relations: of the model, where they are known.
+        shown: indices of the states with a sensor; None: all that are known in the trial.
+        relations: `integrals(model)`, if already computed.
     """
     relations = integrals(model) if relations is None else relations
     known = range(model.n) if shown is None else shown
@@ -62,7 +61,7 @@ def swapped_columns(
 
 
 def judge_columns(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> None:
-    """Stops at trials with two columns in each other's place.
+    """Raise an error for trials with two exchanged columns.
 
     Raises:
         GroundedError: naming the trials and the columns.
@@ -77,21 +76,26 @@ def judge_columns(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -
     one = len(same) == 1
     raise GroundedError(
         f"trial{'s' * (not one)} {', '.join(same)}: {exchanged(pair)}. Correct the log, or the "
-        f"paths in [log], and take it in again, without {'this one' if one else 'these'}",
+        f"paths in [log]; then discard {'this trial' if one else 'these trials'} and ingest the "
+        "log again",
         then=NextCommand("discard", tuple(same)) if trials[0].id else None,
     )
 
 
 def exchanged(pair: str) -> str:
-    """What is said of two such columns."""
+    """Return a clause on two exchanged columns.
+
+    Args:
+        pair: their names, such as `x and v`.
+    """
     return (
-        f"the columns of {pair} look exchanged: only the other way round do positions move as "
-        "their velocities say"
+        f"the columns of {pair} look exchanged: only with them swapped do positions move as their "
+        "velocities imply"
     )
 
 
 def _together(trial: Trial, relation: Integral) -> tuple[float, float]:
-    """Cosine and ratio of what moved and what was said, over the window that agrees best."""
+    """Return cosine and size ratio of displacements by position and velocity, at best window."""
     some = [
         (x[1:-2, 0], np.cumsum([0.0, *over_steps(relation.c * x[:, 1])])[:-1] * trial.dt)
         for x in pieces([trial], (relation.i, relation.j))
@@ -110,12 +114,12 @@ def _together(trial: Trial, relation: Integral) -> tuple[float, float]:
 
 
 def _mirrored_too(trial: Trial, relation: Integral) -> float:
-    """1 - cosine of a relation as it is, or of the other sign: what is mirrored is no exchange."""
+    """Return 1 - cosine of a relation, with either sign: a wrong sign is not an exchange."""
     return min(_left(trial, [replace(relation, c=sign * relation.c)]) for sign in (1, -1))
 
 
 def _left(trial: Trial, relations: Sequence[Integral]) -> float:
-    """1 - cosine of the worst relation; 1 where sizes differ."""
+    """Return 1 - cosine of the worst relation; 1 if sizes differ."""
     found = [_together(trial, relation) for relation in relations]
     sized = all(1 / SIZED < ratio < SIZED for _, ratio in found)
     return 1 - min(cosine for cosine, _ in found) if sized else 1.0

@@ -1,10 +1,10 @@
-"""The way that was travelled against what speeds and a heading say of it, by one complex factor.
+"""Compare the distance travelled with speeds and heading, by one complex factor.
 
-Over stretches of a log what moved is m = x + iy, what the rows of x and y say is w, and
-m = k w + c T with a constant drift c (a current): |k| is a unit, arg k a heading that is off. The
-same is done with the heading turned the other way (a compass), with none (the speeds are in the
-axes of x and y already) and with the way mirrored (x and y exchanged, or one of the other sign).
-Only one of these leaves little of m, however large the factor is.
+Over stretches of a log the displacement is m = x + iy, the rows of x and y predict w, and
+m = k w + c T with a constant drift c (a current): |k| shows a unit, arg k a heading offset. The
+same is fitted with the heading reversed (a compass), without heading (speeds that are already in
+the axes of x and y) and with the displacement mirrored (x and y exchanged, or one with the opposite
+sign). Only one of these leaves a small remainder of m, however large the factor is.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from grounded.model import Model
 from grounded.result import listed
 from grounded.trial import Trial
 
-FITS = 0.25  # of what moved: less is left of it by what is right
-BETTER = 3.0  # times less than by anything else
-CLOSE = 2.0  # times: another explains it nearly as well
-BLOCKS = 16  # their scatter is the uncertainty
-UNITS = {"knots": 1.943844, "mph": 2.236936, "ft/s": 3.28084, "km/h": 3.6}  # in a m/s
-FEET = UNITS["ft/s"]  # in a m
-OF_ONE_UNIT, SURELY = 0.015, 3.0  # relative, of a factor; standard deviations within that
-SOUND = 0.1  # of a factor: no unit's
-SAME_SIZE = 1.5  # times, of a heading's rate and the logged one: both in radians
-SNAPPED = np.deg2rad(3)  # an offset is that of a compass: a multiple of a right angle
+FITS = 0.25  # share of the displacement below which the remainder counts as explained
+BETTER = 3.0  # factor by which the others must be worse
+CLOSE = 2.0  # factor within which another explanation is nearly as good
+BLOCKS = 16  # their scatter gives the uncertainty
+UNITS = {"knots": 1.943844, "mph": 2.236936, "ft/s": 3.28084, "km/h": 3.6}  # per m/s
+FEET = UNITS["ft/s"]  # per m
+OF_ONE_UNIT, SURELY = 0.015, 3.0  # tolerance of a unit's factor; standard deviations within it
+SOUND = 0.1  # deviation of the factor from 1 below which the unit is right
+SAME_SIZE = 1.5  # factor within which a heading's rate and the logged one have the same unit
+SNAPPED = np.deg2rad(3)  # offsets this near to a multiple of a right angle are rounded to it
 TOLD = 0.9  # coherence of a heading with its rate
-SAME, OTHER = ((), "same"), ((), "other")  # units: none of UNITS makes the latter
+SAME, OTHER = ((), "same"), ((), "other")  # the model's unit, and one that is not in UNITS
 
 
 @dataclass(frozen=True)
 class Way:
-    """What of the way is left, and the factor of what is said of it.
+    """How well a displacement is explained, and by which factor.
 
     Args:
-        left: rms that is unexplained, over the rms of what moved.
-        size: what moved over what was said.
-        angle: by which the way is turned against what was said [rad].
+        left: unexplained rms over the rms of the displacement.
+        size: measured displacement over the predicted one.
+        angle: rotation of the measured displacement against the predicted one [rad].
         std: relative standard deviation of the size.
     """
 
@@ -56,15 +56,15 @@ class Way:
 
 @dataclass(frozen=True)
 class Plane:
-    """Rows of two positions that turn with a heading, all of known sensors.
+    """The rows of two positions that rotate with a heading, all with sensors.
 
     Args:
-        model: whose rows they are.
+        model: with these rows.
         relation: the positions and the heading.
         rows: of both positions.
-        speeds: in m/s, of which they are made.
-        angles: with which they turn, the heading among them.
-        rate: the sensor of the heading's rate, None where there is none.
+        speeds: states in m/s that the rows depend on.
+        angles: states in rad that they depend on, the heading among them.
+        rate: state of the heading's rate; None without a sensor for it.
     """
 
     model: Model
@@ -75,34 +75,37 @@ class Plane:
     rate: int | None
 
     def names(self, states: Sequence[int]) -> str:
-        """Of some states, in words."""
+        """Return the names of some states as text."""
         return listed(self.model.state_names[i] for i in states)
 
     @property
     def xy(self) -> tuple[int, int]:
-        """Both positions."""
+        """Indices of both positions."""
         return (self.relation.i, self.relation.j)
 
     def way(self, trial: Trial, factors: Array | None = None, *, mirrored: bool = False) -> Way:
-        """How well a trial's way is explained with its states times factors (n,)."""
+        """Fit a trial's displacements with its states multiplied by factors (n,)."""
         some = trial if factors is None else replace(trial, states=trial.states * factors)
         return _fitted(per_step(self.model, some, self.rows), self.xy, trial.dt, mirrored)
 
     def times(self, states: Sequence[int], factor: float) -> Array:
-        """Factors of all states (n,)."""
+        """Return factors of all states (n,): `factor` for some, 1 for the rest."""
         return np.where(np.isin(np.arange(self.model.n), states), factor, 1.0)
 
 
 def judge_way(model: Model, trials: list[Trial], rows: Sequence[Row]) -> Iterator[Finding]:
-    """Puts a compass's heading right, in the list; stops at other axes and units of speeds.
+    """Correct compass headings in place; raise an error for other axes or units of speeds.
 
     Args:
         model: however crude.
-        trials: any; those that are put right are replaced.
-        rows: kinematic ones, see `rows.kinematic_rows`.
+        trials: of this model's states; corrected ones are replaced in the list.
+        rows: kinematic rows, see `rows.kinematic_rows`.
+
+    Yields:
+        A finding for each corrected signal.
 
     Raises:
-        GroundedError: with what to turn, or the scales for [log].
+        GroundedError: with the rotation to undo, or the scales for [log].
     """
     plane = plane_of(model, rows)
     if plane is not None:
@@ -112,11 +115,11 @@ def judge_way(model: Model, trials: list[Trial], rows: Sequence[Row]) -> Iterato
 
 
 def plane_of(model: Model, rows: Sequence[Row]) -> Plane | None:
-    """The plane in which a model moves; None where it has none, or no sensors for its rows.
+    """Return the plane in which a model moves; None if it has none, or no sensors for its rows.
 
     Args:
         model: any.
-        rows: kinematic ones, see `rows.kinematic_rows`.
+        rows: kinematic rows, see `rows.kinematic_rows`.
     """
     relation = turned(model) if rows else None
     if relation is None:
@@ -135,7 +138,7 @@ def plane_of(model: Model, rows: Sequence[Row]) -> Plane | None:
 def _fitted(
     steps: Sequence[tuple[Array, Array]], xy: tuple[int, int], dt: float, mirrored: bool
 ) -> Way:
-    """The factor of what is said, over the stretches that it explains best."""
+    """Fit the complex factor, over the stretch length with the smallest remainder."""
     sums = [
         (np.cumsum(x[:, xy[0]] + 1j * x[:, xy[1]]), np.cumsum(w[:, xy[0]] + 1j * w[:, xy[1]]))
         for x, w in steps
@@ -162,18 +165,18 @@ def _fitted(
 
 
 def _concerned(told: Sequence[object], what: object) -> list[int]:
-    """The trials that tell something, and those that tell nothing where none tells otherwise."""
+    """Return the trials with this result, or all of them if the others are inconclusive."""
     some = {k for k, one in enumerate(told) if one == what}
     return sorted(some if set(told) - {what, None} else range(len(told)))
 
 
 def stop_at_axes(plane: Plane, trials: Sequence[Trial]) -> None:
-    """Stops at speeds that are the derivatives of x and y: those of a body are meant.
+    """Raise an error if speeds are the derivatives of x and y instead of those in body axes.
 
-    Only where the heading's own rate agrees with it: one in degrees hardly turns, either.
+    Only if the heading agrees with its logged rate: a heading in the wrong unit looks the same.
 
     Raises:
-        GroundedError: with what to turn.
+        GroundedError: with the rotation to undo.
     """
     if len(plane.speeds) < 2 or not rate_agrees(plane.model, plane.relation.k, trials):
         return
@@ -183,18 +186,18 @@ def stop_at_axes(plane: Plane, trials: Sequence[Trial]) -> None:
     speeds, xy = plane.names(plane.speeds), plane.names(plane.xy)
     psi = plane.names((plane.relation.k,))
     said = (
-        f"{speeds} are in the axes of {xy}, not in the body's: they are the rates of {xy} as they "
-        f"stand, and the model turns them by {psi}"
+        f"{speeds} are in the axes of {xy}, not in body axes: they are the rates of {xy}, while "
+        f"the model rotates them by {psi}"
     )
     mend = (
-        f"Turn {speeds} back by {psi}, into the body's axes, where they are logged and in the "
-        "robot's program, or write the model in theirs"
+        f"Rotate {speeds} by -{psi} into body axes, both in the log and in the robot's program, or "
+        "write the model with speeds in world axes"
     )
     raise unusable(trials, _concerned(told, "world"), said, mend)
 
 
 def _axes(plane: Plane, trial: Trial) -> str | None:
-    """Whether a trial's speeds are in the body's axes or the world's; None where it doesn't say."""
+    """Return whether a trial's speeds are in "body" or "world" axes; None if inconclusive."""
     plain, world = plane.way(trial), plane.way(trial, plane.times(plane.angles, 0.0))
     other = plane.way(trial, plane.times(plane.angles, -1.0))
     if plain.left < FITS and plain.left * BETTER < world.left:
@@ -204,12 +207,12 @@ def _axes(plane: Plane, trial: Trial) -> str | None:
 
 
 def rate_agrees(model: Model, heading: int, trials: Sequence[Trial]) -> int:
-    """The sign with which a heading's rate is the logged one, of its size; 0 where it isn't.
+    """Return the sign with which a heading's derivative matches its logged rate; 0 if it doesn't.
 
     Args:
         model: with an exact relation between the two, psi' = r.
-        heading: the state.
-        trials: any; 0 where they have no sensor of the rate.
+        heading: index of the state.
+        trials: of this model's states; without a sensor of the rate the result is 0.
     """
     for relation in integrals(model):
         if relation.i == heading and relation.exact:
@@ -220,9 +223,9 @@ def rate_agrees(model: Model, heading: int, trials: Sequence[Trial]) -> int:
 
 
 def turned_compass(plane: Plane, trials: list[Trial]) -> Iterator[Finding]:
-    """With a heading that turns the other way, from another axis, put right (in the list).
+    """Correct, in the list, a heading that counts clockwise from another axis, as a compass does.
 
-    What its rate says tells whether that is turned as well, or x and y are mirrored.
+    The logged rate shows whether its sign is reversed as well, or x and y are mirrored.
     """
     told = [_compass(plane, trial) for trial in trials]
     angles = [angle for angle in told if angle is not None and angle]
@@ -244,9 +247,9 @@ def turned_compass(plane: Plane, trials: list[Trial]) -> Iterator[Finding]:
     whole = len(some) == len(trials)
     where = f" in trial{'s' * (len(some) > 1)} {', '.join(trials[k].id for k in some)}"
     text = (
-        f"turns the other way than the course that {plane.names(plane.xy)} travel"
-        f"{where * (not whole)}: it is {np.rad2deg(offset):.0f} degrees less what is logged "
-        "(a compass counts from north, clockwise)"
+        f"turns in the opposite direction to the course given by {plane.names(plane.xy)}"
+        f"{where * (not whole)}: it is {np.rad2deg(offset):.0f} degrees minus the logged value "
+        "(a compass counts clockwise from north)"
     )
     log = f"scale = -1, offset = {offset:.8g}" * whole
     yield put_right(psi, text, "sign", log, scale=-1.0)
@@ -256,7 +259,7 @@ def turned_compass(plane: Plane, trials: list[Trial]) -> Iterator[Finding]:
 
 
 def _compass(plane: Plane, trial: Trial) -> float | None:
-    """The offset of a heading that turns the other way, 0 of one that doesn't; None: not told."""
+    """Return the offset [rad] of a reversed heading, 0 if not reversed, None if inconclusive."""
     plain, other = plane.way(trial), plane.way(trial, plane.times(plane.angles, -1.0))
     if plain.left < FITS and plain.left * BETTER < other.left:
         return 0.0
@@ -268,13 +271,13 @@ def _compass(plane: Plane, trial: Trial) -> float | None:
 
 
 def _not_mirrored(plane: Plane, trial: Trial) -> bool:
-    """Whether x and y exchanged, or one of them of the other sign, explain a way much worse."""
+    """Check that mirrored positions (exchanged, or one sign reversed) fit a trial much worse."""
     other = plane.way(trial, plane.times(plane.angles, -1.0))
     return plane.way(trial, mirrored=True).left > CLOSE * other.left
 
 
 def stop_at_units(plane: Plane, trials: Sequence[Trial]) -> None:
-    """Stops at speeds in knots, km/h, mph or feet per second, and at positions in feet.
+    """Raise an error for speeds in knots, km/h, mph or feet per second, and positions in feet.
 
     Raises:
         GroundedError: with the scales for [log].
@@ -289,17 +292,20 @@ def stop_at_units(plane: Plane, trials: Sequence[Trial]) -> None:
     verb = "looks" if len(states) == 1 else "look"
     said = (
         f"{plane.names(states)} {verb} {factor:.4g} times too large (in {unit}): divided by that, "
-        f"positions move as speeds and {plane.names((plane.relation.k,))} say: {some}"
+        f"positions move as speeds and {plane.names((plane.relation.k,))} imply: {some}"
     )
     mend = (
-        "Put these scales into [log] (multiply a scale, 1 where none is given) and into the "
+        "Put these scales into [log] (multiply the scale, 1 where none is set) and into the "
         "robot's program"
     )
     raise unusable(trials, _concerned(told, (states, unit)), said, mend)
 
 
 def _unit(plane: Plane, trial: Trial) -> tuple[tuple[int, ...], str] | None:
-    """The states of a trial in another unit, SAME or OTHER; None where it doesn't say."""
+    """Return the states of a trial in another unit with the unit, SAME, OTHER or None.
+
+    None means that the trial is inconclusive.
+    """
     plain = plane.way(trial)
     if plain.left < FITS and abs(plain.size - 1) < SOUND:
         return SAME

@@ -244,7 +244,7 @@ def test_a_sensor_that_counts_the_other_way_is_named_with_its_velocity(turned):
     told = mistaken(ball(), [Mistake(turned=turned).mended(t) for t in trials], every(ball()))
     assert told is not None and told.mistake.turned == turned and not told.others
     names = [ball().state_names[i] for i in turned]
-    assert holds(described(ball(), told), *names, "the other sign")
+    assert holds(described(ball(), told), *names, "the opposite sign")
     assert all(f"[log.state.{name}]" in mended_by(ball(), told) for name in names)
 
 
@@ -254,7 +254,7 @@ def test_a_position_that_counts_the_other_way_beside_a_right_velocity_is_named_a
     with pytest.raises(GroundedError) as refused:
         gr.diagnose(ball(), trials)
     said = str(refused.value)
-    assert "x looks turned" in said and "[log.state.x]" in said and "[log.state.v]" not in said
+    assert "x looks logged" in said and "[log.state.x]" in said and "[log.state.v]" not in said
 
 
 @pytest.mark.parametrize("gain", [-1.0, 0.0, 0.3])
