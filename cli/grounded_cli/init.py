@@ -193,7 +193,7 @@ def _example(folder: str, name: str, json_: bool) -> None:
     files = [
         ("grounded.toml", "the task: target, reward, limits, search"),
         ("model.py", "the crude model, plain NumPy"),
-        ("target.csv", "what the states are to do"),
+        ("target.csv", "the desired states over time"),
         ("real.py", "a simulated real system, in place of your robot"),
     ]
     show(f"{folder} is a workspace for {name}:")

@@ -1,6 +1,6 @@
 """Validation on held-out trials: which of the likely effects are claimed, and how certain they are.
 
-The modules, from the measurement to the claims:
+Read `ruler`, then `decide`. The modules, from the measurement to the claims:
 
     ruler              held-out open-loop errors over 0.1, 0.5, 1 s and whole trials, in units
     ahead              the open-loop predictions themselves
