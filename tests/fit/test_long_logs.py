@@ -90,7 +90,8 @@ def test_ctrl_c_in_a_diagnosis_says_the_best_hypothesis_so_far(trials, after):
     assert "hypothes" in str(stopped.value)
     if after == 25:
         assert "no diagnosis is stored" in str(stopped.value)
-        assert re.search(r"Predictions \S+ s ahead miss v by \S+ instead of \S+ m/s", str(stopped.value))
+        told = r"Predictions \S+ s ahead miss v by \S+ instead of \S+ m/s"
+        assert re.search(told, str(stopped.value))
 
 
 def test_ctrl_c_in_a_fit_says_the_values_so_far(trials):

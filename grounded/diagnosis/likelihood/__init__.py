@@ -1,6 +1,7 @@
 """Likelihood of the trials under a hypothesis: the model, effects with their values, and noise.
 
-Read `hypothesis`, then `refine`. The modules, each building on those above it (the Kalman filter itself is `grounded.filter`):
+Read `hypothesis`, then `refine`. The modules, each building on those above it (the Kalman filter
+itself is `grounded.filter`):
 
     data          all trials as one record, cut into runs of equal length
     hypothesis    effects with their values, and shifts of the model's parameters
