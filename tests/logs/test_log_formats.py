@@ -250,6 +250,21 @@ def test_a_million_zeros_in_a_small_file_are_refused(tmp_path):
         read_signals(path, {"x": SignalSpec("/npz.x")})
 
 
+def test_each_table_of_an_npz_has_its_own_column_names(tmp_path):
+    path, t = tmp_path / "two.npz", np.linspace(0, 1, 5)
+    np.savez(
+        path,
+        mocap=np.zeros((5, 2)),
+        mocap_t=t,
+        mocap_names=np.array(["x", "v"]),
+        cmd=np.ones((5, 2)),
+        cmd_t=t,
+        cmd_names=np.array(["left", "right"]),
+    )
+    found = read_signals(path, {"v": SignalSpec("/mocap.v"), "u": SignalSpec("/cmd.left")})
+    assert found["v"].values.max() == 0 and found["u"].values.min() == 1
+
+
 def test_several_runs_in_one_archive(tmp_path):
     path = tmp_path / "runs.npz"
     runs = {

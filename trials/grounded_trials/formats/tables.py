@@ -63,18 +63,27 @@ def _check_size(path: Path) -> None:
 
 
 def _npz_tables(arrays: Mapping[str, Any]) -> dict[str, Columns]:
-    labels = [
-        list(map(column_name, a)) for a in arrays.values() if a.ndim == 1 and a.dtype.kind == "U"
-    ]
+    labels = {
+        key: list(map(column_name, a))
+        for key, a in arrays.items()
+        if a.ndim == 1 and a.dtype.kind == "U"
+    }
     numbers = {k: np.asarray(a, float) for k, a in arrays.items() if a.dtype.kind in "fiub"}
     tables: dict[str, Columns] = {}
     for name, t in numbers.items():
         own = numbers.get(name.removesuffix("_t"), np.zeros(0))
         if not name.endswith("_t") or t.ndim != 1 or len(own) != len(t) or own.ndim > 2:
             continue
-        names = [label for label in labels if own.ndim == 2 and len(label) == own.shape[1]]
-        table = column_name(name.removesuffix("_t"))
-        tables["/" + table] = {"t": t} | _columns(own, names[0] if names else [], table)
+        stem = name.removesuffix("_t")
+        fits = [
+            key
+            for key, label in labels.items()
+            if own.ndim == 2 and len(label) == own.shape[1]
+            if not _names_another(key, stem, numbers)
+        ]
+        key = f"{stem}_names" if f"{stem}_names" in fits else next(iter(fits), "")
+        table = column_name(stem)
+        tables["/" + table] = {"t": t} | _columns(own, labels.get(key, []), table)
     used = {name for name in numbers if "/" + column_name(name.removesuffix("_t")) in tables}
     rest = {k: a for k, a in numbers.items() if k not in used and a.ndim in (1, 2)}
     times = [k for k, a in rest.items() if a.ndim == 1 and len(a) > 1 and is_time(k)]
@@ -86,6 +95,12 @@ def _npz_tables(arrays: Mapping[str, Any]) -> dict[str, Columns]:
                 flat |= _columns(a, [], column_name(name))
         tables["/npz"] = flat
     return tables
+
+
+def _names_another(key: str, table: str, numbers: Mapping[str, Any]) -> bool:
+    """Check whether an array of names is called after another table, `other_names`."""
+    other = key.removesuffix("_names")
+    return key.endswith("_names") and other != table and other in numbers
 
 
 def _columns(array: Floats, names: list[str], table: str) -> dict[str, Floats]:
