@@ -172,21 +172,27 @@ def _undecided(verdicts: Sequence[str]) -> list[Key]:
 
 
 def _steps(now: Standing, shown: list[Tried], number: dict[str, int]) -> Panel:
+    """Draw the damping of each step, or alpha if a step was shortened or none was damped."""
+    steps = [t for t in shown if t.candidate.iteration > 0]  # not the model's own policy
+    damped = any(t.candidate.damping > 0 for t in steps)
+    damped &= all(t.candidate.alpha == 1 for t in steps)
     dots = []
-    for t in shown:
+    for t in steps if damped else shown:
         c = t.candidate
         shape, role = _look(t, now.verdict(t))
         note = f"{c.id}: α = {c.alpha:g}, damping {figure(c.damping, 2)}"
-        dots.append(Dot(number[c.id], math.log2(max(c.alpha, 2.0**-30)), role, note, shape))
-    low = min(d.y for d in dots)
+        size = math.log10(max(c.damping, 1e-12)) if damped else math.log2(max(c.alpha, 2.0**-30))
+        dots.append(Dot(number[c.id], size, role, note, shape))
+    low, high = (end(d.y for d in dots) for end in (min, max))
+    title = "Step size: log₂ α (0: full step, −1: half)"
     return Panel(
-        title="Step size: log₂ α (0: full step, −1: half)",
+        title="Step size: log₁₀ damping (higher: more cautious)" if damped else title,
         x_name="candidate",
-        y_name="log₂ α",
+        y_name="log₁₀ damping" if damped else "log₂ α",
         x_ticks=_named(shown, number),
         dots=tuple(dots),
         whole=True,
-        y_range=(min(low, -1.0) - 0.4, 0.6),
+        y_range=(low - 0.5, high + 0.5) if damped else (min(low, -1.0) - 0.4, 0.6),
     )
 
 

@@ -317,6 +317,18 @@ def test_results_plot_what_the_page_shows(cart):
     np.testing.assert_allclose(traces[0].y, findings.best.candidate.predicted_states[:, 0])
 
 
+def test_steps_show_their_damping_where_none_was_shortened(cart):
+    now = gather(Folder(cart)).standing
+    damped = [replace(t, candidate=replace(t.candidate, alpha=1.0)) for t in now.history]
+    for history, name in ((now.history, "log₂ α"), (damped, "log₁₀ damping")):
+        if name == "log₂ α":
+            last = history[-1]
+            history = (*history[:-1], replace(last, candidate=replace(last.candidate, alpha=0.5)))
+        panel = replace(now, history=tuple(history)).figures()[0].panels[-1]
+        assert panel.y_name == name
+        assert all(panel.y_range[0] < dot.y < panel.y_range[1] for dot in panel.dots)
+
+
 def test_a_result_without_a_figure_says_so(cart):
     nothing = replace(gather(Folder(cart)).standing, history=())
     with pytest.raises(GroundedError, match=holding(type(nothing).__name__)):
