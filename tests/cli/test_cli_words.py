@@ -154,7 +154,7 @@ def test_repeats_say_what_is_waited_for(tmp_path):
     [
         (["status", "-C", "grounded.toml"], "is a file: -C takes the folder"),
         (["ingest", "."], "is a workspace: name the log"),
-        (["ingest", "model.py"], "model.py is no log"),
+        (["ingest", "model.py"], "model.py is not a log"),
         (["adopt", "x:y"], "nothing was diagnosed yet"),
         (["diagnose", "--trials", "t9,"], "there is no trial to learn from"),
         (["diagnose", "--without", "delay,delai"], "did you mean 'delay'"),
