@@ -153,8 +153,8 @@ def test_repeats_say_what_is_waited_for(tmp_path):
     ("words", "holds"),
     [
         (["status", "-C", "grounded.toml"], "is a file: -C takes the folder"),
-        (["ingest", "."], "is a workspace: name the log"),
-        (["ingest", "model.py"], "model.py is no log"),
+        (["ingest", "."], "is a workspace: give the log"),
+        (["ingest", "model.py"], "model.py is not a log"),
         (["adopt", "x:y"], "nothing was diagnosed yet"),
         (["diagnose", "--trials", "t9,"], "there is no trial to learn from"),
         (["diagnose", "--without", "delay,delai"], "did you mean 'delay'"),
@@ -164,7 +164,7 @@ def test_repeats_say_what_is_waited_for(tmp_path):
         (["recover", "trials"], "is a folder"),
         (["recover", "model.py"], "look for another copy of the recording"),
         (["ingest", "nofile.mcap"], "nofile.mcap does not exist"),
-        (["ingest", "no/nofile.mcap"], "nor does its folder no: name a log"),
+        (["ingest", "no/nofile.mcap"], "nor does its folder no: give a path"),
         (["inspect", "nowhere.mcap"], "does not exist"),
     ],
 )

@@ -341,7 +341,7 @@ def test_ros_definitions_that_are_none() -> None:
     for text, says in (
         ("Missing a", "uses 'Missing'"),
         ("what is this?", "uses 'what'"),
-        ("???", "no field"),
+        ("???", "invalid line"),
         ("A a\n" + "=" * 80 + "\nMSG: x/A\nA a", "contains itself"),
         ("float64[999999999] a", "999999999 items"),
         (f"float64[{'9' * 5000}] a", "99999 items"),
@@ -545,9 +545,9 @@ def test_paths_that_do_not_fit_name_what_would() -> None:
     for path, says in (
         ("/t.sped", "did you mean 'speed'"),
         ("/t.name", "ends at a string"),
-        ("/t", "go on to one of: speed, name, list, q"),
+        ("/t", "add one of its fields: speed, name, list, q"),
         ("/t.list", "ends at a list"),
-        ("/t.list.x", "of which item"),
+        ("/t.list.x", "select an item first"),
         ("/t.speed.x", "which has no fields"),
         ("/t.q[0]", "has no items"),
         ("/t.q.@rpy.yaw", "needs a quaternion"),

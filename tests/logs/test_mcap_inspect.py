@@ -57,7 +57,7 @@ def test_service_events_are_read() -> None:
         ("pitch-45bag", "@rpy.pitch show the same motion with OPPOSITE SIGN (correlation -1.000)"),
         ("flybag", "@rpy.pitch show the same motion with OPPOSITE SIGN"),
         ("yx3bag", "/vicon/Group466CF/Group466CF/pose has a gap of 0.930 s"),
-        ("yx4bag", "/cf_logpos has values that are no numbers, first in /cf_logpos.position.x"),
+        ("yx4bag", "/cf_logpos has values that are not numbers, first in /cf_logpos.position.x"),
         ("flybag", "/cf_command has a single message"),
     ],
 )

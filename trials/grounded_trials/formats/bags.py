@@ -1,11 +1,11 @@
-"""ROS bags that are not MCAP, as the same records: ROS 2 `.db3` (SQLite) and ROS 1 `.bag`.
+"""Convert ROS bags other than MCAP to MCAP records: ROS 2 `.db3` (SQLite) and ROS 1 `.bag`.
 
-A `.db3` is a table of topics and one of messages, read by Python's own sqlite3, read-only. Since
-ROS 2 Iron it carries the definitions of its messages; for an older one they are taken from the
-standard types of ROS 2 Humble that come with rosbags. A `.bag` is read by rosbags (0.10 and later;
-pure Python but for its decompressors, kept up with each ROS release).
+A `.db3` consists of a table of topics and one of messages, read with Python's sqlite3, read-only.
+Since ROS 2 Iron it contains the definitions of its messages; for older bags they are taken from the
+standard types of ROS 2 Humble in rosbags. A `.bag` is read with rosbags (0.10 and later; pure
+Python except for its decompressors, and maintained for each ROS release).
 
-A batch holds at most `BATCH` messages or `ROOM` bytes: memory is bounded whatever the bag's size.
+A batch holds at most `BATCH` messages or `ROOM` bytes, so memory is bounded for bags of any size.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Piece = tuple[int, int, bytes]  # channel, time [ns], message
 
 
 def batches(pieces: Iterable[Piece]) -> Iterator[Messages]:
-    """Messages one by one as batches."""
+    """Collect single messages into batches."""
     held: list[Piece] = []
     room = 0
     for piece in pieces:
@@ -58,22 +58,22 @@ def _batch(pieces: list[Piece]) -> Messages:
 
 
 def sqlite_records(path: Path) -> Iterator[Record]:
-    """The records of a ROS 2 `.db3` file.
+    """Yield the records of a ROS 2 `.db3` file.
 
     Raises:
-        GroundedError: if it is damaged, or no bag.
+        GroundedError: if it is damaged, or not a bag.
     """
     import sqlite3
 
-    waiting = path.with_name(path.name + "-wal").exists()  # written by a recorder that was killed
+    waiting = path.with_name(path.name + "-wal").exists()  # left by a recorder that was killed
     name = f"{path.absolute().as_uri()}?mode=ro{'' if waiting else '&immutable=1'}"
     try:
         with closing(sqlite3.connect(name, uri=True)) as bag:
             yield from _tables(bag, path)
     except (sqlite3.Error, UnicodeDecodeError, OverflowError, TypeError) as error:
         raise GroundedError(
-            f"{path} can't be read as a ROS 2 bag: {error}; `sqlite3 {path.name} .recover` saves "
-            "what can be saved of a damaged one"
+            f"{path} can't be read as a ROS 2 bag: {error}; if it is damaged, "
+            f"`sqlite3 {path.name} .recover` saves what can be saved"
         ) from None
 
 
@@ -117,21 +117,21 @@ def _messages(bag: Any, channels: dict[int, int], path: Path) -> Iterator[Piece]
 
 
 def _standard(kind: str) -> str:
-    """The definition of a standard ROS 2 type, "" for one that Humble doesn't have."""
+    """Return the definition of a standard ROS 2 type, "" if Humble doesn't have it."""
     store = standard_types()
     return str(store.generate_msgdef(kind, 2)[0]) if kind in store.fielddefs else ""
 
 
 @cache
 def standard_types() -> Any:
-    """The types of ROS 2 Humble."""
+    """Return the types of ROS 2 Humble."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
 def ros1_records(path: Path) -> Iterator[Record]:
-    """The records of a ROS 1 `.bag` file.
+    """Yield the records of a ROS 1 `.bag` file.
 
     Raises:
         GroundedError: if it is damaged, or was not closed.
@@ -151,15 +151,19 @@ def ros1_records(path: Path) -> Iterator[Record]:
     except (ReaderError, AssertionError, KeyError, ValueError, OSError, MemoryError) as error:
         raise GroundedError(
             f"{path} can't be read as a ROS 1 bag: {error or type(error).__name__}; "
-            "`rosbag reindex` mends one that was not closed"
+            "if it was not closed, `rosbag reindex` repairs it"
         ) from None
 
 
 def expanded(batch: Messages, limit: int = ROOM) -> Messages:
-    """A batch whose messages are compressed one by one (rosbag2's zstd mode "message").
+    """Decompress a batch with individually compressed messages (rosbag2's zstd mode "message").
+
+    Args:
+        batch: of messages, compressed or not.
+        limit: largest size of a decompressed message [bytes].
 
     Raises:
-        GroundedError: if a message expands beyond `limit` bytes.
+        GroundedError: if a message expands to more than `limit` bytes.
     """
     import zstandard
 

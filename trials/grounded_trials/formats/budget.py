@@ -1,13 +1,13 @@
-"""What reading one log may cost: CPU time and memory, in proportion to the size of its files.
+"""Limits on reading one log: CPU time and memory, in proportion to the size of its files.
 
-A few kilobytes can ask for gigabytes (compressed zeros, nested lists of JSON) or for hours (a
-hundred thousand lists that are stepped over one by one). No single limit of a record or a list
-stops that: they add up. So whoever reads a log opens a `budget` for all of it, and what decodes
-says what it is about to do: `step` at every turn that may be one of very many, `room` before memory
-is taken and given back, `keep` for what stays until the log is read.
+A file of a few kilobytes can require gigabytes (compressed zeros, nested JSON lists) or hours (a
+hundred thousand lists that must be skipped one by one). Limits on single records or lists don't
+prevent that, since they add up. Readers therefore open a `budget` for a whole log, and decoders
+report what they do: `step` in every loop that may be very long, `room` before they allocate memory
+temporarily, `keep` for memory that stays in use until the log is read.
 
-Outside a budget these do nothing. The time is the CPU's, of the thread that reads: a slow disk or
-a busy machine refuse nothing.
+Outside a budget these functions do nothing. Time is the CPU time of the reading thread, so a slow
+disk or a busy machine does not matter.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from grounded.errors import GroundedError
 
 MB = 10**6
 SECONDS, MEMORY = "GROUNDED_FILE_SECONDS", "GROUNDED_FILE_MB"
-DEFAULTS = {SECONDS: 3.0, MEMORY: 250.0}  # [s], [MB], of an empty file
-SECONDS_PER_MB, MEMORY_PER_BYTE = 1.0, 8.0  # more for each MB, and for each byte, of the file
+DEFAULTS = {SECONDS: 3.0, MEMORY: 250.0}  # [s], [MB], for an empty file
+SECONDS_PER_MB, MEMORY_PER_BYTE = 1.0, 8.0  # in addition, for each MB and byte of the file
 
 
 class OverBudget(GroundedError):
-    """Reading a file takes more time or memory than its size explains."""
+    """Reading a file takes more time or memory than its size justifies."""
 
 
 class _Budget:
@@ -41,7 +41,7 @@ class _Budget:
     def over(self, what: str, setting: str) -> OverBudget:
         return OverBudget(
             f"{self.name}: reading its {_size(self.size)} takes more than {what}: it is damaged or "
-            f"made to do harm. If you trust it, set {setting} (now {_setting(setting):g}) higher"
+            f"malicious. If you trust it, increase {setting} (now {_setting(setting):g})"
         )
 
 
@@ -50,14 +50,14 @@ _NOW: ContextVar[_Budget | None] = ContextVar("budget", default=None)
 
 @contextmanager
 def budget(name: str, files: Iterable[Path] | int) -> Iterator[None]:
-    """What is decoded inside may cost as much as these files explain, all together.
+    """Limit the time and memory of everything decoded in the context, by the size of the files.
 
     Args:
         name: of the log, for the message.
         files: the log's files, or their size [bytes].
 
     Raises:
-        OverBudget: from inside, where more is asked for.
+        OverBudget: raised inside the context when a limit is exceeded.
         GroundedError: for a setting in the environment that is not a positive number.
     """
     size = files if isinstance(files, int) else sum(file.stat().st_size for file in files)
@@ -65,20 +65,20 @@ def budget(name: str, files: Iterable[Path] | int) -> Iterator[None]:
     try:
         yield
     except MemoryError:
-        raise _Budget(name, size).over("the memory that there is", MEMORY) from None
+        raise _Budget(name, size).over("the available memory", MEMORY) from None
     finally:
         _NOW.reset(token)
 
 
 def step() -> None:
-    """Refuses to go on when the time is used up."""
+    """Raise an error if the time is used up."""
     now = _NOW.get()
     if now is not None and thread_time() > now.end:
         raise now.over(f"{now.seconds:.1f} s of CPU time", SECONDS)
 
 
 def room(count: float) -> None:
-    """Refuses to take `count` bytes beside what is kept, and to go on when time is used up."""
+    """Raise an error if `count` more bytes exceed the memory, or if the time is used up."""
     now = _NOW.get()
     if now is not None and now.kept + count > now.memory:
         raise now.over(f"{now.memory / MB:.0f} MB of memory", MEMORY)
@@ -86,7 +86,7 @@ def room(count: float) -> None:
 
 
 def keep(count: int) -> None:
-    """Takes `count` bytes until the log is read."""
+    """Account for `count` bytes that stay in use until the log is read."""
     room(count)
     now = _NOW.get()
     if now is not None:

@@ -1,10 +1,10 @@
-"""CDR (ROS 2) and ROS 1 messages as nodes: one cursor a message, moved over the type's fields.
+"""CDR (ROS 2) and ROS 1 messages as nodes: one cursor per message, moved over the type's fields.
 
-Both encodings are the fields one after the other. CDR pads every number to a multiple of its size
-(at most 8, or 4 in its second version), counted from the start of the message; ROS 1 does not. So
-the size of anything without texts and lists depends only on where it starts modulo 8: a table of
+In both encodings the fields follow each other. CDR aligns every number to a multiple of its size
+(at most 8, or 4 in its second version), counted from the start of the message; ROS 1 does not. The
+size of a value without texts and lists therefore depends only on its start modulo 8. A table of
 eight sizes moves all cursors over it at once, and doubling the table moves them over 2^k items.
-Lists and texts begin with their count. Nothing is read that is not on the way.
+Lists and texts begin with their count. Fields that are not on the path are skipped, not decoded.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from grounded_trials.formats.messages import (
     texts_equal,
 )
 
-ITEM_LIMIT = 100_000  # items of a list whose sizes differ: they are stepped over one by one
-ZSTD = b"\x28\xb5\x2f\xfd"  # a message that rosbag2 compressed by itself
-SIZE_LIMIT = 2**40  # [bytes] of a type; positions must not overflow
+ITEM_LIMIT = 100_000  # items of a list with items of different sizes, skipped one by one
+ZSTD = b"\x28\xb5\x2f\xfd"  # start of a message that rosbag2 compressed individually
+SIZE_LIMIT = 2**40  # [bytes] size of a type, so that positions don't overflow
 
 
 @dataclass(frozen=True)
 class Coding:
-    """How numbers lie in a message."""
+    """How numbers are laid out in a message."""
 
-    align: int  # largest multiple that numbers are padded to
+    align: int  # largest alignment of numbers [bytes]
     order: str  # "<" or ">"
     terminated: bool  # texts end with a zero byte, and an empty struct is one byte
 
@@ -108,7 +108,7 @@ class _CdrNode(Node):
         return self._at(self.pos + ((self.base - self.pos) & (multiple - 1)))
 
     def _read(self, kind: str) -> NDArray[np.generic]:
-        """The numbers at the cursors, which are aligned."""
+        """Read the numbers at the cursors, which must be aligned."""
         size = int(kind[1:])
         self._check(self.pos + size)
         return windows(self.buffer, self.coding.order + kind)[self.pos]
@@ -119,17 +119,17 @@ class _CdrNode(Node):
             raise BadMessage(self.rows[over][0], f"it ends inside a {self.type}")
 
     def _counts(self) -> tuple[Ints, _CdrNode]:
-        """How many items a list or text has, and the cursors at the first."""
+        """Return the item counts of lists or texts, and the cursors at the first items."""
         if isinstance(self.type, Array) and self.type.count is not None:
             return np.full(len(self.rows), self.type.count, dtype=np.int64), self
         node = self._aligned(4)
         counts = node._read("u4").astype(np.int64)
         body = node._at(node.pos + 4)
-        body._check(body.pos + counts)  # an item has a byte at least
+        body._check(body.pos + counts)  # an item has at least one byte
         return counts, body
 
     def _after(self, part: Type | _Table) -> Ints:
-        """Where a value of this type ends."""
+        """Return where a value of this type ends."""
         if isinstance(part, _Table):
             return self._over(part, None)
         node = replace(self, type=part)
@@ -142,7 +142,7 @@ class _CdrNode(Node):
         counts, body = node._counts()
         if isinstance(part, Text):
             if part.unit == 0:
-                raise BadPath("it lies behind a wstring, whose size is not agreed on")
+                raise BadPath("it comes after a wstring, whose encoding is not standardised")
             return body.pos + counts
         sizes = _sizes(part.item, self.coding)
         if sizes is not None:
@@ -150,7 +150,7 @@ class _CdrNode(Node):
         return body._positions(part.item, np.arange(len(counts)), counts)
 
     def _over(self, table: _Table, count: Ints | None) -> Ints:
-        """The cursors moved over `count` values of fixed size (None: one)."""
+        """Return the cursors moved over `count` values of fixed size (None: one)."""
         if count is None:
             return np.asarray(self.pos + table.once[(self.pos - self.base) & 7])
         pos = self.pos.copy()
@@ -161,10 +161,10 @@ class _CdrNode(Node):
         return pos
 
     def _positions(self, item: Type, row: Ints, index: Ints) -> Ints:
-        """Where item index[j] of the list that starts at row[j]'s cursor lies."""
+        """Return the position of item index[j] of the list at the cursor of row[j]."""
         last = int(index.max(initial=0))
         if last > ITEM_LIMIT:
-            raise BadMessage(self.rows[0], f"it has a list of more than {ITEM_LIMIT} {item}")
+            raise BadMessage(self.rows[0], f"it has a list of more than {ITEM_LIMIT} {item} items")
         found, pos, node = self.pos[row], self.pos.copy(), replace(self, type=item)
         order = np.argsort(index, kind="stable")
         ends = np.searchsorted(index[order], np.arange(last + 1), "right")
@@ -182,7 +182,7 @@ class _CdrNode(Node):
 
 
 class _Table:
-    """Sizes of a value for each start modulo 8, and of 2^k such values in a row."""
+    """Sizes of a value for each start modulo 8, and of 2^k consecutive values."""
 
     def __init__(self, once: tuple[int, ...]) -> None:
         if max(once) > SIZE_LIMIT:
@@ -191,7 +191,7 @@ class _Table:
         self.powers = [self.once]
 
     def times(self, k: int) -> Ints:
-        """Sizes of 2^k values in a row, (8,)."""
+        """Return the sizes of 2^k consecutive values, (8,)."""
         while len(self.powers) <= k:
             half = self.powers[-1]
             self.powers.append(half + half[(np.arange(8) + half) & 7])
@@ -200,7 +200,7 @@ class _Table:
 
 @lru_cache(maxsize=4096)
 def _sizes(type: Type, coding: Coding) -> _Table | None:
-    """The table of a type of fixed size; None where texts and lists decide."""
+    """Return the table of a type of fixed size; None if it contains texts or lists."""
     if isinstance(type, Number):
         multiple = min(type.size, coding.align)
         return _Table(tuple((-m) % multiple + type.size for m in range(8)))
@@ -223,14 +223,14 @@ def _sizes(type: Type, coding: Coding) -> _Table | None:
 
 @lru_cache(maxsize=4096)
 def _before(type: Struct, name: str, coding: Coding) -> tuple[Type | _Table, ...]:
-    """What a cursor moves over to reach a field."""
+    """Return the parts that a cursor moves over to reach a field."""
     index = [field.name for field in type.fields].index(name)
     return _parts(type.fields[:index], coding)
 
 
 @lru_cache(maxsize=4096)
 def _parts(fields: tuple[Field, ...], coding: Coding) -> tuple[Type | _Table, ...]:
-    """Fields as the fewest steps: those of fixed size next to each other are one table."""
+    """Group fields into the fewest steps: adjacent fields of fixed size share one table."""
     parts: list[Type | _Table] = []
     for field in fields:
         step()
@@ -247,33 +247,33 @@ def _parts(fields: tuple[Field, ...], coding: Coding) -> tuple[Type | _Table, ..
 
 
 def ros1_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> Node:
-    """ROS 1 messages of one type at buffer[start[i]:end[i]] as the root of a path."""
+    """Return the root node of ROS 1 messages of one type at buffer[start[i]:end[i]]."""
     return _CdrNode(type, np.arange(len(start)), start, start, end, buffer, ROS1)
 
 
 def cdr_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> Node:
-    """CDR messages of one type at buffer[start[i]:end[i]] as the root of a path.
+    """Return the root node of CDR messages of one type at buffer[start[i]:end[i]].
 
     Raises:
         BadMessage: for a message without a header, or in a variant of CDR that can't be read.
     """
     short = end - start < 4
     if short.any():
-        raise BadMessage(int(np.argmax(short)), "it is shorter than its 4 bytes of header")
+        raise BadMessage(int(np.argmax(short)), "it is shorter than its header of 4 bytes")
     octets = np.frombuffer(buffer, dtype=np.uint8)
     kinds = octets[start + 1]
     if len(kinds):
         other = kinds != kinds[0]
         if other.any():
-            raise BadMessage(int(np.argmax(other)), "its variant of CDR is not that of the others")
+            raise BadMessage(int(np.argmax(other)), "its variant of CDR differs from the others")
         if buffer[start[0] : start[0] + 4] == ZSTD:
             raise BadMessage(
                 0,
-                "it is compressed by itself; use `ros2 bag convert` with compression_mode none",
+                "it is compressed individually; use `ros2 bag convert` with compression_mode none",
             )
         if int(kinds[0]) not in _KINDS or octets[start].any():
             raise BadMessage(
-                0, f"its variant of CDR, {int(kinds[0])}, can't be read (plain CDR can)"
+                0, f"its variant of CDR, {int(kinds[0])}, can't be read (only plain CDR can)"
             )
     coding = _KINDS[int(kinds[0])] if len(kinds) else _KINDS[1]
     base = start + 4

@@ -1,11 +1,11 @@
-"""OMG IDL definitions (ros2idl, omgidl) to message types.
+"""Parse OMG IDL definitions (ros2idl, omgidl) to message types.
 
-The text holds modules, structs, typedefs, enums and constants; with ros2idl several files follow
+The text contains modules, structs, typedefs, enums and constants. With ros2idl several files follow
 each other, each after a line of '=' and a line "IDL: package/msg/Type". Annotations and comments
-are stepped over. Unions, maps and optional members are not plain CDR and are refused.
+are skipped. Unions, maps and optional members are not plain CDR and are refused.
 
-Every token is looked at once, and what a name means is remembered: the time taken grows with the
-length of the text, whatever it says.
+Every token is read once and resolved names are cached, so the time is linear in the length of the
+text.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from grounded_trials.formats.budget import step
 from grounded_trials.formats.messages import Array, BadSchema, Field, Number, Struct, Text, Type
 from grounded_trials.formats.schemas import COUNT_LIMIT, DEPTH_LIMIT, NUMBERS
 
-# What is not ended (a comment, a text) goes on to the end: nothing is scanned twice.
+# An unterminated comment or text extends to the end, so that nothing is scanned twice.
 _TOKEN = re.compile(
     r"//[^\n]*|/\*.*?(?:\*/|\Z)|^[^\S\n]*#[^\n]*|^={3,}\s*\nIDL:[^\n]*"
     r'|"(?:[^"\\]|\\.)*(?:"|\\?\Z)|\'(?:[^\'\\]|\\.)*(?:\'|\\?\Z)'
@@ -45,10 +45,10 @@ FIELD_LIMIT = 200_000  # of all structs together
 
 
 def parse_idl(text: str, name: str) -> Struct:
-    """The message type `name` (with / or :: between its parts) of an IDL text.
+    """Return the message type `name` (with / or :: between its parts) of an IDL text.
 
     Raises:
-        BadSchema: if it is damaged, or uses what can't be read.
+        BadSchema: if the text is damaged, or uses an unsupported feature.
     """
     tokens = [t for t in _TOKEN.findall(text) if not t.lstrip().startswith(_SKIPPED)]
     try:
@@ -59,12 +59,12 @@ def parse_idl(text: str, name: str) -> Struct:
 
 @dataclass
 class _Definition:
-    """A struct, typedef, enum or const as written, and where its names are looked up from."""
+    """A struct, typedef, enum or const as tokens, and the scope in which its names are resolved."""
 
     kind: str
     scope: tuple[str, ...]
-    parts: list[list[str]] = field(default_factory=list)  # a struct's members; what the name is
-    base: str = ""  # of a struct
+    parts: list[list[str]] = field(default_factory=list)  # a struct's members; else the value
+    base: str = ""  # base type of a struct
 
 
 class _Parser:
@@ -73,8 +73,8 @@ class _Parser:
         self.defined: dict[str, _Definition] = {}
         self.found: dict[tuple[str, tuple[str, ...]], str] = {}
         self.built: dict[str, Struct] = {}
-        self.aliases: dict[str, Type] = {}  # what a typedef's name means
-        self.counts: dict[str, int] = {}  # what a constant's name means
+        self.aliases: dict[str, Type] = {}  # resolved typedefs
+        self.counts: dict[str, int] = {}  # resolved constants
         self.fields = 0
 
     def read(self, name: str) -> Struct:
@@ -97,7 +97,7 @@ class _Parser:
             raise BadSchema(f"its IDL definition has '{token[:40]}' where '{wanted}' should be")
 
     def until(self, end: str) -> list[str]:
-        """Tokens up to `end`, without annotations."""
+        """Return the tokens up to `end`, without annotations."""
         found: list[str] = []
         while (token := self.take()) != end:
             if token.startswith("@"):
@@ -123,7 +123,7 @@ class _Parser:
         elif token == "module":
             inner = (*scope, self.take())
             if len(inner) > MODULE_LIMIT or len(inner[-1]) > NAME_LIMIT:
-                raise BadSchema(f"its IDL definition has a module '{inner[-1][:40]}' in too many")
+                raise BadSchema(f"its IDL definition nests module '{inner[-1][:40]}' too deep")
             self.expect("{")
             while self.tokens[self.pos] != "}":
                 self.definition(inner)
@@ -181,7 +181,7 @@ class _Parser:
             self.fields += len(fields)
             if self.fields > FIELD_LIMIT:
                 raise BadSchema(f"its IDL definition has more than {FIELD_LIMIT} fields")
-            # ROS gives a struct without members one byte, under a name that nobody uses.
+            # ROS gives a struct without members a dummy member of one byte.
             fields = [f for f in fields if f.name != "structure_needs_at_least_one_member"]
             self.built[name] = Struct(name.replace("::", "/"), tuple(fields))
         return self.built[name]
@@ -189,7 +189,7 @@ class _Parser:
     def check_depth(self, name: str, depth: int) -> None:
         if depth > DEPTH_LIMIT:
             raise BadSchema(
-                f"its IDL definition of '{name[:80]}' contains itself, or goes too deep"
+                f"its IDL definition of '{name[:80]}' contains itself, or is nested too deep"
             )
 
     def member(self, written: list[str], scope: tuple[str, ...], depth: int) -> list[Field]:
@@ -206,7 +206,7 @@ class _Parser:
         return fields
 
     def array(self, kind: Type, counts: list[str], scope: tuple[str, ...]) -> Type:
-        """An array of arrays, the first count outermost."""
+        """Return nested arrays, with the first count outermost."""
         self.check_depth("[...]", len(counts))
         for text in reversed(counts):
             count = self.count(text, scope, 0)
@@ -216,7 +216,7 @@ class _Parser:
         return kind
 
     def count(self, text: str, scope: tuple[str, ...], depth: int) -> int:
-        """A number, or the constant of that name."""
+        """Return the value of a number, or of the constant of that name."""
         if not text[:1].isalpha():
             return int(text)
         self.check_depth(text, depth)
@@ -224,14 +224,16 @@ class _Parser:
         if name not in self.counts:
             constant = self.defined[name]
             if constant.kind != "const":
-                raise BadSchema(f"its IDL definition counts items by '{name[:80]}', not a number")
+                raise BadSchema(
+                    f"its IDL definition has '{name[:80]}' as an item count, which is not a number"
+                )
             self.counts[name] = self.count("".join(constant.parts[0]), constant.scope, depth + 1)
         return self.counts[name]
 
     def type(
         self, written: list[str], scope: tuple[str, ...], depth: int
     ) -> tuple[Type, list[str]]:
-        """The type at the front of the tokens, and the tokens after it."""
+        """Return the type at the front of the tokens, and the tokens after it."""
         first = written[0]
         self.check_depth(first, depth)
         if first in ("string", "wstring"):
@@ -258,7 +260,7 @@ class _Parser:
         return self.aliases[name], written[1:]
 
     def find(self, name: str, scope: tuple[str, ...]) -> str:
-        """The full name that a name means, looked up from the inside out."""
+        """Return the full name of a definition, resolved from the innermost scope outwards."""
         if (name, scope) not in self.found:
             step()
             for i in range(len(scope), -1, -1):

@@ -1,9 +1,9 @@
-"""MCAP's records: what each holds, how its bytes are read, and how a chunk is decompressed.
+"""MCAP records: their contents, how their bytes are parsed, and how chunks are decompressed.
 
-Integers are little-endian; a text is u32 length and UTF-8; a table is u32 length and pairs of
-texts. Messages come in batches: one buffer and the positions of the messages in it, so that a
-million of them can be decoded by array operations. A chunk (lz4, zstd or neither) is decompressed
-to the size that it states, never further.
+Integers are little-endian; a text is a u32 length and UTF-8; a table is a u32 length and pairs of
+texts. Messages come in batches: one buffer with the positions of its messages, so that a million of
+them can be decoded by array operations. A chunk (lz4, zstd or uncompressed) is decompressed at most
+to the size that it states.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _U64 = struct.Struct("<Q")
 
 @dataclass(frozen=True)
 class Header:
-    """The first record: who wrote the file, by which conventions."""
+    """The first record: the profile of the file, and the library that wrote it."""
 
     profile: str
     library: str
@@ -70,16 +70,16 @@ class Messages:
         return len(self.starts)
 
     def channel_ids(self) -> list[int]:
-        """The channels that have messages here, in rising order."""
+        """Return the ids of channels with messages in the batch, in increasing order."""
         return np.flatnonzero(np.bincount(self.channels)).tolist()  # unique imports numpy.ma
 
     def of(self, channel: int) -> Messages:
-        """The messages of one channel."""
+        """Return the messages of one channel."""
         chosen = self.channels == channel
         return self if chosen.all() else self.take(chosen)
 
     def take(self, chosen: NDArray[np.bool_]) -> Messages:
-        """The messages where `chosen` (N,) is true."""
+        """Return the messages where `chosen` (N,) is true."""
         _, *columns = vars(self).values()
         return Messages(self.buffer, *(column[chosen] for column in columns))
 
@@ -105,7 +105,7 @@ class Metadata:
 
 @dataclass(frozen=True)
 class End:
-    """The file ended as it should; `data_crc`: its data section had a checksum, which fits."""
+    """The regular end of a file; `data_crc`: its data section had a valid checksum."""
 
     data_crc: bool
 
@@ -114,14 +114,14 @@ Record = Header | Schema | Channel | Messages | Attachment | Metadata | End
 
 
 def windows(buffer: bytes, dtype: str) -> NDArray[np.generic]:
-    """A view whose element i is the value of `dtype` that starts at byte i, without copying."""
+    """Return a view whose element i is the value of `dtype` at byte i, without copying."""
     kind = np.dtype(dtype)
     count = max(0, len(buffer) - kind.itemsize + 1)
     return np.ndarray((count,), kind, buffer if count else b"\0" * kind.itemsize, 0, (1,))
 
 
 def batch(buffer: bytes, positions: list[int]) -> Messages:
-    """The message records at these positions of a buffer."""
+    """Return the message records at these positions of a buffer."""
     at = np.array(positions, dtype=np.int64)
     return Messages(
         buffer,
@@ -135,41 +135,41 @@ def batch(buffer: bytes, positions: list[int]) -> Messages:
 
 
 class BadRecord(Exception):
-    """Why a record or a chunk can't be read; the walk over the file says where."""
+    """A record or chunk can't be read; the text says why, and the caller adds where."""
 
 
 class Fields:
-    """Reads a record's content from left to right."""
+    """Parses a record's content from left to right."""
 
     def __init__(self, content: bytes) -> None:
         self.content, self.pos = content, 0
 
     def skip(self, count: int) -> bytes:
-        """The next `count` bytes."""
+        """Return the next `count` bytes."""
         end = self.pos + count
         if end > len(self.content):
-            raise BadRecord("it is too short for what it must hold")
+            raise BadRecord("it is too short for its contents")
         piece = self.content[self.pos : end]
         self.pos = end
         return piece
 
     def uint(self, bits: int) -> int:
-        """The next number."""
+        """Return the next unsigned integer."""
         return int.from_bytes(self.skip(bits // 8), "little")
 
     def text(self) -> str:
-        """The next text."""
+        """Return the next text."""
         try:
             return self.skip(self.uint(32)).decode("utf-8")
         except UnicodeDecodeError as error:
             raise BadRecord(str(error)) from None
 
     def blob(self) -> bytes:
-        """The next bytes, after their length."""
+        """Return the next bytes, which follow their length."""
         return self.skip(self.uint(64))
 
     def table(self) -> dict[str, str]:
-        """The next table of texts."""
+        """Return the next table of texts."""
         inner = Fields(self.skip(self.uint(32)))
         pairs: dict[str, str] = {}
         while inner.pos < len(inner.content):
@@ -189,7 +189,7 @@ def _attachment(f: Fields) -> Attachment:
     end = f.pos
     stated = f.uint(32)
     if stated and zlib.crc32(f.content[:end]) != stated:
-        raise BadRecord("its checksum does not fit its content")
+        raise BadRecord("its checksum does not match its content")
     return attachment
 
 
@@ -203,33 +203,37 @@ PARSERS: dict[int, Callable[[Fields], Record]] = {
 
 
 def chunk_content(content: bytes, limit: int) -> tuple[bytes, bool]:
-    """The records in a chunk, and whether a checksum vouches for them.
+    """Return the decompressed records of a chunk, and whether it has a checksum.
+
+    Args:
+        content: of the chunk record.
+        limit: largest size when decompressed [bytes].
 
     Raises:
-        BadRecord: for a checksum that doesn't fit, and see `decompress`.
+        BadRecord: for a wrong checksum, and see `decompress`.
     """
     try:
         size, crc, length = _CHUNK.unpack_from(content)
         name, start = content[32 : 32 + length], 40 + length
         stored = _U64.unpack_from(content, 32 + length)[0]
     except struct.error:
-        raise BadRecord("it is too short for what it must hold") from None
+        raise BadRecord("it is too short for its contents") from None
     if start + stored > len(content):
-        raise BadRecord("it is too short for what it must hold")
+        raise BadRecord("it is too short for its contents")
     data = decompress(name.decode("utf-8", "replace"), content[start : start + stored], size, limit)
     if crc and zlib.crc32(data) != crc:
-        raise BadRecord("its checksum does not fit its content")
+        raise BadRecord("its checksum does not match its content")
     return data, bool(crc)
 
 
 def decompress(compression: str, data: bytes, size: int, limit: int) -> bytes:
-    """The content of a chunk.
+    """Decompress the content of a chunk.
 
     Args:
         compression: "", "lz4" or "zstd".
         data: the compressed bytes.
-        size: the size that the chunk states for its content [bytes].
-        limit: the largest size that is accepted [bytes].
+        size: the decompressed size that the chunk states [bytes].
+        limit: the largest accepted size [bytes].
 
     Raises:
         BadRecord: for another compression, a size beyond the limit, or content of another size.
@@ -237,7 +241,7 @@ def decompress(compression: str, data: bytes, size: int, limit: int) -> bytes:
     if size > limit:
         raise BadRecord(f"it claims {size} bytes when decompressed, the limit is {limit}")
     if compression not in ("", "zstd", "lz4"):
-        raise BadRecord(f"its compression '{compression[:40]}' is not one of zstd, lz4 and none")
+        raise BadRecord(f"its compression '{compression[:40]}' is unknown; expected zstd or lz4")
     if compression == "":
         content, error = data, None
     else:
@@ -246,21 +250,21 @@ def decompress(compression: str, data: bytes, size: int, limit: int) -> bytes:
     if error is not None:
         raise BadRecord(f"it can't be decompressed ({error})")
     if len(content) != size:
-        raise BadRecord(f"it holds {len(content)} bytes, not the {size} that it states")
+        raise BadRecord(f"it holds {len(content)} bytes, but states {size}")
     return content
 
 
 def decompress_part(compression: str, data: bytes, limit: int) -> bytes:
-    """What can still be decompressed of a chunk whose end is missing, at most `limit` bytes."""
+    """Decompress as much as possible of a chunk without its end, at most `limit` bytes."""
     return _expand(compression, data, limit, whole=False)[0][:limit]
 
 
 def _expand(
     compression: str, data: bytes, limit: int, *, whole: bool
 ) -> tuple[bytes, Exception | None]:
-    """The content up to about `limit` bytes or to an error, and the error.
+    """Decompress up to about `limit` bytes, or to an error; return the content and the error.
 
-    Piece by piece unless `whole`: what comes before an error is kept then.
+    Unless `whole`, decompress piece by piece, so that the content before an error is kept.
     """
     parts: list[bytes] = []
     size, pieces = 0, {"zstd": _zstd, "lz4": _lz4}.get(compression)

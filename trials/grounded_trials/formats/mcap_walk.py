@@ -1,15 +1,16 @@
-"""MCAP's outer layer: the bytes of a file as records, every checksum checked, in bounded memory.
+"""Read the records of an MCAP file in order, with every checksum verified, in bounded memory.
 
 An MCAP file is  magic, records, magic;  a record is  opcode u8, length u64, content.  The data
 section (header, schemas, channels, messages, chunks of them, attachments, metadata) ends with a
-DataEnd record that may hold the CRC of everything before it; the summary that follows ends with
-the footer, which may hold the summary's CRC. Nothing in the summary is trusted or needed here.
+DataEnd record that may hold the CRC of everything before it. The summary that follows ends with the
+footer, which may hold the summary's CRC. The contents of the summary are not used here.
 
-A record or chunk beyond a limit is refused before any memory is taken for it. So are a schema's or
-channel's id that is given to two of them, and a message logged after 2262: 2^63 ns.
+A record or chunk larger than a limit is refused before memory is allocated for it. Also refused are
+ids shared by two schemas or channels, and messages logged after 2262 (2^63 ns).
 
-Why not the mcap package: its stream reader takes 5 us a record, hands out short records at the end
-of a truncated file, and checks neither summary nor attachments; its import costs 40 ms.
+The mcap package is not used for reading: its stream reader takes 5 us per record, returns short
+records at the end of a truncated file, and checks neither summary nor attachments; importing it
+takes 40 ms.
 """
 
 from __future__ import annotations
@@ -42,10 +43,10 @@ from grounded_trials.formats.mcap_records import (
 )
 
 MAGIC = b"\x89MCAP0\r\n"
-RECORD_LIMIT = 512 * 2**20  # [bytes] of one record, and of one chunk when decompressed
+RECORD_LIMIT = 512 * 2**20  # [bytes] size of a record, and of a decompressed chunk
 BLOCK = 4 * 2**20  # [bytes] read at a time
-SMALL = 2**16  # [bytes]: chunks below this are handed on together, up to
-TOGETHER = 2**20  # [bytes] of them
+SMALL = 2**16  # [bytes] chunks smaller than this are joined ...
+TOGETHER = 2**20  # [bytes] ... up to this size
 MOST = 250_000  # messages in a batch
 
 PARSED = frozenset((*PARSERS, CHUNK, MESSAGE))
@@ -55,7 +56,7 @@ _U32 = Struct("<I")
 
 
 class DamagedFile(GroundedError):
-    """A file that is not what MCAP says it must be; `offset` is where that was noticed [bytes]."""
+    """A file that violates the MCAP format; `offset` is where that was noticed [bytes]."""
 
     def __init__(self, name: str, offset: int, found: str, advice: str | None = None) -> None:
         self.found, self.offset = found, offset
@@ -65,7 +66,7 @@ class DamagedFile(GroundedError):
 
 
 def read_records(stream: BinaryIO, name: str, *, limit: int = RECORD_LIMIT) -> Iterator[Record]:
-    """Yields the records of an MCAP stream in order, ending with `End`.
+    """Yield the records of an MCAP stream in order, ending with `End`.
 
     Args:
         stream: a seekable binary file, read from its beginning.
@@ -73,13 +74,13 @@ def read_records(stream: BinaryIO, name: str, *, limit: int = RECORD_LIMIT) -> I
         limit: largest record, and largest chunk when decompressed [bytes].
 
     Raises:
-        DamagedFile: where the bytes are not a complete, undamaged MCAP file.
+        DamagedFile: if it is not a complete, undamaged MCAP file.
     """
     yield from _Walk(stream, name, limit).records()
 
 
 class _Walk:
-    """One pass over a file; `buffer[pos:]` is what has been read and not used yet."""
+    """One pass over a file; `buffer[pos:]` has been read, but not used yet."""
 
     def __init__(self, stream: BinaryIO, name: str, limit: int) -> None:
         self.stream, self.name, self.limit = stream, name, limit
@@ -100,13 +101,13 @@ class _Walk:
         return DamagedFile(self.name, self.offset if offset is None else offset, found)
 
     def fold(self) -> int:
-        """The CRC of everything used so far."""
+        """Return the CRC of everything used so far."""
         self.crc = zlib.crc32(memoryview(self.buffer)[self.crc_pos : self.pos], self.crc)
         self.crc_pos = self.pos
         return self.crc
 
     def need(self, count: int, what: str) -> None:
-        """Makes `count` unused bytes available at buffer[pos]."""
+        """Make `count` unused bytes available at buffer[pos]."""
         if len(self.buffer) - self.pos >= count:
             return
         if self.offset + count > self.size:
@@ -128,7 +129,7 @@ class _Walk:
         self._magic()
         while True:
             step()
-            self.need(9, "a record's head; its end is missing")
+            self.need(9, "the head of a record; its end is missing")
             opcode, length = _HEAD.unpack_from(self.buffer, self.pos)
             self.need(9 + self._allowed(length), _NAMES.get(opcode, f"a record of type {opcode}"))
             if self.data_crc is None and opcode in PARSED:
@@ -137,7 +138,7 @@ class _Walk:
                 if opcode == MESSAGE:
                     yield self._run_of_messages()
                     continue
-            elif opcode not in (DATA_END, FOOTER):  # an index, or in the summary
+            elif opcode not in (DATA_END, FOOTER):  # an index, or part of the summary
                 self.pos += 9 + length
                 continue
             at, start = self.offset, self.pos + 9
@@ -159,7 +160,7 @@ class _Walk:
         head = self.stream.read(8)
         self.stream.seek(0)
         if head != MAGIC:
-            advice = "give a log in the MCAP format (ROS 1 bags: `mcap convert` turns them)"
+            advice = "give a log in the MCAP format (`mcap convert` converts ROS 1 bags)"
             found = "this is not an MCAP file"
             if MAGIC.startswith(head):
                 found, advice = "the file ends inside its first 8 bytes", "nothing can be saved"
@@ -173,7 +174,7 @@ class _Walk:
         return int(length)
 
     def _run_of_messages(self) -> Messages:
-        """All message records that follow each other in the buffer."""
+        """Return all consecutive message records in the buffer."""
         try:
             positions, self.pos = message_positions(self.buffer, self.pos, len(self.buffer))
         except BadRecord as error:
@@ -186,7 +187,7 @@ class _Walk:
         return messages
 
     def _together(self) -> Iterator[Messages]:
-        """The messages of the small chunks so far."""
+        """Yield the messages of the small chunks collected so far."""
         if self.positions:
             yield self._in_calendar(batch(b"".join(self.small), self.positions))
         self.small, self.small_size, self.positions = [], 0, []
@@ -210,7 +211,7 @@ class _Walk:
                 yield self._defined(record)
 
     def _defined(self, record: Record) -> Record:
-        """The same record, unless its id belongs to another schema or channel already."""
+        """Return the record; raise an error if its id belongs to another schema or channel."""
         if isinstance(record, Schema | Channel):
             known = self.defined.setdefault((type(record), record.id), record)
             if known != record:
@@ -230,7 +231,7 @@ class _Walk:
     def _data_end(self, content: bytes) -> None:
         stated = Fields(content).uint(32) if len(content) >= 4 else 0
         if stated and stated != self.fold():
-            raise self.damaged("the checksum of the data section does not fit its content")
+            raise self.damaged("the checksum of the data section does not match its content")
         self.data_crc = bool(stated)
         start = self.pos + 9 + len(content)
         self.crc, self.crc_pos = 0, start
@@ -244,29 +245,29 @@ class _Walk:
         self.pos += 9 + 16
         stated = _U32.unpack_from(content, 16)[0]
         if stated and stated != self.fold():
-            raise self.damaged("the checksum of the summary does not fit its content")
+            raise self.damaged("the checksum of the summary does not match its content")
         self.pos = begin + 9 + len(content)
         self.need(8, "its last 8 bytes")
         if self.buffer[self.pos : self.pos + 8] != MAGIC:
             raise self.damaged("the file does not end as an MCAP file does")
         self.pos += 8
         if self.offset != self.size:
-            raise self.damaged(f"{self.size - self.offset} bytes follow after the end")
+            raise self.damaged(f"{self.size - self.offset} bytes follow after the end of the log")
 
 
 def again(known: Schema | Channel, other: Schema | Channel) -> str:
-    """Why a second definition under the id of a first is refused."""
+    """Return a message on a second definition with the id of a first one."""
     what = type(known).__name__.lower()
     names = [r.topic if isinstance(r, Channel) else r.name for r in (known, other)]
     return f"{what} {known.id} is '{names[0][:80]}' and defined again as '{names[1][:80]}'"
 
 
 def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channel | Messages]:
-    """Yields the schemas and channels of a decompressed chunk, and its messages in batches.
+    """Yield the schemas and channels of a decompressed chunk, and its messages in batches.
 
     Args:
         data: the chunk's content.
-        cut: its end is missing: stop at the first record that is not wholly there.
+        cut: its end is missing: stop at the first incomplete record.
 
     Raises:
         BadRecord: if the records do not fit the chunk.
@@ -284,7 +285,7 @@ def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channe
 
 
 def chunk_parts(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channel | list[int]]:
-    """Yields the schemas and channels of a chunk, and where the messages between them start.
+    """Yield the schemas and channels of a chunk, and the positions of the messages between them.
 
     Arguments and errors are those of `chunk_records`.
     """
@@ -308,7 +309,7 @@ def chunk_parts(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channel 
 
 
 def message_positions(buffer: bytes, pos: int, end: int) -> tuple[list[int], int]:
-    """Starts of the complete message records from `pos` on, at most MOST; and where they stop.
+    """Return the starts of consecutive message records from `pos` on, at most MOST, and their end.
 
     Raises:
         BadRecord: for a message that is shorter than its header.
@@ -320,7 +321,7 @@ def message_positions(buffer: bytes, pos: int, end: int) -> tuple[list[int], int
         if opcode != MESSAGE or length > end - pos - 9:
             break
         if length < MESSAGE_HEADER:
-            raise BadRecord(f"a message claims {length} bytes, it needs {MESSAGE_HEADER}")
+            raise BadRecord(f"a message claims {length} bytes; it needs at least {MESSAGE_HEADER}")
         append(pos)
         pos += 9 + length
     return positions, pos

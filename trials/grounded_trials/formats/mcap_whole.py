@@ -1,9 +1,8 @@
-"""A whole MCAP file at once, byte for byte what the mcap package writes message by message.
+"""Write a whole MCAP file at once, byte for byte as the mcap package does message by message.
 
-For candidates: that of an aircraft has 9,001 messages, for which the package takes 0.1 s of CPU, a
-quarter of `propose`, beside 0.03 s for its import. Here columns become records in NumPy.
-What is written as it is sampled, in time for a flat battery, goes through the package
-(`mcap_writer`).
+Used for candidates: that of an aircraft has 9,001 messages, which take the package 0.1 s of CPU, a
+quarter of `propose`, plus 0.03 s for its import. Here columns become records in NumPy. Files
+written while they are sampled, which must survive a flat battery, use the package (`mcap_writer`).
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ import numpy as np
 from grounded_trials.formats.mcap_walk import MAGIC
 from grounded_trials.formats.mcap_writer import LIBRARY, Rows, file_descriptor_set
 
-CHUNK = 1024 * 1024  # [bytes] after which one ends
-MESSAGE = np.dtype(  # a record before the message's own data
+CHUNK = 1024 * 1024  # [bytes] after which a chunk ends
+MESSAGE = np.dtype(  # the part of a record before the message's data
     {
         "names": ["op", "size", "channel", "sequence", "logged", "published"],
         "formats": ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"],
@@ -31,15 +30,15 @@ HEAD = MESSAGE.itemsize
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """Messages of one channel: opcode, size and head are put before each row.
+    """Messages of one channel.
 
     Args:
         topic: of the channel.
-        message: the name of its type, which has one double (or list of doubles) a field.
-        fields: their names.
+        message: the name of its type, which has one double (or list of doubles) per field.
+        fields: names of the fields.
         rows: the encoded messages (N, bytes).
-        times: [ns] of each, increasing.
-        repeated: the fields are lists.
+        times: of each message, increasing [ns].
+        repeated: whether the fields are lists.
     """
 
     topic: str
@@ -50,7 +49,7 @@ class Column:
     repeated: bool = False
 
     def records(self, channel: int) -> Rows:
-        """The message records (N, HEAD + bytes)."""
+        """Return the message records (N, HEAD + bytes)."""
         count, size = self.rows.shape
         head = np.zeros(count, MESSAGE)
         head["op"], head["size"], head["channel"] = 0x05, HEAD - 9 + size, channel
@@ -62,13 +61,13 @@ class Column:
 def whole_file(
     table: Mapping[str, str], about: bytes, columns: Sequence[Column], written: Sequence[int]
 ) -> bytes:
-    """The file: the table `grounded`, a text `about`, and the messages in order of their times.
+    """Return the bytes of a file with a table `grounded`, a text `about`, and messages by time.
 
     Args:
         table: of strings.
-        about: of the attachment, text/plain.
-        columns: in the order of their channels' numbers, from 1.
-        written: which column comes first where times are equal, by its place.
+        about: content of the attachment, text/plain.
+        columns: in the order of their channel numbers, from 1.
+        written: rank of each column where times are equal.
     """
     header = _record(0x01, _text(""), _text(LIBRARY))
     metadata = _record(0x0C, _text("grounded"), _map(table))
@@ -134,15 +133,15 @@ def whole_file(
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Records of some messages, and where each channel's are in them."""
+    """Records of some messages, with an index by channel."""
 
     data: bytes
     first: int  # [ns]
-    last: int
-    entries: Mapping[int, bytes]  # of each channel: times and places in the data
+    last: int  # [ns]
+    entries: Mapping[int, bytes]  # by channel: times and positions in the data
 
     def at(self, offset: int) -> tuple[bytes, bytes]:
-        """The chunk's record with those of its message indexes, and the index of the chunk."""
+        """Return the chunk record with its message indexes, and the chunk's index record."""
         size, span = len(self.data), struct.pack("<QQ", self.first, self.last)
         head = span + struct.pack("<QI", size, crc32(self.data)) + _text("") + _long(size)
         chunk, places = _record(0x06, head, self.data), b""
@@ -163,7 +162,7 @@ class _Chunk:
 
 
 def _chunked(columns: Sequence[Column], written: Sequence[int], before: bytes) -> list[_Chunk]:
-    """The messages in order of time; what comes `before` them is in the first chunk."""
+    """Split messages, sorted by time, into chunks; the records `before` go into the first one."""
     number = np.repeat(np.arange(len(columns)), [len(one.rows) for one in columns])
     times = np.concatenate([one.times for one in columns])
     order = np.lexsort((np.argsort(written)[number], times))

@@ -1,8 +1,8 @@
-"""Writing MCAP: protobuf channels of named doubles, a table of strings, attached files.
+"""Write MCAP: protobuf channels of named doubles, a table of strings, attachments.
 
-The only importer of the mcap package; candidates are written whole (`mcap_whole`). Files are not
-compressed: a trial is small, its numbers compress badly, and so equal input gives equal bytes
-whatever the version of a compressor.
+Only this module imports the mcap package; candidates are written at once (`mcap_whole`). Files are
+not compressed: trials are small, their numbers compress badly, and without compression equal input
+gives equal bytes whatever the version of the compressor.
 """
 
 from __future__ import annotations
@@ -40,54 +40,58 @@ class _Writer:
         self._writer.start(profile=header.profile, library=header.library)
 
     def finish(self) -> None:
-        """Ends the file; the stream stays open."""
+        """End the file; the stream stays open."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.flush()
 
 
 class LogWriter(_Writer):
-    """Writes one file: metadata and attachments first, then messages, flushed in time."""
+    """Writes one file: metadata and attachments first, then messages."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         super().__init__(stream, Header("", LIBRARY), compressed=False)
         self._sequences: dict[int, int] = {}
 
     def metadata(self, name: str, table: Mapping[str, str]) -> None:
-        """Adds a table of strings."""
+        """Add a table of strings."""
         self._writer.add_metadata(name, dict(table))
 
     def attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """Adds a file."""
+        """Add an attachment."""
         self._writer.add_attachment(0, 0, name, media_type, data)
 
     def channel(
         self, topic: str, message: str, names: Sequence[str], *, repeated: bool = False
     ) -> int:
-        """Opens a protobuf channel; its message has one double (or list of doubles) a name."""
+        """Open a protobuf channel whose message has one double (or list of doubles) per name.
+
+        Returns:
+            The id of the channel.
+        """
         descriptor = file_descriptor_set(message, names, repeated=repeated)
         schema = self._writer.register_schema(f"grounded.{message}", "protobuf", descriptor)
         return self._writer.register_channel(topic, "protobuf", schema)
 
     def message(self, channel: int, time_ns: int, data: bytes) -> None:
-        """Adds a message that was sampled, and logged, at `time_ns`."""
+        """Add a message that was sampled and logged at `time_ns`."""
         sequence = self._sequences.get(channel, 0)
         self._sequences[channel] = sequence + 1
         self._writer.add_message(channel, time_ns, data, time_ns, sequence)
 
     def flush(self) -> None:
-        """Hands everything written so far to the operating system."""
+        """Pass everything written so far to the operating system."""
         self._writer.flush()  # type: ignore[no-untyped-call]
 
 
 class CopyWriter(_Writer):
-    """Writes records as they were read; ids are given anew."""
+    """Writes records as they were read, with new ids."""
 
     def __init__(self, stream: IO[bytes], header: Header, *, compressed: bool) -> None:
         super().__init__(stream, header, compressed=compressed)
         self._schemas: dict[Schema, int] = {}
 
     def channel(self, channel: Channel, schema: Schema | None) -> int:
-        """Adds a channel with its schema; returns the id for its messages."""
+        """Add a channel with its schema; return the id for its messages."""
         number = 0
         if schema is not None:
             if schema not in self._schemas:
@@ -100,7 +104,7 @@ class CopyWriter(_Writer):
         )
 
     def messages(self, batch: Messages, channel: int) -> None:
-        """Adds the messages of a batch, all of one channel."""
+        """Add the messages of a batch, all of one channel."""
         columns = (batch.starts, batch.ends, batch.log_times, batch.publish_times, batch.sequences)
         rows = zip(*(column.tolist() for column in columns), strict=True)
         for start, end, log_time, publish_time, sequence in rows:
@@ -108,21 +112,21 @@ class CopyWriter(_Writer):
             self._writer.add_message(channel, log_time, data, publish_time % 2**64, sequence)
 
     def metadata(self, record: Metadata) -> None:
-        """Adds a table."""
+        """Add a table."""
         self._writer.add_metadata(record.name, record.data)
 
     def attachment(self, record: Attachment) -> None:
-        """Adds a file."""
+        """Add an attachment."""
         self._writer.add_attachment(
             record.create_time, record.log_time, record.name, record.media_type, record.data
         )
 
 
 def file_descriptor_set(message: str, names: Sequence[str], *, repeated: bool = False) -> bytes:
-    """A serialised FileDescriptorSet of one proto3 message of doubles, numbered from 1.
+    """Return a serialised FileDescriptorSet of one proto3 message of doubles, numbered from 1.
 
-    Written out here, by the numbers of google/protobuf/descriptor.proto: the protobuf package takes
-    longer to import than to say this.
+    It is written by hand, with the numbers of google/protobuf/descriptor.proto, to avoid the slow
+    import of the protobuf package.
     """
     label, double = (3 if repeated else 1), 1  # LABEL_REPEATED, LABEL_OPTIONAL; TYPE_DOUBLE
     fields = [
@@ -136,9 +140,9 @@ def file_descriptor_set(message: str, names: Sequence[str], *, repeated: bool = 
 
 
 class DoublesEncoder:
-    """Protobuf messages of `count` doubles, numbered from 1.
+    """Encodes protobuf messages of `count` doubles, numbered from 1.
 
-    Zeros are written too, so that every message has the same length and -0.0 survives.
+    Zeros are written as well, so that all messages have the same length and -0.0 is preserved.
     """
 
     def __init__(self, count: int) -> None:
@@ -148,26 +152,28 @@ class DoublesEncoder:
         self._parts[::2] = tags
 
     def __call__(self, values: Array) -> bytes:
-        """The message of these values (count,)."""
+        """Return the message of these values (count,)."""
         self._parts[1::2] = values.tolist()
         return self._form.pack(*self._parts)
 
 
 def encode_doubles(values: Array) -> list[bytes]:
-    """The messages of `DoublesEncoder` for many rows, (N, count)."""
+    """Return the messages of `DoublesEncoder` for many rows, (N, count)."""
     return [row.tobytes() for row in rows_of(values)]
 
 
 def rows_of(values: Array) -> Rows:
-    """The same as an array (N, bytes)."""
+    """Return the messages of `encode_doubles` as an array (N, bytes)."""
     tags = [double_tag(number) for number in range(1, values.shape[1] + 1)]
     return _joined(list(zip(tags, values.T[:, :, None], strict=True)))
 
 
 def rows_of_lists(lists: Sequence[Array]) -> Rows:
-    """Messages of packed repeated doubles, numbered from 1: (N, bytes); an empty list is absent.
+    """Return messages (N, bytes) of packed repeated doubles, numbered from 1.
 
-    Each list has a row for each message, (N, count).
+    Args:
+        lists: one array (N, count) per field, with a row for each message; a field with count 0
+            is left out.
     """
     return _joined(
         [
@@ -179,7 +185,7 @@ def rows_of_lists(lists: Sequence[Array]) -> Rows:
 
 
 def _joined(fields: Sequence[tuple[bytes, Array]]) -> Rows:
-    """Rows of fields, each the same prefix and then the row's doubles (N, ...)."""
+    """Return rows of fields, each a constant prefix followed by the row's doubles (N, ...)."""
     parts = list[Rows]()
     for prefix, values in fields:
         data = np.ascontiguousarray(values, dtype="<f8").view(np.uint8)

@@ -1,4 +1,4 @@
-"""Message paths, as Foxglove writes them: which number of which topic's messages is meant.
+"""Parse message paths in Foxglove's syntax, which select a number in a topic's messages.
 
     /odom.pose.pose.orientation.@rpy.yaw      a field, then a function of it
     /motors.current[2]   .ranges[-1]          an item; negative counts from the end
@@ -8,8 +8,8 @@
 
 Functions: @rpy.roll|pitch|yaw of a quaternion, @norm of a vector or list, and of a number: @abs
 @negative @sign @sqrt @sin @cos @tan @asin @acos @atan @exp @log @ceil @floor @round @deg2rad
-@rad2deg @add(c) @sub(c) @mul(c) @div(c). Filters compare with == != < <= > >=, several may follow
-each other or be joined by &&. This file only parses; `path_walk` applies a path to messages.
+@rad2deg @add(c) @sub(c) @mul(c) @div(c). Filters compare with == != < <= > >=; several may follow
+each other or be joined by &&. This module only parses; `path_walk` applies a path to messages.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ _ROUNDING = ("abs", "negative", "sign", "ceil", "floor", "round")
 UNARY = (*_TRIGONOMETRY, *_ROUNDING, "sqrt", "exp", "log", "deg2rad", "rad2deg")
 BINARY = ("add", "sub", "mul", "div")
 ANGLES = ("roll", "pitch", "yaw")
-LENGTH_LIMIT = 1000  # characters of a path
+LENGTH_LIMIT = 1000  # characters in a path
 
 _REFUSED = {
     "delta": "differences amplify noise; measure the state or let [estimate] smooth it",
     "derivative": "differences amplify noise; measure the state or let [estimate] smooth it",
-    "timedelta": "times between messages are no signal",
-    "quat": "it gives four numbers; take a field of the orientation",
-    "rpy": "say which: .@rpy.roll, .@rpy.pitch or .@rpy.yaw",
+    "timedelta": "times between messages are not a signal",
+    "quat": "it gives four numbers; use a field of the orientation",
+    "rpy": "name the angle: .@rpy.roll, .@rpy.pitch or .@rpy.yaw",
 }
 
 
 @dataclass(frozen=True)
 class Field:
-    """Into a struct's field."""
+    """A step into a struct's field."""
 
     name: str
 
@@ -53,13 +53,13 @@ class Slice:
 
     @property
     def is_index(self) -> bool:
-        """Whether it is one item."""
+        """Whether it selects one item."""
         return self.start == self.stop
 
 
 @dataclass(frozen=True)
 class Filter:
-    """Only where the field at `path` compares to `value` as `operator` says."""
+    """A condition: the field at `path` compares to `value` by `operator`."""
 
     path: tuple[str, ...]
     operator: str
@@ -68,7 +68,7 @@ class Filter:
 
 @dataclass(frozen=True)
 class Function:
-    """A function of what the path found; `argument` of the arithmetic ones."""
+    """A function of the value found; `argument` is used by the arithmetic ones."""
 
     name: str
     argument: float = 0.0
@@ -79,7 +79,7 @@ Step = Field | Slice | Filter
 
 @dataclass(frozen=True)
 class MessagePath:
-    """A topic, the way into its messages, and functions of what is there."""
+    """A topic, the steps into its messages, and functions of the value there."""
 
     text: str
     topic: str
@@ -88,10 +88,10 @@ class MessagePath:
 
 
 def parse_path(text: str) -> MessagePath:
-    """Parses a message path.
+    """Parse a message path.
 
     Raises:
-        GroundedError: if it is not one, saying at which character.
+        GroundedError: if it is invalid, stating the character.
     """
     return _Parser(text).path()
 
@@ -106,12 +106,12 @@ _BLANK = re.compile(r"\s*")
 
 
 def is_name(text: str) -> bool:
-    """Whether a field's name needs no quotes."""
+    """Check whether a field's name needs no quotes."""
     return _NAME.fullmatch(text) is not None
 
 
 def is_topic(text: str) -> bool:
-    """Whether a topic's name needs no quotes."""
+    """Check whether a topic's name needs no quotes."""
     return _TOPIC.fullmatch(text) is not None
 
 
@@ -121,7 +121,7 @@ class _Parser:
 
     def path(self) -> MessagePath:
         if not isinstance(self.text, str) or not self.text.strip():
-            raise GroundedError("a message path is empty; write it as /topic.field")
+            raise GroundedError("a message path is empty; expected the form /topic.field")
         if len(self.text) > LENGTH_LIMIT:
             raise GroundedError(f"a message path has more than {LENGTH_LIMIT} characters")
         topic = self.name(_TOPIC, "a topic")
@@ -161,7 +161,7 @@ class _Parser:
 
     def integer(self) -> int | None:
         if self.peek() == "$":
-            self.fail("variables such as $name have no value here; write the number")
+            self.fail("variables such as $name are not supported; write the number")
         found = _INTEGER.match(self.text, self.pos)
         if not found:
             return None
@@ -223,14 +223,14 @@ class _Parser:
         value = float(self.match(_NUMBER, "a number"))
         self.expect(")")
         if not math.isfinite(value) or (name == "div" and value == 0):
-            self.fail(f"'@{name}' needs a finite number other than a division by 0")
+            self.fail(f"'@{name}' needs a finite number, and no division by 0")
         return value
 
     def quoted(self) -> str:
         mark = self.peek()
         end = self.text.find(mark, self.pos + 1)
         if end < 0:
-            self.fail(f"the text that begins with {mark} does not end")
+            self.fail(f"the text that begins with {mark} has no closing quote")
         value = self.text[self.pos + 1 : end]
         self.pos = end + 1
         return value

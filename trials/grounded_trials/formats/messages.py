@@ -1,11 +1,11 @@
-"""What messages hold, whatever encoded them: a tree of types, and nodes that walk it.
+"""The contents of messages, whatever their encoding: a tree of types, and nodes that walk it.
 
 A definition in ROS, IDL or protobuf becomes a `Type`: numbers, texts, structs and arrays of these.
 A `Node` is one place of that tree in many messages at once: row i is a value in message `rows[i]`.
 `field` goes into a struct, `items` into an array (a message then has as many rows as items, or
-none), `keep` drops rows; `numbers` and `equals` read the values. `cdr.py` and `protobuf.py` have
-nodes that decode bytes by array operations. JSON's are here: each message tells its own types, so
-they are parsed one by one.
+none), `keep` drops rows; `numbers` and `equals` read the values. The nodes in `cdr.py` and
+`protobuf.py` decode bytes by array operations. Those for JSON are here: every message has its own
+types, so messages are parsed one by one.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from grounded_trials.formats.budget import room, step
 
 @dataclass(frozen=True)
 class Number:
-    """A number of a numpy kind without byte order: f8, f4, i1 .. i8, u1 .. u8, b1.
+    """A number of a NumPy kind without byte order: f8, f4, i1 .. i8, u1 .. u8, b1.
 
-    `coding` is protobuf's of integers: "varint", "zigzag" (sint32, ...) or "fixed" (fixed32, ...).
+    `coding` is protobuf's encoding of integers: "varint", "zigzag" (sint32, ...) or "fixed"
+    (fixed32, ...).
     """
 
     kind: str
@@ -43,7 +44,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Text:
-    """A string; `unit` is the size of a character on the wire (0: a size nobody agrees on)."""
+    """A string; `unit` is the size of a character on the wire (0: not standardised)."""
 
     unit: int = 1
 
@@ -53,7 +54,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Array:
-    """Items of one type: `count` of them, or as many as the message says (None)."""
+    """Items of one type: a fixed `count`, or as many as the message states (None)."""
 
     item: Type
     count: int | None = None
@@ -64,7 +65,7 @@ class Array:
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """A named member of a struct; `number` is protobuf's, `default` its value when absent."""
+    """A named member of a struct; `number` is that of protobuf, `default` the value if absent."""
 
     name: str
     type: Type
@@ -90,7 +91,7 @@ class Struct:
 
 @dataclass(frozen=True)
 class Dynamic:
-    """A value whose type only the message tells (JSON)."""
+    """A value whose type is known only from the message (JSON)."""
 
     def __str__(self) -> str:
         return "value"
@@ -98,8 +99,8 @@ class Dynamic:
 
 Type = Number | Text | Array | Struct | Dynamic
 
-ROW_LIMIT, ROW_BYTES = 10_000_000, 64  # values that a path may find in a batch; while it does
-# [bytes] that parsed JSON takes at most: for each object, each other value, each byte of text
+ROW_LIMIT, ROW_BYTES = 10_000_000, 64  # values that a path may find in a batch; memory for each
+# [bytes] largest memory for parsed JSON: for each object, each other value, each byte of text
 OBJECT, VALUE, LETTER = 250, 90, 2
 
 Ints = NDArray[np.int64]
@@ -112,7 +113,7 @@ class BadSchema(Exception):
 
 
 class BadMessage(Exception):
-    """A message's bytes don't fit its schema; `message` is its index in the batch."""
+    """A message's bytes don't match its schema; `message` is its index in the batch."""
 
     def __init__(self, message: int, found: str) -> None:
         self.message = int(message)
@@ -120,7 +121,7 @@ class BadMessage(Exception):
 
 
 class BadPath(Exception):
-    """A path does not fit the type of the messages; the text says where and what would fit."""
+    """A path does not fit the message type; the text says where, and what would fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,49 +132,49 @@ class Node:
     rows: Ints
 
     def field(self, name: str) -> Node:
-        """The struct's field; rows where it is absent drop out."""
+        """Return the node of a struct's field, without the rows where it is absent."""
         raise NotImplementedError
 
     def items(self, start: int, stop: int) -> Node:
-        """The array's items from start to stop, both included; negative counts from the end."""
+        """Return array items from start to stop, both included; negative counts from the end."""
         raise NotImplementedError
 
     def pick(self, index: Ints) -> Self:
-        """These rows, in this order; a row may come several times."""
+        """Return these rows, in this order; a row may occur several times."""
         arrays = ((k, v) for k, v in vars(self).items() if isinstance(v, np.ndarray))
         columns: dict[str, Any] = {name: column[index] for name, column in arrays}
         return replace(self, **columns)
 
     def keep(self, chosen: Bools) -> Self:
-        """The rows where `chosen` is true."""
+        """Return the rows where `chosen` is true."""
         return self.pick(np.flatnonzero(chosen))
 
     def numbered(self, rows: Ints) -> Self:
-        """The same values with other numbers for their rows."""
+        """Return the same values with other row numbers."""
         return replace(self, rows=rows)
 
     def sample(self) -> Any:
-        """The first row's value where only it tells the type (JSON); else None."""
+        """Return the first row's parsed value if the type is dynamic (JSON), else None."""
         return None
 
     def names(self) -> tuple[str, ...]:
-        """The fields of a struct."""
+        """Return the field names of a struct."""
         return tuple(self.type.by_name) if isinstance(self.type, Struct) else ()
 
     def numbers(self) -> Floats:
-        """The values of a number, a row each."""
+        """Return the values of a number, one per row."""
         raise NotImplementedError
 
     def equals(self, text: str) -> Bools:
-        """Where a text is `text`."""
+        """Return where a text equals `text`."""
         raise NotImplementedError
 
 
 def choose_items(counts: Ints, start: int, stop: int) -> tuple[Ints, Ints]:
-    """Which items a slice takes: (row, index) for arrays of counts[row] items.
+    """Return the items that a slice selects, as (row, index), for arrays of counts[row] items.
 
-    Both ends are included and negative ones count from the end, as in Foxglove; what lies outside
-    the array is left out.
+    Both ends are included and negative ones count from the end, as in Foxglove; indices outside
+    the array are left out.
     """
     first = np.maximum(counts + start, 0) if start < 0 else np.full_like(counts, start)
     last = counts + stop if stop < 0 else np.minimum(counts - 1, stop)
@@ -182,7 +183,7 @@ def choose_items(counts: Ints, start: int, stop: int) -> tuple[Ints, Ints]:
         last = np.where(first < 0, first - 1, first)
     lengths = np.maximum(last - first + 1, 0)
     if (total := int(lengths.sum())) > ROW_LIMIT:
-        raise BadPath(f"it finds {total} values at once; name the items that are meant")
+        raise BadPath(f"it finds {total} values at once; select single items")
     room(ROW_BYTES * total)
     rows = np.repeat(np.arange(len(counts)), lengths)
     offset = np.arange(len(rows)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
@@ -190,7 +191,7 @@ def choose_items(counts: Ints, start: int, stop: int) -> tuple[Ints, Ints]:
 
 
 def texts_equal(buffer: bytes, start: Ints, length: Ints, text: bytes) -> Bools:
-    """Where the `length` bytes at `start` are exactly `text`."""
+    """Return where the `length` bytes at `start` are exactly `text`."""
     equal: Bools = length == len(text)
     octets = np.frombuffer(buffer, dtype=np.uint8)
     at = np.flatnonzero(equal)
@@ -202,13 +203,13 @@ def texts_equal(buffer: bytes, start: Ints, length: Ints, text: bytes) -> Bools:
 
 
 def json_messages(buffer: bytes, start: Ints, end: Ints) -> Node:
-    """JSON messages at buffer[start[i]:end[i]] as the root of a path.
+    """Return the root node of JSON messages at buffer[start[i]:end[i]].
 
-    null is a number that was not one, since JSON has no NaN; NaN itself is read too, since some
-    write it all the same.
+    null is read as NaN, which JSON does not have; NaN itself is accepted too, since some programs
+    write it.
 
     Raises:
-        BadMessage: for one that is not JSON.
+        BadMessage: for a message that is not JSON.
     """
     objects, taken = [], 0
     for i, (a, b) in enumerate(zip(start.tolist(), end.tolist(), strict=True)):
@@ -225,16 +226,16 @@ def json_messages(buffer: bytes, start: Ints, end: Ints) -> Node:
 
 @dataclass(frozen=True, eq=False)
 class _JsonNode(Node):
-    """Row i is the parsed value objects[i]; what a message lacks drops out."""
+    """Row i is the parsed value objects[i]; rows without a field are dropped."""
 
     objects: NDArray[np.object_]
 
     def sample(self) -> Any:
-        """The first message, parsed."""
+        """Return the first message, parsed."""
         return self.objects[0]
 
     def names(self) -> tuple[str, ...]:
-        """Those of the first row that is an object."""
+        """Return the names in the first row that is an object."""
         return next((tuple(o) for o in self.objects if isinstance(o, dict)), ())
 
     def field(self, name: str) -> _JsonNode:

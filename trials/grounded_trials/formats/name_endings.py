@@ -1,10 +1,10 @@
-"""Units that names end with, `x_mm` or `speed_kmh`."""
+"""Units at the end of names, such as `x_mm` or `speed_kmh`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-ENDINGS = {  # of a name, and the unit that they write
+ENDINGS = {  # unit by the ending of a name
     **dict.fromkeys(("deg_s", "degs", "deg_per_s", "dps"), "deg/s"),
     **dict.fromkeys(("rad_s", "rads", "rad_per_s"), "rad/s"),
     **dict.fromkeys(("m_s", "mps", "m_per_s"), "m/s"),
@@ -20,7 +20,7 @@ ENDINGS = {  # of a name, and the unit that they write
 
 
 def unit_ending(name: str) -> str:
-    """The ending of a name that writes a unit, `mm` of `x_mm`; "" for none."""
+    """Return the ending of a name that denotes a unit, such as `mm` of `x_mm`; "" for none."""
     for ending in sorted(ENDINGS, key=len, reverse=True):
         if name.endswith("_" + ending) and len(name) > len(ending) + 1:
             return ending
@@ -28,7 +28,7 @@ def unit_ending(name: str) -> str:
 
 
 def in_another_unit(name: str, known: Iterable[str]) -> list[str]:
-    """Those names that are the same word with another unit at its end, or without one."""
+    """Return the known names that differ from `name` only in the unit at the end."""
     return [one for one in known if one != name and _bare(one) == _bare(name)]
 
 

@@ -1,9 +1,8 @@
-"""Message paths and messages: which paths a type has, whether one fits it, what it finds.
+"""Apply message paths: check them against a type, evaluate them, list the paths of a type.
 
-`bind` checks a path against a type once, and says where the time stamp of its value lies: in the
-deepest struct on the way that has a `header.stamp`, a `stamp` or a `timestamp`. `evaluate` then
-walks the nodes of many messages by array operations. `number_paths` lists the paths of an unknown
-type.
+`bind` checks a path against a type once, and finds the time stamp of its value: in the innermost
+struct on the path that has a `header.stamp`, a `stamp` or a `timestamp`. `evaluate` then walks the
+nodes of many messages by array operations. `number_paths` lists the paths of an unknown type.
 """
 
 from __future__ import annotations
@@ -53,17 +52,17 @@ QUATERNION = ("x", "y", "z", "w")
 
 @dataclass(frozen=True)
 class Bound:
-    """A path that fits a type: the steps to the struct with the stamp, and from there on."""
+    """A path that fits a type, split at the struct with the stamp."""
 
     before: tuple[Step, ...]
     after: tuple[Step, ...]
-    stamp: tuple[str, ...] | None  # names from that struct to the stamp; None: it has none
+    stamp: tuple[str, ...] | None  # names from that struct to the stamp; None: there is none
     functions: tuple[Function, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Values:
-    """What a path found: values[i] in message rows[i], stamped stamps[i] [ns]."""
+    """The values found: values[i] in message rows[i], with the stamp stamps[i] [ns]."""
 
     rows: Ints
     values: Floats
@@ -71,10 +70,10 @@ class Values:
 
 
 def bind(path: MessagePath, type: Type) -> Bound:
-    """Checks a path against the type of a topic's messages.
+    """Check a path against the type of a topic's messages.
 
     Raises:
-        BadPath: if it does not fit, naming the nearest that would.
+        BadPath: if it does not fit, suggesting the nearest name.
     """
     split, stamp = 0, _stamp_in(type)
     for i, step in enumerate(path.steps):
@@ -108,9 +107,9 @@ def _into(type: Type, step: Step) -> Type:
 
 def _field(type: Type, name: str) -> Type:
     if isinstance(type, Array):
-        raise BadPath(f"'{name}' is asked of a list; say of which item, as in [0] or [:]")
+        raise BadPath(f"'{name}' follows a list; select an item first, as in [0] or [:]")
     if not isinstance(type, Struct):
-        raise BadPath(f"'{name}' is asked of a {type}, which has no fields")
+        raise BadPath(f"'{name}' follows a {type}, which has no fields")
     if name not in type.by_name:
         alike = in_another_unit(name, type.by_name)
         hint = f"did you mean '{alike[0]}'?" if alike else nearest(name, type.by_name)
@@ -131,9 +130,9 @@ def _check_end(type: Type, path: MessagePath) -> None:
         if not fits and not (isinstance(type, Struct) and _numbers_of(type)):
             raise BadPath(f"@norm needs a vector or a list of numbers, found {type}")
     elif isinstance(type, Struct):
-        raise BadPath(f"it ends at a {type}; go on to one of: {', '.join(type.by_name)}")
+        raise BadPath(f"it ends at a {type}; add one of its fields: {', '.join(type.by_name)}")
     elif isinstance(type, Array):
-        raise BadPath(f"it ends at a list, {type}; say which item, as in [0]")
+        raise BadPath(f"it ends at a list, {type}; select an item, as in [0]")
     elif not isinstance(type, Number):
         raise BadPath(f"it ends at a {type}, not at a number")
 
@@ -147,7 +146,7 @@ def _numbers_of(type: Struct) -> list[str]:
 
 
 def _stamp_in(type: Type) -> tuple[str, ...] | None:
-    """Names that lead from a struct to its time stamp."""
+    """Return the names that lead from a struct to its time stamp; None if it has none."""
     for names in STAMPS:
         inner: Type = type
         for name in names:
@@ -161,13 +160,23 @@ def _stamp_in(type: Type) -> tuple[str, ...] | None:
 
 
 def is_time(type: Struct) -> bool:
-    """Whether a struct is a time: seconds and nanoseconds, by any of their names."""
+    """Check whether a struct is a time: seconds and nanoseconds, under any usual names."""
     names = tuple(type.by_name)
     return len(names) == 2 and names[0] in SECONDS and names[1] in NANOSECONDS
 
 
 def evaluate(root: Node, bound: Bound, stamps: bool) -> Values:
-    """Walks the messages; reads the stamps too where asked for."""
+    """Evaluate a path on messages.
+
+    Args:
+        root: node of the messages.
+        bound: the path.
+        stamps: whether to read the time stamps too.
+
+    Raises:
+        BadMessage: if a message does not match its type.
+        BadPath: if a JSON message has no number at the end of the path.
+    """
     node = walk(root, bound.before)
     messages = node.rows
     with _numbered(node) as numbered:
@@ -184,7 +193,7 @@ def evaluate(root: Node, bound: Bound, stamps: bool) -> Values:
 
 @contextmanager
 def _numbered(node: Node) -> Iterator[Node]:
-    """The node with its rows counted from 0; what is wrong inside still names its message."""
+    """Provide the node with rows counted from 0; map row numbers in errors back to messages."""
     try:
         yield node.numbered(np.arange(len(node.rows)))
     except BadMessage as error:
@@ -192,7 +201,7 @@ def _numbered(node: Node) -> Iterator[Node]:
 
 
 def _dynamic_stamp(root: Node) -> tuple[str, ...] | None:
-    """Names that lead to the stamp in JSON messages, whose first one tells."""
+    """Return the names that lead to the stamp in JSON messages, judging by the first one."""
     first = root.keep(np.arange(len(root.rows)) == 0)
     for names in STAMPS:
         found = walk(first, tuple(Field(name) for name in names)).names()
@@ -202,7 +211,7 @@ def _dynamic_stamp(root: Node) -> tuple[str, ...] | None:
 
 
 def walk(node: Node, steps: Sequence[Step]) -> Node:
-    """Follows steps from a node."""
+    """Follow steps from a node."""
     for step in steps:
         if isinstance(step, Field):
             node = node.field(step.name)
@@ -214,7 +223,7 @@ def walk(node: Node, steps: Sequence[Step]) -> Node:
 
 
 def read_stamp(node: Node) -> tuple[Ints, Ints]:
-    """Rows and times [ns]; the parts may be named as ROS 1, ROS 2 or protobuf name them."""
+    """Return rows and times [ns] of a stamp with the field names of ROS 1, ROS 2 or protobuf."""
     names = node.names()
     parts = [next((n for n in known if n in names), "") for known in (SECONDS, NANOSECONDS)]
     if "" in parts:
@@ -228,12 +237,12 @@ def read_stamp(node: Node) -> tuple[Ints, Ints]:
     if outside.any():
         k = int(np.argmax(outside))
         when = f"{whole[k]:g} s and {part[k]:g} ns"
-        raise BadMessage(seconds.rows[k], f"its stamp, {when}, is outside the calendar")
+        raise BadMessage(seconds.rows[k], f"its stamp, {when}, is out of range")
     return seconds.rows, whole.astype(np.int64) * 10**9 + part.astype(np.int64)
 
 
 def _passes(node: Node, step: Filter) -> Bools:
-    """Where a filter holds; rows in which its field is absent do not pass."""
+    """Return where a filter holds; it does not in rows without its field."""
     with _numbered(node) as inner:
         for name in step.path:
             inner = inner.field(name)
@@ -258,7 +267,7 @@ _COMPARE: dict[str, Callable[[Floats, float], Bools]] = {
 
 
 def _apply(node: Node, functions: Sequence[Function]) -> tuple[Ints, Floats]:
-    """Values at the end of a path, through its functions: (rows, values)."""
+    """Return the values at the end of a path after its functions, as (rows, values)."""
     first, rest = (functions[0].name, functions[1:]) if functions else ("", ())
     if first in ANGLES:
         rows, values = node.rows, _angle(first, [_part(node, name) for name in QUATERNION])
@@ -274,7 +283,7 @@ def _apply(node: Node, functions: Sequence[Function]) -> tuple[Ints, Floats]:
 
 
 def _part(node: Node, name: str) -> Floats:
-    """A number of a struct in each row; NaN where it is absent."""
+    """Return a number of a struct for each row; NaN where it is absent."""
     values = np.full(len(node.rows), np.nan)
     with _numbered(node) as numbered:
         inner = numbered.field(name)
@@ -283,7 +292,7 @@ def _part(node: Node, name: str) -> Floats:
 
 
 def _angle(name: str, quaternion: list[Floats]) -> Floats:
-    """Roll, pitch or yaw [rad] of R = Rz(yaw) Ry(pitch) Rx(roll); NaN of a zero quaternion."""
+    """Return roll, pitch or yaw [rad] for R = Rz(yaw) Ry(pitch) Rx(roll); NaN for zero."""
     with np.errstate(invalid="ignore", divide="ignore"):
         norm = np.sqrt(sum(q**2 for q in quaternion))
         x, y, z, w = (q / norm for q in quaternion)
@@ -306,31 +315,31 @@ def _norm(node: Node) -> Floats:
         return np.sqrt(np.bincount(items.rows, items.numbers() ** 2, minlength=len(node.rows)))
 
 
-_NUMPY = {"asin": "arcsin", "acos": "arccos", "atan": "arctan"}  # where its name is another
+_NUMPY = {"asin": "arcsin", "acos": "arccos", "atan": "arctan"}  # names in NumPy
 _FUNCTIONS: dict[str, Callable[..., Floats]] = {
     name: getattr(np, _NUMPY.get(name, name)) for name in UNARY
 } | {"add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide}
 
 
-FIELD_LIMIT = 200  # paths of one topic
-ITEM_LIMIT = 12  # items of a list that are named one by one
+FIELD_LIMIT = 200  # paths listed per topic
+ITEM_LIMIT = 12  # items of a list that are listed individually
 DEPTH_LIMIT = 12
-VISIT_LIMIT = 20_000  # parts of a type that are looked at; a hostile one has no end
+VISIT_LIMIT = 20_000  # parts of a type that are visited; a malicious one may be endless
 
 
 def number_paths(type: Type, sample: Any = None) -> list[str]:
-    """Paths (without the topic) to the numbers of a type, quaternions also as angles.
+    """List the paths (without the topic) to the numbers of a type, and angles of quaternions.
 
     Args:
         type: of the messages.
-        sample: one parsed message, where only it tells the type (JSON).
+        sample: one parsed message, if the type is dynamic (JSON).
     """
     inside = sample if isinstance(type, Dynamic) else type
     return list(islice(_paths_in(inside, 0, iter(range(VISIT_LIMIT))), FIELD_LIMIT))
 
 
 def _paths_in(thing: Any, depth: int, patience: Iterator[int]) -> Iterator[str]:
-    """Paths inside a type, or inside a parsed JSON value."""
+    """Yield the paths inside a type, or inside a parsed JSON value."""
     if depth > DEPTH_LIMIT or next(patience, None) is None:
         return
     if isinstance(thing, Number | int | float):
@@ -344,7 +353,7 @@ def _paths_in(thing: Any, depth: int, patience: Iterator[int]) -> Iterator[str]:
 
 
 def _steps_into(thing: Any) -> list[tuple[str, Any]]:
-    """The parts of a struct or array that are named one by one, by the step that leads there."""
+    """Return the parts of a struct or array, each with the step that leads to it."""
     if isinstance(thing, Array):
         count = ITEM_LIMIT if thing.count is None else thing.count
         named = (count if isinstance(thing.item, Number) else 1) * (count <= ITEM_LIMIT)

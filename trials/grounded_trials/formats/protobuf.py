@@ -1,9 +1,9 @@
-"""Protobuf messages as nodes: many messages decoded side by side, straight to arrays.
+"""Protobuf messages as nodes: many messages are decoded in parallel, directly to arrays.
 
-A message is a sequence of  tag varint (number << 3 | wire type), content.  A struct is read by
-one cursor a row: in each round every row reads its next tag, until the longest row is done. The
-last occurrence of a field counts, as the format says; a field that is absent has its default, a
-message that is absent has no row.
+A message is a sequence of  tag varint (number << 3 | wire type), content.  A struct is read with
+one cursor per row: in each round every row reads its next tag, until the longest row is done. As
+the format requires, the last occurrence of a field counts. An absent field has its default, an
+absent message has no row.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from grounded_trials.formats.messages import (
 
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 Words = NDArray[np.uint64]
-PACKED_LIMIT = 2**27  # [bytes] of the lists of integers in one batch of messages
-MOST_FIELDS = 200_000  # in one message; a hostile one would take minutes
+PACKED_LIMIT = 2**27  # [bytes] size of the lists of integers in one batch of messages
+MOST_FIELDS = 200_000  # fields in one message; a malicious one would take minutes
 
 
 @dataclass(frozen=True, eq=False)
 class _ProtobufNode(Node):
-    """Row i is the bytes start[i]:end[i] of the buffer, coded as wire[i]; start -1: absent."""
+    """Row i is the bytes start[i]:end[i] of the buffer with wire type wire[i]; start -1: absent."""
 
     start: Ints
     end: Ints
@@ -84,7 +84,7 @@ class _ProtobufNode(Node):
             return _integers(kind, raw)
         size = {FIXED64: 8, FIXED32: 4}.get(wire)
         if size != kind.size or not _is_fixed(kind):
-            raise BadMessage(self.rows[at[0]], "a number is not coded as its schema says")
+            raise BadMessage(self.rows[at[0]], "a number is not encoded as its schema says")
         return np.asarray(windows(self.buffer, f"<{kind.kind}")[start], dtype=np.float64)
 
     def equals(self, text: str) -> Bools:
@@ -94,19 +94,19 @@ class _ProtobufNode(Node):
 
 @dataclass(frozen=True, eq=False)
 class ProtobufItems(Node):
-    """The items of a repeated field, all rows' in one node; owner[j] is the row of item j."""
+    """The items of a repeated field, of all rows in one node; owner[j] is the row of item j."""
 
     owner: Ints
     all: _ProtobufNode
 
     def keep(self, chosen: Bools) -> ProtobufItems:
-        """The lists of the chosen messages."""
+        """Return the lists of the chosen messages."""
         stays = chosen[self.owner]
         owner = (np.cumsum(chosen) - 1)[self.owner[stays]]
         return replace(self, rows=self.rows[chosen], owner=owner, all=self.all.keep(stays))
 
     def items(self, start: int, stop: int) -> _ProtobufNode:
-        """Items `start` to `stop` of every list, as `Node.items`."""
+        """Return items `start` to `stop` of every list, as `Node.items`."""
         counts = np.bincount(self.owner, minlength=len(self.rows)).astype(np.int64)
         first = np.cumsum(counts) - counts
         owner, index = choose_items(counts, start, stop)
@@ -114,36 +114,36 @@ class ProtobufItems(Node):
 
 
 def protobuf_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> Node:
-    """Messages of one type at buffer[start[i]:end[i]] as the root of a path."""
+    """Return the root node of messages of one type at buffer[start[i]:end[i]]."""
     wire = np.full(len(start), BYTES, dtype=np.int64)
     return _ProtobufNode(type, np.arange(len(start)), start, end, wire, buffer)
 
 
 def double_tag(number: int) -> bytes:
-    """What stands before a double."""
+    """Return the tag of a double field."""
     return varint(number << 3 | FIXED64)
 
 
 def doubles_tag(number: int, count: int) -> bytes:
-    """What stands before a packed list of so many doubles."""
+    """Return the tag and length of a packed list of `count` doubles."""
     return varint(number << 3 | BYTES) + varint(8 * count)
 
 
 def uniform_doubles(
     buffer: bytes, start: Ints, end: Ints, fields: Sequence[tuple[bytes, int]]
 ) -> list[Floats] | None:
-    """Messages that all hold exactly these fields in this order; None for others.
+    """Decode messages that all have exactly these fields in this order.
 
-    It is how `mcap_writer` writes; reading it this way is ten times as fast as field by field.
+    `mcap_writer` writes such messages; this is ten times as fast as decoding field by field.
 
     Args:
         buffer: the bytes.
         start: where each message starts, (N,).
         end: where it ends, (N,).
-        fields: the tag of each, and how many doubles follow it.
+        fields: the tag of each field, and the number of doubles after it.
 
     Returns:
-        The numbers of each field, (N, count).
+        The numbers of each field, (N, count); None if the messages differ from this.
     """
     sizes = [size for tag, count in fields for size in (len(tag), 8 * count)]
     if not len(start) or (end - start != sum(sizes)).any():
@@ -157,7 +157,7 @@ def uniform_doubles(
 
 
 def _occurrences(node: _ProtobufNode, number: int) -> tuple[Ints, Ints, Ints, Ints]:
-    """Where field `number` occurs: (row index, start, end, wire), by row, then in wire order."""
+    """Return where field `number` occurs, as (row, start, end, wire), by row, then wire order."""
     cursor, active = node.start.copy(), np.flatnonzero(node.start < node.end)
     found: list[tuple[Ints, Ints, Ints, Ints]] = []
     for _ in range(MOST_FIELDS):
@@ -184,7 +184,7 @@ def _occurrences(node: _ProtobufNode, number: int) -> tuple[Ints, Ints, Ints, In
 
 
 def _content(buffer: bytes, wire: Ints, pos: Ints, limit: Ints, message: Ints) -> tuple[Ints, Ints]:
-    """Start and end of the contents that follow tags of these wire types."""
+    """Return start and end of the contents after tags of these wire types."""
     start, end = pos.copy(), pos.copy()
     for kind in sorted(set(wire.tolist())):
         at = wire == kind
@@ -202,14 +202,14 @@ def _content(buffer: bytes, wire: Ints, pos: Ints, limit: Ints, message: Ints) -
                 after = after + value.astype(np.int64)
             end[at] = after
         else:
-            raise BadMessage(message[at][0], f"wire type {kind} is not known")
+            raise BadMessage(message[at][0], f"wire type {kind} is unknown")
     if (end > limit).any():
         raise BadMessage(message[end > limit][0], "it ends inside a field")
     return start, end
 
 
 def varint(value: int) -> bytes:
-    """Seven bits a byte, lowest first; all bytes but the last have their top bit set."""
+    """Encode a number with seven bits per byte, lowest first; the top bit is set if more follow."""
     parts = bytearray()
     while value > 0x7F:
         parts.append(value & 0x7F | 0x80)
@@ -219,7 +219,7 @@ def varint(value: int) -> bytes:
 
 
 def _varints(buffer: bytes, pos: Ints, limit: Ints, message: Ints) -> tuple[Words, Ints]:
-    """The varints at `pos` as uint64, and where they end."""
+    """Decode the varints at `pos` as uint64, and return where they end."""
     octets = np.frombuffer(buffer, dtype=np.uint8)
     value, end = np.zeros(len(pos), dtype=np.uint64), pos.copy()
     active = np.arange(len(pos))
@@ -253,7 +253,7 @@ def _integers(kind: Number, raw: Words) -> Floats:
 def _unpack(
     node: _ProtobufNode, item: Number, owner: Ints, start: Ints, end: Ints, wire: Ints
 ) -> tuple[Ints, Ints, Ints, Ints]:
-    """Occurrences of a repeated number as its items: packed ones are taken apart."""
+    """Split packed occurrences of a repeated number into single items."""
     packed = wire == BYTES
     if not packed.any():
         return owner, start, end, wire

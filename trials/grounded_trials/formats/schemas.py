@@ -1,16 +1,17 @@
-"""Definitions of message types (protobuf, ros1msg, ros2msg; IDL is in `idl_schema`) to types.
+"""Parse definitions of message types (protobuf, ros1msg, ros2msg; IDL is in `idl_schema`).
 
-Protobuf's are a FileDescriptorSet, which is protobuf itself: Google's library reads it. Those that
-grounded writes are recognised without it, since its import takes longer than reading a trial.
+A protobuf definition is a FileDescriptorSet, itself encoded in protobuf, which Google's library
+reads. Those that grounded writes are recognised without it, since importing it takes longer than
+reading a trial.
 
 A ROS definition is the text of the message's .msg file, followed by those of the types it uses,
 each after a line of '=' and a line "MSG: package/Type". A line is "type name [default]", or
-"type NAME=value" for a constant, which is not sent. Service events ("..._Event") are stored as
-the service's request and response, with '---' between; what is sent is an info and both of them.
+"type NAME=value" for a constant, which is not sent. Service events ("..._Event") are defined as
+the service's request and response with '---' between them; the message has an info and both.
 
-Why not rosbags' parsers (0.11.9): they refuse service events, line ends of Windows, constants in
-lower case, IDL with several files, base types or arrays of arrays; they take 20 to 40 times as
-long, and more than 20 s for 25 sequences in each other, which is 230 bytes.
+The parsers of rosbags (0.11.9) are not used: they refuse service events, Windows line ends,
+constants in lower case, and IDL with several files, base types or nested arrays. They take 20 to 40
+times as long, and more than 20 s for 25 nested sequences, a text of 230 bytes.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from grounded_trials.formats.mcap_records import Schema
 from grounded_trials.formats.mcap_writer import file_descriptor_set
 from grounded_trials.formats.messages import Array, BadSchema, Field, Number, Struct, Text, Type
 
-DEPTH_LIMIT, COUNT_LIMIT = 64, 10**8  # of types inside types, and of an array's items
+DEPTH_LIMIT, COUNT_LIMIT = 64, 10**8  # nesting of types; items of an array
 _KINDS = {"int": ("i", 1, 2, 4, 8), "uint": ("u", 1, 2, 4, 8), "float": ("f", 4, 8)}
-NUMBERS = {  # by their names in ROS: int8 ... float64
+NUMBERS = {  # by their ROS names: int8 ... float64
     f"{word}{8 * size}": Number(f"{kind}{size}")
     for word, (kind, *sizes) in _KINDS.items()
     for size in sizes
@@ -33,7 +34,7 @@ NUMBERS = {  # by their names in ROS: int8 ... float64
 
 
 def struct_of(schema: Schema) -> Struct:
-    """The message type that a schema defines.
+    """Return the message type that a schema defines.
 
     Raises:
         BadSchema: if it can't be parsed, or its language is unknown.
@@ -48,8 +49,8 @@ def struct_of(schema: Schema) -> Struct:
 
         return parse_idl(text, schema.name)
     raise BadSchema(
-        f"the schema's language '{schema.encoding}' can't be read; ros1msg, ros2msg, ros2idl, "
-        "omgidl and protobuf can"
+        f"the schema's language '{schema.encoding}' can't be read; expected ros1msg, ros2msg, "
+        "ros2idl, omgidl or protobuf"
     )
 
 
@@ -57,7 +58,7 @@ _OWN_FIELD = re.compile(rb"\n[\x01-\x7f]([!-~]+)\x18.{1,2} ([\x01\x03])\(\x01", 
 
 
 def _own_type(data: bytes, name: str) -> Struct | None:
-    """The type of a channel that grounded wrote, proved by writing its definition again."""
+    """Return the type of a channel written by grounded, verified by writing it again; else None."""
     found = _OWN_FIELD.findall(data)
     names = [field.decode() for field, _ in found]
     repeated = bool(found) and found[0][1] == b"\3"
@@ -87,11 +88,11 @@ _PROTOBUF: dict[int, Type] = {
     18: Number("i8", "zigzag"),
 }
 MESSAGE, REPEATED = 11, 3
-NUMBER_LIMIT = 2**29  # of a field
+NUMBER_LIMIT = 2**29  # largest number of a field, exclusive
 
 
 def parse_protobuf(data: bytes, name: str) -> Struct:
-    """The message type `name` (with its package, without a leading dot) of a FileDescriptorSet.
+    """Return message type `name` (with package, without leading dot) of a FileDescriptorSet.
 
     Raises:
         BadSchema: if the set is damaged or does not define what it uses.
@@ -133,7 +134,7 @@ class _ProtobufTypes:
 
     def field(self, field: Any) -> Field:
         if not isinstance(field.name, str):
-            raise ValueError("a field's name is no text")
+            raise ValueError("a field's name is not a text")
         code = field.type if field.HasField("type") else 0
         if code != MESSAGE and code not in _PROTOBUF:
             raise BadSchema(f"field '{field.name}' has protobuf type {code}, which can't be read")
@@ -169,10 +170,10 @@ _INFO = (
 
 
 def parse_ros(text: str, name: str, *, ros1: bool) -> Struct:
-    """The message type `name` that a definition describes.
+    """Return the message type `name` of a ROS definition.
 
     Raises:
-        BadSchema: if it uses a type it does not define, or is no definition.
+        BadSchema: if it uses a type that it does not define, or is not a definition.
     """
     first, *others = _SEPARATOR.split(text.replace("\r\n", "\n"))
     texts = {"builtin_interfaces/Duration": _TIME}
@@ -194,13 +195,13 @@ def parse_ros(text: str, name: str, *, ros1: bool) -> Struct:
 
 
 def _short(name: str) -> str:
-    """package/Type of package/msg/Type."""
+    """Return package/Type for package/msg/Type."""
     parts = name.split("/")
     return f"{parts[0]}/{parts[-1]}" if len(parts) == 3 else name
 
 
 def _service_event(texts: dict[str, str], root: str) -> None:
-    """Replaces "request --- response" by what a service event really holds."""
+    """Replace "request --- response" by the fields that a service event message has."""
     parts = re.split(r"^---\s*$", texts[root], maxsplit=1, flags=re.MULTILINE)
     if len(parts) == 1:
         return
@@ -233,7 +234,7 @@ class _RosTypes:
                 continue
             match = _FIELD.match(stripped)
             if not match:
-                raise BadSchema(f"its definition has a line that is no field: '{stripped[:60]}'")
+                raise BadSchema(f"its definition has an invalid line: '{stripped[:60]}'")
             if match["constant"]:
                 continue
             fields.append(Field(match["name"], self.type(match, package, depth)))

@@ -1,9 +1,9 @@
-"""Tables of numbers as the records of a log: `.npz`, PX4's `.ulg`; `text_tables` has `.csv`.
+"""Convert tables of numbers to log records: `.npz` and PX4's `.ulg`; `text_tables` reads `.csv`.
 
-A table is a topic whose messages hold a stamp and one double a column, so that everything that
-reads a bag reads a table: `/csv.speed`, `/run03.q[1]`, `/vehicle_attitude.q[0]`. Every table needs
-a column of times, which its type's name states ("csv, time in 't' [s]"). Names keep letters,
-digits and underscores; a unit in brackets or after the last comma is left out.
+A table becomes a topic whose messages hold a stamp and one double per column, so that tables are
+read like bags: `/csv.speed`, `/run03.q[1]`, `/vehicle_attitude.q[0]`. Every table needs a column of
+times, which is stated in the name of its type ("csv, time in 't'"). Names keep letters, digits and
+underscores; a unit in brackets is left out.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from grounded_trials.formats.mcap_records import Channel, End, Header, Messages,
 from grounded_trials.formats.messages import Floats
 
 ULOG, ZIP = b"ULog\x01\x12\x35", b"PK\x03\x04"  # how the files begin
-VALUES = 200_000_000  # numbers in one file
-ROWS = 50_000  # of a batch
+VALUES = 200_000_000  # largest number of values in one file
+ROWS = 50_000  # rows in a batch
 STAMPS = ("t", "time", "timestamp", "stamp", "times", "timestamps")
 TIMES = (*STAMPS, "seconds", "secs", "clock", "clk", "elapsed")
-ABROAD = (  # the same in other languages, where no column has an English name
+ABROAD = (  # the same in other languages, used if no column has an English name
     *("zeit", "zeitstempel", "uhrzeit", "temps", "horodatage", "heure", "tiempo", "hora"),
     *("tempo", "ora", "tijd", "tid", "czas", "aika", "время", "时间", "時間", "时间戳"),
 )
@@ -38,10 +38,10 @@ Columns = Mapping[str, Floats]
 
 
 def npz_records(path: Path) -> Iterator[Record]:
-    """The records of a NumPy archive: arrays of one length and their times.
+    """Yield the records of a NumPy archive: arrays of one length and their times.
 
-    `NAME` (N, k) beside `NAME_t` (N,) is the table /NAME, its columns named by an array of k texts
-    where there is one; arrays (N,) beside a time of that length are the table /npz.
+    `NAME` (N, k) with `NAME_t` (N,) becomes the table /NAME, its columns named by an array of k
+    texts if there is one; arrays (N,) with a time of that length become the table /npz.
 
     Raises:
         GroundedError: if it is damaged, holds Python objects, or has no times.
@@ -111,7 +111,7 @@ def _columns(array: Floats, names: list[str], table: str) -> dict[str, Floats]:
 
 
 def ulog_records(path: Path) -> Iterator[Record]:
-    """The records of a PX4 log, by pyulog.
+    """Yield the records of a PX4 log, read with pyulog.
 
     Raises:
         GroundedError: if it is damaged, or pyulog is not installed.
@@ -119,7 +119,7 @@ def ulog_records(path: Path) -> Iterator[Record]:
     needs("pyulog", "px4")
     from pyulog import ULog
 
-    try:  # it prints what it finds wrong, and left a file open that it had opened itself
+    try:  # pyulog prints problems, and does not close a file that it opened itself
         with path.open("rb") as stream, redirect_stdout(io.StringIO()):
             log = ULog(stream)
     except Exception as error:  # pyulog raises whatever a damaged file leads to
@@ -133,21 +133,21 @@ def ulog_records(path: Path) -> Iterator[Record]:
 
 
 def table_records(tables: Mapping[str, Columns], kind: str, path: Path) -> Iterator[Record]:
-    """Tables as records, one topic a table.
+    """Yield tables as records, one topic per table.
 
     Args:
-        tables: columns by topic, equally long, one of them the times.
-        kind: what the file is.
+        tables: columns by topic, equally long, one of them with the times.
+        kind: of the file, such as "csv".
         path: of the file, for messages.
 
     Raises:
         GroundedError: if there is no table, no column of times, or more than `VALUES` numbers.
     """
     if sum(len(column) for columns in tables.values() for column in columns.values()) > VALUES:
-        raise GroundedError(f"{path} holds more than {VALUES} numbers: cut it into several files")
+        raise GroundedError(f"{path} holds more than {VALUES} numbers: split it into several files")
     if not tables:
         raise GroundedError(
-            f"{path} has no column of times: name one 't' (seconds), of the other arrays' length"
+            f"{path} has no column of times: add an array 't' (seconds), as long as the others"
         )
     yield Header("", kind)
     packed = []
@@ -165,7 +165,7 @@ def table_records(tables: Mapping[str, Columns], kind: str, path: Path) -> Itera
 
 
 def _definition(fields: list[str]) -> bytes:
-    """A message of a header and doubles; `q[0]`, `q[1]` ... are an array."""
+    """Return the definition of a message with a header and doubles; `q[0]`, ... are an array."""
     lines, seen = ["std_msgs/Header header"], dict[str, int]()
     for field in fields:
         name = field.partition("[")[0]
@@ -195,7 +195,7 @@ def _rows(channel: int, stamps: Any, columns: list[Floats]) -> Messages:
 
 
 def _times(columns: Columns, path: Path) -> tuple[str, Any]:
-    """The column of times, and its values [ns]."""
+    """Return the name of the column of times, and its values [ns]."""
     for name, values in columns.items():
         if values.dtype.kind == "i":  # [ns], from texts
             return name, values
@@ -208,13 +208,13 @@ def _times(columns: Columns, path: Path) -> tuple[str, Any]:
         unit = "ns" if top > 1e17 else "us" if top > 1e14 else "ms" if top > 1e11 else "s"
     if lost := len(values) - len(finite):
         raise GroundedError(
-            f"{path}: '{name}' is no number in {lost} of {len(values)} rows: delete those rows, "
-            "or name the column of times 't' if this is not it"
+            f"{path}: '{name}' is not a number in {lost} of {len(values)} rows: delete those rows, "
+            "or, if these are not the times, name their column 't'"
         )
     if top * UNITS[unit] > LATEST:
         raise GroundedError(
-            f"{path}: '{name}' goes up to {top:g}, beyond every calendar when read in {unit}: let "
-            "its name end with the unit, _ms, _us or _ns"
+            f"{path}: '{name}' goes up to {top:g}, which is out of range in {unit}: end its name "
+            "with its unit, _ms, _us or _ns"
         )
     return name, np.rint(values * UNITS[unit]).astype(np.int64)
 
@@ -224,24 +224,24 @@ def _time_of(names: Sequence[str], path: Path) -> str:
         return name
     raise GroundedError(
         f"{path} has no column of times among {', '.join(names[:8])}: name one 't' (seconds), or "
-        "'t_ms', 't_us' or 't_ns' in their units ('time', 'stamp', 'clock', 'elapsed' will do too)"
+        "'t_ms', 't_us' or 't_ns' in their units ('time', 'stamp', 'clock', 'elapsed' also work)"
     )
 
 
 def time_among(names: Sequence[str]) -> str:
-    """The first name of times, in English before other languages; "" for none."""
+    """Return the first name of a column of times, English before other languages; "" for none."""
     ranked = (n for words in (TIMES, ABROAD) for n in names if is_time(n, words))
     return next(ranked, "")
 
 
 def is_time(name: str, words: Sequence[str] = (*TIMES, *ABROAD)) -> bool:
-    """Whether a column's name says time, perhaps with its unit at the end."""
+    """Check whether a column's name is that of a time, perhaps with a unit at the end."""
     stem = re.sub(r"_?(in_)?(s|ns|us|ms|sec)$", "", name.lower()) or name.lower()
     return name.lower() in words or stem in words
 
 
 def column_name(cell: str) -> str:
-    """A column's name as a message path can say it."""
+    """Return a column's name in a form that a message path can contain."""
     bare = re.sub(r"[\[(].*?[\])]", "", cell.strip()) if not re.search(r"\[\d+\]", cell) else cell
     name = re.sub(r"[^\w\[\]]+", "_", bare.strip()).strip("_")
     unit = re.search(r"[\[(]\s*(ms|us|ns)\s*[\])]$", cell.strip())

@@ -1,9 +1,9 @@
-"""Tables of numbers as text, `.csv`, as the records of a log.
+"""Convert text tables, `.csv`, to log records.
 
-The line that names the columns is the first one with rows of numbers below it: what a PLC or a
-logger writes above it is passed over, and a line of units between the two belongs to the names.
-Columns are parted by tabs, semicolons or commas; where it isn't commas, 0,5 is a number. Times are
-numbers, or texts of a date, a time of day, or both, in one column or two.
+The line with the column names is the first one with rows of numbers below it. Lines above it, as a
+PLC or a logger writes them, are skipped; a line of units below it belongs to the names. Columns are
+separated by tabs, semicolons or commas; if not by commas, 0,5 is a number. Times are numbers, or
+texts with a date, a time of day, or both, in one column or two.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from grounded_trials.formats.mcap_records import Record
 from grounded_trials.formats.messages import Floats
 from grounded_trials.formats.tables import column_name, is_time, table_records, time_among
 
-PREAMBLE = 100  # lines that may stand above the names of the columns
-LOOK = 65536  # characters of a line
+PREAMBLE = 100  # largest number of lines above the column names
+LOOK = 65536  # characters read of a line
 DATES = ("date", "datetime", "date_time", "datum", "datum_zeit", "fecha")
 DAY = re.compile(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})")  # as in Germany
 CLOCK = re.compile(r"^(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d*)?)$")
@@ -34,20 +34,20 @@ CLOCK = re.compile(r"^(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d*)?)$")
 
 @dataclass(frozen=True)
 class _Head:
-    """The line that names the columns."""
+    """The line with the column names."""
 
     names: tuple[str, ...]  # "" for a column without a name
-    cells: tuple[str, ...]  # as the file has them, with the units of a line of their own
-    mark: str  # between columns
-    line: int  # of the names, from 1
-    rows: int  # lines before the first row
+    cells: tuple[str, ...]  # as in the file, with units from a separate line
+    mark: str  # separator of columns
+    line: int  # line number of the names, from 1
+    rows: int  # number of lines before the first row
 
 
 def csv_records(path: Path) -> Iterator[Record]:
-    """The records of a text table: a row of names, then rows of numbers.
+    """Yield the records of a text table: a row of names, then rows of numbers.
 
     Raises:
-        GroundedError: without names or times, or where a row doesn't fit.
+        GroundedError: if names or times are missing, or a row has a wrong number of cells.
     """
     with _opened(path) as stream:
         first = [stream.readline(LOOK) for _ in range(PREAMBLE + 2)]
@@ -55,7 +55,7 @@ def csv_records(path: Path) -> Iterator[Record]:
         width, times = len(head.names), _times_among(head, first, path)
         _pass_over(stream, head)
         try:
-            with warnings.catch_warnings():  # a table without rows is found below
+            with warnings.catch_warnings():  # a table without rows is reported below
                 warnings.simplefilter("ignore")
                 values = np.loadtxt(stream, delimiter=head.mark, ndmin=2, usecols=range(width))
             stamps = None
@@ -63,7 +63,7 @@ def csv_records(path: Path) -> Iterator[Record]:
             _pass_over(stream, head)
             values, stamps = _with_texts(stream, head, times, path)
     if not values.size:
-        raise GroundedError(f"{path} has no rows below line {head.line}, which names the columns")
+        raise GroundedError(f"{path} has no rows below line {head.line} with the column names")
     columns: dict[str, Any] = {name: values[:, i] for i, name in enumerate(head.names) if name}
     if stamps is not None:
         columns[times] = stamps
@@ -71,7 +71,7 @@ def csv_records(path: Path) -> Iterator[Record]:
 
 
 def column_units(path: Path) -> dict[str, str]:
-    """The units that a text table's head states, `x [m]` or `x (m)`, by message path."""
+    """Return the units in a text table's column names, `x [m]` or `x (m)`, by message path."""
     if path.suffix.lower() not in (".csv", ".tsv", ".txt"):
         return {}
     with _opened(path) as stream:
@@ -84,7 +84,7 @@ def column_units(path: Path) -> dict[str, str]:
 
 
 def cut_off(path: Path) -> str:
-    """That the last row of a text table was cut off and is left out; "" where it is whole."""
+    """Return a warning if the last row of a text table is cut off and left out; "" otherwise."""
     if path.suffix.lower() not in (".csv", ".tsv", ".txt"):
         return ""
     with _opened(path) as stream:
@@ -97,12 +97,12 @@ def cut_off(path: Path) -> str:
         return ""
     return (
         f"its last row, {last.strip()[:80]!r}, was cut off and is left out: the file ends in the "
-        "middle of it, what came after is lost"
+        "middle of it, and everything after that is lost"
     )
 
 
 def _opened(path: Path) -> TextIO:
-    """The text in its encoding: UTF-8, UTF-16 where it says so, else that of Windows."""
+    """Open a text file in its encoding: UTF-16 with a byte order mark, UTF-8, else Windows-1252."""
     with path.open("rb") as stream:
         start = stream.read(LOOK)
     encoding = "utf-8-sig"
@@ -117,14 +117,14 @@ def _opened(path: Path) -> TextIO:
 
 
 def _pass_over(stream: TextIO, head: _Head) -> None:
-    """Moves to the first row."""
+    """Move the stream to the first row."""
     stream.seek(0)
     for _ in range(head.rows):
         stream.readline()
 
 
 def _head(lines: Sequence[str], path: Path) -> _Head:
-    """The line that names the columns: the first one above a row of numbers, else the first."""
+    """Find the line with the column names: the first one above a row of numbers, else line 1."""
     for i, line in enumerate(lines[:PREAMBLE]):
         below = next((row for row in lines[i + 1 :] if row.strip()), "")
         for mark in (m for m in "\t;," if m in line):
@@ -135,14 +135,14 @@ def _head(lines: Sequence[str], path: Path) -> _Head:
     cells = _cells(lines[0], mark)
     if not any(map(column_name, cells)) or _share(cells) == 1:
         raise GroundedError(
-            f"{path} begins with {lines[0][:40].strip()!r}: a line above its rows must name the "
-            "columns, one of them 't' (time in seconds), such as 't,x,v'"
+            f"{path} begins with {lines[0][:40].strip()!r}; expected a line with column names "
+            "above the rows, one of them 't' (time in seconds), such as 't,x,v'"
         )
     return _named(lines, 0, mark)
 
 
 def _named(lines: Sequence[str], at: int, mark: str) -> _Head:
-    """The head at a line, which is the line of units where the one above it names the time."""
+    """Return the head at a line; if the line above names a time, this one holds the units."""
     cells, units, rows = _cells(lines[at], mark), [], at + 1
     above = _cells(lines[at - 1], mark) if at else []
     if len(above) == len(cells) and _any_time(above) and not _any_time(cells):
@@ -162,24 +162,28 @@ def _any_time(cells: Sequence[str]) -> bool:
 
 
 def _share(cells: Sequence[str]) -> float:
-    """How many of the cells that hold something hold a number or a time."""
+    """Return the share of non-empty cells that hold a number or a time."""
     full = [cell for cell in cells if cell]
     held = [c for c in full if not np.isnan(_number(c.replace(",", ".", 1))) or _moment(c)]
     return len(held) / max(len(full), 1)
 
 
 def _times_among(head: _Head, lines: Sequence[str], path: Path) -> str:
-    """The name of the column of times; the message where none is names what could be."""
+    """Return the name of the column of times.
+
+    Raises:
+        GroundedError: if there is none, suggesting a column whose values increase.
+    """
     found = time_among(head.names) or next((n for n in head.names if n.lower() in DATES), "")
     if found:
         return found
     rows = [_cells(row, head.mark) for row in lines[head.rows :] if row.strip()]
     rising = [n for i, n in enumerate(head.names) if n and _rises([r[i : i + 1] for r in rows])]
-    maybe = f"'{rising[0]}' rises from row to row: if that is the time, name it" if rising else ""
+    maybe = f"'{rising[0]}' increases in every row: if that is the time, name it" if rising else ""
     raise GroundedError(
-        f"{path} has no column of times among {', '.join(filter(None, head.names[:8]))}, which its "
-        f"line {head.line} names. {maybe or 'Name one'} 't' (seconds), or 't_ms', 't_us' or 't_ns' "
-        "in their units ('time', 'stamp', 'clock', 'Zeit', 'temps', 'tiempo' will do too)"
+        f"{path} has no column of times among {', '.join(filter(None, head.names[:8]))} (line "
+        f"{head.line}). {maybe or 'Name one'} 't' (seconds), or 't_ms', 't_us' or 't_ns' in their "
+        "units ('time', 'stamp', 'clock', 'Zeit', 'temps', 'tiempo' also work)"
     )
 
 
@@ -189,9 +193,9 @@ def _rises(cells: Sequence[Sequence[str]]) -> bool:
 
 
 def _with_texts(stream: TextIO, head: _Head, times: str, path: Path) -> tuple[Floats, Any]:
-    """Rows with texts or empty cells, which are no number, and the times [ns] where those are.
+    """Read rows with texts or empty cells as NaN, and times [ns] if these are texts, else None.
 
-    Without a last row that was cut off.
+    A last row that is cut off is left out.
     """
     rows: list[list[float]] = []
     width, at = len(head.names), head.names.index(times)
@@ -203,17 +207,17 @@ def _with_texts(stream: TextIO, head: _Head, times: str, path: Path) -> tuple[Fl
             continue
         if len(row) != width:
             if number > len(lines) + head.rows - 1 and len(row) < width and _is_cut(lines):
-                break  # whoever wrote it was stopped there
+                break  # the writer was interrupted
             raise GroundedError(
-                f"{path}, line {number}: it has {len(row)} cells, line {head.line} names {width}"
+                f"{path}, line {number} has {len(row)} cells, but line {head.line} names {width}"
             )
         texts.append((number, row[at], "" if date is None else row[date]))
-        if head.mark != ",":  # half of Europe writes 0,5
+        if head.mark != ",":  # decimal comma
             row = [cell.replace(",", ".", 1) if "." not in cell else cell for cell in row]
         rows.append([_number(cell) for cell in row])
     values = np.array(rows, dtype=float).reshape(-1, width)
     if np.isfinite(values[:, at]).any() or not rows:
-        return values, None  # numbers; those that are missing are counted with the times
+        return values, None  # times are numbers; missing ones are reported later
     return values, _stamps(texts, times, path)
 
 
@@ -222,15 +226,15 @@ def _is_cut(lines: Sequence[str]) -> bool:
 
 
 def _stamps(texts: Sequence[tuple[int, str, str]], name: str, path: Path) -> Any:
-    """Times [ns] of texts: since 1970 with a date, UTC where no zone is said, else of the day."""
+    """Convert texts to times [ns]: since 1970 with a date (UTC without a zone), else of the day."""
     found, days = list[datetime](), timedelta()
     for line, text, date in texts:
         moment = _moment(f"{date.strip()} {text.strip()}".strip()) or _moment(text)
         if moment is None:
             raise GroundedError(
-                f"{path}, line {line}: '{name}' is {text.strip()!r}, which is no time. Read are "
-                "numbers (seconds, or in the unit that the name ends with, _ms, _us or _ns), "
-                "2026-11-21 10:05:00.250, 21.11.2026 10:05:00.250 and 10:05:00.250, with the date "
+                f"{path}, line {line}: '{name}' is {text.strip()!r}, which is not a time. Expected "
+                "a number (in seconds, or in the unit at the end of the name, _ms, _us or _ns), "
+                "2026-11-21 10:05:00.250, 21.11.2026 10:05:00.250 or 10:05:00.250, with the date "
                 "in a column 'Date' or without one"
             )
         if found and moment + days < found[-1] - timedelta(hours=12) and moment.year == 1970:
@@ -242,7 +246,7 @@ def _stamps(texts: Sequence[tuple[int, str, str]], name: str, path: Path) -> Any
 
 
 def _moment(text: str) -> datetime | None:
-    """A date, a time of day (of 1970-01-01), or both; None for other texts."""
+    """Parse a date with a time of day, or a time of day (of 1970-01-01); None for other texts."""
     if ":" not in text:
         return None
     if clock := CLOCK.match(text):

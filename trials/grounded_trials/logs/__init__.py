@@ -1,9 +1,9 @@
-"""Foreign logs: what is in them, which signal is which state, their samples on the grid.
+"""Reading foreign logs: contents, assignment of signals to states and inputs, resampling.
 
-Read `log_table.py` first (the [log] table and how it is followed), then `log_files.py` (which files
-a log is), `signals.py`, `samples.py` and `resample.py`. `inspect_log.py` looks at an unknown log,
-`twins.py` for signals of one motion in it, `inspect_guess.py` guesses its table,
-`inspect_evidence.py` weighs the guesses by the log's own numbers, `inspect_pairs.py` positions by
-their rates, `joint_names.py` by its joints;
-`recover.py` saves what a damaged one still holds, which `salvage.py` finds.
+Read `log_table.py` first (the [log] table and its use), then `log_files.py` (the files of a log),
+`signals.py`, `samples.py` and `resample.py`. `inspect_log.py` summarises an unknown log, `twins.py`
+finds redundant signals in it, and `inspect_guess.py` guesses its [log] table.
+`inspect_evidence.py` checks the guesses against the samples, `inspect_pairs.py` positions against
+rates, `joint_names.py` the names of joints. `recover.py` saves the contents of a damaged log, which
+`salvage.py` finds.
 """

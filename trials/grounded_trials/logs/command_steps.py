@@ -1,10 +1,10 @@
-"""When commands change, in a log that nobody cut: where its steps begin, and what was held before.
+"""Find when commands change in an uncut log: where its control steps begin, and what came before.
 
-Where commands change within the steps of the grid, all of them would lie up to half a step early or
-late: data begin with the next change. A recording that begins in motion does not say what was
-commanded before it; with a delay in the model its first steps would be judged by commands that
-nobody knows. There data begin where the commands have been steady for a while. A robot that stands
-still until its first command was sent nothing, or what holds it there.
+If commands changed in the middle of grid steps, each would be up to half a step early or late, so
+the data start at a change. A recording that starts in motion does not contain the commands before
+it, but a model with a delay needs them in the first steps. Such data start where the commands have
+been constant for a while. A robot that stands still until its first command had no command before,
+or one that keeps it at rest.
 """
 
 from __future__ import annotations
@@ -17,33 +17,34 @@ from grounded_trials.formats.message_path import parse_path
 from grounded_trials.formats.messages import Floats, Ints
 from grounded_trials.logs.samples import Samples
 
-FEW = 5  # changes, which are too few to say when the steps begin
-IN_STEP = 0.8  # mean of the changes' phases, as unit vectors: the commands come in steps
-IN_ROWS = 0.9  # of the changes can have been at one phase, each within its row: likewise
-COARSEST = 0.6  # of a step: longer rows would allow any changes
-TOUCH = 0.01  # of a step: how exactly commands come in steps
+FEW = 5  # with so few changes, the beginning of the steps can't be found
+IN_STEP = 0.8  # length of the mean unit vector of phases above which commands are periodic
+IN_ROWS = 0.9  # share of changes that fit one phase, each within its row, to be periodic
+COARSEST = 0.6  # of a step: with longer rows any phase would fit
+TOUCH = 0.01  # of a step: tolerance of the phase
 TRIED = 256  # changes whose phases are tried
-MOVED = 0.05  # of a step; a start that is nearer to a change is left where it is
-HELD = 0.5  # of a table's rows repeat the one before: it was not made where commands change
-STEADY_S, STEADY_STEPS = 0.25, 4  # without a change, both: what was commanded before is known
-LOOK_S, LOOK = 3.0, 0.2  # how far into a log, and into what share of it, such a moment is sought
-STILL_S = 0.2  # of a standstill say that it is one
-STILL, NOISE = 2e-3, 4.0  # of a state's range, and times its noise: what stands still is within
+MOVED = 0.05  # of a step: a start nearer to a change than this is not moved
+HELD = 0.5  # share of repeated rows above which rows are not written at changes of commands
+STEADY_S, STEADY_STEPS = 0.25, 4  # commands are steady if constant for both times
+LOOK_S, LOOK = 3.0, 0.2  # the steady moment is sought within this time and share of a log
+STILL_S = 0.2  # [s] shortest standstill
+STILL, NOISE = 2e-3, 4.0  # at rest: within this share of its range, and this multiple of its noise
 
 
 def phase_of(changes: Floats, dt: float, late: Floats | None = None) -> tuple[float, float] | None:
-    """When within a step commands change, and by how much earlier that may be; None: not in steps.
+    """Return the phase within a step at which commands change, and its uncertainty.
 
-    Rows that are not in step with the commands show each change late by another part of a row; all
-    of them together leave little room.
+    If table rows and commands have different periods, each change is seen late by another part of
+    a row; all changes together leave little uncertainty.
 
     Args:
-        changes: (K,) when one was seen to change, counted from the beginning of a step [s].
-        dt: the step [s].
-        late: (K,) by how much each may have been seen late [s]; None: by nothing.
+        changes: (K,) times at which a change was seen, from the beginning of a step [s].
+        dt: control step [s].
+        late: (K,) largest delay with which each change may have been seen [s]; None: no delay.
 
     Returns:
-        The latest such instant, -dt / 2 to dt / 2, and the room before it [s].
+        The latest possible phase, -dt / 2 to dt / 2, and by how much earlier it may be [s]; None if
+        the changes have no common phase.
     """
     if len(changes) <= FEW:
         return None
@@ -64,7 +65,7 @@ def phase_of(changes: Floats, dt: float, late: Floats | None = None) -> tuple[fl
 
 
 def changes_of(t: Ints, values: Floats) -> tuple[Ints, Ints]:
-    """When a command was seen to change (K,), and by how much that may be late (K,) [ns].
+    """Return when a command was seen to change (K,), and by how much that may be late (K,) [ns].
 
     Args:
         t: (N,) stamps [ns].
@@ -77,11 +78,14 @@ def changes_of(t: Ints, values: Floats) -> tuple[Ints, Ints]:
 
 
 def held_rows(t: Ints, values: Floats) -> float:
-    """By how much a held value is seen late [s]: the time between rows that repeat it; 0: by none.
+    """Return the interval of rows that repeat a held value [s], by which a change may be late.
 
     Args:
         t: (N,) stamps [ns].
-        values: (N,) one that changes, each with its own stamp, or one that every row repeats.
+        values: (N,) a signal stamped at each change, or one that every row repeats.
+
+    Returns:
+        0 if rows do not repeat values.
     """
     order = np.argsort(t, kind="stable")
     if len(t) <= 2 * FEW or np.mean(np.diff(values[order]) == 0) < HELD:
@@ -90,9 +94,9 @@ def held_rows(t: Ints, values: Floats) -> float:
 
 
 def rows_apart(inputs: Sequence[Samples], states: Sequence[Samples]) -> float:
-    """The time between rows that say what is measured and, each anew, what is commanded [s].
+    """Return the interval of rows that hold both measurements and commands [s].
 
-    0 where commands have messages of their own: their stamps say when they were sent.
+    0 if commands have messages of their own, whose stamps say when they were sent.
     """
     measured = {parse_path(s.spec.path).topic for s in states}
     shared = [s for s in inputs if parse_path(s.spec.path).topic in measured]
@@ -100,13 +104,13 @@ def rows_apart(inputs: Sequence[Samples], states: Sequence[Samples]) -> float:
 
 
 def first_step(inputs: Sequence[Samples], start: int, dt: float, unknown: bool) -> tuple[int, str]:
-    """From a start to where data begin [ns], and a warning, "" for none.
+    """Return by how much to move the start of data [ns], and a warning, "" for none.
 
     Args:
         inputs: the commands.
-        start: where every signal is known [ns].
-        dt: the step [s].
-        unknown: whether nobody knows what was sent before, see `in_motion`.
+        start: from where every signal is known [ns].
+        dt: control step [s].
+        unknown: whether the commands before the start are unknown, see `in_motion`.
     """
     at, late = (
         np.concatenate(x) for x in zip(*(changes_of(s.t, s.y) for s in inputs), strict=True)
@@ -120,10 +124,10 @@ def first_step(inputs: Sequence[Samples], start: int, dt: float, unknown: bool) 
         moved = round((phase if phase > 0 else phase + dt) * 1e9)
     elif phase is None and len(later) > FEW:
         apart = float(np.median(np.diff(later))) * 1e-9
-        if apart > dt / 2:  # oftener, and a step has the mean
+        if apart > dt / 2:  # with more frequent changes a step has their mean
             warning = (
                 f"commands change every {apart:.3g} s, not in steps of {dt:g} s: each is up to "
-                f"{dt / 2:.3g} s early or late, and so is a delay that is found"
+                f"{dt / 2:.3g} s early or late, and an identified delay is no more accurate"
             )
     if unknown:
         moved = _steady(inputs, found, start, moved, dt)
@@ -131,18 +135,18 @@ def first_step(inputs: Sequence[Samples], start: int, dt: float, unknown: bool) 
 
 
 def in_motion(inputs: Sequence[Samples], start: int, rest: Floats) -> bool:
-    """Whether a table's rows begin with commands that are not those of rest."""
+    """Check whether a table starts with commands that are not those of rest."""
     rows = any(held_rows(s.t, s.y) > 0 for s in inputs)
     return rows and any(s.before(start) != u for s, u in zip(inputs, rest, strict=True))
 
 
 def stands_still(states: Sequence[Samples], rates: Sequence[str], until: int) -> bool:
-    """Whether a robot was recorded before its first command, and did not move.
+    """Check whether a robot was recorded at rest before its first command.
 
     Args:
-        states: those that are measured; no state may drift, nor a rate be anything but zero.
+        states: the measured states; none may drift, and velocities must be zero.
         rates: names of the states that are velocities.
-        until: the first command [ns].
+        until: time of the first command [ns].
     """
     for one in states:
         y = one.y[one.t < until]
@@ -158,7 +162,10 @@ def stands_still(states: Sequence[Samples], rates: Sequence[str], until: int) ->
 
 
 def _steady(inputs: Sequence[Samples], changes: Ints, start: int, moved: int, dt: float) -> int:
-    """From a start to the first step before which no command changed for a while."""
+    """Return the shift [ns] to the first step before which no command changed for a while.
+
+    `moved` if there is no such step.
+    """
     first = max(int(s.t[0]) for s in inputs)
     length = min(LOOK_S, LOOK * 1e-9 * (max(int(s.t[-1]) for s in inputs) - start))
     quiet = max(STEADY_S, STEADY_STEPS * dt) * 1e9

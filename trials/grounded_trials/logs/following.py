@@ -1,4 +1,4 @@
-"""A rate against the derivative of its position: how well it follows, and in which unit."""
+"""Compare a rate with the derivative of a position: correlation, scale and unit."""
 
 from __future__ import annotations
 
@@ -9,19 +9,25 @@ import numpy as np
 from grounded_trials.formats.messages import Floats
 
 SAME, DEGREE = 0.15, 180 / np.pi
-SPAN = 5  # samples a slope is taken over
+SPAN = 5  # samples over which a slope is taken
 
 
 @dataclass(frozen=True)
 class Follows:
-    """How alike two signals are, and how many times as large the second is."""
+    """Correlation of two signals, and how many times as large the second is."""
 
     correlation: float
     slope: float
 
 
 def follows(q: Floats, w: Floats, step: float) -> Follows:
-    """How w goes with the derivative of q, both averaged over a few samples."""
+    """Compare w with the derivative of q, both averaged over a few samples.
+
+    Args:
+        q: (N,) position.
+        w: (N,) rate.
+        step: sample time [s].
+    """
     slope = (q[SPAN:] - q[:-SPAN]) / (SPAN * step)
     mean = np.convolve(0.5 * (w[1:] + w[:-1]), np.ones(SPAN) / SPAN, "valid")
     good = np.isfinite(slope) & np.isfinite(mean)
@@ -33,7 +39,7 @@ def follows(q: Floats, w: Floats, step: float) -> Follows:
 
 
 def scale_of(slope: float) -> tuple[float, str]:
-    """What a rate must be multiplied by, and how to say it."""
+    """Return the factor that a rate must be multiplied by, and a phrase on sign and unit."""
     sign, size = np.sign(slope), abs(slope)
     opposite = " with the OPPOSITE SIGN" if sign < 0 else ""
     if abs(size / DEGREE - 1) < SAME:

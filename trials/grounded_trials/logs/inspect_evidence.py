@@ -1,16 +1,16 @@
-"""What the numbers of a log say about a guessed [log] table: units, derivatives, the model's steps.
+"""Check a guessed [log] table against the samples of the log: units, derivatives, model steps.
 
-Names mislead; a rate is the derivative of its position in every log. So each guess is tried against
-its rivals with the log's own samples:
+Names mislead, but a rate is the derivative of its position in every log. Each guess is therefore
+compared with its rivals by the samples:
 
-- joints: a JointState says which of its numbers is which joint (`joint_names`);
-- units: what a ROS type measures, against the unit that the model states;
-- derivatives: where the model says dq/dt = w, the samples of w must follow those of q. Their slope
-  tells degrees (57.3) and signs (-1);
-- steps: of the rivals for an input, and of positions with their rates that no name tells apart,
-  those with which the model's steps fit the log clearly best.
+- joints: a JointState names the joint of each of its numbers (`joint_names`);
+- units: the unit by the ROS message type, against the unit of the model;
+- derivatives: where the model has dq/dt = w, the samples of w must follow those of q. Their ratio
+  shows degrees (57.3) and signs (-1);
+- steps: among rivals for an input, and for positions with their rates that names don't
+  distinguish, those with which the model's steps fit the log clearly best.
 
-Every guess that is changed or confirmed says by what; where the numbers can't decide it stays
+Every guess that is changed or confirmed states its reason; if the samples can't decide, it stays
 unsure.
 """
 
@@ -54,14 +54,17 @@ def weigh(
     inputs: Sequence[Guess],
     joints: Mapping[str, tuple[str, ...]] | None = None,
 ) -> tuple[tuple[Guess, ...], tuple[Guess, ...]]:
-    """The guesses, with what the log's numbers say for and against them.
+    """Check guesses against the log's samples.
 
     Args:
-        log: that was looked through.
+        log: an inspected log.
         model: whose states and inputs are sought.
-        states: one guess for each state, in order; `inputs` likewise.
-        inputs: see `states`.
-        joints: what `joint_names` says of the log, where it was asked already.
+        states: one guess for each state, in order.
+        inputs: one guess for each input, in order.
+        joints: the result of `joint_names`, if already known.
+
+    Returns:
+        The changed or confirmed guesses for states and for inputs, with reasons.
     """
     units = {**model.states, **model.inputs}
     joints = joint_names(log) if joints is None else joints
@@ -99,7 +102,7 @@ def weigh(
 
 
 def as_stated(stated: Stated, wanted: str, guess: Guess) -> Guess:
-    """The guess with the factor between the unit that the log states and the model's."""
+    """Return the guess with the factor between the unit that the log states and the model's."""
     said, factor = stated.unit(guess.path), stated.factor(guess.path, wanted)
     why = f"{stated.by_whom(guess.path)} says {said}, the model {wanted}"
     if said and guess.scale == 1 and factor_between(f"{said}/s", wanted) is not None:
@@ -110,7 +113,7 @@ def as_stated(stated: Stated, wanted: str, guess: Guess) -> Guess:
 
 
 def _taken_by_inputs(guesses: Mapping[str, Guess], model: Model) -> dict[str, Guess]:
-    """States without the rivals that are commands: what an input was found at is no measurement."""
+    """Remove rivals of states that are assigned to inputs: a command is not a measurement."""
     commands = {guesses[name].path: name for name in model.input_names if guesses[name].path}
     found = {}
     for name in model.state_names:
@@ -124,7 +127,7 @@ def _taken_by_inputs(guesses: Mapping[str, Guess], model: Model) -> dict[str, Gu
 
 
 def _as_logged(guess: Guess, log: LogReport) -> Guess:
-    """The guess with the clock and the range of the signal that it ended at."""
+    """Return the guess with the clock and the range of its final signal."""
     for topic in log.topics:
         for field in topic.fields:
             if field.path == guess.path:
@@ -139,23 +142,23 @@ def _unit(guess: Guess, unit: str, joints: Mapping[str, str]) -> Guess:
     if not known or unit in ("", "1"):
         return guess
     others = tuple(path for path in guess.others if unit_of(path, joints) in ("", unit))
-    if known == unit and others != guess.others:  # rivals of another unit are none
+    if known == unit and others != guess.others:  # rivals with another unit don't count
         guess = replace(guess, others=others, sure=not others)
     if known == unit:
         return replace(guess, reasons=(*guess.reasons, f"its unit is {unit}"))
     fits = [path for path in guess.others if unit_of(path, joints) == unit]
     if fits:
         rest = tuple(p for p in guess.others if p != fits[0])
-        why = f"its unit is {unit}, that of {guess.path} {known}"
+        why = f"its unit is {unit}, while that of {guess.path} is {known}"
         return replace(guess, path=fits[0], others=(guess.path, *rest), reasons=(why,), field=None)
-    why = f"its unit should be {unit}, the log's is {known}"
+    why = f"its unit should be {unit}, but in the log it is {known}"
     return replace(guess, sure=False, reasons=(*guess.reasons, why))
 
 
 def _by_unit(guesses: Mapping[str, Guess], model: Model) -> dict[str, Guess]:
-    """Inputs that no name gives, each at the only command left that is in its unit.
+    """Assign inputs without a matching name to the only remaining command in their unit.
 
-    A Twist of a robot on wheels has one number in m/s that moves and one in rad/s.
+    The Twist of a wheeled robot, for example, has one changing number in m/s and one in rad/s.
     """
     taken = {guesses[name].path for name in model.input_names if guesses[name].path}
     found = {}
@@ -164,7 +167,7 @@ def _by_unit(guesses: Mapping[str, Guess], model: Model) -> dict[str, Guess]:
         fits = [path for path in left if unit and unit_of(path) == unit]
         rivals = [n for n in model.input_names if n != name and not guesses[n].path]
         alone = len(fits) == 1 and all(model.inputs[n] != unit for n in rivals)
-        why = f"no name says it; the only command in {unit}"
+        why = f"no name matches; the only command in {unit}"
         found[name] = (
             replace(guesses[name], path=fits[0], others=(), sure=True, reasons=(why,))
             if alone
@@ -174,7 +177,7 @@ def _by_unit(guesses: Mapping[str, Guess], model: Model) -> dict[str, Guess]:
 
 
 def _speed_asked(guesses: Mapping[str, Guess], model: Model, log: LogReport) -> dict[str, Guess]:
-    """A speed that no name gives, with the numbers of the log that have no name as its rivals."""
+    """Give a speed without a matching name all unnamed numbers of the log as candidates."""
     name = str(model.roles.get("speed", ""))
     taken = {guess.path for guess in guesses.values()}
     if name not in guesses or guesses[name].path or guesses[name].others:
@@ -185,7 +188,7 @@ def _speed_asked(guesses: Mapping[str, Guess], model: Model, log: LogReport) -> 
 
 
 def _speed(guesses: Mapping[str, Guess], model: Model, signals: Signals) -> dict[str, Guess]:
-    """The number without a name that goes with the speed of the position."""
+    """Assign the speed to the unnamed number that correlates with the speed of the position."""
     name, position = str(model.roles.get("speed", "")), model.roles.get("position", ())
     axes = [guesses[axis].path for axis in position if axis in guesses]
     if name not in guesses or guesses[name].path or not axes or not all(axes):
@@ -208,6 +211,6 @@ def _speed(guesses: Mapping[str, Guess], model: Model, signals: Signals) -> dict
         return {name: replace(guesses[name], others=())}
     best, slope, path = good[0]
     rivals = tuple(p for value, _, p in good[1:] if best - value < 0.05)
-    why = f"no name says it; it goes with the speed of {listed(position)}, correlation "
+    why = f"no name matches; it follows the speed of {listed(position)}, correlation "
     why += f"{best:.3f}, {slope:.3g} times as large"
     return {name: replace(guesses[name], path=path, others=rivals[:3], reasons=(why,))}

@@ -1,10 +1,10 @@
-"""Which of the log's positions, each with its rate, is which of the model's, where no name says it.
+"""Assign the log's positions with their rates to the model's, where names don't decide.
 
-A trolley and the load that swings below it both have a position and a rate that follows it, so that
-derivatives tell neither from the other: they are right or wrong together. All ways to give them out
-are tried: with each the model predicts the log a quarter of a second ahead, calibrated as far as
-its parameters go (`short_runs`). One is believed if it leaves clearly less than every other, and if
-units do not refute it; else all of them are unsure, and the others are named.
+A trolley and the load below it both have a position and a rate that follows it, so derivatives
+can't tell them apart: they are right or wrong together. All assignments are tried. With each, the
+calibrated model predicts the log a quarter of a second ahead (`short_runs`). An assignment is
+accepted if its error is clearly smaller than that of every other and its units fit; otherwise all
+of them stay unsure, with the alternatives listed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from grounded_trials.logs.inspect_pairs import COMBINATIONS, Signals, rates_in
 from grounded_trials.logs.stated_units import factor_between, may_be
 
 STARTS = 120  # samples to predict from
-MANY = 16  # numbers among which positions and their rates are sought
+MANY = 16  # largest number of signals among which positions and rates are sought
 Pair = tuple[str, str]  # a position and its rate: names, or paths
 Way = tuple[Pair, ...]  # the paths of each pair of states, in order
 
@@ -37,14 +37,14 @@ def by_groups(
     signals: Signals,
     joints: Mapping[str, str],
 ) -> dict[str, Guess]:
-    """The guesses of positions and rates that no name gives: decided together, or open together.
+    """Assign positions and rates without matching names, all together; unsure if undecided.
 
     Args:
         model: however crude.
         guesses: of all its states and inputs.
-        pairs: of states that no name gives.
-        signals: the samples of everything that was guessed.
-        joints: units of joints' numbers by their paths.
+        pairs: position and rate states without a matching name.
+        signals: the samples of all candidates.
+        joints: units of joints' numbers by path.
     """
     said = tuple((guesses[q].path, guesses[w].path) for q, w in pairs)
     ways = [w for w in permutations(_in_log(guesses, said, signals), len(pairs)) if _apart(w)]
@@ -64,7 +64,7 @@ def by_groups(
     )
     if not clear or best not in fits:
         rivals = [way for way in fits or ways if way != first]
-        why = ("the model's steps don't clearly tell which it is",) if rivals and left else ()
+        why = ("the model's steps don't clearly favour one",) if rivals and left else ()
         return _given(guesses, pairs, first, rivals, why)
     second = min((way for way in ways if way != best), key=lambda way: float(left[way].sum()))
     better = 1 - np.exp(-float((left[second] - left[best]).sum()) / len(model.states))
@@ -73,7 +73,7 @@ def by_groups(
 
 
 def _in_log(guesses: Mapping[str, Guess], said: Way, signals: Signals) -> list[Pair]:
-    """Positions and their rates among the numbers that no other state or input was found at."""
+    """Return the positions with their rates among the log's unassigned numbers."""
     own = {path for pair in said for path in pair if path}
     taken = {guess.path for guess in guesses.values()} - own
     free = [path for path in signals.found if path not in taken]
@@ -94,7 +94,7 @@ def _of_their_units(
     signals: Signals,
     joints: Mapping[str, str],
 ) -> bool:
-    """Whether no number is of another kind than its state: an angle is no length."""
+    """Check that every number has a unit that fits its state."""
     both = [one for k, pair in enumerate(pairs) for one in zip(pair, way[k], strict=True)]
     units = [(model.states[name], path, signals.stated.unit(path)) for name, path in both]
     return all(
@@ -110,15 +110,15 @@ def _left(
     way: Way,
     signals: Signals,
 ) -> Array | None:
-    """Logarithms of each state's error (n,), as parts of its changes; None where none is told.
+    """Return the logarithm of each state's error (n,) relative to its changes; None if unknown.
 
-    An input that is unsure is taken at whichever of its rivals, or of other unsure ones, fits best.
+    An unsure input is taken from whichever of its rivals, or those of other unsure ones, fits best.
     """
     names, paths = [*model.state_names, *model.input_names], {n: g.path for n, g in guesses.items()}
     paths |= {n: p for k, pair in enumerate(pairs) for n, p in zip(pair, way[k], strict=True)}
     states = {paths[name] for name in model.state_names}
     own = [guesses[name] for name in model.input_names]
-    open_ = [one.path for one in own if not one.sure]  # joints and their commands go together
+    open_ = [one.path for one in own if not one.sure]  # commands may be exchanged like joints
     may = [dict.fromkeys((g.path, *g.others, *open_ * (not g.sure))) for g in own]
     inputs = [[path for path in some if path and path not in states] for some in may]
     found = []
@@ -134,7 +134,7 @@ def _left(
 def _ahead(
     model: Model, guesses: Mapping[str, Guess], paths: Sequence[str], signals: Signals
 ) -> Ahead | None:
-    """The model on the log, with its states and inputs read at some paths."""
+    """Return the model's predictions of the log, with states and inputs read at some paths."""
     gridded = signals.grid(paths) if len(set(paths)) == len(paths) else None
     if gridded is None:
         return None
@@ -153,7 +153,7 @@ def _ahead(
 
 
 def _clearly(best: Array, other: Array) -> bool:
-    """Whether errors are clearly smaller, in all and of one state at least."""
+    """Check whether errors are clearly smaller, in total and for at least one state."""
     gained = other - best
     return float(gained.sum()) > CLEAR and float(gained.max()) > -np.log(HALF)
 
@@ -165,7 +165,7 @@ def _given(
     rivals: Sequence[Way],
     why: tuple[str, ...],
 ) -> dict[str, Guess]:
-    """The guesses at their paths: sure where nothing else may be, as one group."""
+    """Return the guesses with their paths; sure, as a group, if there are no rivals."""
     scale = {guess.path: guess.scale for guess in guesses.values()}
     reasons = {guess.path: guess.reasons for guess in guesses.values()}
     paths = {n: p for k, pair in enumerate(pairs) for n, p in zip(pair, way[k], strict=True)}

@@ -1,10 +1,9 @@
-"""A [log] table for an unknown log: which topic's which number is probably which state or input.
+"""Guess a [log] table for an unknown log: which number of which topic is which state or input.
 
-Every number of the log is scored against every name: by the words in its path, by what robots
-usually call such a thing, by the shape of its type, and by whether it moves at all. States that
-lie in one message are preferred to states scattered over many; what never changes in the log, or is
-of another unit, loses against what does, or is not. Where the best is not clearly
-better than the rest, the table says so and names the rest.
+Every number of the log is scored against every name: by the words in its path, by common names of
+such quantities, by its message type, and by whether it changes at all. States from one message are
+preferred to states scattered over many. Numbers that never change, or that have another unit, rank
+lower. If the best is not clearly better than the rest, the table says so and lists the rest.
 """
 
 from __future__ import annotations
@@ -20,12 +19,12 @@ from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
 from grounded_trials.logs.stated_units import bare_command, may_be, unit_of, without_unit
 from grounded_trials.toml_table import key
 
-FEW = 8  # others that [log] names
-SURE = 1.5  # how much better than the next topic's best a guess must be
-AS_OFTEN = 0.5  # of wheel odometry's rate: a pose that comes so often is taken before its
+FEW = 8  # alternatives listed in [log]
+SURE = 1.5  # lead in score over the next candidate, to be sure
+AS_OFTEN = 0.5  # of the wheel odometry's rate: a pose at this rate is preferred to the odometry's
 LEAST = 2.0  # below this score nothing is proposed
-DRIFT = 2e-4  # of a signal's range: the least deviation that is proposed for it
-SIMULATED_S = 1.0  # header stamps this far from the log's clock are not its time
+DRIFT = 2e-4  # of a signal's range: the smallest standard deviation proposed for it
+SIMULATED_S = 1.0  # header stamps further from the log's clock are simulation time
 
 _YAW = ("@rpy.yaw", "yaw", "heading", "theta", "psi")
 _TURN = ("@rpy.pitch", "@rpy.yaw", "theta", "angle", "pitch", "tilt", "lean")
@@ -58,22 +57,22 @@ _MEANINGS: dict[str, tuple[str, ...]] = {
     "brake": ("brake",),
     "torque": ("torque", "effort", "tau"),
 }
-_BY_UNIT: dict[str, tuple[str, ...]] = {  # what an input is called for what it is
+_BY_UNIT: dict[str, tuple[str, ...]] = {  # further names of an input by its unit
     "V": ("voltage", "volts", "volt"),
     "A": ("current", "amps", "ampere"),
     "N m": ("torque", "effort", "tau"),
     "N": ("force", "thrust"),
 }
-_BESIDE_U = ("linear.y", "v", "sway")  # what v is where u is a state, too: not the speed
-_COMPASS = (("north", "northing"), ("east", "easting"))  # a plane's axes, whichever x is
-_RATES = {"rate", "rates", "dot", "vel", "velocity"}  # words that make another thing of an angle's
+_BESIDE_U = ("linear.y", "v", "sway")  # meaning of v beside a state u: sway, not the speed
+_COMPASS = (("north", "northing"), ("east", "easting"))  # axes of a plane; either may be x
+_RATES = {"rate", "rates", "dot", "vel", "velocity"}  # words of a rate, not of an angle
 _COMMANDED = ("ref", "desired", "des", "target", "setpoint", "goal", "cmd", "command")
 _COMMAND_TOPIC = re.compile("control|cmd|command|setpoint|ref|target")
 _ANGLES = ("roll", "pitch", "yaw")
 _QUATERNION = tuple(f"{name}.{part}" for name in ("orientation", "rotation") for part in "xyzw")
 _POSE = ("position.x", "position.y", "@rpy.yaw")
 _POSES = ("/PoseStamped", "/PoseWithCovarianceStamped", "/TransformStamped")
-_NO_WHEELS = re.compile(  # what is published as odometry, too
+_NO_WHEELS = re.compile(  # topics with odometry messages that is not from wheels
     "mocap|vicon|optitrack|qualisys|truth|filter|fused|ekf|gps|gnss|slam|lidar|visual|vio"
 )
 _WORD = re.compile(r"[a-z]+")
@@ -81,16 +80,16 @@ _WORD = re.compile(r"[a-z]+")
 
 @dataclass(frozen=True)
 class Guess:
-    """What a state or input probably is in the log."""
+    """The probable signal of a state or input in the log."""
 
     name: str
-    path: str  # "" where nothing fits
+    path: str  # "" if nothing fits
     clock: str
     sure: bool
-    others: tuple[str, ...]  # what else it might be, best first
+    others: tuple[str, ...]  # alternatives, best first
     field: FieldReport | None = None
-    reasons: tuple[str, ...] = ()  # what speaks for it
-    scale: float = 1.0  # of its values: degrees, or a sign
+    reasons: tuple[str, ...] = ()  # evidence, as phrases for a person
+    scale: float = 1.0  # factor on its values: degrees, or a sign
 
     @property
     def is_angle(self) -> bool:
@@ -111,13 +110,13 @@ def guess_mapping(
     inputs: Sequence[str],
     units: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[tuple[Guess, ...], tuple[Guess, ...]]:
-    """Guesses for the states and for the inputs, in their order.
+    """Return guesses for the states and for the inputs, in their order.
 
     Args:
-        log: that was looked through.
-        states: names; `inputs` likewise.
-        inputs: see `states`.
-        units: the model's, by name, where they are known.
+        log: an inspected log.
+        states: names of the states.
+        inputs: names of the inputs.
+        units: the model's units by name, where known.
     """
     meant = {name: _meanings(log, name, states) for name in states}
     scored = {name: _candidates(log, name, meant[name], is_input=False) for name in states}
@@ -138,9 +137,10 @@ def guess_mapping(
 
 
 def _of_unit(log: LogReport, candidates: list[_Candidate], unit: str) -> list[_Candidate]:
-    """A state's candidates without those of another unit, if one that fits is left.
+    """Drop a state's candidates in another unit, if one that fits is left.
 
-    Where all that its name fits are of another unit, whatever moves in its own is a candidate.
+    If all candidates by name have another unit, every changing number in the right unit becomes a
+    candidate.
     """
     fit = [c for c in candidates if _may_be(c.field.path, unit)]
     good = [c for c in candidates if c.score >= LEAST]
@@ -157,14 +157,14 @@ def _of_unit(log: LogReport, candidates: list[_Candidate], unit: str) -> list[_C
 
 
 def _may_be(path: str, unit: str) -> bool:
-    """Whether a number's unit is none that contradicts; a joint's may be either, see `in_order`."""
+    """Check that a number's unit does not contradict; a joint's may be either, see `in_order`."""
     return path.endswith("]") or may_be(path, unit)
 
 
 def _only_command(log: LogReport, guess: Guess, unit: str) -> Guess:
-    """The one input, at the one command that moves and that is nothing else, where none is named.
+    """Assign a single input without a matching name to the only command that changes.
 
-    A topic of commands with a second number that moves, or another such topic, leaves it open.
+    The guess is unchanged if several commanded numbers change.
     """
     if guess.path or not guess.reasons or len(guess.others) != 1:
         return guess
@@ -172,22 +172,22 @@ def _only_command(log: LogReport, guess: Guess, unit: str) -> Guess:
     topic, field = next((t, f) for t in log.topics for f in t.fields if f.path == path)
     if not _may_be(path, unit):
         return guess
-    why = ("no name says it; the only command in the log that moves",)
+    why = ("no name matches; the only command in the log that changes",)
     clock = _clock(log, topic)
     return replace(guess, path=path, clock=clock, others=(), field=field, reasons=why)
 
 
 def _commands_of(log: LogReport, guess: Guess, taken: set[str]) -> Guess:
-    """An input that nothing is named after, with the numbers of topics that carry commands."""
+    """Give an input without a matching name the changing numbers of command topics."""
     commands = [t for t in log.topics if _COMMAND_TOPIC.search(t.topic.lower())]
     moving = [f.path for t in commands for f in t.fields if f.low != f.high]
     others = tuple(path for path in moving if path not in taken and not path.endswith(_QUATERNION))
-    why = ("no name says it; these are commanded",) if others else ()
+    why = ("no name matches; these are commands",) if others else ()
     return replace(guess, others=others[:8], reasons=why)
 
 
 def _meanings(log: LogReport, name: str, states: Sequence[str]) -> tuple[str, ...]:
-    """What a state may be called: north and east are places only where the log has both."""
+    """Return the usual names of a state; north and east only if the log has both."""
     if name == "v" and "u" in states:
         return _BESIDE_U
     said = {without_unit(f.path).lower().rpartition(".")[2] for t in log.topics for f in t.fields}
@@ -226,13 +226,13 @@ def _score(
     best -= 1.0 if topic.messages < 3 else 0.0
     best -= 2.0 if field.not_finite > 0.1 * topic.messages else 0.0
     best -= 2.0 if "covariance" in path or "layout" in path else 0.0
-    best -= 3.0 if inside.endswith(_QUATERNION) else 0.0  # a part of one says nothing alone
+    best -= 3.0 if inside.endswith(_QUATERNION) else 0.0  # useless alone
     best += 0.5 if topic.stamped and not is_input else 0.0
     return best
 
 
 def _fit(called: Sequence[str], inside: str, topic: str) -> float:
-    """How well a name fits: by the end of the path, or by the topic where the path says nothing."""
+    """Score how well a name fits: by the end of the path, or by the topic if that is generic."""
     best = 0.0
     for rank, meaning in enumerate(called):
         worth = 4.0 - 0.3 * max(rank - 1, 0)
@@ -243,20 +243,23 @@ def _fit(called: Sequence[str], inside: str, topic: str) -> float:
             best = max(best, worth)
         elif len(meaning) > 1:
             words = set(_WORD.findall(_named(inside, last)))
-            rate = words & _RATES - set(_WORD.findall(meaning))  # `yaw_rate` is no yaw
+            rate = words & _RATES - set(_WORD.findall(meaning))  # `yaw_rate` is not a yaw
             best = max(best, worth - 1.0) if meaning in words and not rate else best
     return best
 
 
 def _named(inside: str, last: str) -> str:
-    """The text whose words name a number: a topic of one number, or a table's column."""
+    """Return the text whose words name a number: a topic of one number, or a table's column."""
     if inside in ("data", "value"):
         return last
     return "" if "." in inside or "[" in inside or last not in ("npz", "csv", "run") else inside
 
 
 def _homes(scored: dict[str, list[_Candidate]]) -> dict[str, float]:
-    """Topics by how many states each could give; all from one message is better than scattered."""
+    """Return a bonus for each topic by the number of states it could provide.
+
+    States from one message are preferred to scattered ones.
+    """
     homes: dict[str, float] = {}
     for candidates in scored.values():
         for topic in {c.topic.topic for c in candidates if c.score >= LEAST}:
@@ -283,8 +286,8 @@ def _choose(
     reasons: tuple[str, ...] = ()
     if (measured := _measured(best, ranked)) is not None:
         reasons = (
-            f"measured apart from the wheels; {best.topic.topic}'s pose is most likely summed up "
-            "from its own speed, which says nothing more of the motion",
+            f"measured independently of the wheels; the pose of {best.topic.topic} is most likely "
+            "integrated from its own speed, so it adds no information",
         )
         best, near = measured, [best, *(c for c in near if c is not measured)]
     others = tuple(c.field.path for c in near[:3])
@@ -293,7 +296,7 @@ def _choose(
 
 
 def _moving(ranked: list[_Candidate]) -> _Candidate:
-    """The best; if that never changes, the best that does and is called so as well."""
+    """Return the best candidate; if it never changes, the best one of the same name that does."""
     best = ranked[0]
     if best.field.low is None or best.field.low != best.field.high:
         return best
@@ -302,7 +305,7 @@ def _moving(ranked: list[_Candidate]) -> _Candidate:
 
 
 def _alike(path: str, other: str) -> bool:
-    """Whether two numbers are called the same in their messages, or are surely in one unit."""
+    """Check whether two numbers have the same name in their messages, or the same known unit."""
     said = unit_of(path)
     return path.split(".")[-2:] == other.split(".")[-2:] or said == unit_of(other) != ""
 
@@ -312,40 +315,40 @@ def _clock(log: LogReport, topic: TopicReport) -> str:
 
 
 def _measured(best: _Candidate, ranked: list[_Candidate]) -> _Candidate | None:
-    """What shows the same place or heading as a pose of wheel odometry, but measures it."""
+    """Return a candidate that measures the position or heading given by wheel odometry."""
     kind = next((one for one in _POSE if best.field.path.endswith(one)), None)
     if kind is None or not _reckons(best.topic):
         return None
-    often = AS_OFTEN * best.topic.rate_hz  # a localiser that jumps twice a second shows no motion
+    often = AS_OFTEN * best.topic.rate_hz  # a pose updated twice a second shows no motion
     poses = (c for c in ranked if c.topic.type.endswith(_POSES) and c.topic.rate_hz >= often)
     fits = (c for c in poses if c.field.path.endswith(kind) and c.score > best.score - SURE)
     return next(fits, None)
 
 
 def _reckons(topic: TopicReport) -> bool:
-    """Whether a topic's pose is most likely summed up from its own speed."""
+    """Check whether a topic's pose is most likely integrated from its own speed."""
     moves = any(f.path.endswith("twist.linear.x") and f.low != f.high for f in topic.fields)
     return topic.type.endswith("/Odometry") and moves and not _NO_WHEELS.search(topic.topic.lower())
 
 
 def _rate(candidate: _Candidate) -> float:
-    """A little for how often it comes, which decides between equals."""
+    """Return a small bonus for a high rate, which breaks ties."""
     return 0.1 * float(np.log10(1 + candidate.topic.rate_hz))
 
 
 def is_simulated(log: LogReport) -> bool:
-    """Whether header stamps are on another clock than the log, as in a simulation."""
+    """Check whether header stamps are on another clock than the log, as in a simulation."""
     return any(t.skew_s is not None and abs(t.skew_s) > SIMULATED_S for t in log.topics)
 
 
 def mapping_toml(
     states: Sequence[Guess], inputs: Sequence[Guess], *, simulated: bool = False
 ) -> str:
-    """The guesses as a [log] table, with a comment wherever a person should look."""
+    """Format guesses as a [log] table, with comments where a person should check."""
     clock = "log" if simulated else "header"
     lines = ["[log]", f'clock = "{clock}"']
     if simulated:
-        lines[-1] += "  # header stamps are on another clock (simulation time?)"
+        lines[-1] += "  # header stamps are on another clock than the log (simulation time?)"
     for kind, guesses in (("state", states), ("input", inputs)):
         for guess in guesses:
             lines += ["", *_table(kind, guess, clock)]
@@ -360,7 +363,7 @@ def _table(kind: str, guess: Guess, clock: str) -> list[str]:
         return [f"# {head}  # nothing in the log fits"]
     if not guess.path:
         rest = f"  # or {', '.join(guess.others[1:FEW])}" * (len(guess.others) > 1)
-        what = "no name in the log fits; if one of these is it, delete the two #"
+        what = "no name in the log fits; to use one of these, remove both #"
         return [f"# {head}  # {what}", f"# path = {_quote(guess.others[0])}{rest}"]
     lines = [head if guess.sure else f"{head}  # unsure{others}"]
     lines.append(f"path = {_quote(guess.path)}")
@@ -378,7 +381,7 @@ def _table(kind: str, guess: Guess, clock: str) -> list[str]:
 
 
 def _estimate(states: Sequence[Guess]) -> list[str]:
-    """An [estimate] table for the states that nothing in the log gives."""
+    """Return an [estimate] table for the states that the log does not contain."""
     missing = [guess.name for guess in states if not guess.path]
     known = [guess for guess in states if guess.path and guess.field is not None]
     if not missing or not known:
@@ -388,14 +391,14 @@ def _estimate(states: Sequence[Guess]) -> list[str]:
     )
     return [
         "",
-        f"[estimate]  # the smoother finds {', '.join(missing)}",
+        f"[estimate]  # the smoother estimates {', '.join(missing)}",
         f"measured = {{ {deviations} }}  # standard deviations, in the model's units; check them",
-        f"# add {' or '.join(missing)} where you find it in the log after all",
+        f"# add {' or '.join(missing)} if the log contains it after all",
     ]
 
 
 def _deviation(guess: Guess) -> float:
-    """Its noise in this log; not less than a small part of its range, since sensors drift too."""
+    """Return its noise in this log, at least a small part of its range, since sensors drift."""
     assert guess.field is not None
     low, high = guess.field.low or 0.0, guess.field.high or 0.0
     return max(guess.field.noise, DRIFT * (high - low), 1e-6)

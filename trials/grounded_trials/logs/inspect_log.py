@@ -1,9 +1,9 @@
-"""What is in an unknown log: topics, types, rates, and every number with its range.
+"""Summarise an unknown log: topics, types, rates, and every number with its range.
 
-One pass over the files; a topic with very many messages has its ranges from every k-th of them.
-Signals of different topics that show one motion are compared: a motion capture's pitch and the
-on-board estimate's should rise together. Where they rise opposite, one of them follows another
-convention, and a log that mixes them is wrong.
+The files are read once; for topics with very many messages, ranges come from every k-th message.
+Signals of different topics that show the same motion are compared, such as the pitch of a motion
+capture and of the on-board estimate. If their signs are opposite, their conventions differ, and the
+two must not be mixed.
 """
 
 from __future__ import annotations
@@ -39,28 +39,28 @@ from grounded_trials.logs.log_files import log_records, reading
 from grounded_trials.logs.signals import Decoder, decoder_of
 from grounded_trials.logs.twins import Twins, find_twins, measured_kind
 
-NOISE_SAMPLES = 10  # in a batch, to tell a signal's noise
-DECODED = 20_000  # messages of a topic whose numbers are looked at
-TIME_BYTES = 40  # that a message's times take until the report
-GAP = 10.0  # intervals; a longer gap is remarked on
-SKEW_S = 0.1  # a header stamp further from the log's clock is remarked on
+NOISE_SAMPLES = 10  # samples of a batch needed to estimate the noise
+DECODED = 20_000  # decoded messages of a topic beyond which messages are skipped
+TIME_BYTES = 40  # memory for the times of a message
+GAP = 10.0  # intervals; longer gaps are reported
+SKEW_S = 0.1  # larger differences between header stamps and the log's clock are reported
 
 
 @dataclass(frozen=True)
 class FieldReport:
-    """A number in a topic's messages, by its message path."""
+    """A number in a topic's messages."""
 
     path: str
     low: float | None  # smallest and largest finite value; None if there is none
     high: float | None
     not_finite: int
-    noise: float = 0.0  # standard deviation of what changes from sample to sample
-    held: float = 0.0  # share of samples that repeat the one before, but for zeros
+    noise: float = 0.0  # standard deviation of the white noise
+    held: float = 0.0  # share of nonzero samples that repeat the one before
 
 
 @dataclass(frozen=True)
 class TopicReport:
-    """A topic: how its messages come, and what is in them."""
+    """A topic: timing and contents of its messages."""
 
     topic: str
     type: str
@@ -82,18 +82,18 @@ class LogReport:
     """A log: its files, its length, its topics, and whether it is damaged."""
 
     files: tuple[Path, ...]
-    library: str  # who wrote it
+    library: str  # that wrote it
     start_ns: int
     duration_s: float
     messages: int
     topics: tuple[TopicReport, ...]
     twins: tuple[Twins, ...]  # signals of different topics with one motion
     damage: str = ""  # where reading it ended early, and why
-    meta: Mapping[str, str] = field(default_factory=dict)  # of a file of ours: its own table
+    meta: Mapping[str, str] = field(default_factory=dict)  # metadata, if grounded wrote the file
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Sentences about what a person should know before using the log."""
+        """Warnings about the log, as sentences for a person."""
         return _remarks(self)
 
 
@@ -111,17 +111,17 @@ def _remarks(log: LogReport) -> tuple[str, ...]:
             found.append(f"{topic.topic} has a gap of {topic.largest_gap_s:.3f} s")
         if topic.skew_s is not None and abs(topic.skew_s) > SKEW_S:
             found.append(
-                f"{topic.topic} is stamped {topic.skew_s:.3f} s from the log's clock "
+                f"the stamps of {topic.topic} differ from the log's clock by {topic.skew_s:.3f} s "
                 "(simulation time, or an unset clock?)"
             )
         if len(topic.fields) >= FIELD_LIMIT:
             found.append(
                 f"{topic.topic} is listed with its first {FIELD_LIMIT} numbers; "
-                "[log] may name any other by its path"
+                "[log] can use any other by its path"
             )
         bad = [f.path for f in topic.fields if f.not_finite]
         if bad:
-            found.append(f"{topic.topic} has values that are no numbers, first in {bad[0]}")
+            found.append(f"{topic.topic} has values that are not numbers, first in {bad[0]}")
     for twins in log.twins:
         if twins.opposite:
             found.append(
@@ -132,13 +132,13 @@ def _remarks(log: LogReport) -> tuple[str, ...]:
 
 
 def inspect_log(paths: str | Path | Sequence[str | Path]) -> LogReport:
-    """Looks through a log; damage ends the look, and is reported.
+    """Summarise a log; at damage the reading ends, and the damage is reported.
 
     Args:
-        paths: an MCAP file, several that follow each other, or the folder of a bag.
+        paths: a log file, several in order, or the folder of a bag.
 
     Raises:
-        GroundedError: if a file can't be read, or is no log at all.
+        GroundedError: if a file can't be read, or is not a log.
     """
     look = _Look()
     with reading(paths) as files:
@@ -156,7 +156,7 @@ def inspect_log(paths: str | Path | Sequence[str | Path]) -> LogReport:
 
 
 class _Look:
-    """What has been seen so far; topics go on from file to file, channels do not."""
+    """The summary while it is built; topics continue from file to file, channels do not."""
 
     def __init__(self) -> None:
         self.headers: list[Header] = []
@@ -222,7 +222,7 @@ class _Range:
     high: float = -np.inf
     count: int = 0
     not_finite: int = 0
-    samples: list[tuple[Ints, Floats]] | None = None  # kept where twins may be found
+    samples: list[tuple[Ints, Floats]] | None = None  # kept if it may have a twin
     noises: list[float] = field(default_factory=list)
     repeated: int = 0
 
@@ -340,5 +340,5 @@ def _field(path: str, found: _Range) -> FieldReport:
 
 
 def _noise(values: Floats) -> float:
-    """Deviation of white noise on a smooth signal, from its second differences; outliers aside."""
+    """Return a robust standard deviation of a signal's white noise, from second differences."""
     return float(np.median(np.abs(np.diff(values, 2))) / (0.6745 * np.sqrt(6)))

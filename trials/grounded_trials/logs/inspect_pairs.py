@@ -1,7 +1,7 @@
-"""Positions and rates among a log's numbers: what follows the derivative of what.
+"""Find positions and rates among a log's numbers: which one follows the derivative of which.
 
-`paired` tries which candidates are a state and its rate, where the model says q' = w; what a name
-gives and the numbers refute is sought among those that nobody has taken. `Signals` reads them.
+`paired` tries which candidates are a state and its rate where the model has q' = w. If a candidate
+found by name does not follow, the unassigned numbers are tried. `Signals` reads the samples.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from grounded_trials.logs.samples import Samples, tidy
 from grounded_trials.logs.signals import Series, SignalSpec, read_signals
 from grounded_trials.logs.stated_units import LENGTHS, Stated, factor_between, may_be
 
-SLOPE = 0.01
+SLOPE = 0.01  # tolerance of the factor 1 in q' = w
 FOLLOWS = 0.8  # correlation of a rate with the derivative of its position
-SURELY = 0.95  # the same, where no name says that it is one
-COMBINATIONS, LONGEST = 64, 20_000  # tried at most; samples of a grid
-FEW = 8  # numbers without a name that are tried as a position or a rate
-MANY = 60  # numbers that are tried in place of one whose name gives it and that does not follow
+SURELY = 0.95  # the same, without matching names
+COMBINATIONS, LONGEST = 64, 20_000  # largest number of combinations tried; samples of a grid
+FEW = 8  # largest number of unnamed signals tried as a position or a rate
+MANY = 60  # largest number of signals tried in place of one that does not follow
 
 
 def velocities(model: Model) -> dict[str, str]:
-    """Which state's rate is another state, as the model has it: {q: w}."""
+    """Return the states whose rate is another state of the model: {q: w}."""
     names = model.state_names
     own = [r for r in integrals(model) if r.exact and abs(r.c - 1) < SLOPE]
     return {names[r.i]: names[r.j] for r in own}
@@ -47,9 +47,19 @@ def paired(
     log: LogReport,
     joints: Mapping[str, str],
 ) -> dict[str, Guess]:
-    """A position and its rate; what no name gives is sought among the numbers nobody has taken.
+    """Check a position and its rate against each other; fill in one without a matching name.
 
-    `joints`: units of joints' numbers by their paths; what is in another unit is no state's.
+    Args:
+        guesses: of all states and inputs.
+        pair: names of the position and its rate.
+        signals: the samples of all candidates.
+        units: of the model, by name.
+        log: an inspected log.
+        joints: units of joints' numbers by path.
+
+    Returns:
+        The changed guesses. Candidates without a matching name are unassigned numbers whose unit
+        fits.
     """
     taken = {guess.path for guess in guesses.values()}
     free = [f.path for t in log.topics for f in t.fields if f.low != f.high and f.path not in taken]
@@ -67,7 +77,7 @@ def paired(
     if len(found) < 2:
         return {}
     known = len(bare) == 1 and all(own[name].sure for name in pair if name not in bare)
-    why = "no name says it" + "; of what is left only this pair fits" * (len(bare) == 2)
+    why = "no name matches" + "; only this pair of the rest fits" * (len(bare) == 2)
     for name in bare:
         reasons = (why, *found[name].reasons)
         found[name] = replace(found[name], sure=known and found[name].scale == 1, reasons=reasons)
@@ -82,9 +92,9 @@ def _elsewhere(
     signals: Signals,
     units: Mapping[str, str],
 ) -> dict[str, Guess]:
-    """What was found of a rate that its name gives, and that does not follow: another's number.
+    """Look for a rate among unassigned numbers if the one found by name does not follow.
 
-    The quaternion of a position has a w, and a twist; what moves as the rate says more than a name.
+    A name may mislead: `w` may be a component of a quaternion.
     """
     q, w = (own[name] for name in pair)
     if not 0 < len(free) <= MANY:
@@ -97,7 +107,7 @@ def _elsewhere(
         return dict(found)
     moved = again[w.name]
     others = tuple(dict.fromkeys((w.path, *w.others)))
-    why = f"not {w.path}, which its name gives"
+    why = f"not {w.path}, despite its name"
     return {
         **again,
         w.name: replace(moved, sure=False, others=others, reasons=(why, *moved.reasons)),
@@ -105,9 +115,9 @@ def _elsewhere(
 
 
 def _derivative(q: Guess, w: Guess, signals: Signals, units: Mapping[str, str]) -> dict[str, Guess]:
-    """Both guesses, after trying which pair of candidates are a position and its rate.
+    """Return both guesses, after trying which pair of candidates are a position and its rate.
 
-    Their scales are beside the units that the log states: those are multiplied in by `as_stated`.
+    The scales exclude the units that the log states, which `as_stated` multiplies in.
     """
     stated = signals.stated
     tried = []
@@ -136,7 +146,7 @@ def _derivative(q: Guess, w: Guess, signals: Signals, units: Mapping[str, str]) 
             scale /= DEGREE
         found_w = replace(found_w, scale=scale, sure=found_w.sure or (fits and found_q.sure))
     elif abs(abs(logged.slope) - 1) < SAME and bool(stated.unit(a)) != bool(stated.unit(b)):
-        why += ", as large as it is logged: both are taken to be in one unit"
+        why += ", of the same size as logged: both are assumed to have the same unit"
         if stated.unit(a):
             found_w = replace(found_w, scale=scale * by[0], sure=False)
         else:
@@ -156,10 +166,10 @@ def agreed(
     log: LogReport,
     joints: Mapping[str, str],
 ) -> dict[str, Guess]:
-    """A position and its rate that are sure without a name: all that the log says agrees.
+    """Mark a position and its rate as sure if all evidence of the log agrees, whatever the names.
 
-    The position's is the only number in a unit of its kind, the rate's follows its derivative in
-    that unit, and neither of them fits any other number so. A joint that is called a slide has it
+    The position is the only number with a unit of its kind, the rate follows its derivative in that
+    unit, and no other number fits either of them as well. The position of a sliding joint counts as
     in metres.
     """
     stated, (q, w) = signals.stated, (guesses[name] for name in pair)
@@ -193,15 +203,15 @@ def agreed(
 
 
 def rates_among(log: LogReport, paths: Sequence[str]) -> dict[str, tuple[str, float]]:
-    """Which numbers are the rate of which: {position: (rate, how much of it a unit of that is)}.
+    """Return which numbers are the rate of which: {position: (rate, factor of the rate)}.
 
-    Only where one unit or a power of ten of it lies between them; each is one pair's at most.
+    Only pairs whose units differ by a power of ten; each number is in one pair at most.
     """
     return rates_in(Signals(log, (), (), Stated.by(log.files)), paths)
 
 
 def rates_in(signals: Signals, paths: Sequence[str]) -> dict[str, tuple[str, float]]:
-    """The same, with samples that may have been read."""
+    """Return the same as `rates_among`, using samples that may have been read already."""
     found = []
     signals.read(paths)
     for a, b in permutations(paths, 2):
@@ -222,7 +232,7 @@ def rates_in(signals: Signals, paths: Sequence[str]) -> dict[str, tuple[str, flo
 
 
 def moved_to(guess: Guess, path: str) -> Guess:
-    """The guess at another of its candidates."""
+    """Return the guess moved to another of its candidates."""
     if path == guess.path:
         return guess
     rest = tuple(p for p in (guess.path, *guess.others) if p not in ("", path))
@@ -230,7 +240,7 @@ def moved_to(guess: Guess, path: str) -> Guess:
 
 
 class Signals:
-    """The samples of everything that was guessed, read once, and put on one grid when asked."""
+    """The samples of all candidates, read once, and put on a common grid on request."""
 
     def __init__(
         self, log: LogReport, guesses: Iterable[Guess], angles: Collection[str], stated: Stated
@@ -244,7 +254,7 @@ class Signals:
         self.read([p for g in guesses for p in (g.path, *g.others) if p])
 
     def read(self, paths: Iterable[str]) -> None:
-        """The samples of these as well."""
+        """Read the samples of further paths."""
         more = (p for p in paths if p not in self.found)
         specs = {p: SignalSpec(p, clock=_clock(p, self._clocks)) for p in more}  # type: ignore[arg-type]
         try:
@@ -259,7 +269,11 @@ class Signals:
             self.found[path] = _unwound(found) if path in self._angles else found
 
     def grid(self, paths: Sequence[str]) -> tuple[float, list[Floats]] | None:
-        """These signals on a common grid: its step [s] and the columns; None if they don't meet."""
+        """Interpolate signals on a common grid.
+
+        Returns:
+            Its step [s] and one column per path; None if the signals don't overlap.
+        """
         if not all(path in self.found and len(self.found[path].t) > 20 for path in paths):
             return None
         samples = [self.found[path] for path in paths]
@@ -274,7 +288,7 @@ class Signals:
 
 
 def _unwound(angle: Samples) -> Samples:
-    """An angle whose values jump by a turn, in radians or degrees, without the jumps."""
+    """Unwrap an angle that jumps by a full turn, in radians or degrees."""
     jump, width = np.abs(np.diff(angle.y)).max(initial=0.0), np.ptp(angle.y)
     turns = [turn for turn in (2 * np.pi, 360.0) if 0.9 * turn < jump <= width < 1.02 * turn]
     return replace(angle, y=np.unwrap(angle.y, period=turns[0])) if turns else angle

@@ -1,11 +1,11 @@
-"""Which of its rivals an input is, by the steps of the model: where they tell, and tell clearly.
+"""Decide between rivals for an input by the steps of the model, if they are conclusive.
 
-A skeleton knows neither masses nor gravity, so the size of its error says nothing: the smaller of
-two torques fits whatever it is given to. What is compared is what is left of each state's motion
-once all is taken out that the state itself may explain (a drag, a spring, gravity) and every input
-has the gain that suits it, of the model's sign. An assignment is believed only if it leaves clearly
-less than every other one of each state that tells them apart, over most pieces of the log, and less
-than no input at all.
+A model skeleton has neither correct masses nor gravity, so the size of its error is meaningless:
+the smaller of two torques fits anywhere. What is compared is the part of each state's motion that
+remains after removing everything that the states may explain (drag, springs, gravity) and after
+giving every input its best gain, with the model's sign. An assignment is accepted only if it leaves
+clearly less than every other one, for each state that distinguishes them and over most pieces of
+the log, and less than no input at all.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from grounded_trials.formats.messages import Floats
 from grounded_trials.logs.inspect_guess import Guess
 from grounded_trials.logs.inspect_pairs import COMBINATIONS, Signals, moved_to
 
-WINDOW = 0.05  # [s] over which a step is taken: noise of a speed hides shorter ones
-PIECES = 8  # of the log, that are asked one by one
-LEAST = 20  # steps of a piece: fewer pieces where the log is short
-BETTER = 0.2  # [nats] of squares that the best must leave less than any other: 10 % of the error
-USE = 0.1  # [nats] less than without any input
-SCATTER = 2.0  # standard errors over the pieces, by which it must do so
-MOST = 0.75  # of the pieces that agree
-SAME = 1e-6  # of the squares: a state that does not tell two assignments apart
+WINDOW = 0.05  # [s] length of a step: in shorter ones noise dominates
+PIECES = 8  # pieces of the log, evaluated separately
+LEAST = 20  # steps of a piece; short logs have fewer pieces
+BETTER = 0.2  # [nats] lead of the best in squared error: 10 % of the error
+USE = 0.1  # [nats] lead over no input at all
+SCATTER = 2.0  # standard errors over the pieces by which the lead must be significant
+MOST = 0.75  # share of the pieces that must agree
+SAME = 1e-6  # of the squares: with less difference a state does not distinguish assignments
 Paths = tuple[str, ...]
 
 
 def by_steps(model: Model, guesses: Mapping[str, Guess], signals: Signals) -> dict[str, Guess]:
-    """Inputs that are unsure: decided where the model's steps tell, else with their rivals.
+    """Decide unsure inputs by the model's steps if they are conclusive; else list the rivals.
 
     Args:
         model: however crude.
         guesses: of all its states and inputs.
-        signals: the samples of everything that was guessed.
+        signals: the samples of all candidates.
     """
     unsure = [n for n in model.input_names if guesses[n].path and guesses[n].others]
     known = [*model.state_names, *model.input_names]
@@ -65,7 +65,7 @@ def by_steps(model: Model, guesses: Mapping[str, Guess], signals: Signals) -> di
         return {}
     best = min(left, key=lambda one: float(left[one][..., 0].sum()))
     rivals = [one for one in left if one != best and not _clearly(left[best], left[one])]
-    if len(tried) > COMBINATIONS:  # who knows what the others would leave
+    if len(tried) > COMBINATIONS:  # not all could be tried
         rivals = [one for one in left if one != best]
     if rivals:
         first = tuple(guesses[n].path for n in unsure)
@@ -75,14 +75,14 @@ def by_steps(model: Model, guesses: Mapping[str, Guess], signals: Signals) -> di
     found = {}
     for name, path in zip(unsure, best, strict=True):
         why = f"with it the model's steps fit {100 * (1 - np.exp(-gain / 2)):.0f} % better than "
-        why += "with the next best, each state by itself and throughout the log"
+        why += "with the next best, for each state and throughout the log"
         moved = moved_to(guesses[name], path)
         found[name] = replace(moved, sure=True, reasons=(*moved.reasons, why))
     return found
 
 
 def _apart(choices: Sequence[Sequence[str]], taken: Paths = ()) -> Iterator[Paths]:
-    """One of each, no two the same."""
+    """Yield combinations with one path of each list, all different."""
     if len(taken) == len(choices):
         yield taken
         return
@@ -94,13 +94,13 @@ def _apart(choices: Sequence[Sequence[str]], taken: Paths = ()) -> Iterator[Path
 def _open(
     guesses: Mapping[str, Guess], unsure: Sequence[str], said: Paths, rivals: Sequence[Paths]
 ) -> dict[str, Guess]:
-    """The guesses as they are said, with what else each may be by those that fit about as well."""
+    """Return the guesses with paths `said`, and rivals from assignments that fit about as well."""
     found = {}
     for k, name in enumerate(unsure):
         others = tuple(dict.fromkeys(one[k] for one in rivals if one[k] != said[k]))
         moved = moved_to(guesses[name], said[k])
         if others:
-            reasons = (*moved.reasons, "the model's steps don't clearly tell which it is")
+            reasons = (*moved.reasons, "the model's steps don't clearly favour one")
             found[name] = replace(moved, sure=False, others=others, reasons=reasons)
         else:
             found[name] = moved
@@ -108,7 +108,7 @@ def _open(
 
 
 def _left(model: Model, step: float, values: Floats) -> Array:
-    """Logarithm of the squares that inputs leave, and that are there without, (P, n, 2)."""
+    """Return the log squared error per piece and state, with inputs and without, (P, n, 2)."""
     k, n = max(1, round(WINDOW / step)), model.n
     x, sums = values[:, :n], np.cumsum(np.vstack([np.zeros(model.m), values[:, n:]]), axis=0)
     u, dt = ((sums[k:] - sums[:-k]) / k)[: len(x) - k], probe(model, k * step)
@@ -136,7 +136,7 @@ def _left(model: Model, step: float, values: Floats) -> Array:
 
 
 def _explained(model: Model, x: Array) -> Array:
-    """What may move a state by itself: each state, those that turn also by gravity's sine."""
+    """Return regressors (N, k) for motion without inputs: the states, and sines of angles."""
     turns = [i for i, unit in enumerate(model.states.values()) if unit == "rad"]
     columns = [np.ones(len(x)), x, np.sin(x[:, turns]), np.cos(x[:, turns])]
     own = np.column_stack(columns)
@@ -145,7 +145,7 @@ def _explained(model: Model, x: Array) -> Array:
 
 
 def _gains(effects: Array, y: Array) -> Array:
-    """The gains that suit best, none below 0: those of exchanged wheels would be."""
+    """Return the best gains, none below 0, since exchanged wheels would need negative ones."""
     from scipy.optimize import nnls
 
     size = np.sqrt((effects**2).sum(axis=0))
@@ -157,7 +157,7 @@ def _gains(effects: Array, y: Array) -> Array:
 
 
 def _clearly(best: Array, other: Array) -> bool:
-    """Whether one assignment leaves less than another of every state that tells them apart."""
+    """Check whether one assignment leaves less of every state that distinguishes the two."""
     if best.shape != other.shape:
         return False
     gained, used = other[..., 0] - best[..., 0], best[..., 1] - best[..., 0]

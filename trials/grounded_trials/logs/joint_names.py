@@ -1,7 +1,7 @@
-"""Which joint each number of a JointState is, and which states of a model are those joints.
+"""Assign the numbers of a JointState to joints, and the joints to states of a model.
 
-A JointState names its joints, often in the order of the alphabet; an array of commands names none.
-Models, and controllers, count from the base.
+A JointState names its joints, often in alphabetical order; an array of commands names none.
+Models and controllers count from the base.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ if TYPE_CHECKING:
 
 LIMB = ("base", "waist", "torso", "shoulder", "upper", "elbow", "fore", "wrist", "hand", "finger")
 LEG = ("hip", "thigh", "knee", "shin", "ankle", "foot", "toe")
-WITHIN = ("yaw", "pan", "lift", "pitch", "flex", "roll")  # of the joints of one part
-SIDES = ("left", "right", "front", "rear")  # of several limbs
-ROLLS = re.compile("wheel|caster|track|rotor|prop|crank|spindle")  # turns on and on
-SLIDES = {  # words of a joint that is a slide: its numbers are in m
+WITHIN = ("yaw", "pan", "lift", "pitch", "flex", "roll")  # order of joints within one part
+SIDES = ("left", "right", "front", "rear")  # words that indicate several limbs
+ROLLS = re.compile("wheel|caster|track|rotor|prop|crank|spindle")  # joints that turn endlessly
+SLIDES = {  # words of prismatic joints, in metres
     *("trolley", "cart", "carriage", "slide", "slider", "rail", "prismatic", "linear"),
     *("gantry", "lift", "elevator", "telescope"),
 }
-TURNS = {  # words of one that turns all the same: a shoulder's lift, a pole on a cart
+TURNS = {  # words of revolute joints, which take precedence: a shoulder's lift, a pole on a cart
     *LIMB,
     *LEG,
     *("yaw", "pan", "pitch", "flex", "roll", "tilt", "wheel", "hinge", "revolute", "rotation"),
     *("pole", "pendulum", "swing", "sway", "angle", "theta"),
 } - {"base", "torso"}
-ALIKE, CLEARLY = 0.9, 0.1  # a command's correlation with an effort; how much less all others have
-LATEST = 0.1  # [s] that an effort may come after its command
-FULL_TURNS, DEGREES = 4 * math.pi, 720.0  # of a joint: what spans more; its most, in degrees
+ALIKE, CLEARLY = 0.9, 0.1  # least correlation of a command with an effort, and lead over others
+LATEST = 0.1  # [s] largest delay of an effort behind its command
+FULL_TURNS, DEGREES = 4 * math.pi, 720.0  # range that suggests degrees; largest angle in degrees
 
 
 def joint_names(log: LogReport) -> dict[str, tuple[str, ...]]:
-    """The joints of each JointState topic, in the order of its numbers.
+    """Return the joints of each JointState topic, in the order of its numbers.
 
-    A topic whose messages name different joints is left out: an index then means several things.
+    A topic whose messages name different joints is left out, since its indices are ambiguous.
     """
     wanted = {t.topic for t in log.topics if t.type.endswith("/JointState") and t.messages}
     found: dict[str, set[tuple[str, ...]]] = {topic: set() for topic in wanted}
@@ -65,15 +65,15 @@ def joint_names(log: LogReport) -> dict[str, tuple[str, ...]]:
 
 
 def slides(joint: str) -> bool:
-    """Whether a joint is called like one that slides: a trolley, a rail, a lift."""
+    """Check whether a joint's name is that of a prismatic joint: a trolley, a rail, a lift."""
     words = _words(joint)
     return bool(words & SLIDES) and not words & TURNS
 
 
 def joint_units(joints: Mapping[str, Sequence[str]]) -> dict[str, str]:
-    """The units of joints' numbers by their paths, "" for a joint that its name doesn't explain.
+    """Return the units of joints' numbers by path: rad for revolute, m for prismatic joints.
 
-    Radians where it turns, metres where it slides.
+    "" for a joint whose name does not show its kind.
 
     Args:
         joints: see `joint_names`.
@@ -94,7 +94,7 @@ def _words(joint: str) -> set[str]:
 
 
 def _names_in(batch: Messages, encoding: str) -> set[tuple[str, ...]]:
-    """The lists of names in the first and last message of a batch."""
+    """Return the lists of names in the first and last message of a batch."""
     from rosbags.typesys import Stores, get_typestore
 
     ros1 = encoding == "ros1"
@@ -106,12 +106,12 @@ def _names_in(batch: Messages, encoding: str) -> set[tuple[str, ...]]:
         try:
             found.add(tuple(read(data, "sensor_msgs/msg/JointState").name))  # type: ignore[attr-defined]
         except (AttributeError, KeyError, ValueError, IndexError, AssertionError):
-            continue  # another encoding than ROS's: joints go unnamed
+            continue  # not a ROS encoding: joints have no names
     return found
 
 
 def from_base(joints: Sequence[str]) -> tuple[str, ...]:
-    """The joints of one limb from its base on, by parts of the body or numbers; else as given."""
+    """Sort the joints of one limb from its base, by body parts or numbers; else keep the order."""
     if any(_first(SIDES, joint) < len(SIDES) for joint in joints):
         return tuple(joints)
     numbers = {joint: [int(n) for n in re.findall(r"\d+", joint)] for joint in joints}
@@ -127,7 +127,7 @@ def from_base(joints: Sequence[str]) -> tuple[str, ...]:
 
 
 def _first(words: Sequence[str], joint: str) -> int:
-    """Which of some words a joint's name holds; how many there are for none."""
+    """Return the index of the first word in a joint's name; `len(words)` if there is none."""
     return next((i for i, word in enumerate(words) if word in joint.lower()), len(words))
 
 
@@ -139,10 +139,15 @@ def of_joint(
     *,
     sent: bool = False,
 ) -> Guess:
-    """A name that holds a joint's is that joint's number of its unit, if the log has it.
+    """Assign a state or input whose name contains a joint's to that joint's number.
 
-    `sent`: an input. Efforts are what came out, after the drive's delay and limits: an array with a
-    command for each joint comes before them.
+    Args:
+        guess: of the state or input.
+        unit: of the state or input, which decides between position, velocity and effort.
+        joints: see `joint_names`.
+        log: an inspected log.
+        sent: whether it is an input. An array with a command for each joint is then preferred to
+            measured efforts, which include the delay and the limits of the drive.
     """
     there = _there(log)
     for topic, names in joints.items():
@@ -153,14 +158,14 @@ def of_joint(
             kind = next((k for k, u in measured.items() if u == unit), None)
             kind = kind or ("position" if unit in ("m", "1") else None)
             path = f"{topic}.{kind}[{i}]"
-            plain = unit == "1"  # an actuator takes torques, or places, or speeds
+            plain = unit == "1"  # commands may be torques, positions or speeds
             torque = sent and kind == "effort"
             if commanded := _commands(log, len(names), plain) if torque or (sent and plain) else []:
                 at = from_base(names).index(joint)
                 paths = [f"{command}[{at}]" for command in commanded]
                 paths += [path] if torque and path in there else []
                 rest = [f"{c}[{k}]" for c in commanded for k in range(len(names)) if k != at]
-                why = f"commands name no joint; in their order from the base, {at} is '{joint}'"
+                why = f"commands name no joints; in order from the base, {at} is '{joint}'"
                 others = (*paths[1:], *rest)
                 return replace(guess, path=paths[0], sure=False, others=others, reasons=(why,))
             if path in there:
@@ -176,7 +181,10 @@ def wide_joints(
     joints: Mapping[str, tuple[str, ...]],
     log: LogReport,
 ) -> tuple[str, ...]:
-    """Joints that span turns in rad, as ROS's conventions have it, and no wheel does: degrees?"""
+    """Return a warning on joints other than wheels that span full turns if they are in rad.
+
+    They are probably in degrees, against the ROS conventions.
+    """
     fields = {field.path: field for topic in log.topics for field in topic.fields}
     called = {f"{t}.position[{i}]": j for t, names in joints.items() for i, j in enumerate(names)}
     found = []
@@ -193,9 +201,9 @@ def wide_joints(
         return ()
     several = len(found) > 1
     return (
-        f"{'; '.join(found)}: turns of a joint, if {'these are' if several else 'that is'} rad. "
-        f"In degrees? Then scale = {math.pi / 180:.8g} in [log.state] of each, of "
-        "the joints' velocities too, makes it rad",
+        f"{'; '.join(found)}: full turns of a joint, if {'these are' if several else 'that is'} "
+        f"rad. If it is in degrees, set scale = {math.pi / 180:.8g} in [log.state] of each, and of "
+        "the joints' velocities too",
     )
 
 
@@ -205,9 +213,9 @@ def in_order(
     joints: Mapping[str, tuple[str, ...]],
     log: LogReport,
 ) -> dict[str, Guess]:
-    """As many names of a unit as there are joints, none of them found: taken from the base on.
+    """Assign states in order from the base, if there are as many of a unit as joints.
 
-    Joints that slide have states in m, those that turn in rad.
+    Only if none of them has a path yet. Prismatic joints have states in m, revolute ones in rad.
     """
     found: dict[str, Guess] = {}
     if len(joints) != 1:
@@ -228,10 +236,10 @@ def in_order(
             paths += [path] if (path := f"{topic}.{kind}[{names.index(joint)}]") in there else []
             if not paths:
                 continue
-            why = f"in the order of the joints from the base, {at} is '{joint}'"
+            why = f"in the order of joints from the base, {at} is '{joint}'"
             if len(some) == 1:
                 why = f"'{joint}' is the only joint{' that slides' * slide}"
-            why = f"no name says it; {why}" if commanded else why
+            why = f"no name matches; {why}" if commanded else why
             rest = [f"{c}[{i}]" for c in commanded for i in range(len(names)) if i != at]
             others = (*paths[1:], *rest)
             found[name] = replace(guesses[name], path=paths[0], others=others, reasons=(why,))
@@ -239,7 +247,7 @@ def in_order(
 
 
 def _there(log: LogReport) -> set[str]:
-    """The numbers of a log; efforts where they are told: many a robot has them all at zero."""
+    """Return the paths of a log, except for constant efforts: many robots leave them at zero."""
     return {
         field.path
         for topic in log.topics
@@ -255,17 +263,17 @@ def by_efforts(
     signals: Signals,
     log: LogReport,
 ) -> dict[str, Guess]:
-    """Commands of an array, told by the joints' measured efforts: what is sent comes out there.
+    """Assign the commands of an array to joints by their correlation with measured efforts.
 
-    Where each command goes with one joint's effort, and clearly less with the others', that joint's
-    input is there; where not, it is said what decides.
+    If each command correlates with one joint's effort, clearly more than with the others, it is
+    assigned to that joint. Otherwise the reasons say where to look it up.
 
     Args:
         guesses: of all states and inputs.
         inputs: names of inputs.
         joints: see `joint_names`.
-        signals: reads their samples.
-        log: that was looked through.
+        signals: reads the samples.
+        log: an inspected log.
     """
     found: dict[str, Guess] = {}
     there = _there(log)
@@ -282,17 +290,17 @@ def by_efforts(
         known = torques and there.issuperset(measured)
         at = _goes_with(sent, measured, signals)[joint] if known else None
         if at is None:
-            why = "to decide, see the order of `joints` in the parameters of its controller"
+            why = "check it by the order of `joints` in the parameters of the controller"
             found[name] = replace(guess, reasons=(*guess.reasons, why))
         else:
-            why = f"goes with {measured[joint]}, the effort of '{own[0]}', clearly more than with "
-            why += "any other joint's"
+            why = f"correlates with {measured[joint]}, the effort of '{own[0]}', clearly more than "
+            why += "with any other joint's"
             found[name] = replace(guess, path=sent[at], sure=True, others=(), reasons=(why,))
     return found
 
 
 def _goes_with(sent: Sequence[str], measured: Sequence[str], signals: Signals) -> list[int | None]:
-    """Which command goes with each of some efforts; all None where that is not clear of each."""
+    """Return the index of the command for each effort; all None unless every one is clear."""
     signals.read([*sent, *measured])
     gridded = signals.grid((*sent, *measured))
     none: list[int | None] = [None] * len(measured)
@@ -317,7 +325,7 @@ def _goes_with(sent: Sequence[str], measured: Sequence[str], signals: Signals) -
 
 
 def _commands(log: LogReport, count: int, plain: bool = False) -> list[str]:
-    """Topics of arrays with a command for each of `count` joints: torques; `plain`: or any."""
+    """Return array topics with a torque command for each of `count` joints; `plain`: any kind."""
     words = ("cmd", "command", "effort", "torque", "desired", "ref")
     return [
         f"{topic.topic}.data"
@@ -330,7 +338,7 @@ def _commands(log: LogReport, count: int, plain: bool = False) -> list[str]:
 
 
 def _holds(name: str, joint: str) -> bool:
-    """Whether a state's name is a joint's with a letter or word for what is measured."""
+    """Check whether a state's name is a joint's, perhaps with a word for the quantity."""
     plain = re.sub(r"(_?joint_?)", "", joint.lower()) or joint.lower()
     parts = name.lower().split("_")
     return (

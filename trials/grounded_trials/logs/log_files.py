@@ -1,8 +1,9 @@
-"""Which files a log consists of, and the records of each, whatever its format.
+"""The files of a log, and the records of each, in any supported format.
 
-A log is a file, several in order, or a bag's folder with split files. A file's format is told by
-how it begins, not by its name: MCAP, ROS 2 SQLite, ROS 1, NumPy, PX4, any of them as a zstd file,
-else a text table. All give the records of MCAP, so that nobody above needs to know which it was.
+A log is a file, several files in order, or a bag's folder with split files. The format is detected
+by the first bytes, not by the name: MCAP, ROS 2 SQLite, ROS 1, NumPy, PX4, any of them compressed
+with zstd, else a text table. Every format is converted to MCAP records, so callers need not know
+it.
 """
 
 from __future__ import annotations
@@ -24,25 +25,26 @@ from grounded_trials.plain_file import open_file, read_file
 
 BAGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")  # files of a bag's folder
 KINDS = (*BAGS, ".bag", ".csv", ".npz", ".ulg")
-EXPANDED = 4 * 2**30  # bytes of a compressed file, at most
+EXPANDED = 4 * 2**30  # [bytes] largest size of a decompressed file
 LISTING_LIMIT = 2**24  # [bytes] of a metadata.yaml
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _LISTED = re.compile(
     r"^\s*-\s+(?:path:\s*)?[\"']?([^\"'\s#]+\.(?:mcap|db3)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE
 )
-_NO_LOG = re.compile(r"c\d{4,}\.\w+|target\.csv")  # a candidate, as it was exported, or a target
+_NO_LOG = re.compile(r"c\d{4,}\.\w+|target\.csv")  # an exported candidate, or a target
 _DIGITS = re.compile(r"(\d+)")
 
 
 def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
-    """The files of a log in order.
+    """Return the files of a log in order.
 
     Args:
-        paths: a file, files in order, or the folder of a bag. A folder's metadata.yaml says which
-            files it has and in which order; without it, all *.mcap, else *.db3, by their numbers.
+        paths: a file, files in order, or the folder of a bag. A folder's metadata.yaml lists its
+            files in order; without it, all *.mcap, else *.db3, sorted by the numbers in their
+            names.
 
     Raises:
-        GroundedError: if one of them is missing, or a folder has none.
+        GroundedError: if a file is missing, or a folder has none.
     """
     given = [paths] if isinstance(paths, str | Path) else list(paths)
     files: list[Path] = []
@@ -79,55 +81,55 @@ def _bag(folder: Path) -> list[Path]:
 
 
 def _nearby(path: Path) -> str:
-    """What to do about a file that is not there."""
+    """Return advice on a file that does not exist, to append to the message."""
     if not path.parent.is_dir():
-        return f", nor does its folder {path.parent}: name a log, seen from the folder you are in"
+        return f", nor does its folder {path.parent}: give a path relative to the current folder"
     there = (p.name for p in path.parent.iterdir() if p.name.endswith(KINDS))
     names = sorted(name for name in there if not _NO_LOG.fullmatch(name))
     if names:
         return f": {nearest(path.name, names)}"
-    return ": name a log or a bag's folder, seen from the folder you are in"
+    return ": give the path of a log or of a bag's folder, relative to the current folder"
 
 
 def _advice(folder: Path) -> str:
     if (folder / "grounded.toml").is_file():
-        return "; it is a workspace: name the log, or its folder, inside"
+        return "; it is a workspace: give the log in it, or the log's folder"
     tables = sorted(path.name for path in folder.iterdir() if path.name.endswith(".csv"))
     if len(tables) > 1:
         return (
-            f": name the log itself. If {listed(tables[:3])} are one run, put them into one .npz, "
-            "an array NAME of each beside its times NAME_t and its columns NAME_names: "
-            'docs/log-reference.md, "Two tables, two clocks", has the lines'
+            f": give the log itself. If {listed(tables[:3])} are one run, put them into one .npz, "
+            "each as an array NAME with its times NAME_t and its columns NAME_names; for the code "
+            'see docs/log-reference.md, "Two tables, two clocks"'
         )
-    return ": name the log itself"
+    return ": give the log itself"
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """Sorts bag_2 before bag_10."""
+    """Return a key that sorts bag_2 before bag_10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in _DIGITS.split(name)]
 
 
 def open_log(path: Path) -> BinaryIO:
-    """Opens a log for reading.
+    """Open a log for reading.
 
     Raises:
-        GroundedError: if it can't be, or is no file at all (a pipe, a device).
+        GroundedError: if it can't be opened, or is not a regular file (a pipe, a device).
     """
     try:
         return open_file(path)
     except FileNotFoundError:
         raise GroundedError(f"{path} does not exist{_nearby(path)}") from None
     except IsADirectoryError:
-        raise GroundedError(f"{path} is a folder: name a file in it") from None
+        raise GroundedError(f"{path} is a folder: give a file in it") from None
     except OSError as error:
         raise GroundedError(f"{path} can't be read: {error.strerror}") from None
 
 
 def log_records(path: Path) -> Iterator[Record]:
-    """The records of one file, MCAP or not.
+    """Yield the records of one file of any supported format.
 
     Raises:
-        GroundedError: if it can't be read, is damaged, or is no log.
+        GroundedError: if it can't be read, is damaged, or is not a log.
     """
     with open_log(path) as stream:
         head = stream.read(16)
@@ -156,14 +158,14 @@ def _by_format(path: Path, head: bytes, stream: BinaryIO) -> Iterator[Record]:
     reader = next((read for magic, read in begins.items() if head.startswith(magic)), None)
     if reader is None and path.suffix not in (".csv", ".tsv", ".txt"):
         raise GroundedError(
-            f"{path} is no log: it begins with {head[:8]!r}; MCAP, ROS 2 .db3, ROS 1 .bag, .csv, "
-            ".npz and PX4 .ulg can be read"
+            f"{path} is not a log: it begins with {head[:8]!r}; expected MCAP, ROS 2 .db3, ROS 1 "
+            ".bag, .csv, .npz or PX4 .ulg"
         )
     yield from map(_plain, (reader or text_tables.csv_records)(path))
 
 
 def _plain(record: Record) -> Record:
-    """A record whose messages, if compressed one by one (rosbag2's mode "message"), no longer are.
+    """Decompress the messages of a record if each is compressed (rosbag2's mode "message").
 
     No CDR message begins like a zstd frame.
     """
@@ -196,10 +198,10 @@ def _expand(path: Path, stream: BinaryIO, target: Path) -> None:
 
 @contextmanager
 def reading(paths: str | Path | Sequence[str | Path]) -> Iterator[tuple[Path, ...]]:
-    """The files of a log, and a budget of time and memory for what is decoded of them.
+    """Provide the files of a log, with a budget of time and memory for decoding them.
 
     Raises:
-        GroundedError: as `log_files`, and where the budget is used up.
+        GroundedError: as `log_files`, and if the budget is exceeded.
     """
     files = log_files(paths)
     with budget(str(files[0]), files):
@@ -207,9 +209,9 @@ def reading(paths: str | Path | Sequence[str | Path]) -> Iterator[tuple[Path, ..
 
 
 def kind_of(path: Path) -> str:
-    """The `format` that a file of ours states ahead of its messages, "" for any other file.
+    """Return the `format` stated in a file written by grounded, "" for any other file.
 
-    Damage is not judged here: whoever reads the file does that.
+    Damage is ignored here; it is reported when the file is read.
     """
     try:
         with reading(path):

@@ -1,6 +1,6 @@
 """The [log] table of grounded.toml: how a foreign log maps to the model's states and inputs.
 
-A foreign log as a trial's arrays: what the [log] table asks for, read and resampled at once.
+`log_mapping` parses the table; `read_log` reads and resamples a log accordingly.
 """
 
 from __future__ import annotations
@@ -20,7 +20,12 @@ CLOCKS = ("header", "log", "publish")
 
 
 def log_mapping(table: Table, states: Sequence[str], inputs: Sequence[str]) -> LogMapping | None:
-    """The mapping, or None when there is no [log] table.
+    """Parse the [log] table; None if there is none.
+
+    Args:
+        table: the [log] table.
+        states: names of the model's states.
+        inputs: names of the model's inputs.
 
     Raises:
         GroundedError: for an unknown key or name, or a value of the wrong kind.
@@ -55,12 +60,12 @@ def _signal(table: Table, clock: str) -> SignalSpec:
     if spec.max_age_s is not None and spec.max_age_s <= 0:
         raise table.error("max_age_s", f"must be positive, found {spec.max_age_s:g}")
     if spec.scale == 0:
-        raise table.error("scale", "must not be 0: the signal would say nothing")
+        raise table.error("scale", "must not be 0: the signal would always be 0")
     return spec
 
 
 def _path(table: Table) -> str:
-    """The message path under `path`, known to be one."""
+    """Return the value of `path`, checked to be a valid message path."""
     path: str = table.take("path", str)
     try:
         parse_path(path)
@@ -79,7 +84,7 @@ def _span(table: Table) -> Span:
 
 
 def _end(table: Table, key: str) -> Any:
-    """None, "first-input", a time, or a crossing."""
+    """Parse one end of the span: None, "first-input", a time, or a crossing."""
     value = table.peek(key)
     if value is None:
         table.has(key)
@@ -103,7 +108,7 @@ def _end(table: Table, key: str) -> Any:
 
 @dataclass(frozen=True)
 class LogMapping:
-    """The [log] table: where each state and input is found, and which part is the trial."""
+    """The [log] table: the signal of each state and input, and which part is the trial."""
 
     states: Mapping[str, SignalSpec]
     inputs: Mapping[str, SignalSpec]
@@ -120,15 +125,15 @@ def read_log(
     angles: Sequence[str] = (),
     steps: int | None = None,
 ) -> Gridded:
-    """Reads a log and samples it every dt.
+    """Read a log and sample it every dt.
 
     Args:
-        paths: an MCAP file, several that follow each other, or the folder of a bag.
-        mapping: where to find what.
+        paths: a log file, several in order, or the folder of a bag.
+        mapping: the signal of each state and input.
         dt: control interval [s].
-        states: which of the mapped states, in array order; all of them by default.
+        states: the mapped states to read, in array order; all of them by default.
         inputs: the same for the inputs.
-        angles: states that are unwrapped.
+        angles: states to unwrap.
         steps: at most this many steps.
 
     Raises:
@@ -146,7 +151,7 @@ def mapped_signals(
     states: Sequence[str],
     inputs: Sequence[str],
 ) -> dict[str, Series]:
-    """The raw samples of a log's states, inputs, and of what its span watches.
+    """Return the raw samples of a log's states and inputs, and of the signals for its span.
 
     Raises:
         GroundedError: see `signals.read_signals`.

@@ -1,10 +1,10 @@
-"""What can be saved of a damaged log, written as a good one; and what was lost.
+"""Recover a damaged log: write what can be saved to a new file, and report what was lost.
 
-The file is walked record by record. A chunk whose checksum fails is dropped whole, since nobody
-knows which of its numbers are wrong; the message indexes that follow it tell what it held. A chunk
-that the end of the file cuts through gives the messages that lie wholly before the cut. Where the
-chain of records itself is broken, the next place is looked for from which it holds again. Schemas
-and channels are taken from wherever they still stand, the summary included.
+The file is read record by record. A chunk with a wrong checksum is dropped entirely, since its
+wrong numbers can't be located; the message indexes after it show what it contained. Of a chunk cut
+off by the end of the file, the messages before the cut are kept. Where the chain of records is
+broken, the next place is sought from which it is intact. Schemas and channels are taken from
+anywhere in the file, including the summary.
 """
 
 from __future__ import annotations
@@ -34,45 +34,46 @@ from grounded_trials.store.own_files import TRIAL
 from grounded_trials.store.store import sync_folder
 from grounded_trials.wording import count
 
-MOST_LOSSES = 50  # that are told one by one
+MOST_LOSSES = 50  # number of losses listed
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """What was saved, what was not, and what of it no checksum vouches for."""
+    """What was saved, what was lost, and how much of it has no valid checksum."""
 
     source: Path
     target: Path
     messages: Mapping[str, int]  # saved, by topic
     lost_messages: Mapping[str, int]  # known to be lost, by topic
-    losses: tuple[str, ...]  # sentences; empty: the file was not damaged
-    unverified: int  # saved messages without a checksum that fits
+    losses: tuple[str, ...]  # sentences; empty if the file was not damaged
+    unverified: int  # saved messages without a valid checksum
     duration_s: float  # from the first to the last saved message
-    format: str = ""  # of a file of ours: TRIAL or CANDIDATE; "" for any other log
-    candidate: str = ""  # that a trial of ours ran
-    steps: int = 0  # of it that are saved
-    planned: int | None = None  # steps of the policy that it ran, where that is saved too
-    hole: bool = False  # steps before the last one are missing: it can't be read as a trial
+    format: str = ""  # TRIAL or CANDIDATE if grounded wrote the file, else ""
+    candidate: str = ""  # the candidate that a trial ran
+    steps: int = 0  # saved steps of a trial
+    planned: int | None = None  # steps of the policy that it ran, if saved
+    hole: bool = False  # steps before the last one are missing, so it can't be read as a trial
 
     @property
     def complete(self) -> bool:
-        """Whether nothing was lost and everything saved is known to be right."""
+        """Whether nothing was lost, and everything saved is verified."""
         return not self.losses
 
 
 def recover_log(source: str | Path, target: str | Path) -> Recovery:
-    """Writes what can be saved of a log to a new file.
+    """Write what can be saved of a log to a new file.
 
     Args:
         source: the damaged file; it is not changed.
         target: the file to write; it must not exist.
 
     Raises:
-        GroundedError: if nothing can be saved, `source` can't be read, or `target` not be written.
+        GroundedError: if nothing can be saved, `source` can't be read, or `target` can't be
+            written.
     """
     source, target = Path(source), Path(target)
     if target.exists():
-        raise GroundedError(f"{target} exists already; name a file that does not")
+        raise GroundedError(f"{target} exists already; choose another file name")
     with open_log(source) as stream, budget(str(source), [source]):
         salvage = Salvage(stream, str(source))
         try:
@@ -91,12 +92,12 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
         target.unlink()
         why = salvage.losses[0] if salvage.losses else "it is a log without messages"
         raise GroundedError(
-            f"{source}: there is nothing to save: {why}; expected an MCAP log, whole or damaged: "
-            "look for another copy of the recording"
+            f"{source}: nothing can be saved: {why}; expected an MCAP log, intact or damaged; look "
+            "for another copy of the recording"
         )
     losses = salvage.losses[:MOST_LOSSES]
     if more := len(salvage.losses) - len(losses):
-        losses.append(f"{more} more of these kinds")
+        losses.append(f"{more} more losses of these kinds")
     if copy.homeless:
         these = count(copy.homeless, "message")
         losses.append(f"{these} of topics whose name and type are lost")
@@ -109,7 +110,7 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
 
 
 def _own(found: Recovery, copy: _Copy) -> Recovery:
-    """What was saved of a file of ours, in steps."""
+    """Add what was saved of a file written by grounded, in steps."""
     kind = copy.meta.get("format", "")
     if kind != TRIAL:
         return replace(found, format=kind)
@@ -125,7 +126,7 @@ def _own(found: Recovery, copy: _Copy) -> Recovery:
 
 
 def _hole(copy: _Copy, states: int) -> bool:
-    """Whether the saved states do not follow each other from the start, step by step."""
+    """Check whether steps are missing among the saved states, from the start on."""
     try:
         start, step = max(int(copy.meta["start_ns"]), 0), float(copy.meta["dt"]) * 1e9
         first, last = copy.span or (start, start)
@@ -181,7 +182,7 @@ class _Copy:
                 self.policy = record.data
 
     def start(self, header: Header | None = None) -> CopyWriter:
-        """The writer, opened at the first record."""
+        """Return the writer, opened at the first record."""
         if self.writer is None:
             header = header or Header("", "")
             compressed = not header.library.startswith(LIBRARY)
@@ -189,7 +190,7 @@ class _Copy:
         return self.writer
 
     def messages(self, batch: Messages, *, final: bool) -> None:
-        """Writes the messages of known channels, keeps or counts the others."""
+        """Write the messages of known channels; keep the others, or count them at the end."""
         for identity in batch.channel_ids():
             own = batch.of(identity)
             channel = self.channels.get(identity)
@@ -212,17 +213,17 @@ class _Copy:
             self.span = (min(first, ends[0]), max(last, ends[1]))
 
     def topic(self, channel: int) -> str:
-        """The name of a channel's topic, if it is known."""
+        """Return a channel's topic, or its number if the topic is unknown."""
         known = self.channels.get(channel)
         return known.topic if known else f"channel {channel}"
 
     @property
     def duration_s(self) -> float:
-        """From the first to the last saved message."""
+        """Time from the first to the last saved message [s]."""
         return 0.0 if self.span is None else (self.span[1] - self.span[0]) * 1e-9
 
     def without(self, dropped: Sequence[tuple[int, int]]) -> list[str]:
-        """When the blocks were recorded that were dropped; what they state may be damaged too."""
+        """Return the time spans of dropped chunks, if plausible: these may be damaged as well."""
         if self.span is None:
             return []
         first, last = self.span
@@ -235,7 +236,7 @@ class _Copy:
         ]
 
     def finish(self) -> None:
-        """Writes what waited, and ends the file."""
+        """Write the messages kept back, and end the file."""
         waiting, self.waiting = self.waiting, []
         for batch in waiting:
             self.messages(batch, final=True)

@@ -1,12 +1,12 @@
-"""Asynchronous samples onto the control grid; arrays in, arrays out.
+"""Resample asynchronous samples onto the control grid; arrays in, arrays out.
 
-    state k = value at t_k = start + k dt       linear between the samples around t_k
-    input k = value held at t_k + dt / 2        the command in force in the middle of the step
+    state k = value at t_k = start + k dt       linear interpolation between the samples around t_k
+    input k = value held at t_k + dt / 2        zero-order hold, at the middle of the step
 
-Half a step, because a command's stamp scatters about its t_k: held at t_k itself, every late one
-would be missed and appear a whole step later.
+Inputs are taken at the middle because a command's stamp scatters around its t_k: taken at t_k,
+every late one would appear a whole step later.
 
-Gaps, clocks that jump and clocks that differ are refused, since they hide what happened; everything
+Gaps, clocks that jump and clocks that differ are refused, since they hide what happened. Everything
 else is counted and reported.
 """
 
@@ -40,10 +40,10 @@ from grounded_trials.logs.samples import (
 from grounded_trials.logs.signals import Clock, Series, SignalSpec
 
 START, END = "[log.span] start", "[log.span] end"  # names of the series that a span watches
-ABSOLUTE_S = 1e8  # a time beyond this is a stamp, not one that counts from the log's beginning
+ABSOLUTE_S = 1e8  # larger times are stamps, not relative to the beginning of the log
 STEP_LIMIT = 2_000_000
-UNITS_OF_TIME = (1e3, 1e6, 1e9)  # seconds that were read as milliseconds, say
-MANY, STEPS_APART = 10, (0.02, 3.0)  # samples that tell so, as far apart as a log's may be
+UNITS_OF_TIME = (1e3, 1e6, 1e9)  # factors if seconds were read as ms, us or ns
+MANY, STEPS_APART = 10, (0.02, 3.0)  # fewest samples, and plausible intervals in steps, to say so
 
 
 @dataclass(frozen=True)
@@ -60,17 +60,17 @@ class Crossing:
 class Span:
     """Which part of a log is the trial.
 
-    A number counts in seconds from the first sample of any signal (from 1e8 on it is a stamp), by
-    its stamp: a delay_s of a sensor moves its samples, not the count.
-    "first-input": when every input has been sent for the first time. No end: as long as every
-    state is known and the inputs are sent.
+    A number is in seconds after the first sample of any signal (from 1e8 on it is a stamp), by its
+    stamp: delay_s moves the samples of a sensor, but not this origin. "first-input" is the time
+    when every input has been sent once. Without an end the trial lasts as long as every state is
+    known and the inputs are sent.
     """
 
     start: Literal["first-input"] | float | Crossing = "first-input"
     end: float | Crossing | None = None
 
     def signals(self) -> dict[str, SignalSpec]:
-        """What it watches, to be read along with the states and inputs."""
+        """Return the signals it watches, to be read along with the states and inputs."""
         ends = {START: self.start, END: self.end}
         return {
             name: SignalSpec(end.path, end.clock)
@@ -81,17 +81,17 @@ class Span:
 
 @dataclass(frozen=True, eq=False)
 class Gridded:
-    """A log on the control grid, and what was found on the way."""
+    """A log on the control grid, with reports and warnings."""
 
     states: Floats  # (T + 1, n)
     inputs: Floats  # (T, m)
-    start_inputs: Floats | None  # (m,) held before t = 0; None where the log does not say
+    start_inputs: Floats | None  # (m,) held before t = 0; None if the log does not contain them
     start_ns: int  # t = 0 on the signals' clock [ns]
-    origin_ns: int  # the first sample of any signal by its stamp, likewise
-    late_s: float  # the start was moved by this much, because a state was not known yet
-    moved_s: float  # and by this much more, to where the commands change
-    row_s: float  # by how much commands may be logged late: rows repeat them beside the states
-    last_ns: int  # the last sample of the state whose samples end first, likewise
+    origin_ns: int  # stamp of the first sample of any signal, on the same clock [ns]
+    late_s: float  # shift of the start because a state was not known yet [s]
+    moved_s: float  # further shift to where the commands change [s]
+    row_s: float  # interval of rows that repeat commands, by which these may be logged late [s]
+    last_ns: int  # last sample of the state whose samples end first, on the same clock [ns]
     reports: tuple[SignalReport, ...]  # of the states, then of the inputs
     warnings: tuple[str, ...]
 
@@ -109,24 +109,25 @@ def to_grid(
     rates: Sequence[str] = (),
     past: Floats | None = None,
 ) -> Gridded:
-    """Samples signals every dt.
+    """Sample signals every dt.
 
     Args:
         series: the raw samples by name, with those that the span watches as START and END.
         dt: control interval [s].
         states: names in array order.
         inputs: names in array order.
-        span: which part of the log.
+        span: which part of the log to use.
         angles: names that are unwrapped whether their spec says so or not.
         steps: at most this many steps.
-        rest: (m,) what inputs hold before a run: to begin where `command_steps` says; None: not.
+        rest: (m,) inputs at rest before a run; the start is then moved as in `command_steps`.
+            None: the start is not moved.
         rates: names of states that are velocities.
-        past: (m,) what inputs hold before their first samples, where a span begins a step sooner
-            or more; None: then the log is refused.
+        past: (m,) inputs before their first samples, for a span that begins a step or more before
+            these; None: such a log is refused.
 
     Raises:
-        GroundedError: for a gap beyond max_age_s, a clock that jumps, signals on clocks that do
-            not fit each other, or a span that is not in the log.
+        GroundedError: for a gap longer than max_age_s, a clock that jumps, signals on different
+            clocks, or a span that is not in the log.
     """
     span = span or Span()
     names = [*states, *inputs]
@@ -142,7 +143,7 @@ def to_grid(
     start, late = _start(span, series, samples, inputs, known, origin)
     whole = dict(samples)
     for name, value in zip(inputs, [] if past is None else past, strict=False):
-        if samples[name].t[0] > start + dt * 0.5e9:  # in the first step nothing was sent
+        if samples[name].t[0] > start + dt * 0.5e9:  # nothing was sent in the first step
             whole[name] = samples[name].held_from(start - round(dt * 1e9), float(value))
     sent = [whole[name] for name in inputs]
     tracked = [samples[name] for name in states if how[name] == "linear"]
@@ -184,12 +185,12 @@ def to_grid(
 def _extent(
     samples: Mapping[str, Samples], states: Sequence[str], inputs: Sequence[str], dt: float
 ) -> tuple[int, int]:
-    """From when every state is known, and until when every signal is [ns]."""
+    """Return from when every state is known, and until when every signal is known [ns]."""
     first, last = [], []
     for name in states:
         s = samples[name]
         held = s.spec.resample == "hold"
-        slack = 0 if held else int(s.slack(dt) * 1e9)  # rounded up, it would be refused there
+        slack = 0 if held else int(s.slack(dt) * 1e9)  # rounded down: beyond it values are refused
         first.append(int(s.t[0]) - slack)
         last.append(int(s.t[-1]) + (round(s.max_gap(dt) * 1e9) if held else slack))
     for name in inputs:
@@ -209,7 +210,7 @@ def _start(
     known: int,
     origin: int,
 ) -> tuple[int, float]:
-    """T = 0 [ns], and by how much it was moved because a state was not known yet [s]."""
+    """Return t = 0 [ns], and by how much it was moved because a state was not known yet [s]."""
     if isinstance(span.start, Crossing):
         start = _crossing(span.start, series[START], "start", None)
     elif isinstance(span.start, str):
@@ -232,7 +233,7 @@ def _time(seconds: float, origin: int) -> int:
 
 
 def _crossing(crossing: Crossing, series: Series, which: str, after: int | None) -> int:
-    """The first stamp at which the watched signal is beyond its value."""
+    """Return the first stamp [ns] at which the watched signal is beyond its value."""
     order = np.argsort(series.t, kind="stable")
     t, y = series.t[order], series.values[order]
     beyond = np.ones(len(t), dtype=np.bool_)
@@ -246,20 +247,20 @@ def _crossing(crossing: Crossing, series: Series, which: str, after: int | None)
         limits = {"above": crossing.above, "below": crossing.below}
         wanted = " and ".join(f"{k} {v}" for k, v in limits.items() if v is not None)
         raise GroundedError(
-            f"[log.span] {which}: {crossing.path} is never {wanted} in this log; its values go "
+            f"[log.span] {which}: {crossing.path} is never {wanted} in this log; its values range "
             f"from {y.min():g} to {y.max():g}"
         )
     return int(t[np.argmax(beyond)])
 
 
 def _stamped_otherwise(samples: Iterable[Samples], dt: float) -> str:
-    """What says that times are in another unit: samples that would come about every step."""
+    """Return a hint if the times seem to be in another unit, by the interval of the samples."""
     many = [one for one in samples if len(one.t) >= MANY]
     every = max((one.interval for one in many), default=0.0)
     for factor in UNITS_OF_TIME:
         if STEPS_APART[0] * dt <= factor * every <= STEPS_APART[1] * dt:
             return (
-                f". Its samples are {every:.3g} s apart; times {factor:g} they would be "
+                f". Its samples are {every:.3g} s apart; multiplied by {factor:g} it would be "
                 f"{factor * every:.3g} s: are its times in another unit than their column says "
                 "(seconds under t_ms)?"
             )

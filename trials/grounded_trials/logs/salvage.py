@@ -1,8 +1,8 @@
-"""Reading a damaged MCAP file: every record that can be trusted, and a list of what can not.
+"""Read a damaged MCAP file: every record that can be trusted, and a list of losses.
 
-Nothing marks the start of a record, but each says where the next one starts. After damage, the
-next place is sought from which that chain holds again: one that begins a chunk whose inner lengths
-fit each other, or the first of several records in a row, or the last ones of the file.
+Nothing marks the start of a record, but each states where the next one starts. After damage, the
+next place with an intact chain is sought: a chunk whose inner lengths are consistent, the first of
+several records in a row, or the last ones of the file.
 """
 
 from __future__ import annotations
@@ -48,17 +48,19 @@ _HEAD = Struct("<BQ")
 _SPAN = Struct("<QQ")  # a chunk's first and last time
 _NAMES = {1: "the header", 3: "a schema", 4: "a channel", 5: "a message", 6: "a block of messages"}
 _NAMES |= {9: "an attached file", 12: "a table of metadata"}
-BATCH = 2**22  # [bytes] of messages outside chunks that are handed on together
-CHAIN = 3  # records in a row that make a place believed
-_BLOCKS = (2**9, 2**20)  # [bytes] that are searched at once: growing, since gaps may be many
+BATCH = 2**22  # [bytes] of messages outside chunks passed on together
+CHAIN = 3  # consecutive plausible records after which a place is accepted
+_BLOCKS = (2**9, 2**20)  # [bytes] searched at once; growing, since there may be many gaps
 
 
 class Salvage:
     """One pass over a damaged file.
 
-    `losses` are sentences, `lost_messages` counts by channel what the indexes say was in dropped
-    chunks, `dropped` has the first and last time that such chunks state [ns], `unverified` counts
-    messages that no checksum vouches for.
+    Attributes:
+        losses: sentences on what was lost.
+        lost_messages: messages in dropped chunks by channel, according to the indexes.
+        dropped: first and last time stated in each dropped chunk [ns].
+        unverified: number of saved messages without a valid checksum.
     """
 
     def __init__(self, stream: BinaryIO, name: str) -> None:
@@ -69,15 +71,15 @@ class Salvage:
         self.dropped: list[tuple[int, int]] = []
         self.unverified = 0
         self._crc = 0
-        self._outside = 0  # messages outside checked chunks, which only the data checksum covers
-        self._tables = 0  # metadata and attached files, likewise
-        self._ended = False  # the data are over: what follows is an index
+        self._outside = 0  # messages outside checked chunks, covered only by the data checksum
+        self._tables = 0  # metadata and attachments covered only by the data checksum
+        self._ended = False  # the data section has ended; only the index follows
         self._pending, self._waiting = list[bytes](), 0  # messages outside chunks; their bytes
         self._defined: dict[tuple[type, int], Schema | Channel] = {}
-        self._doubtful: set[int] = set()  # channels that are defined twice
+        self._doubtful: set[int] = set()  # channels with two different definitions
 
     def records(self) -> Iterator[Record]:
-        """Yields what can be saved, in file order."""
+        """Yield what can be saved, in file order."""
         pos = self._first()
         dropped_chunk = False
         while pos is not None and pos < self.size - len(MAGIC):
@@ -91,7 +93,7 @@ class Salvage:
                     yield from self._cut(pos)
                     return
                 self.losses.append(
-                    f"{after - pos} bytes can't be read, from byte {pos} on: what was there is lost"
+                    f"{after - pos} bytes from byte {pos} on can't be read: their content is lost"
                 )
                 pos = after
                 continue
@@ -115,8 +117,8 @@ class Salvage:
 
     def _ends_early(self) -> str:
         if self._ended:
-            return "the index at the end of the file is missing; every message stands before it"
-        return f"the file is cut off at byte {self.size}: what came after that is lost"
+            return "the index at the end of the file is missing; all messages are before it"
+        return f"the file is cut off at byte {self.size}: everything after that is lost"
 
     def _first(self) -> int | None:
         if read_at(self.stream, 0, 8) == MAGIC:
@@ -154,11 +156,11 @@ class Salvage:
             yield from self._sound(record)
 
     def _sound(self, record: Record) -> Iterator[Record]:
-        """The record without what nobody can place: whose channel, and when."""
+        """Yield the record without messages of an ambiguous channel or an invalid time."""
         if isinstance(record, Schema | Channel):
             known = self._defined.setdefault((type(record), record.id), record)
             if known != record:
-                self.losses.append(f"{again(known, record)}: what follows under it is left out")
+                self.losses.append(f"{again(known, record)}: messages that use it are left out")
                 self._doubtful |= {
                     c.id
                     for c in self._defined.values()
@@ -189,10 +191,10 @@ class Salvage:
         stated = int.from_bytes(record[9:13], "little")
         wrong = bool(stated) and stated != self._crc
         if wrong and not self.losses and (self._outside or self._tables):
-            these = f"its {self._outside} messages" if self._outside else "what it says of itself"
+            these = f"its {self._outside} messages" if self._outside else "its metadata"
             self.losses.append(
-                f"the checksum of the file does not fit: a number in {these} may be wrong, and "
-                "nobody knows which"
+                f"the checksum of the file does not match: some number in {these} may be wrong, "
+                "and it can't be located"
             )
         if self.losses or not stated:
             self.unverified += self._outside
@@ -207,14 +209,14 @@ class Salvage:
             return
 
     def _is_cut_chunk(self, pos: int) -> bool:
-        """Whether a sound chunk begins here, which the end of the file cuts through."""
+        """Check whether an intact chunk begins here that is cut off by the end of the file."""
         start = read_at(self.stream, pos, 9 + 64)
         if len(start) < 49 or start[0] != CHUNK:
             return False
         return is_chunk(start[9:], int.from_bytes(start[1:9], "little"))
 
     def _cut(self, pos: int) -> Iterator[Record]:
-        """The file ends inside the record at `pos`: what of it is whole."""
+        """Yield the intact parts of the record at `pos`, in which the file ends."""
         rest = read_at(self.stream, pos, min(self.size - pos, RECORD_LIMIT))
         saved = 0
         if len(rest) > 49 and rest[0] == CHUNK:
@@ -244,13 +246,13 @@ class Salvage:
 
 
 def read_at(stream: BinaryIO, offset: int, count: int) -> bytes:
-    """Bytes of a file, fewer at its end."""
+    """Read `count` bytes of a file, fewer at its end."""
     stream.seek(offset)
     return stream.read(count)
 
 
 def plausible(stream: BinaryIO, size: int, offset: int) -> int | None:
-    """Where the record at `offset` ends, if one may be there."""
+    """Return where the record at `offset` ends; None if there can't be one."""
     head = read_at(stream, offset, 9)
     if len(head) < 9:
         return None
@@ -266,7 +268,7 @@ def plausible(stream: BinaryIO, size: int, offset: int) -> int | None:
 
 
 def is_chunk(start: bytes, length: int) -> bool:
-    """Whether the content of a chunk of this length may start so: its inner lengths fit."""
+    """Check whether a chunk of this length may start so: its inner lengths are consistent."""
     if len(start) < 40:
         return False
     name = int.from_bytes(start[28:32], "little")
@@ -276,7 +278,7 @@ def is_chunk(start: bytes, length: int) -> bool:
 
 
 def next_chain(stream: BinaryIO, size: int, start: int) -> int | None:
-    """The first offset from `start` on where records follow each other again; None: nowhere."""
+    """Return the first offset from `start` on with a chain of records; None if there is none."""
     block, count = start, _BLOCKS[0]
     while block < size:
         step()

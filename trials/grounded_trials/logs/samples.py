@@ -1,9 +1,8 @@
-"""One signal of a log: its samples made fit for interpolation, its value at any time, a report.
+"""One signal of a log: clean samples, values at any time, and a report.
 
 `tidy` sorts by stamp, drops (and counts) repeated stamps and numbers that are not finite, scales
-and unwraps. `Samples` interpolates or holds; between two samples further apart than the signal's
-max age nothing is known. `SignalReport` says how often the signal came, how regularly, how late,
-and what had to be bridged.
+and unwraps. `Samples` interpolates or holds; between samples further apart than the signal's
+max_age_s the value is unknown. `SignalReport` states rate, jitter, delay and gaps of the signal.
 """
 
 from __future__ import annotations
@@ -19,21 +18,21 @@ from grounded.result import listed
 from grounded_trials.formats.messages import Floats, Ints
 from grounded_trials.logs.signals import Series, SignalSpec
 
-GAP_INTERVALS, GAP_STEPS, GAP_S = 5.0, 3.0, 0.1  # a gap, without max_age_s: more than all these
-JUMP_S = 1.0  # a clock that goes back by more was set, or a simulation was started again
-NEAR_0_S = 10.0  # a clock whose stamps come nearer to 0 may show 0 itself: it was not unset
-MIXED_S = 1.0  # signals on different clocks whose clocks differ by more don't fit each other
-SKEW_S = 0.1  # and by more than this, they may be shifted
-SPARSE = 50.0  # steps between two samples: the log's time is in another unit
-BRIDGED = 1.9  # a value between samples this many intervals apart was bridged
-REGULAR = 10  # inputs sent more often than this are sent all the time; their end is the trial's
-LEAST_RUNS, REPEATED = 20, 0.8  # runs of equal samples, and those of two and more: it is held
-COARSE = 2.5  # times its least change is the median one of a signal that is not quantised
+GAP_INTERVALS, GAP_STEPS, GAP_S = 5.0, 3.0, 0.1  # without max_age_s a gap exceeds all of these
+JUMP_S = 1.0  # a larger jump back means that the clock was set or a simulation restarted
+NEAR_0_S = 10.0  # if other stamps come nearer to 0 than this, a stamp of 0 is valid
+MIXED_S = 1.0  # signals whose clocks differ by more than this are refused
+SKEW_S = 0.1  # signals whose clocks differ by more than this cause a warning
+SPARSE = 50.0  # steps between two samples above which the log's time seems to be in another unit
+BRIDGED = 1.9  # a value between samples more than this many intervals apart counts as bridged
+REGULAR = 10  # an input with more samples is sent continuously; it ends the trial with its last
+LEAST_RUNS, REPEATED = 20, 0.8  # a held signal: fewest runs, and share with two or more samples
+COARSE = 2.5  # least ratio of median to smallest change of a signal that is not quantised
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """A signal's usable samples: value y[i] at t[i], stamps strictly rising."""
+    """A signal's usable samples: value y[i] at t[i], stamps strictly increasing."""
 
     name: str
     spec: SignalSpec
@@ -42,8 +41,8 @@ class Samples:
     not_finite: int
     repeated: int
     out_of_order: int
-    unstamped: int  # stamp 0 among others that are not
-    lost: Ints  # (K,) [ns] where a sample came that is not a finite number
+    unstamped: int  # stamp 0, although other stamps are not
+    lost: Ints  # (K,) [ns] stamps of samples that are not finite numbers
 
     @cached_property
     def interval(self) -> float:
@@ -52,18 +51,22 @@ class Samples:
 
     @property
     def first_stamp(self) -> int:
-        """When the first sample was stamped, on the clock that a delay_s may put it on [ns]."""
-        sensor = 0 < self.spec.delay_s <= MIXED_S  # else it bridges two clocks
+        """Stamp of the first sample [ns], before a sensor's delay_s is subtracted."""
+        sensor = 0 < self.spec.delay_s <= MIXED_S  # other values of delay_s bridge two clocks
         return int(self.t[0]) + round(self.spec.delay_s * 1e9) * sensor
 
     def max_gap(self, dt: float) -> float:
-        """How far apart two samples may be for what lies between to be believed [s]."""
+        """Return the largest distance of two samples between which values are known [s]."""
         if self.spec.max_age_s is not None:
             return self.spec.max_age_s
         return max(GAP_INTERVALS * self.interval, GAP_STEPS * dt, GAP_S)
 
     def check_linear(self, dt: float) -> None:
-        """Refuses what can't be interpolated: a single sample, or far more steps than samples."""
+        """Raise an error if interpolation is impossible: one sample, or far too few for the steps.
+
+        Args:
+            dt: control step [s].
+        """
         if len(self.t) < 2:
             raise _unusable(
                 self.name, self.spec, 'one sample can\'t be interpolated; set resample = "hold"'
@@ -73,14 +76,19 @@ class Samples:
                 self.name,
                 self.spec,
                 f"it comes every {self.interval:.3g} s, a control step is {dt:.3g} s. If its times "
-                "are milliseconds, call a table's column t_ms; if it is that slow, set max_age_s",
+                "are milliseconds, name the table's column t_ms; if it is so slow, set max_age_s",
             )
 
     def linear(self, at: Ints, dt: float, origin: int) -> Floats:
-        """Values at times [ns], interpolated; half an interval beyond the ends is allowed.
+        """Interpolate values at times [ns]; up to half an interval beyond the ends is allowed.
+
+        Args:
+            at: (M,) times [ns].
+            dt: control step [s].
+            origin: the trial's start, for messages [ns].
 
         Raises:
-            GroundedError: where a time lies in a gap, or outside the samples.
+            GroundedError: if a time is in a gap, or outside the samples.
         """
         i = np.clip(np.searchsorted(self.t, at, "right"), 1, len(self.t) - 1)
         t0, t1 = self.t[i - 1], self.t[i]
@@ -89,11 +97,16 @@ class Samples:
         return self.y[i - 1] + fraction * (self.y[i] - self.y[i - 1])
 
     def hold(self, at: Ints, dt: float, origin: int) -> Floats:
-        """Values at times [ns], those of the last sample before.
+        """Return the value of the last sample before each time (zero-order hold).
+
+        Args:
+            at: (M,) times [ns].
+            dt: control step [s].
+            origin: the trial's start, for messages [ns].
 
         Raises:
-            GroundedError: where there is none, or it is older than max_age_s, or than a gap may be
-                where the newer ones were not finite.
+            GroundedError: if there is no such sample, or it is older than max_age_s; or older than
+                the largest gap, if newer ones were not finite.
         """
         i = np.searchsorted(self.t, at, "right") - 1
         if (i < 0).any():
@@ -112,13 +125,13 @@ class Samples:
         return self.y[i]
 
     def held_from(self, at: int, value: float) -> Samples:
-        """With a value that was held from a time [ns] until the first sample; where it is later."""
+        """Return the samples with a value added at an earlier time [ns], if it is earlier."""
         if at >= self.t[0]:
             return self
         return replace(self, t=np.r_[at, self.t], y=np.r_[value, self.y])
 
     def before(self, at: int) -> float:
-        """The value in force at a time [ns]; NaN if there is none yet."""
+        """Return the value in force at a time [ns]; NaN before the first sample."""
         i = int(np.searchsorted(self.t, at, "right")) - 1
         return float(self.y[i]) if i >= 0 else float("nan")
 
@@ -134,24 +147,29 @@ class Samples:
             k = int(np.argmax(beyond))
             raise GroundedError(
                 f"'{self.name}' ({self.spec.path}) is not known at {(at[k] - origin) * 1e-9:.3f} s:"
-                f" its samples go from {(self.t[0] - origin) * 1e-9:.3f} s "
+                f" its samples range from {(self.t[0] - origin) * 1e-9:.3f} s "
                 f"to {(self.t[-1] - origin) * 1e-9:.3f} s"
             )
 
     def slack(self, dt: float) -> float:
-        """How far beyond its first and last sample a value is still taken [s]."""
+        """Return how far beyond the first and last sample a value is extrapolated [s]."""
         return 0.5 * min(self.interval, dt)
 
     def _refuse(self, t0: int, t1: int, limit: float, origin: int) -> None:
         raise GroundedError(
             f"'{self.name}' ({self.spec.path}) has a gap of {(t1 - t0) * 1e-9:.3f} s from "
             f"{(t0 - origin) * 1e-9:.3f} s to {(t1 - origin) * 1e-9:.3f} s after the start, more "
-            f"than {limit:.3f} s; end the span before it, or set max_age_s if it may be bridged"
+            f"than {limit:.3f} s; end the span before it, or set max_age_s to interpolate over it"
         )
 
 
 def tidy(name: str, series: Series, *, unwrap: bool) -> Samples:
-    """The usable samples of a signal.
+    """Return the usable samples of a signal: sorted, finite, scaled, unwrapped.
+
+    Args:
+        name: of the signal, for messages.
+        series: its raw samples.
+        unwrap: unwrap it as an angle even if its spec does not say so.
 
     Raises:
         GroundedError: if there are none, or their clock jumps back.
@@ -173,7 +191,7 @@ def tidy(name: str, series: Series, *, unwrap: bool) -> Samples:
             name,
             spec,
             f"its {spec.clock} clock jumps back by {-back[k] * 1e-9:.3f} s after sample {k}; it "
-            "was set, ran over, or a simulation began again: cut the log there"
+            "was set or overflowed, or a simulation restarted: cut the log there"
             + ', or use clock = "log"'
             * (spec.clock != "log"),
         )
@@ -202,7 +220,7 @@ def _unusable(name: str, spec: SignalSpec, why: str) -> GroundedError:
 
 @dataclass(frozen=True)
 class SignalReport:
-    """One signal as it was found; times in seconds, places in seconds after the trial's start."""
+    """Statistics of one signal; durations in seconds, positions in seconds after the start."""
 
     name: str
     path: str
@@ -213,20 +231,20 @@ class SignalReport:
     jitter_s: float  # half the width that holds 90 % of the intervals
     largest_gap_s: float  # between samples, within the trial
     largest_gap_at_s: float
-    bridged: int  # values of the trial that lie in a gap
+    bridged: int  # values of the trial that were interpolated over a gap
     skew_s: float | None  # median of stamp minus log time; None: it is on the log's clock
     not_finite: int  # dropped: NaN or infinite
     repeated: int  # dropped: same stamp as the next
     out_of_order: int
     unstamped: int  # dropped: stamp 0
-    low: float  # smallest and largest value in the trial, scaled
-    high: float
+    low: float  # smallest value in the trial, scaled
+    high: float  # largest value in the trial, scaled
 
 
 def report_of(
     samples: Samples, series: Series, values: Floats, at: Ints, origin: int
 ) -> SignalReport:
-    """The report on a signal that was sampled at times `at` [ns], giving `values`."""
+    """Return the report on a signal that has `values` at the times `at` [ns]."""
     t = samples.t
     gaps = np.diff(t) * 1e-9
     inside = (t[1:] > at[0]) & (t[:-1] < at[-1])
@@ -272,7 +290,7 @@ def _skew(series: Series) -> float | None:
 
 
 def check_clocks(series: Mapping[str, Series]) -> None:
-    """Refuses signals whose clocks differ: one by the header of a simulation, one by the log.
+    """Raise an error for signals on different clocks, such as simulation time and log time.
 
     Raises:
         GroundedError: naming two of them, and the difference.
@@ -282,22 +300,22 @@ def check_clocks(series: Mapping[str, Series]) -> None:
         a, b = series[first].spec.clock, series[last].spec.clock
         raise GroundedError(
             f"'{first}' (clock {a}) and '{last}' (clock {b}) are on clocks that differ by "
-            f"{apart:.3f} s (simulation time, or an unset clock?); read both "
-            'by the same one, such as clock = "log"'
+            f"{apart:.3f} s (simulation time, or an unset clock?); use the same clock for both, "
+            'such as clock = "log"'
         )
 
 
 def check_overlap(states: Sequence[Samples], inputs: Sequence[Samples]) -> None:
-    """Refuses signals of which some end before others begin: their stamps are of two clocks.
+    """Raise an error if some signals end before others begin: their stamps are on two clocks.
 
-    What is held, or sent seldom, is in force after its last sample: its end says nothing.
+    The end of a signal that is held, or sent rarely, is ignored: it stays in force after that.
 
     Args:
-        states: the samples of each, on the clocks that [log] names.
-        inputs: likewise.
+        states: the samples of each state, on the clocks chosen in [log].
+        inputs: the samples of each input, likewise.
 
     Raises:
-        GroundedError: with the signals of both clocks, and the delay_s that puts one on the other.
+        GroundedError: naming the signals of both clocks, and the delay_s that aligns them.
     """
     held = [s for s in states if s.spec.resample == "hold"]
     held += [s for s in inputs if len(s.t) <= REGULAR or s.spec.max_age_s is not None]
@@ -320,16 +338,16 @@ def check_overlap(states: Sequence[Samples], inputs: Sequence[Samples]) -> None:
     )
     raise GroundedError(
         f"the log's signals are on clocks that differ, by about {abs(by) * 1e-9:.3f} s if they "
-        f"begin together: {', '.join(spans)} after its first sample. Log all by one clock, or "
-        f"bridge the two: {lines}. Find the difference to a few ms (by a knock that both show): "
-        "what is left of it is taken for a delay, or for a motion before its command"
+        f"begin together: {', '.join(spans)} after its first sample. Log all on one clock, or "
+        f"align the two: {lines}. Determine the difference to a few ms (by a knock that both "
+        "show): any error of it looks like a delay, or like motion before its command"
     )
 
 
 def _furthest(skews: Mapping[str, float | None]) -> tuple[str, str, float]:
-    """The signals whose clocks are the furthest behind and ahead of the log's, and how far apart.
+    """Return the signals whose clocks are furthest behind and ahead, and the difference [s].
 
-    None is the log's own clock.
+    A skew of None stands for the log's own clock.
     """
     known = {name: skew or 0.0 for name, skew in skews.items()}
     first, last = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
@@ -337,16 +355,16 @@ def _furthest(skews: Mapping[str, float | None]) -> tuple[str, str, float]:
 
 
 def staircase(samples: Samples, first: int, last: int, dt: float) -> str:
-    """What a signal whose rows repeat each value loses by it, "" where it does not matter.
+    """Return a warning if a signal is late because rows repeat each of its values; else "".
 
-    A table has a row for its fastest signal; a slower sensor's last sample stands in several. A
-    quantised signal repeats values, too, but changes by few different steps.
+    A table has a row per sample of its fastest signal, so rows repeat the samples of a slower
+    sensor. A quantised signal also repeats values, but changes by few different steps.
 
     Args:
         samples: of a state.
-        first: the trial's first moment [ns].
-        last: and its last.
-        dt: the control step [s]; samples that are held for less than half of it are as good as new.
+        first: the trial's start [ns].
+        last: the trial's end [ns].
+        dt: control step [s]; values held for up to half of it don't matter.
     """
     inside = (samples.t >= first) & (samples.t <= last)
     y = samples.y[inside]
@@ -360,17 +378,17 @@ def staircase(samples: Samples, first: int, last: int, dt: float) -> str:
         return ""
     late = (each - 1) / 2 * samples.interval
     return (
-        f"'{samples.name}' changes every {each:g} rows only: samples of {1 / apart:.3g} Hz that "
-        f"are held, {late:.2g} s late on average. Leave its cell empty in the rows that repeat it "
+        f"'{samples.name}' changes only every {each:g} rows: its samples at {1 / apart:.3g} Hz are "
+        f"held and {late:.2g} s late on average. Leave its cell empty in rows that repeat a value "
         "(or log the sensor's own messages): then it is interpolated"
     )
 
 
 def warnings_of(reports: tuple[SignalReport, ...], late: float) -> tuple[str, ...]:
-    """Sentences about what a person should know before believing the trial."""
+    """Return warnings on a trial, as sentences for a person."""
     found = []
     if late > 0:
-        found.append(f"the trial starts {late:.3f} s late, when every state is known")
+        found.append(f"the trial starts {late:.3f} s late, when all states are known")
     for r in reports:
         if r.not_finite:
             found.append(f"'{r.name}': {r.not_finite} of {r.samples} values are not finite numbers")

@@ -1,8 +1,8 @@
-"""Signals out of logs: for each name the samples that its message path finds, in file order.
+"""Read signals from logs: for each name the samples at its message path, in file order.
 
-One pass over the files reads all signals; only what the paths name is decoded and kept. Whatever
-the encoding (cdr, ros1, protobuf, json), a message gives one number or none, and three times: when
-it was logged, when it was published, and its header's stamp.
+All signals are read in one pass over the files, and only the fields in the paths are decoded.
+Whatever the encoding (cdr, ros1, protobuf, json), a message gives one number or none, and three
+times: when it was logged, when it was published, and its header's stamp.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ from grounded_trials.formats.schemas import struct_of
 from grounded_trials.logs.log_files import log_records, reading
 
 Clock = Literal["header", "log", "publish"]
-SAMPLE_BYTES = 48  # that a sample takes until it is on the grid
-JSON_PIECE = 2**20  # [bytes] of JSON that are parsed at once, or one message
+SAMPLE_BYTES = 48  # memory for a sample until it is on the grid
+JSON_PIECE = 2**20  # [bytes] of JSON parsed at once, at least one message
 
 
 @dataclass(frozen=True)
 class SignalSpec:
-    """Where a signal is found in a log, and how its samples become values at times.
+    """Where a signal is in a log, and how its samples become values.
 
     value = scale * number + offset, at stamp - delay_s. Between samples it is interpolated
-    ("linear") or held ("hold"; None: as its kind asks, states linear and inputs held). A gap of
-    more than max_age_s is refused (None: a limit from the signal's own rate, see `resample`).
+    ("linear") or held ("hold"); None: linear for states, held for inputs. A gap of more than
+    max_age_s is refused; None: the limit depends on the signal's rate, see `Samples.max_gap`.
     """
 
     path: str
@@ -68,23 +68,23 @@ class Series:
     t: Ints  # (N,) stamp on the spec's clock [ns]
     values: Floats  # (N,)
     log_times: Ints  # (N,) [ns]
-    messages: int  # of its topic, whether the path found a number in them or not
+    messages: int  # number of messages of its topic, with this number or not
     type: str  # of the topic's messages
-    stamped: bool  # the messages have a header stamp, whether it is the clock or not
+    stamped: bool  # the messages have a header stamp, used as the clock or not
 
 
 def read_signals(
     paths: str | Path | Sequence[str | Path], specs: Mapping[str, SignalSpec]
 ) -> dict[str, Series]:
-    """Reads signals from a log: a file, files in order, or the folder of a bag.
+    """Read signals from a log: a file, files in order, or the folder of a bag.
 
     Args:
-        paths: a log of any format, several that follow each other, or a folder with them.
+        paths: a log of any format, several in order, or a folder with them.
         specs: what to read, by name.
 
     Raises:
-        GroundedError: for a damaged file, a topic or field that is not there, a message with more
-            than one value for a signal, a clock that a topic does not have.
+        GroundedError: for a damaged file, a missing topic or field, a message with more than one
+            value for a signal, or a clock that a topic does not have.
     """
     collectors = {name: _Collector(name, spec) for name, spec in specs.items()}
     with reading(paths) as files:
@@ -135,7 +135,7 @@ class _Log:
         if unknown:
             raise GroundedError(
                 f"{self.name}: a message belongs to channel {unknown[0]}, which is not defined; "
-                "`recover` saves the others",
+                "`recover` saves the other messages",
                 NextCommand("recover", (self.name,)),
             )
         for identity, (decoder, wanting) in self.wanted.items():
@@ -176,7 +176,7 @@ class _Log:
 
 @dataclass(frozen=True, eq=False)
 class Decoder:
-    """How a channel's messages become the nodes that paths walk over."""
+    """Decodes a channel's messages into the nodes that message paths are evaluated on."""
 
     topic: str
     name: str  # of the message type
@@ -184,7 +184,7 @@ class Decoder:
     root: Callable[[bytes, Ints, Ints], Node] = field(repr=False)
 
     def parts(self, batch: Messages) -> Iterator[Messages]:
-        """A batch in pieces that may be decoded at once: parsed, JSON takes many times its size."""
+        """Split a batch into pieces to decode at once, since parsed JSON takes much memory."""
         if not isinstance(self.type, Dynamic) or not len(batch):
             yield batch
             return
@@ -201,7 +201,7 @@ _READERS: dict[str, Callable[[bytes, Struct, Ints, Ints], Node]] = {
 
 
 def decoder_of(channel: Channel, schema: Schema | None) -> Decoder:
-    """The decoder of a channel.
+    """Return the decoder of a channel.
 
     Raises:
         BadSchema: if its encoding is not one of cdr, ros1, protobuf, json, or its schema is bad.
@@ -211,10 +211,10 @@ def decoder_of(channel: Channel, schema: Schema | None) -> Decoder:
         return Decoder(channel.topic, name or "json", Dynamic(), json_messages)
     if encoding not in _READERS:
         raise BadSchema(
-            f"the messages are encoded as '{encoding}'; cdr, ros1, protobuf and json can be read"
+            f"the messages are encoded as '{encoding}'; expected cdr, ros1, protobuf or json"
         )
     if schema is None:
-        raise BadSchema(f"the messages are {encoding} without a schema, which says what they hold")
+        raise BadSchema(f"the messages are {encoding} without a schema, which defines their fields")
     type, read = struct_of(schema), _READERS[encoding]
     return Decoder(channel.topic, name, type, lambda b, s, e: read(b, type, s, e))
 

@@ -1,13 +1,13 @@
-"""Units of a log's numbers against those of the model: stated, or by ROS's conventions.
+"""Units of a log's numbers, stated or by ROS conventions, compared with those of the model.
 
-What a CSV's first row says in brackets, `x [mm]`, is no guess, and the end of a name hardly one:
-where either names a multiple of the model's unit, [log] gets the factor between the two. Units that
-are no multiples of each other say nothing.
+A unit in brackets in a CSV's first row, such as `x [mm]`, is certain, and one at the end of a name
+nearly so. If it is a multiple of the model's unit, [log] gets the factor between the two. Units
+that are not multiples of each other are ignored.
 
-What ROS's messages measure their names say (REP 103: metres, radians, seconds). A JointState's
-position is in radians where the joint turns and in metres where it slides, which the joint's name
-may say: `joint_units` of joint_names.py. A field `angle` is an angle in any message, if not surely
-one in radians: it is no length.
+The fields of ROS messages have fixed units (REP 103: metres, radians, seconds). A JointState's
+position is in radians for a revolute and in metres for a prismatic joint, which the joint's name
+may show: `joint_units` in joint_names.py. A field `angle` is an angle in any message, though
+perhaps not in radians; it is not a length.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pathlib import Path
 from grounded_trials.formats.name_endings import ENDINGS, unit_ending
 from grounded_trials.formats.text_tables import column_units
 
-_OF = {  # a multiple of another unit, itself a product
+_OF = {  # units as multiples of another unit, which may be a product
     "mm": ("m", 1e-3),
     "cm": ("m", 1e-2),
     "km": ("m", 1e3),
@@ -49,14 +49,14 @@ _OF = {  # a multiple of another unit, itself a product
     "%": ("1", 0.01),
 }
 
-_ROLES = re.compile(  # what a command is to its robot: its unit may stand before that, or after
+_ROLES = re.compile(  # suffixes that mark a command; its unit may come before or after them
     r"_(?:cmd|command|commanded|ref|reference|target|setpoint|sp|desired|des|goal|request|req)$"
 )
 _SHORT = ("s", "V", "A", "N")  # may be part of a name as well: `vel_N`
-_NUMBER = re.compile(r"(?:\.(?:data|value))?(?:\[-?\d+\])*\"?$")  # what follows a number's name
+_NUMBER = re.compile(r"(?:\.(?:data|value))?(?:\[-?\d+\])*\"?$")  # what may follow a name
 TURNING = {"position": "rad", "velocity": "rad/s", "effort": "N m"}  # of a joint
 SLIDING = {"position": "m", "velocity": "m/s", "effort": "N"}
-UNITS = (  # what the end of a path measures
+UNITS = (  # units by the end of a path
     (r"(position|translation)\.[xyz]$", "m"),
     (r"@rpy\.\w+$|steering_angle$", "rad"),
     (r"angular_velocity\.[xyz]$|angular\.[xyz]$|steering_angle_velocity$", "rad/s"),
@@ -69,78 +69,78 @@ LENGTHS = ("m", "m/s")
 
 @dataclass(frozen=True)
 class Stated:
-    """The units that a log states by message path: in a table's first row, or by a name's end."""
+    """The units that a log states: in a table's first row, or at the end of names."""
 
     heads: Mapping[str, str]
 
     @classmethod
     def by(cls, files: Sequence[str | Path]) -> Stated:
-        """What a log's files state; names do so in every log."""
+        """Read the units in the first row of a log's first file; names are used in any log."""
         return cls(column_units(Path(files[0])) if files else {})
 
     def unit(self, path: str) -> str:
-        """The unit of a number, "" where none is stated."""
+        """Return the unit of a number, "" if none is stated."""
         return self.heads.get(path) or unit_in_name(path)
 
     def factor(self, path: str, wanted: str) -> float:
-        """What makes the model's unit of a number in the log's; 1 where nothing is stated."""
+        """Return the factor from the log's unit to the model's; 1 if no unit is stated."""
         found = factor_between(said, wanted) if (said := self.unit(path)) else None
         return 1.0 if found is None else found
 
     def by_whom(self, path: str) -> str:
-        """What states it, for a sentence."""
+        """Return what states the unit, as the subject of a sentence."""
         return "the log" if path in self.heads else "its name"
 
 
 def unit_in_name(path: str) -> str:
-    """The unit that the last name of a message path ends with, `/csv.x_mm`; "" for none."""
+    """Return the unit at the end of a message path's last name, as in `/csv.x_mm`; "" for none."""
     return ENDINGS.get(_parts(path)[1] or _parts(without_role(path))[1], "")
 
 
 def without_unit(path: str) -> str:
-    """A message path without the unit that its last name ends with, where that is surely one."""
+    """Return a message path without the unit at the end of its last name, unless ambiguous."""
     bare, ending = _parts(path)
     return bare if ending and ending not in _SHORT else path
 
 
 def without_role(path: str) -> str:
-    """A message path without what says that a number is a command, `steering_pct_cmd`."""
+    """Return a message path without the suffix of a command, as in `steering_pct_cmd`."""
     whole = _NUMBER.sub("", path)
     bare = _ROLES.sub("", whole)
     return path if bare == whole or bare.endswith((".", "/")) else bare
 
 
 def bare_command(path: str) -> str:
-    """A message path without its unit and what says that it is a command, in either order."""
+    """Return a message path without unit and command suffix, in either order."""
     return without_role(without_unit(without_role(path)))
 
 
 def _parts(path: str) -> tuple[str, str]:
-    """A path without the ending of its last name, and that ending."""
+    """Return a path without the unit ending of its last name, and that ending."""
     whole = _NUMBER.sub("", path)
     ending = unit_ending(re.split(r"[./]", whole)[-1])
     return (whole[: -len(ending) - 1], ending) if ending else (path, "")
 
 
 def factor_between(said: str, wanted: str) -> float | None:
-    """By what a number in one unit is multiplied to be in another; None where that makes no sense.
+    """Return the factor that converts a number from one unit to another; None if incompatible.
 
     Args:
-        said: as a log writes it, such as "mm/s" or "deg/s^2".
-        wanted: as the model has it.
+        said: the unit in the log, such as "mm/s" or "deg/s^2".
+        wanted: the unit in the model.
     """
     (a, one), (b, other) = _in_base(said), _in_base(wanted)
     return one / other if a == b else None
 
 
 def same_unit(said: str, wanted: str) -> bool:
-    """Whether two ways of writing a unit mean one: `N·m`, `Nm` and `N m`."""
+    """Check whether two spellings mean the same unit, such as `N·m`, `Nm` and `N m`."""
     factor = factor_between(said, wanted)
     return factor is not None and math.isclose(factor, 1.0)
 
 
 def _in_base(unit: str) -> tuple[Counter[str], float]:
-    """The powers of a unit's parts that are no multiples of others, and its size in those."""
+    """Return a unit as powers of base units, and its factor to these."""
     powers, size = Counter[str](), 1.0
     for k, side in enumerate(unit.replace("²", "^2").replace("·", " ").split("/")):
         for part in re.findall(r"[^\s*^()]+(?:\^-?\d)?", side):
@@ -154,11 +154,11 @@ def _in_base(unit: str) -> tuple[Counter[str], float]:
 
 
 def unit_of(path: str, joints: Mapping[str, str] | None = None) -> str:
-    """The unit of a path's number, "" where no convention gives one.
+    """Return the unit of a path's number by convention, "" if there is none.
 
     Args:
-        path: of a message.
-        joints: units of joints' numbers by their paths, where the joints' names are known.
+        path: a message path.
+        joints: units of joints' numbers by path, if the joints' names are known.
     """
     if joints and path in joints:
         return joints[path]
@@ -170,15 +170,15 @@ def unit_of(path: str, joints: Mapping[str, str] | None = None) -> str:
 
 
 def is_angle(path: str) -> bool:
-    """Whether a number is called an angle, of whichever unit."""
+    """Check whether a number's name is that of an angle, in any unit."""
     return bool(ANGLE.search(path.lower()))
 
 
 def may_be(path: str, unit: str, joints: Mapping[str, str] | None = None) -> bool:
-    """Whether a number may be a state in some unit: an angle is no length, nor a slide a turn.
+    """Check whether a number may be a state with a given unit, by its name and by convention.
 
     Args:
-        path: of a message.
+        path: a message path.
         unit: of the state.
         joints: see `unit_of`.
     """

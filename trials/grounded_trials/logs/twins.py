@@ -1,4 +1,4 @@
-"""Twins: signals of different topics that show one motion, the sign of one perhaps reversed."""
+"""Twins: signals of different topics that show the same motion, perhaps with opposite signs."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from grounded_trials.formats.messages import Floats, Ints
 
-SAME = 0.95  # correlation from which two signals show the same motion
-LEAST = 30  # samples
+SAME = 0.95  # correlation above which two signals show the same motion
+LEAST = 30  # fewest samples
 KINDS = (
     *(f"@rpy.{angle}" for angle in ("roll", "pitch", "yaw")),
     *(f"{place}.{axis}" for place in ("position", "translation") for axis in "xyz"),
@@ -21,7 +21,7 @@ KINDS = (
 
 @dataclass(frozen=True)
 class Twins:
-    """Two signals with one motion; a negative correlation says that a sign differs."""
+    """Two signals with the same motion; the correlation is negative if their signs differ."""
 
     first: str  # message paths
     second: str
@@ -29,20 +29,20 @@ class Twins:
 
     @property
     def opposite(self) -> bool:
-        """Whether one of them has the other's sign reversed."""
+        """Whether the two have opposite signs."""
         return self.correlation < 0
 
 
 def measured_kind(path: str) -> str:
-    """What a path measures, such as position.x; "" if that can't be told from its name."""
+    """Return what a path measures, such as position.x; "" if its name does not show it."""
     return next((kind for kind in KINDS if path.endswith("." + kind)), "")
 
 
 def find_twins(samples: Mapping[str, tuple[Ints, Floats]]) -> tuple[Twins, ...]:
-    """Compares signals of the same kind.
+    """Find signals of the same kind that show the same motion.
 
     Args:
-        samples: by message path, stamps [ns] and values.
+        samples: stamps [ns] and values by message path.
     """
     found = []
     for first, second in combinations(samples, 2):
@@ -54,7 +54,7 @@ def find_twins(samples: Mapping[str, tuple[Ints, Floats]]) -> tuple[Twins, ...]:
 
 
 def _correlation(a: tuple[Ints, Floats], b: tuple[Ints, Floats]) -> float:
-    """Of the rarer signal with the other at its stamps."""
+    """Return the correlation of the slower signal with the other one at its stamps."""
     (ta, ya), (tb, yb) = sorted((_clean(*a), _clean(*b)), key=lambda s: len(s[0]))
     inside = (ta >= tb[0]) & (ta <= tb[-1]) if len(tb) else np.zeros(len(ta), dtype=np.bool_)
     if inside.sum() < LEAST:

@@ -1,7 +1,7 @@
-"""Numbers of a log for the states and inputs that no name gives: by their unit, or all to choose.
+"""Candidates for states and inputs without a matching name: by unit, or all that are left.
 
-What a table's head says in brackets, `boom_angle [deg]`, fits a state in rad and no input in N m.
-Where one number alone is left in the unit of one state or input alone, it is proposed, unsure.
+A unit in a table's header, such as `boom_angle [deg]`, fits a state in rad, but not an input in
+N m. If exactly one number fits the unit of exactly one state or input, it is proposed, but unsure.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from grounded_trials.logs.inspect_guess import Guess
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.stated_units import Stated, factor_between, may_be, unit_of
 
-PARTS = re.compile("covariance|layout")  # of messages: no robot's numbers
-MOST = 20  # numbers of the log to choose from
+PARTS = re.compile("covariance|layout")  # parts of messages that are not signals
+MOST = 20  # largest number of candidates
 
 
 def from_the_rest(
@@ -25,13 +25,13 @@ def from_the_rest(
     log: LogReport,
     joints: Mapping[str, str] | None = None,
 ) -> tuple[Guess, ...]:
-    """The guesses, where those without a path get what the rest of the log may be to them.
+    """Give guesses without a path candidates among the unassigned numbers of the log.
 
     Args:
         guesses: of states and inputs.
-        units: of the model, by their names.
-        log: that was looked through.
-        joints: units of joints' numbers by their paths, see `joint_units`.
+        units: of the model, by name.
+        log: an inspected log.
+        joints: units of joints' numbers by path, see `joint_units`.
     """
     stated, taken = Stated.by(log.files), {guess.path for guess in guesses}
     moving = [f.path for t in log.topics for f in t.fields if f.low != f.high]
@@ -64,7 +64,7 @@ def from_the_rest(
 
 def _by_unit(guess: Guess, path: str, log: LogReport) -> Guess:
     topic, field = next((t, f) for t in log.topics for f in t.fields if f.path == path)
-    why = "no name says it; of the numbers left it alone has a unit that fits"
+    why = "no name matches; of the remaining numbers only this one has a unit that fits"
     clock = "header" if topic.stamped else "log"
     return replace(guess, path=path, field=field, clock=clock, reasons=(why,))
 
