@@ -63,7 +63,7 @@ def test_a_wave_is_a_cause_only_where_motions_differ():
     assert "periodic:v" not in found.effects and found.motions == 1
     one = next(one for one in found.unconfirmed if one.repeats)
     assert one.effect == "periodic:v" and one.seen == (4, 4) and one.evidence > 20
-    assert found.leftover and "moves differently" in found.next_trial
+    assert found.leftover and "different motion" in found.next_trial
 
 
 def test_trials_make_one_motion_whatever_noise_and_chatter_do():
