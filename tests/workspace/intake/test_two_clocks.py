@@ -78,7 +78,7 @@ def test_a_log_that_was_put_together_too_early_is_told_with_its_delay(tmp_path, 
     assert len(said) == (early > 0)
     for one in said:
         assert holds(one, "before force", "[log.state.x]", "[log.state.v]", "t0001")
-        assert float(re.search(r"Take (\S+) s", one)[1]) == pytest.approx(early, abs=0.06)
+        assert float(re.search(r"Subtract (\S+) s", one)[1]) == pytest.approx(early, abs=0.06)
 
 
 def test_the_lines_of_the_docs_make_one_log_of_two_tables(tmp_path, monkeypatch):
