@@ -129,7 +129,7 @@ class _Walk:
         self._magic()
         while True:
             step()
-            self.need(9, "the head of a record; its end is missing")
+            self.need(9, "a record's head; its end is missing")
             opcode, length = _HEAD.unpack_from(self.buffer, self.pos)
             self.need(9 + self._allowed(length), _NAMES.get(opcode, f"a record of type {opcode}"))
             if self.data_crc is None and opcode in PARSED:

@@ -260,7 +260,7 @@ def _stamped_otherwise(samples: Iterable[Samples], dt: float) -> str:
     for factor in UNITS_OF_TIME:
         if STEPS_APART[0] * dt <= factor * every <= STEPS_APART[1] * dt:
             return (
-                f". Its samples are {every:.3g} s apart; multiplied by {factor:g} it would be "
+                f". Its samples are {every:.3g} s apart; times {factor:g} they would be "
                 f"{factor * every:.3g} s: are its times in another unit than their column says "
                 "(seconds under t_ms)?"
             )

@@ -118,7 +118,7 @@ class Salvage:
     def _ends_early(self) -> str:
         if self._ended:
             return "the index at the end of the file is missing; all messages are before it"
-        return f"the file is cut off at byte {self.size}: everything after that is lost"
+        return f"the file is cut off at byte {self.size}: what came after that is lost"
 
     def _first(self) -> int | None:
         if read_at(self.stream, 0, 8) == MAGIC:
