@@ -37,7 +37,7 @@ from grounded.trial import Trial
 EARLY_S, REACH_S, GRID_S = 0.1, 1.0, 0.05  # [s] smallest and largest shift tried; coarse spacing
 ALIKE = 0.1  # relative tolerance within which the ratios agree
 CHORD_S = 0.5  # [s] chord over which distance is measured: noise lengthens shorter ones
-LEAST_M = 1.0  # shorter distances (by positions or by the speed) tell nothing
+LEAST_M = 1.0  # shorter distances (by positions or by the speed) are not compared
 PART = 0.25  # of a trial: the largest shift tried
 HINT, CLEAR = 0.5, 0.8  # [nats] least reduction of the errors: uncalibrated, calibrated
 HALF = 0.5  # the error of at least one state must fall to this share
