@@ -225,21 +225,22 @@ def _verdict(found: Diagnosis) -> str:
 
 def _places(found: Diagnosis, *, details: bool) -> None:
     """Print where the gap lies: a line, or with `details` a table of channels and regions."""
+    from grounded.diagnosis.error_report import furthest
+
     where = found.where
     channels = [c for c in where.channels if c.share >= LEAST_SHARE]  # NaN: the gap is noise
     regions = [
-        f"{percent(one.share)} of the gap in {percent(one.occupancy)} of the time, where {one.told}"
+        f"{percent(one.share)} falls into {percent(one.occupancy)} of the time, where {one.told}"
         for one in where.regions[: REGIONS if details else 1]
     ]
     if not channels:
         return
     if not details:
-        parts = [f"{percent(c.share)} of the gap in {c.name}" for c in channels[:CHANNELS]]
-        return show("\n" + field("where", "; ".join([listed(parts), *regions])))
+        parts = [f"{percent(c.share)} in {c.name}" for c in channels[:CHANNELS]]
+        text = "; ".join([f"of the gap, {listed(parts)}", *regions])
+        return show("\n" + field("where", text))
     rows = [(c.name, percent(c.share), with_unit(number(c.rms, 3), c.unit)) for c in channels]
     show("\n" + table(rows, ("where", "share of the gap", "rms")))
-    from grounded.diagnosis.error_report import furthest
-
     row = furthest(found.prediction_error)
     ahead = f" {row.horizon_s:.3g} s ahead" if row else ""
     _note(

@@ -44,7 +44,7 @@ VERDICTS = {
 @in_workspace
 @as_json
 def command(files: tuple[str, ...], candidate: str | None, data: bool, json_: bool) -> None:
-    """Check, resample and store trials: MCAP files or bag folders.
+    """Check, resample and store logs of any format that `inspect` reads.
 
     Ingesting a file again succeeds and names the trial it is stored as. Trials written by grounded
     are stored unchanged; other logs are mapped by the [log] table (`grounded inspect LOG` prints

@@ -69,7 +69,7 @@ def verdict(
         if above := rest(rows):
             text = f"The model explains what these trials show: {above}."
         elif row is not None and row.floor_at_most:
-            what = "A gap remains that is neither white noise nor any known effect"
+            what = "No known effect explains the rest, which may be noise that is not white"
             return _said("unknown", f"{what}{floor(row)}.", *once)
         else:
             text = explained(rows)

@@ -808,6 +808,19 @@ def test_a_generic_skeleton_has_the_rates_that_its_log_shows_and_an_actuator_as_
     assert (relation.i, relation.j, round(relation.c, 6)) == (0, 1, 1.0)
 
 
+@pytest.mark.parametrize("name", ["force", "grip [N]"])
+def test_a_force_is_the_input_if_nothing_looks_like_a_command(tmp_path, name):
+    """A cart's force became a state, beside an input `u` that the log did not have."""
+    t = 0.02 * np.arange(500)
+    table = np.column_stack([t, np.sin(t), np.cos(t), 3 * np.sin(2.2 * t)])
+    header = f"t,x,v,{name}"
+    np.savetxt(tmp_path / "cart.csv", table, "%.5f", ",", header=header, comments="")
+    made = grounded("init", tmp_path / "w", "--from", tmp_path / "cart.csv")
+    assert made.code == 0, made.err
+    model = Workspace(tmp_path / "w").base_model
+    assert model.state_names == ("x", "v") and model.input_names == (name.split()[0],)
+
+
 def test_a_target_beyond_safety_is_told_when_it_is_drawn(tmp_path):
     """A step to 60 m, of 60 cm, was drawn without a word."""
     made = workspaces.make(tmp_path / "w")

@@ -266,7 +266,7 @@ def _model_in(folder: Path, text: str) -> Model:
 
 def _only_named(guess: Guess, of: str) -> Guess:
     """Mark a generic skeleton's signal as a guess: only its name comes from the log."""
-    why = f"named as in the log; assumed to be a{'n' * (of == 'input')} {of}"
+    why = f"a guess that it is a{'n' * (of == 'input')} {of}"
     return replace(guess, sure=False, reasons=(*guess.reasons, why)) if guess.path else guess
 
 
@@ -276,7 +276,10 @@ def _left_out(report: LogReport, model: Model) -> tuple[str, ...]:
     found = [f"left out of model.py: {', '.join(reversed(left))}"] * bool(left)
     if not set(model.inputs) & set(moving(report)):
         last = next(iter(moving(report)), "A")
-        found.append(f"no number looks like a command: name the inputs, such as --inputs {last}")
+        found.append(
+            "no number looks like a command: create the workspace again in another folder and name "
+            f"the inputs, such as --inputs {last}"
+        )
     return tuple(found)
 
 

@@ -37,6 +37,8 @@ COMMANDED = re.compile(
     r"|goal|control|_con|_ref|stellgr|stellwert|sollwert|_soll\b|befehl|consigne|commande|comando"
 )
 ACTUATOR = re.compile("servo|actuator")  # either a command or a measured position
+EFFORT = re.compile("force|thrust|power")  # an input if nothing else looks like one
+EFFORT_UNITS = {"N", "N m", "V"}
 
 HEADING = re.compile(r"(^|[/._])(yaw|psi|heading|theta|th|orientation)([/._\d]|$)")
 SENSED = re.compile(
@@ -68,7 +70,7 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
     A state whose rate is another state gets that as its derivative; every other state follows the
     inputs with a first-order lag. Without `inputs`, the inputs are the numbers that are named like
     commands, else those held constant over several samples while others move, else those named
-    after an actuator.
+    after an actuator, else forces, torques and voltages.
 
     Args:
         log: the log.
@@ -79,6 +81,7 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
         GroundedError: for an input that the log does not have.
     """
     found, known = moving(log), units or {}
+    unit = {n: known.get(f.path) or unit_in_name(f.path) or "1" for n, f in found.items()}
     for name in inputs:
         if name not in found:
             raise GroundedError(f"the log has no number '{name}': {nearest(name, found)}")
@@ -88,10 +91,10 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
         held = [n for n in names if found[n].held > HELD]
         driven = [n for n in names if ACTUATOR.search(n.lower())]
         held = held if 2 * len(held) < len(names) else []
-        inputs = (called or held or driven)[:INPUTS] or ["u"]
+        efforts = [n for n in names if EFFORT.search(n.lower()) or unit[n] in EFFORT_UNITS]
+        inputs = (called or held or driven or efforts)[:INPUTS] or ["u"]
     states = [name for name in reversed(found) if name not in inputs][:MOST] or ["x"]
     rates = _rates(log, {name: found[name].path for name in states if name in found})
-    unit = {n: known.get(f.path) or unit_in_name(f.path) or "1" for n, f in found.items()}
     per = {i: f"/({u})" * (u != "1") for i in inputs if (u := unit.get(i, "1"))}
     gains = {
         f"gain_{s}_{i}": f'0.0, "{unit.get(s, "1")}{per[i]}", -100.0, 100.0'

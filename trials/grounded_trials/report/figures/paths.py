@@ -80,7 +80,9 @@ def path_figure(findings: Findings) -> Figure | None:
                 f"desired dashed. The curves are paths of {body.watched}."
             )
     if body is None and not scene.spatial:
-        caption.append(f"No role gives a position: phase plane of {listed(scene.names)}.")
+        position = findings.task.model.roles.get("position")
+        why = "No role gives a position" if position is None else "The position has one axis"
+        caption.append(f"{why}: phase plane of {listed(scene.names)}.")
     if body is not None and not body.unit:
         caption.append(
             "The lengths of its links are unknown (name parameters l, or l1, l2 ... in m): they "
