@@ -143,7 +143,7 @@ def _show(found: Diagnosis, nominal: dict[str, float], *, details: bool) -> None
     _instruments(found.preflight)
     for text in found.unknowable:
         if text not in found.sentence:
-            show(field("limits", text))
+            show(field("caveats", text))
     if not found.no_cause:
         if found.prediction_error:
             show("\n" + table(*error_table(found, whole_trials=details)))

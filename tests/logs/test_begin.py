@@ -821,6 +821,16 @@ def test_a_force_is_the_input_if_nothing_looks_like_a_command(tmp_path, name):
     assert model.state_names == ("x", "v") and model.input_names == (name.split()[0],)
 
 
+def test_an_input_that_never_changes_is_reported_as_constant(tmp_path):
+    """It was "no number of the log", though the log has that column."""
+    t = 0.02 * np.arange(500)
+    table = np.column_stack([t, np.sin(t), np.cos(t), 0.1 + 0 * t])
+    np.savetxt(tmp_path / "c.csv", table, "%.5f", ",", header="t,x,v,steering", comments="")
+    words = ("--from", tmp_path / "c.csv", "--inputs", "steering")
+    made = grounded("init", tmp_path / "w", *words)
+    assert made.code == 1 and holds(made.err, "'steering' is constant (0.1)")
+
+
 def test_a_target_beyond_safety_is_told_when_it_is_drawn(tmp_path):
     """A step to 60 m, of 60 cm, was drawn without a word."""
     made = workspaces.make(tmp_path / "w")

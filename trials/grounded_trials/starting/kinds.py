@@ -84,6 +84,12 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
     unit = {n: known.get(f.path) or unit_in_name(f.path) or "1" for n, f in found.items()}
     for name in inputs:
         if name not in found:
+            same = [one for t in log.topics for one in t.fields if _word(one.path) == name]
+            if same:
+                raise GroundedError(
+                    f"'{name}' is constant ({same[0].low:g}) in this log, so it can't be an input "
+                    "of a skeleton: record a log in which it changes"
+                )
             raise GroundedError(f"the log has no number '{name}': {nearest(name, found)}")
     if not inputs:
         names = list(reversed(found))
