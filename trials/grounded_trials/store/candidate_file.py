@@ -166,7 +166,7 @@ def _hash(table: Meta, arrays: Iterable[Array]) -> str:
     digest = hashlib.sha256(json.dumps(known, sort_keys=True).encode())
     for array in arrays:
         digest.update(repr(array.shape).encode())
-        digest.update(np.ascontiguousarray(array + 0.0, dtype="<f8").reshape(-1))
+        digest.update(np.ascontiguousarray(array + 0.0, dtype="<f8").reshape(-1).data)
     return digest.hexdigest()
 
 
