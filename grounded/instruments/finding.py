@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from grounded.result import Document
+from grounded.trial import Trial
 
 DEGREES = 57.29577951308232  # in a radian
 RPM = 9.549296585513721  # revolutions per minute in one radian per second
@@ -104,3 +105,33 @@ def scaled(name: str, position: str, size: float, unit: str) -> Finding:
     else:
         text = f"{text}; either may be wrong"
     return Finding(name, text, "scale", scale=size)
+
+
+@dataclass(frozen=True, eq=False)
+class Preflight:
+    """The findings of all checks, and the corrected trials."""
+
+    findings: tuple[Finding, ...]
+    trials: tuple[Trial, ...]
+    in_step: frozenset[str] = frozenset()  # states whose sensors are seen to be synchronous
+    refuted: frozenset[str] = frozenset()  # effects ruled out because two sensors agree
+
+    @property
+    def filters(self) -> dict[str, float]:
+        """Time constants of filtering sensors by state [s]."""
+        return filters_of(self.findings)
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        """States whose sensors add nothing to others."""
+        return frozenset(f.signal for f in self.findings if f.kind == "smoothed")
+
+    @property
+    def settled(self) -> frozenset[str]:
+        """Names of the sensor effects that are already corrected or ruled out."""
+        mended = {f.signal for f in self.findings if f.corrected and f.kind in ("delay", "lag")}
+        return self.refuted | frozenset(
+            f"{family}:{name}"
+            for name in self.in_step | mended
+            for family in ("sensor_delay", "sensor_lag")
+        )

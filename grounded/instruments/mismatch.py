@@ -23,8 +23,9 @@ from grounded.instruments.kinematics import (
     integrals,
     travelled,
 )
-from grounded.instruments.odd_trial import Odd, missed, spread
+from grounded.instruments.odd_trial import Odd, missed
 from grounded.instruments.other_units import FACTORS, described, unusable
+from grounded.instruments.rate_ratios import spread
 from grounded.instruments.rows import Gap, Row, gaps, per_step
 from grounded.instruments.swapped import exchanged
 from grounded.model import Model

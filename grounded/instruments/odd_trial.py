@@ -1,12 +1,11 @@
-"""Find trials in other units than the rest: degrees for radians, milliseconds for seconds.
+"""Find trials in other units than the rest: degrees for radians, thousandths of a command.
 
-If one state of a trial is in degrees, or its stamps are in milliseconds, the rate of a position is
-a constant multiple of the velocity; the sizes in sound trials show which of the two is off. If all
-angles and their rates are in degrees, they agree with each other. Commands of the usual size then
-seem to move the body tens of times as far, and the model's error is tens of times as large; divided
-by 57.3 it is as in the other trials. Commands in thousandths are tens of times smaller than in
-other trials, and the model predicts the motion with a thousand times as much, but not with a third
-or three times of that.
+If one state of a trial is in degrees, the rate of a position is a constant multiple of the
+velocity; the sizes in sound trials show which of the two is off. If all angles and their rates are
+in degrees, they agree with each other. Commands of the usual size then seem to move the body tens
+of times as far, and the model's error is tens of times as large; divided by 57.3 it is as in the
+other trials. Commands in thousandths are tens of times smaller than in other trials, and the model
+predicts the motion with a thousand times as much, but not with a third or three times of that.
 """
 
 from __future__ import annotations
@@ -16,10 +15,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.instruments.finding import DEGREES
-from grounded.instruments.kinematics import Integral, integrals, over_steps, pieces
+from grounded.instruments.kinematics import integrals
+from grounded.instruments.rate_ratios import Ratios, size_of, spread
 from grounded.model import Model
 from grounded.trial import Trial
 
@@ -30,14 +29,14 @@ SIMILAR = 3.0  # within this factor sizes count as similar
 BETTER = 0.9  # of the error with the commands as logged, or a third or three times the corrected
 STAMPS = 1000.0  # factor between time stamps in milliseconds and in seconds
 NEAR = 0.1  # relative tolerance of these factors
-TOGETHER = 0.95  # cosine between displacements by position and by velocity, in the best window
-TURNS = (2 * np.pi, 360.0)  # jumps of a wrapped angle
 LIKE = 10.0  # factor within which corrected commands must match those of other trials
 MANY = 8  # number of trials examined
-LEAST = 8  # windows that a trial must hold
 FAR = 1e9  # bound on predicted states
-
-Ratios = Sequence[tuple[Integral, float]]  # of a trial's positions, see `ratios_of`
+PREDICTED = 1.0  # error relative to the motion, below which a prediction is informative
+FULL_TURNS = 4 * np.pi  # [rad] range of an angle that suggests degrees (or a wheel, or a heading)
+SOON = 0.1  # [s] horizon: a very crude model soon diverges
+CONCORDANT, PLAINLY = 0.1, 1.5  # least concordance, and factor by which it must exceed others
+WHOLE = 0.3  # least concordance of each angle with the motion by its rate
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ def odd_states(
     Args:
         model: however crude.
         trials: several.
-        ratios: of each trial, see `ratios_of`.
+        ratios: of each trial, see `rate_ratios.ratios_of`.
         shown: indices of the states with a sensor in every trial.
 
     Yields:
@@ -123,18 +122,6 @@ def _one_state(trials: Sequence[Trial], ratios: Sequence[Ratios], k: int) -> lis
             choice = [choice[int(np.argmin(strange))]]
         found.append(choice[0])
     return found
-
-
-def spread(trial: Trial, some: Sequence[int]) -> Array:
-    """Return the standard deviations of some states (len(some),), in their units."""
-    return np.asarray(np.nanstd(trial.states[:, some], axis=0) + 1e-300)
-
-
-PREDICTED = 1.0  # error relative to the motion, below which a prediction is informative
-FULL_TURNS = 4 * np.pi  # [rad] range of an angle that suggests degrees (or a wheel, or a heading)
-SOON = 0.1  # [s] horizon: a very crude model soon diverges
-CONCORDANT, PLAINLY = 0.1, 1.5  # least concordance, and factor by which it must exceed others
-WHOLE = 0.3  # least concordance of each angle with the motion by its rate
 
 
 def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Odd]:
@@ -304,103 +291,3 @@ def predicted(
         x = model.system.step(x, trial.inputs[at + j], model.values, trial.dt)
         x = np.fmax(np.fmin(x, FAR), -FAR)
     return logged[at], x, logged[at + steps]
-
-
-def judge_stamps(model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios]) -> None:
-    """Raise an error if a trial's stamps are in milliseconds, or were read as milliseconds.
-
-    If all positions are lengths, they may be in mm instead. Then the stamps are blamed only if
-    positions and velocities are as large as in sound trials.
-
-    Args:
-        model: however crude.
-        trials: of this model's states.
-        ratios: of each trial, see `ratios_of`.
-
-    Raises:
-        GroundedError: naming the trial, a state and the factor.
-    """
-    for k, (trial, every) in enumerate(zip(trials, ratios, strict=True)):
-        if (found := slow_or_fast(model, every)) is None:
-            continue
-        relation, ratio = found
-        if model.states[model.state_names[relation.i]] == "m":
-            some = sorted({i for r, _ in every for i in (r.i, r.j)})
-            sound = [t for t, one in zip(trials, ratios, strict=True) if _sound(one)]
-            if not sound:
-                continue
-            apart = spread(trial, some) / np.median([spread(t, some) for t in sound], axis=0)
-            if max(apart.max(), 1 / apart.min()) > np.sqrt(STAMPS):
-                continue
-        q, w = (model.state_names[i] for i in (relation.i, relation.j))
-        name = trial.id or f"number {k + 1}"
-        raise GroundedError(
-            f"trial {name}: {q} moves {ratio:.3g} times as fast as {w} says, so the "
-            "stamps of its log are in another unit (milliseconds instead of seconds): "
-            "correct them, discard this trial and ingest the log again",
-            then=NextCommand("discard", (trial.id,)) if trial.id else None,
-        )
-
-
-def slow_or_fast(model: Model, every: Ratios) -> tuple[Integral, float] | None:
-    """Return a position and its ratio if all positions move 1000 times too fast or too slowly.
-
-    A position whose unit is not m is preferred.
-    """
-    found = [one for one in every if one[0].exact]
-    for factor in (STAMPS, 1 / STAMPS):
-        if found and all(abs(ratio / factor - 1) < NEAR for _, ratio in found):
-            units = list(model.states.values())
-            return min(found, key=lambda one: units[one[0].i] == "m")
-    return None
-
-
-def _sound(every: Ratios) -> bool:
-    """Check whether positions move as their velocities imply."""
-    found = [ratio for relation, ratio in every if relation.exact]
-    return bool(found) and all(1 / SIMILAR < ratio < SIMILAR for ratio in found)
-
-
-def ratios_of(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Ratios]:
-    """Return for each trial the rate of each position over its velocity.
-
-    The ratio is 1 where the two do not correlate, and no ratio can be given.
-    """
-    relations = [one for one in integrals(model) if {one.i, one.j} <= set(shown)]
-    return [_ratios(relations, trial) for trial in trials]
-
-
-def _ratios(relations: Sequence[Integral], trial: Trial) -> Ratios:
-    """Return the ratios over the window with the best agreement; longer ones suppress noise."""
-    found = []
-    for relation in relations:
-        some = [
-            (_unturned(x[:, 0])[1:-1], np.cumsum([0.0, *over_steps(relation.c * x[:, 1])]))
-            for x in pieces([trial], (relation.i, relation.j))
-        ]
-        best, ratio, steps = TOGETHER, 1.0, 1
-        while usable := [pair for pair in some if len(pair[0]) > LEAST * steps]:
-            parts = [[z[steps:] - z[:-steps] for z in pair] for pair in usable]
-            moved, said = (np.concatenate(z) for z in zip(*parts, strict=True))
-            same = abs(moved @ said) / max(size_of(moved) * size_of(said) * len(said), 1e-300)
-            if same > best:
-                best, ratio = same, size_of(moved) / (size_of(said) * trial.dt)
-            steps *= 2
-        if some:
-            found.append((relation, ratio))
-    return found
-
-
-def _unturned(q: Array) -> Array:
-    """Remove the jumps of a wrapped angle."""
-    steps = np.diff(q)
-    for turn in TURNS:
-        jumps = np.abs(np.abs(steps) - turn) < 0.1 * turn
-        if np.median(np.abs(steps)) < 0.05 * turn:
-            steps -= np.where(jumps, np.sign(steps) * turn, 0.0)
-    return np.concatenate([[q[0]], q[0] + np.cumsum(steps)])
-
-
-def size_of(x: Array) -> float:
-    """Return the root mean square of x, of any shape, ignoring NaN; 0 if it is empty."""
-    return float(np.sqrt(np.nanmean(x**2))) if x.size else 0.0

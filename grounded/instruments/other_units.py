@@ -1,10 +1,12 @@
 """Detect positions and velocities in units that don't match, such as mm beside m/s.
 
-Their ratio is then a power of ten that no physics causes. Which of the two is off does not follow
-from the ratio. It follows from the sizes in other trials that are in the model's units; without
-such trials, from how well the model predicts the velocity with either one corrected; otherwise the
-larger is named first, since logs are more often in mm than in km. Nothing is corrected here: the
-factor belongs in [log], where feedback and utilities use it too.
+If time stamps are in milliseconds, every position moves a thousand times as fast as its velocity
+says (`judge_stamps`). If one signal is in another unit, its ratio is a power of ten that no physics
+causes. Which of the two is off does not follow from the ratio. It follows from the sizes in other
+trials that are in the model's units; without such trials, from how well the model predicts the
+velocity with either one corrected; otherwise the larger is named first, since logs are more often
+in mm than in km. Nothing is corrected here: the factor belongs in [log], where feedback and
+utilities use it too.
 """
 
 from __future__ import annotations
@@ -17,20 +19,8 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.instruments.kinematics import Integral
-from grounded.instruments.odd_trial import (
-    AHEAD,
-    NEAR,
-    SIMILAR,
-    STAMPS,
-    Odd,
-    Ratios,
-    missed,
-    predicted,
-    ratios_of,
-    size_of,
-    slow_or_fast,
-    spread,
-)
+from grounded.instruments.odd_trial import AHEAD, NEAR, SIMILAR, STAMPS, Odd, missed, predicted
+from grounded.instruments.rate_ratios import Ratios, ratios_of, size_of, spread
 from grounded.model import Model
 from grounded.trial import Trial
 
@@ -68,7 +58,7 @@ def judge_units(
     Args:
         model: however crude.
         trials: of this model's states.
-        ratios: of each trial, see `odd_trial.ratios_of`.
+        ratios: of each trial, see `rate_ratios.ratios_of`.
         shown: indices of the states with a sensor.
 
     Raises:
@@ -226,3 +216,58 @@ def described(model: Model, i: int, factor: float) -> str:
     unit = f" (in {prefix}{base}{'/' * bool(per)}{per})" if prefix else ""
     text = f"{size:g} times too {'large' if factor > 1 else 'small'}{unit}"
     return f"{name} looks {text}, corrected by [log.state.{name}] scale = {1 / factor:g}"
+
+
+def judge_stamps(model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios]) -> None:
+    """Raise an error if a trial's stamps are in milliseconds, or were read as milliseconds.
+
+    If all positions are lengths, they may be in mm instead. Then the stamps are blamed only if
+    positions and velocities are as large as in sound trials.
+
+    Args:
+        model: however crude.
+        trials: of this model's states.
+        ratios: of each trial, see `rate_ratios.ratios_of`.
+
+    Raises:
+        GroundedError: naming the trial, a state and the factor.
+    """
+    for k, (trial, every) in enumerate(zip(trials, ratios, strict=True)):
+        if (found := slow_or_fast(model, every)) is None:
+            continue
+        relation, ratio = found
+        if model.states[model.state_names[relation.i]] == "m":
+            some = sorted({i for r, _ in every for i in (r.i, r.j)})
+            sound = [t for t, one in zip(trials, ratios, strict=True) if _sound(one)]
+            if not sound:
+                continue
+            apart = spread(trial, some) / np.median([spread(t, some) for t in sound], axis=0)
+            if max(apart.max(), 1 / apart.min()) > np.sqrt(STAMPS):
+                continue
+        q, w = (model.state_names[i] for i in (relation.i, relation.j))
+        name = trial.id or f"number {k + 1}"
+        raise GroundedError(
+            f"trial {name}: {q} moves {ratio:.3g} times as fast as {w} says, so the "
+            "stamps of its log are in another unit (milliseconds instead of seconds): "
+            "correct them, discard this trial and ingest the log again",
+            then=NextCommand("discard", (trial.id,)) if trial.id else None,
+        )
+
+
+def slow_or_fast(model: Model, every: Ratios) -> tuple[Integral, float] | None:
+    """Return a position and its ratio if all positions move 1000 times too fast or too slowly.
+
+    A position whose unit is not m is preferred.
+    """
+    found = [one for one in every if one[0].exact]
+    for factor in (STAMPS, 1 / STAMPS):
+        if found and all(abs(ratio / factor - 1) < NEAR for _, ratio in found):
+            units = list(model.states.values())
+            return min(found, key=lambda one: units[one[0].i] == "m")
+    return None
+
+
+def _sound(every: Ratios) -> bool:
+    """Check whether positions move as their velocities imply."""
+    found = [ratio for relation, ratio in every if relation.exact]
+    return bool(found) and all(1 / SIMILAR < ratio < SIMILAR for ratio in found)

@@ -23,7 +23,7 @@ could cause as well, such as a scale error of a few percent or wheel slip, is on
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -34,8 +34,8 @@ from grounded.instruments.dead import judge_dead
 from grounded.instruments.finding import (
     DEGREES,
     Finding,
+    Preflight,
     a_mean,
-    filters_of,
     in_degrees,
     put_right,
     scaled,
@@ -63,16 +63,9 @@ from grounded.instruments.mismatch import (
     stop_at_folded,
     unexplained,
 )
-from grounded.instruments.odd_trial import (
-    Odd,
-    Ratios,
-    all_in_degrees,
-    judge_stamps,
-    odd_commands,
-    odd_states,
-    ratios_of,
-)
-from grounded.instruments.other_units import judge_units
+from grounded.instruments.odd_trial import Odd, all_in_degrees, odd_commands, odd_states
+from grounded.instruments.other_units import judge_stamps, judge_units
+from grounded.instruments.rate_ratios import Ratios, ratios_of
 from grounded.instruments.rows import kinematic_rows, tied
 from grounded.instruments.single import judge_signal, signal_of
 from grounded.instruments.swapped import judge_columns
@@ -85,36 +78,6 @@ LEAST_STEPS = 0.1  # of a time step: smaller delays may come from the time stamp
 ALIKE = 0.9  # coherence above which two sensors are compared
 UNIT = 0.1  # relative tolerance within which a scale counts as that of degrees
 SMOOTH = 2.0  # time steps: a velocity averaged over less still resolves the motion
-
-
-@dataclass(frozen=True, eq=False)
-class Preflight:
-    """The findings of all checks, and the corrected trials."""
-
-    findings: tuple[Finding, ...]
-    trials: tuple[Trial, ...]
-    in_step: frozenset[str] = frozenset()  # states whose sensors are seen to be synchronous
-    refuted: frozenset[str] = frozenset()  # effects ruled out because two sensors agree
-
-    @property
-    def filters(self) -> dict[str, float]:
-        """Time constants of filtering sensors by state [s]."""
-        return filters_of(self.findings)
-
-    @property
-    def left_out(self) -> frozenset[str]:
-        """States whose sensors add nothing to others."""
-        return frozenset(f.signal for f in self.findings if f.kind == "smoothed")
-
-    @property
-    def settled(self) -> frozenset[str]:
-        """Names of the sensor effects that are already corrected or ruled out."""
-        mended = {f.signal for f in self.findings if f.corrected and f.kind in ("delay", "lag")}
-        return self.refuted | frozenset(
-            f"{family}:{name}"
-            for name in self.in_step | mended
-            for family in ("sensor_delay", "sensor_lag")
-        )
 
 
 def preflight(

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from grounded.instruments.clocks import judge_clocks
+from grounded.instruments.finding import Preflight
 from grounded.instruments.mistaken import judge_commands
-from grounded.instruments.preflight import Preflight, preflight
+from grounded.instruments.preflight import preflight
 from grounded.model import Model
 from grounded.task import Task
 from grounded.trial import Trial

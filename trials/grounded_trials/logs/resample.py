@@ -26,15 +26,12 @@ from grounded_trials.logs.command_steps import (
     rows_apart,
     stands_still,
 )
-from grounded_trials.logs.samples import (
-    REGULAR,
-    Samples,
+from grounded_trials.logs.samples import REGULAR, Samples, check_overlap, tidy
+from grounded_trials.logs.signal_report import (
     SignalReport,
     check_clocks,
-    check_overlap,
     report_of,
     staircase,
-    tidy,
     warnings_of,
 )
 from grounded_trials.logs.signals import Clock, Series, SignalSpec

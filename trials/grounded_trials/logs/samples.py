@@ -1,13 +1,13 @@
-"""One signal of a log: clean samples, values at any time, and a report.
+"""One signal of a log: clean samples, and values at any time.
 
 `tidy` sorts by stamp, drops (and counts) repeated stamps and numbers that are not finite, scales
 and unwraps. `Samples` interpolates or holds; between samples further apart than the signal's
-max_age_s the value is unknown. `SignalReport` states rate, jitter, delay and gaps of the signal.
+max_age_s the value is unknown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,12 +22,8 @@ GAP_INTERVALS, GAP_STEPS, GAP_S = 5.0, 3.0, 0.1  # without max_age_s a gap excee
 JUMP_S = 1.0  # a larger jump back means that the clock was set or a simulation restarted
 NEAR_0_S = 10.0  # if other stamps come nearer to 0 than this, a stamp of 0 is valid
 MIXED_S = 1.0  # signals whose clocks differ by more than this are refused
-SKEW_S = 0.1  # signals whose clocks differ by more than this cause a warning
 SPARSE = 50.0  # steps between two samples above which the log's time seems to be in another unit
-BRIDGED = 1.9  # a value between samples more than this many intervals apart counts as bridged
 REGULAR = 10  # an input with more samples is sent continuously; it ends the trial with its last
-LEAST_RUNS, REPEATED = 20, 0.8  # a held signal: fewest runs, and share with two or more samples
-COARSE = 2.5  # least ratio of median to smallest change of a signal that is not quantised
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,93 +214,6 @@ def _unusable(name: str, spec: SignalSpec, why: str) -> GroundedError:
     return GroundedError(f"'{name}' ({spec.path}) can't be used: {why}")
 
 
-@dataclass(frozen=True)
-class SignalReport:
-    """Statistics of one signal; durations in seconds, positions in seconds after the start."""
-
-    name: str
-    path: str
-    type: str
-    clock: str
-    samples: int  # in the whole log
-    rate_hz: float  # 1 / median interval; 0 for one sample
-    jitter_s: float  # half the width that holds 90 % of the intervals
-    largest_gap_s: float  # between samples, within the trial
-    largest_gap_at_s: float
-    bridged: int  # values of the trial that were interpolated over a gap
-    skew_s: float | None  # median of stamp minus log time; None: it is on the log's clock
-    not_finite: int  # dropped: NaN or infinite
-    repeated: int  # dropped: same stamp as the next
-    out_of_order: int
-    unstamped: int  # dropped: stamp 0
-    low: float  # smallest value in the trial, scaled
-    high: float  # largest value in the trial, scaled
-
-
-def report_of(
-    samples: Samples, series: Series, values: Floats, at: Ints, origin: int
-) -> SignalReport:
-    """Return the report on a signal that has `values` at the times `at` [ns]."""
-    t = samples.t
-    gaps = np.diff(t) * 1e-9
-    inside = (t[1:] > at[0]) & (t[:-1] < at[-1])
-    widest, place = 0.0, 0.0
-    if inside.any():
-        i = int(np.flatnonzero(inside)[np.argmax(gaps[inside])])
-        widest, place = float(gaps[i]), float((t[i] - origin) * 1e-9)
-    low, high = np.percentile(gaps, [5, 95]) if len(gaps) else (0.0, 0.0)
-    return SignalReport(
-        name=samples.name,
-        path=samples.spec.path,
-        type=series.type,
-        clock=samples.spec.clock,
-        samples=len(series.t),
-        rate_hz=1 / samples.interval if len(t) > 1 else 0.0,
-        jitter_s=float(high - low) / 2,
-        largest_gap_s=widest,
-        largest_gap_at_s=place,
-        bridged=_bridged(samples, at),
-        skew_s=_skew(series),
-        not_finite=samples.not_finite,
-        repeated=samples.repeated,
-        out_of_order=samples.out_of_order,
-        unstamped=samples.unstamped,
-        low=float(values.min()),
-        high=float(values.max()),
-    )
-
-
-def _bridged(samples: Samples, at: Ints) -> int:
-    t = samples.t
-    if len(t) < 2:
-        return 0
-    i = np.clip(np.searchsorted(t, at, "right"), 1, len(t) - 1)
-    wide = (t[i] - t[i - 1]) * 1e-9 > BRIDGED * samples.interval
-    return int((wide & (at > t[i - 1]) & (at < t[i])).sum())
-
-
-def _skew(series: Series) -> float | None:
-    if series.spec.clock == "log":
-        return None
-    return float(np.median(series.t - series.log_times)) * 1e-9
-
-
-def check_clocks(series: Mapping[str, Series]) -> None:
-    """Raise an error for signals on different clocks, such as simulation time and log time.
-
-    Raises:
-        GroundedError: naming two of them, and the difference.
-    """
-    first, last, apart = _furthest({name: _skew(s) for name, s in series.items()})
-    if apart > MIXED_S:
-        a, b = series[first].spec.clock, series[last].spec.clock
-        raise GroundedError(
-            f"'{first}' (clock {a}) and '{last}' (clock {b}) are on clocks that differ by "
-            f"{apart:.3f} s (simulation time, or an unset clock?); use the same clock for both, "
-            'such as clock = "log"'
-        )
-
-
 def check_overlap(states: Sequence[Samples], inputs: Sequence[Samples]) -> None:
     """Raise an error if some signals end before others begin: their stamps are on two clocks.
 
@@ -342,69 +251,3 @@ def check_overlap(states: Sequence[Samples], inputs: Sequence[Samples]) -> None:
         f"align the two: {lines}. Determine the difference to a few ms (by a knock that both "
         "show): any error of it looks like a delay, or like motion before its command"
     )
-
-
-def _furthest(skews: Mapping[str, float | None]) -> tuple[str, str, float]:
-    """Return the signals whose clocks are furthest behind and ahead, and the difference [s].
-
-    A skew of None stands for the log's own clock.
-    """
-    known = {name: skew or 0.0 for name, skew in skews.items()}
-    first, last = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
-    return first, last, known[last] - known[first]
-
-
-def staircase(samples: Samples, first: int, last: int, dt: float) -> str:
-    """Return a warning if a signal is late because rows repeat each of its values; else "".
-
-    A table has a row per sample of its fastest signal, so rows repeat the samples of a slower
-    sensor. A quantised signal also repeats values, but changes by few different steps.
-
-    Args:
-        samples: of a state.
-        first: the trial's start [ns].
-        last: the trial's end [ns].
-        dt: control step [s]; values held for up to half of it don't matter.
-    """
-    inside = (samples.t >= first) & (samples.t <= last)
-    y = samples.y[inside]
-    new = np.flatnonzero(np.append(True, np.diff(y) != 0)) if len(y) else np.empty(0, int)
-    lengths, sizes = np.diff(new), np.abs(np.diff(y[new]))
-    if len(lengths) < LEAST_RUNS or np.mean(lengths >= 2) < REPEATED:
-        return ""
-    each = float(np.median(lengths))
-    apart = each * samples.interval
-    if apart <= dt / 2 or float(np.median(sizes)) < COARSE * float(sizes.min()):
-        return ""
-    late = (each - 1) / 2 * samples.interval
-    return (
-        f"'{samples.name}' changes only every {each:g} rows: its samples at {1 / apart:.3g} Hz are "
-        f"held and {late:.2g} s late on average. Leave its cell empty in rows that repeat a value "
-        "(or log the sensor's own messages): then it is interpolated"
-    )
-
-
-def warnings_of(reports: tuple[SignalReport, ...], late: float) -> tuple[str, ...]:
-    """Return warnings on a trial, as sentences for a person."""
-    found = []
-    if late > 0:
-        found.append(f"the trial starts {late:.3f} s late, when all states are known")
-    for r in reports:
-        if r.not_finite:
-            found.append(f"'{r.name}': {r.not_finite} of {r.samples} values are not finite numbers")
-        if r.bridged:
-            found.append(
-                f"'{r.name}': {r.bridged} values bridged, the largest gap is "
-                f"{r.largest_gap_s:.3f} s at {r.largest_gap_at_s:.3f} s"
-            )
-        if r.out_of_order or r.repeated or r.unstamped:
-            found.append(
-                f"'{r.name}': {r.out_of_order} stamps out of order, {r.repeated} repeated, "
-                f"{r.unstamped} zero"
-            )
-        if r.samples == 1:
-            found.append(f"'{r.name}': held from a single sample")
-    low, high, apart = _furthest({r.name: r.skew_s for r in reports})
-    if len({r.clock for r in reports}) > 1 and apart > SKEW_S:
-        found.append(f"'{low}' and '{high}' are on clocks that differ by {apart:.3f} s")
-    return tuple(found)

@@ -7,7 +7,7 @@ from typing import Any
 
 from grounded.errors import NextCommand
 from grounded.result import Result
-from grounded_trials.logs.samples import SignalReport
+from grounded_trials.logs.signal_report import SignalReport
 from grounded_trials.workspace.next_step import PROPOSE
 from grounded_trials.workspace.off_target import OffTarget
 
