@@ -52,7 +52,8 @@ class Named(Mapping[str, Any]):
         )
 
     def __iter__(self) -> Iterator[str]:
-        return (name for name in self.__dict__ if name != " what")
+        what = self.__dict__[" what"]
+        return (Name(name, what) for name in self.__dict__ if name != " what")
 
     def __len__(self) -> int:
         return len(self.__dict__) - 1
@@ -62,9 +63,48 @@ class Named(Mapping[str, Any]):
 
     def _unknown(self, name: object, frame: FrameType) -> GroundedError:
         what = self.__dict__[" what"]
+        if isinstance(name, int | slice):
+            return GroundedError(
+                f"{line_of(frame)}: the {what}s have names, not numbers such as [{name}]: write "
+                f"s.{next(iter(self))} for a function f(s, ...); they are {', '.join(self)}"
+            )
         return GroundedError(
             f"{line_of(frame)}: there is no {what} '{name}': {nearest(str(name), list(self))}"
         )
+
+
+class Name(str):
+    """A name obtained by iterating over `Named`, which refuses to be taken for the value.
+
+    `x, v = s` unpacks names, as with a dict; arithmetic with them would fail far from the slip, or,
+    as `2 * x`, not at all.
+    """
+
+    what: str  # state, input or parameter
+
+    def __new__(cls, name: str, what: str = "value") -> Name:
+        """Return a name that knows what it names."""
+        self = super().__new__(cls, name)
+        self.what = what
+        return self
+
+    def _slip(self, frame: FrameType) -> GroundedError:
+        return GroundedError(
+            f"{line_of(frame)}: '{self}' names one of the {self.what}s and is not its value: "
+            f"unpacking gives names. Write s.{self} for a function f(s, ...), or unpack s.values()"
+        )
+
+    def _refuse(self, *_: Any, **__: Any) -> Any:
+        raise self._slip(sys._getframe(1))
+
+    __array_ufunc__ = __sub__ = __rsub__ = __truediv__ = __rtruediv__ = __pow__ = __rpow__ = _refuse
+    __mul__ = __rmul__ = __neg__ = __abs__ = __radd__ = __float__ = _refuse
+
+    def __add__(self, other: Any) -> str:
+        """Join two strings; refuse numbers."""
+        if isinstance(other, str):
+            return super().__add__(other)
+        raise self._slip(sys._getframe(1))
 
 
 def line_of(frame: FrameType) -> str:

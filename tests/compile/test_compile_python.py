@@ -38,6 +38,28 @@ def test_names():
     assert not hasattr(s, "__array__")
 
 
+@pytest.mark.parametrize(
+    "rate",
+    [lambda v, f: f - v, lambda v, f: 2 * v, lambda v, f: np.sin(v), lambda v, f: v + f],
+    ids=["minus", "times", "sin", "plus"],
+)
+def test_values_unpacked_by_mistake_as_names(rate):
+    """`x, v = s` gives names, as of a dict: the error says so, with the user's line."""
+
+    def dynamics(s, a, p):
+        _, v = s
+        return {"x": s.v, "v": rate(v, a.f)}
+
+    with pytest.raises(GroundedError, match=r"test_compile_python.py:\d+: 'v' .*s\.v.*values\(\)"):
+        make(dynamics).step(X, U, P, 0.1)
+
+    def sound(s, a, p):
+        _, v = s.values()
+        return {name: {"x": v, "v": a.f}[name] for name in s}
+
+    assert make(sound).step(X, U, P, 0.1).shape == X.shape
+
+
 def test_unknown_name_says_which_line_and_what_was_meant():
     def dynamics(s, a, p):
         return {"x": s.velo, "v": a.f}
