@@ -121,7 +121,7 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     """The squared error in three parts: at each horizon in all, and by state."""
     if not splits:
         return []
-    bound = any(one.irreducible_from == "at most" for one in splits.values())
+    bound = any(one.bound for one in splits.values())
     header = ("ahead", "explained", "unexplained", "noise" + ", at most" * bound)
     named = {
         key: words.format(f"{one.horizon_s:.3g} s")
@@ -131,18 +131,19 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     rows = [(words, *_shares(splits[key], splits[key].whole)) for key, words in named.items()]
     main = "horizon" if "horizon" in named else next(iter(named))
     by_state = [(parts.name, *_shares(splits[main], parts)) for parts in splits[main].channels]
-    known = {"repeats": "repeated trials", "alike": "trials whose commands agree to 2 %"}
-    known["at most"] = "what one step leaves, and is at most that: no trial was repeated"
+    known = {"repeats": "the scatter of repeated trials"}
+    known["alike"] = "the scatter of trials whose commands agree to 2 %, and is at most that"
+    known["at most"] = "one-step errors, and is at most that: no trial was repeated"
     source = known.get(splits[main].irreducible_from, "the estimated noise")
     words = (
-        "Explained is the share of the squared error that the effects take away on trials that "
-        "were held out, unexplained what they leave above the noise; how large the noise is comes "
-        f"from {source}."
+        "Explained: the share of the squared error of held-out predictions that the effects "
+        f"remove. Unexplained: what they leave above the noise. The noise is taken from {source}."
     )
     if any("≤" in cell for row in [*rows, *by_state] for cell in row):
         words += (
-            f" ≤ and ≥: errors of up to {_doubts(splits)} times the noise, as it is known here, "
-            "are not told from it: what is unexplained may be noise too."
+            f" ≤ and ≥: the noise is not known well enough to tell errors of up to "
+            f"{_doubts(splits)} times its estimate from noise, so what is unexplained may be noise "
+            "too."
         )
     each = table("split-states", ("state", *header[1:]), by_state)
     return [
