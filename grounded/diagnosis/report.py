@@ -42,7 +42,7 @@ class Verdict(Document):
     `clauses`, which describe the `causes` (a clause each, in the order of `Diagnosis.credit`), or
     groups of them if there are many. `parameters` are those of the model that are off, with or
     without effects. `look_for` is the number of effects to search for before any is adopted, if the
-    usual number leaves more than noise; else 0. `limit`: why no cause may be named, of `unknowable`.
+    usual number leaves more than noise; else 0. `limit`: why no cause is named, as in `unknowable`.
     """
 
     kind: str  # one of `Kind`

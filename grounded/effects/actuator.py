@@ -165,7 +165,8 @@ def _fade(site: Site) -> tuple[Quantity, ...]:
 input_fade = InputFamily(
     name="input_fade",
     equation="u_eff = (1 - k t) u",
-    sentence="{target} gets {k%weaker every second (a battery that sags)|stronger every second}",
+    sentence="the gain of {target} gets {k%lower every second (a battery that sags)|higher every "
+    "second}",
     targets=places.inputs,
     quantities=_fade,
     lookalikes=("input_gain", "trend", "input_bias"),

@@ -176,8 +176,13 @@ def _logs(findings: Findings, table: Table) -> str:
     ahead = findings.ahead_s
     columns = [forecast_error(findings.crude, log.trial, ahead) for log in logs]
     rows = by_state(findings.task.model, columns)
-    title = f"data: what the {findings.plain}, set right every {ahead:.3g} s, misses by then, rms\n"
-    return title + table(rows, ("state", "unit", *(log.trial.id for log in logs)))
+    title = (
+        f"data: rms error of the {findings.plain} {ahead:.3g} s after each restart from the "
+        "measured state, by log, not held out"
+    )
+    return "\n".join([*wrapped(title, "", "  "), ""]) + table(
+        rows, ("state", "unit", *(log.trial.id for log in logs))
+    )
 
 
 def _wrapped(text: str, indent: str) -> list[str]:

@@ -57,7 +57,7 @@ def gap_section(findings: Findings) -> list[Block]:
 def _details(diagnosis: Diagnosis, since: Since) -> list[Block]:
     found = drawn(where_figure(diagnosis), title=True)
     if diagnosis.ranking:
-        found += [Block("heading", "Effects that were weighed"), effect_table(diagnosis, since)]
+        found += [Block("heading", "Effects that were compared"), effect_table(diagnosis, since)]
         found += [Block("text", f"{text}.") for text in in_vain(diagnosis)]
     found += _alike(diagnosis) + _by_trial(diagnosis)
     found += leftover_table(diagnosis)
@@ -91,7 +91,12 @@ def _by_trial(diagnosis: Diagnosis) -> list[Block]:
     header = ("effect", "quantity ", "trial ", "value", "agrees with the others")
     strong = [i for i, p in enumerate(found) if not p.agrees]
     each = table("per-trial", header, rows, strong)
-    return [Block("folded", "Trial by trial", blocks=[each], wide=bool(strong))]
+    words = (
+        "Linear estimates from one trial each, all other values held. A trial that hardly shows an "
+        "effect may give a value that is not possible, with a large standard deviation."
+    )
+    blocks = [Block("soft", words), each]
+    return [Block("folded", "Trial by trial", blocks=blocks, wide=bool(strong))]
 
 
 def _unit(diagnosis: Diagnosis, value: TrialValue) -> str:
@@ -109,8 +114,8 @@ def _alike(diagnosis: Diagnosis) -> list[Block]:
     if diagnosis.lookalikes:
         rows = [(one.effect, one.like, percent(one.share)) for one in diagnosis.lookalikes]
         words = (
-            "In these trials the look-alike, by itself, would make this share of what the claimed "
-            "effect does. A trial in which the two differ settles it."
+            "In these trials the look-alike alone reproduces this share of the signal of the "
+            "claimed effect. Only a trial in which the two act differently tells them apart."
         )
         found += [Block("heading", "Look-alikes"), Block("text", words)]
         found.append(table("lookalikes", ("claimed effect", "look-alike ", "share"), rows))

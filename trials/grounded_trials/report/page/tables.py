@@ -142,7 +142,7 @@ def effect_table(diagnosis: Diagnosis, since: Since) -> Block:
             figure(r.evidence, 3) if r.effect in beside else "",
             "" if r.effect in beside else figure(r.evidence, 3),
             figure(r.gap_after, 3),
-            percent(r.shrinkage),
+            percent(r.shrinkage) if not r.shrinkage < 0 else "none, it grows",
             _params(r),
         )
         for r in diagnosis.ranking
