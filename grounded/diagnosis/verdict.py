@@ -181,7 +181,7 @@ def _moved(claims: Claims) -> str:
     return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
 
 
-UNSURE = ", but its size is not confirmed: it is within 2 standard deviations of zero"
+UNSURE = ", but its size is uncertain: within 2 standard deviations of zero"
 
 
 def _others(claims: Claims, identified: Sequence[Identifiable]) -> str:

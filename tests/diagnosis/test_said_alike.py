@@ -134,7 +134,7 @@ def test_why_no_cause_is_named_is_a_field_that_survives_json():
 
 
 @pytest.mark.parametrize(("std", "sure"), [(0.4, True), (0.6, False), (float("inf"), False)])
-def test_a_trend_within_two_standard_deviations_of_zero_is_said_to_be_unconfirmed(std, sure):
+def test_the_size_of_a_trend_within_two_standard_deviations_of_zero_is_called_uncertain(std, sure):
     """A log's volts "got 3.93 % stronger every second" by 1.6 standard deviations."""
     effect = Library().effect("input_fade:u", MODEL)
     said = _verdict(effect, {"k": Estimate(-1.0, std, None, "1/s")})
