@@ -182,7 +182,7 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
         for value in (found.before, found.after)
     )
     whole = count(found.trials, "whole trial")
-    text = f"rms error of the predicted utility of {whole}: {without} by the crude model"
+    text = f"rms error of the predicted utility of {whole}: {without} by the model"
     if diagnosis.effects:
         text += f", {better} by the diagnosed one"
     if found.trials > 1:
