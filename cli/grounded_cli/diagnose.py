@@ -142,7 +142,7 @@ def _show(found: Diagnosis, nominal: dict[str, float], *, details: bool) -> None
     show(_verdict(found))
     _instruments(found.preflight)
     for text in found.unknowable:
-        if text not in found.sentence:
+        if text != found.verdict.limit:
             show(field("caveats", text))
     if not found.no_cause:
         if found.prediction_error:
@@ -172,7 +172,7 @@ def _held_out(found: Diagnosis) -> str:
     }
     noise = {
         "repeats": "the scatter of repeats",
-        "alike": "the scatter of trials whose commands agree to 2 %",
+        "alike": "at most the scatter of trials whose commands agree to 2 %",
         "short horizon": "extrapolated from one-step errors",
     }
     if row.floor_at_most:
@@ -230,14 +230,14 @@ def _places(found: Diagnosis, *, details: bool) -> None:
     where = found.where
     channels = [c for c in where.channels if c.share >= LEAST_SHARE]  # NaN: the gap is noise
     regions = [
-        f"{percent(one.share)} falls into {percent(one.occupancy)} of the time, where {one.told}"
+        f"{percent(one.share)} in the {percent(one.occupancy)} of the time in which {one.told}"
         for one in where.regions[: REGIONS if details else 1]
     ]
     if not channels:
         return
     if not details:
         parts = [f"{percent(c.share)} in {c.name}" for c in channels[:CHANNELS]]
-        text = "; ".join([f"of the gap, {listed(parts)}", *regions])
+        text = f"of the one-step errors beyond the noise, {'; '.join([listed(parts), *regions])}"
         return show("\n" + field("where", text))
     rows = [(c.name, percent(c.share), with_unit(number(c.rms, 3), c.unit)) for c in channels]
     show("\n" + table(rows, ("where", "share of the gap", "rms")))
@@ -254,19 +254,19 @@ def _places(found: Diagnosis, *, details: bool) -> None:
 def _effects(found: Diagnosis, *, details: bool) -> None:
     """Print the claimed effects and what ties with them, or with `details` all rivals."""
     from grounded.diagnosis.tables import effect_table
-    from grounded.diagnosis.verdict import told_apart
 
     rows, header = effect_table(found, rivals=details)
+    tied = " (a tied effect: in place of the claimed one)" * bool(found.indistinguishable)
     if rows:
         show("\n" + table(rows, header))
         _note(
             "credit: share of the improvement lost without it; evidence: log-likelihood lost "
-            "without it" + "; of rivals, gained by it alone" * details + "; +-: one standard "
-            "deviation" + _if_right(found)
+            "without it"
+            + tied
+            + "; alone: log-likelihood gained by it alone" * ("alone [nats]" in header)
+            + "; +-: one standard deviation"
+            + _if_right(found)
         )
-    for group in found.indistinguishable:
-        if (text := told_apart(group, found.equivalent)) not in found.sentence:
-            show(field("tied", text))
 
 
 def _if_right(found: Diagnosis) -> str:

@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, parallel
-from grounded_cli.terminal import field, names_in, number, remark, show, show_json, stages, table
+from grounded_cli.terminal import (
+    field,
+    lines,
+    names_in,
+    number,
+    remark,
+    show,
+    show_json,
+    stages,
+    table,
+)
 from grounded_trials.wording import count, shown
 
 if TYPE_CHECKING:
@@ -18,6 +28,11 @@ if TYPE_CHECKING:
 STANDS_IN = (
     "fitted parameters can also compensate for effects that the equations lack (a mass for a "
     "friction): `grounded diagnose` separates the two, on the same trials"
+)
+HELD_OUT = (  # `fit.parameters.split_in_time`
+    "rms, open loop, on data that this fit did not use: the last quarter of each trial, or every "
+    "fourth trial if they are short. `grounded diagnose` predicts all trials, each with values "
+    "from the others, so its errors differ"
 )
 
 
@@ -56,6 +71,7 @@ def command(params: str | None, latency: bool, apply_: bool, engine: Engine, jso
     show("\n" * bool(corrected) + _parameters(found))
     if found.before is not None and found.after is not None:
         show(f"\n{_errors(found, workspace.base_model)}")
+        show("\n".join(lines(HELD_OUT, "  ", "  ")))
     remark("fit", f"{found.sentence}; {count(found.samples, 'sample')}")
     if apply_:
         show("\nwritten to grounded.toml [model] params")

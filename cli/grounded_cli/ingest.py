@@ -25,6 +25,7 @@ AGAIN = "run again"  # a verdict
 VERDICTS = {
     "first": ": what the search improves on",
     "better": ": the best so far",
+    "maybe better": ": the best so far, by less than the scatter of repeats may explain",
     "no better": " than the best so far",
     "crashed": ": it did not run to the end",
     "waiting": ": more trials of it are needed ([search] repeats)",

@@ -277,12 +277,14 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     if len(missed) == 1:
         promised, real = number(promises[-1]), number(last[-1].utility)
         said = number(last[-1].candidate.predicted_utility)
-        noise = f" ({said} without sensor noise)" * (said != promised)
-        text = f"the last prediction was {promised}{noise}, the real run gave {real}"
+        noise = f" ({promised} in its log, with sensor noise)" * (said != promised)
+        text = f"the last prediction was {said}{noise}, the real run gave {real}"
         if failed:
-            text = f"the last run failed, where {promised}{noise} was predicted"
+            text = f"the last run failed, where {said} was predicted"
     elif not failed:
-        text = f"the last {len(whole)} predictions missed by {listed(whole)}"
+        noisy = any(one.promised != one.candidate.predicted_utility for one in last)
+        counted = ", with sensor noise," * noisy
+        text = f"the last {len(whole)} predictions{counted} missed by {listed(whole)}"
     elif not whole:
         text = f"the last {failed} runs failed"
     else:

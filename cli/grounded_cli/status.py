@@ -92,7 +92,8 @@ def summary(status: Status) -> str:
 
 def _gained(standing: Standing) -> str:
     """Return by how much the best candidate beats the model's own policy, as a sentence's end."""
-    from grounded.search.certainty import owed_to_start
+    from grounded.search.candidate import SURE
+    from grounded.search.certainty import chance, owed_to_start
 
     best, own = standing.incumbent, standing.history[0]
     if best is None or best.candidate is own.candidate or own.candidate.base or not own.utilities:
@@ -101,6 +102,8 @@ def _gained(standing: Standing) -> str:
         return "; the model's own policy failed"
     if best.candidate.base == "" or not own.utility:
         return ""
+    if chance(own, best, standing.history) < SURE:
+        return "; the scatter of repeats may explain its lead on the model's own policy"
     percent = 100 / abs(own.utility)
     gain = f", {percent * (best.utility - own.utility):.1f} % better than the model's own policy"
     if start := owed_to_start(own, best, standing.history):

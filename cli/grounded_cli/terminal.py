@@ -29,7 +29,9 @@ BOLD, ALARM, _END, GOOD, DOUBT = _MARKS
 MEANING = {
     **dict.fromkeys(("better", "first", "effect", "several", "none", "converged"), GOOD),
     **dict.fromkeys(("crashed", "failed", "DAMAGED", "damaged", "lost"), ALARM),
-    **dict.fromkeys(("in doubt", "waiting", "unknown", "UNSURE", "warning", "left out"), DOUBT),
+    **dict.fromkeys(
+        ("in doubt", "maybe better", "waiting", "unknown", "UNSURE", "warning", "left out"), DOUBT
+    ),
 }  # words shown in colour on a terminal
 
 

@@ -40,7 +40,7 @@ GREEK = (
 def called(model: Model, name: str) -> str:
     """Name a state or input in a sentence: `the speed v`, `the state delta`, `the throttle`.
 
-    Symbols (short names, Greek letters, names with digits) get a noun in front.
+    Symbols (short names, Greek letters, names with digits) and plurals (volts) get a noun in front.
     """
     from grounded.effects import places
 
@@ -52,7 +52,9 @@ def called(model: Model, name: str) -> str:
         "angle": model.angles,
     }
     word = next((role for role, played in roles.items() if name in played), "")
-    if not word and (len(name) <= 3 or re.fullmatch(GREEK, name) or not name.isalpha()):
+    if not word and (
+        len(name) <= 3 or re.fullmatch(GREEK, name) or not name.isalpha() or name.endswith("s")
+    ):
         word = "input" if name in model.input_names else "state"
     return f"the {name}" if not word or name == word else f"the {word} {name}"
 
@@ -80,7 +82,7 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
             return f"{number(value)} %"
         return f"{number(abs(value))} % {more if value >= 0 else less}"
 
-    told = set(_told(params))
+    told = {*_told(params), *(n for n, e in constants.items() if e.value)}
 
     def kept(found: re.Match[str]) -> str:  # parts whose quantities are estimated and not zero
         parts = found[1].split(" & ")

@@ -85,6 +85,11 @@ class Split(Document):
     irreducible_from: str = "noise"
     irreducible_unsure: float = field(metadata=BRIEF, default=0.0)
 
+    @property
+    def bound(self) -> bool:
+        """Whether the irreducible part is an upper bound."""
+        return self.irreducible_from in ("at most", "alike")
+
     def may_be_noise(self, parts: Parts | ChannelParts) -> bool:
         """Check whether the unexplained part is within the uncertainty of the noise."""
         left, bound = parts.unexplained + parts.irreducible, self.irreducible_from == "at most"
@@ -191,6 +196,14 @@ class RulerRow(Document):
     outset: Mapping[str, float] = field(metadata=BRIEF, default_factory=dict)
     runs_away: Mapping[str, tuple[str, ...]] = field(metadata=BRIEF, default_factory=dict)
     drowned: bool = field(metadata=BRIEF, default=False)
+
+    @property
+    def floor_bound(self) -> bool:
+        """Whether the noise is at most `noise_floor`.
+
+        The scatter of trials that are merely alike also holds the difference of their commands.
+        """
+        return self.floor_at_most or self.floor_from == "alike"
 
     def tells(self, name: str, *columns: str) -> bool:
         """Check that the errors of a channel are meaningful: none of these columns runs away."""
@@ -301,15 +314,12 @@ def beside_noise(errors: Sequence[float], floor: float, unit: str, *, at_most: b
     """Return errors as text in one unit, then the noise as `" (noise: 0.1 rad)"`.
 
     Args:
-        errors: the first one is compared with the noise.
+        errors: one or more.
         floor: the error from noise alone; if it is not known, the last text is empty.
         unit: unit of all of them.
         at_most: `floor` is an upper bound.
     """
     if not 0 < floor < math.inf:
         return [*measured_alike(errors, unit), ""]
-    if at_most and errors[0] <= ABOVE * floor:
-        bound = " (noise: at most that; only repeated trials can show)"
-        return [*measured_alike(errors, unit), bound]
     *told, noise = measured_alike([*errors, floor], unit)
     return [*told, f" (noise: {'at most ' * at_most}{noise})"]

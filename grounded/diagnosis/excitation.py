@@ -152,7 +152,7 @@ def probe(
         return None
     expected, chosen, words = best
     if expected < NOTHING:
-        same = f"no probe can distinguish {group[0]} from {group[1]}: with the other values"
+        same = f"No probe can distinguish {group[0]} from {group[1]}: with the other values"
         text = f"{same} refitted they are equivalent"
         return Probe(chosen, expected, (group[0], group[1]), text, little=True)
     gain = f"{expected:,.{int(expected < 100)}f} nats"

@@ -28,7 +28,7 @@ MODELS = {  # keys of a prediction error: role, name
 def models(error: RulerRow) -> dict[str, tuple[str, str]]:
     """Return `MODELS`, with the noise labelled as a bound if it is one."""
     bound = {"noise_floor": ("other", "noise, at most")}
-    return MODELS | bound if error.floor_at_most else MODELS
+    return MODELS | bound if error.floor_bound else MODELS
 
 
 def _told_apart(errors: Sequence[RulerRow]) -> dict[str, tuple[str, str]]:
@@ -70,7 +70,7 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
     if not panels:
         return None
     where = "on held-out data" if held else "on the data used for the diagnosis"
-    least = "" if any(e.floor_at_most for e in errors) else " No model gets below the noise."
+    least = "" if any(e.floor_bound for e in errors) else " No model gets below the noise."
     caption = f"Rms error of predictions, {where}.{least}"
     key = tuple(sorted(legend(panels), key=lambda one: one.role == "other"))
     return Figure("accuracy", "Predictions before and after", caption, tuple(panels), key)

@@ -38,11 +38,10 @@ Kind = Literal["effect", "several", "none", "unknown"]
 class Verdict(Document):
     """The verdict: its kind, the effects that it claims, and sentences that explain them.
 
-    `sentences` has one entry per line, `sentence` joins them. The first sentence is made of
-    `clauses`, which describe the `causes` (a clause each, in the order of `Diagnosis.credit`), or
-    groups of them if there are many. `parameters` are those of the model that are off, with or
-    without effects. `look_for` is the number of effects to search for before any is adopted, if the
-    usual number leaves more than noise; else 0.
+    `sentences` has one entry per line, `sentence` joins them. The first is made of `clauses`, one
+    per cause in the order of `Diagnosis.credit`, or per group of `causes`. `parameters` are those
+    that are off. `look_for`: number of effects to look for before any is adopted, if the usual one
+    leaves more than noise, else 0. `limit`: why no cause is named, an entry of `unknowable`.
     """
 
     kind: str  # one of `Kind`
@@ -53,6 +52,7 @@ class Verdict(Document):
     clauses: tuple[str, ...] = ()
     parameters: tuple[str, ...] = ()
     look_for: int = 0
+    limit: str = field(metadata=BRIEF, default="")
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -337,7 +337,7 @@ class Diagnosis(Document):
     @property
     def no_cause(self) -> bool:
         """Whether the data are insufficient to name any cause; figures are meaningless then."""
-        return self.kind == "unknown" and any(text in self.sentence for text in self.unknowable)
+        return bool(self.verdict.limit)
 
     def ranked(self, effect: str) -> Ranked | None:
         """Return the row of an effect, or None if it is not in the ranking."""

@@ -146,6 +146,7 @@ def in_doubt(rows: Sequence[RulerRow]) -> str:
     values = [row.with_effects[name], row.noise_floor[name]]
     error, noise = measured_alike(values, row.unit_by_channel[name])
     few = f"known only to a factor of {doubt_of(row.floor_unsure):.2g} from so few repeats"
+    noise = f"{'at most ' * row.floor_bound}{noise}"
     return f"{_when(row)} {name} is off by {error}, {times:.2g} times its noise of {noise}, {few}"
 
 
@@ -186,7 +187,7 @@ def rest(rows: Sequence[RulerRow]) -> str:
         return ""
     times, share, name, row = max(found, key=lambda one: one[:3])
     when = _when(row)
-    least = "at least " * rows[0].floor_at_most
+    least = "at least " * row.floor_bound
     text = f"the state {name} is still off by {least}{times:.2g} times the noise {when}"
     if share < MATTERS:
         of = f"{100 * share:.1g} % of the crude model's error"
@@ -203,4 +204,4 @@ def _told(row: RulerRow, name: str, *columns: str) -> list[str]:
     """Return a state's errors in these columns, then the noise as text, in one unit."""
     errors = [getattr(row, column)[name] for column in columns]
     noise, unit = row.noise_floor.get(name, math.nan), row.unit_by_channel[name]
-    return beside_noise(errors, noise, unit, at_most=row.floor_at_most)
+    return beside_noise(errors, noise, unit, at_most=row.floor_bound)

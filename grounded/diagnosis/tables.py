@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from grounded.instruments.finding import Finding
 
 Cells = tuple[str, ...]
-EFFECTS = 8  # rows of the table of effects
+EFFECTS = 8  # rows of the table of effects, more if more are claimed or tied
 
 
 def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[list[Cells], Cells]:
@@ -36,7 +36,7 @@ def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[lis
     }
     if any(row.outset for row in ahead):
         columns["crude"] = "now"
-    if any(row.floor_at_most for row in ahead):
+    if any(row.floor_bound for row in ahead):
         columns["noise_floor"] = "noise, at most"
     for key in ("outset", "calibrated"):
         if not any(getattr(row, key) for row in ahead):
@@ -78,24 +78,46 @@ def instrument_lines(findings: Iterable[Finding]) -> list[str]:
 def effect_table(diagnosis: Diagnosis, *, rivals: bool = True) -> tuple[list[Cells], Cells]:
     """Return (rows, header) of the effects that were compared, the claimed ones first.
 
+    Every claimed effect and every tied one has a row; rivals fill the table up to EFFECTS rows. The
+    evidence of a rival is what it gains alone, so it has a column of its own.
+
     Args:
         diagnosis: the result.
         rivals: whether to list effects that are neither claimed nor tied with a claimed one.
     """
-    tied = {name for group in diagnosis.indistinguishable for name in group}
+    beside = weighed_beside(diagnosis)
+    own = [r for r in diagnosis.ranking if r.effect in beside]
+    others = [r for r in diagnosis.ranking if r.effect not in beside] if rivals else []
+    others = others[: max(EFFECTS - len(own), 0)]
+    columns = 2 if others else 1  # of evidence
     rows: list[Cells] = [
         (
             ("* " if r.claimed else "  ") + r.effect,
             credit_of(diagnosis, r.effect),
-            "-" if math.isnan(r.evidence) else f"{r.evidence:,.{int(abs(r.evidence) < 1000)}f}",
+            *((_evidence(r), "") if r in own else ("", _evidence(r)))[:columns],
             _values(r),
         )
-        for r in diagnosis.ranking[:EFFECTS]
-        if rivals or r.claimed or r.effect in tied
+        for r in (*own, *others)
     ]
     if rows and (share := credit_of(diagnosis, "calibration")):
-        rows.insert(0, ("  (calibration)", share, "", "the model's own parameters"))
-    return rows, ("effect (*: claimed)", "credit", "evidence [nats]", "value")
+        blank = ("", "")[:columns]
+        rows.insert(0, ("  (calibration)", share, *blank, "the model's own parameters"))
+    evidence = ("evidence [nats]", "alone [nats]")[:columns]
+    return rows, ("effect (*: claimed)", "credit", *evidence, "value")
+
+
+def weighed_beside(diagnosis: Diagnosis) -> set[str]:
+    """Return the effects whose evidence is what is lost without them: claimed or tied with these.
+
+    That of the other ranked effects is what they gain alone.
+    """
+    tied = {name for group in diagnosis.indistinguishable for name in group}
+    return tied | {row.effect for row in diagnosis.ranking if row.claimed}
+
+
+def _evidence(row: Ranked) -> str:
+    decimals = int(abs(row.evidence) < 1000)
+    return "-" if math.isnan(row.evidence) else f"{row.evidence:,.{decimals}f}"
 
 
 def _values(row: Ranked) -> str:

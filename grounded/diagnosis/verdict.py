@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 from grounded.diagnosis.cause_words import clauses, give_or_take, meaning
 from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, furthest, runaway
-from grounded.diagnosis.report import Kind, Ranked, Unconfirmed, Verdict
+from grounded.diagnosis.report import Identifiable, Kind, Ranked, Unconfirmed, Verdict
 from grounded.diagnosis.ruler_words import explained, floor, improvement, rest, worsened
 from grounded.diagnosis.stopped import AT_BOUNDS, ENDED, wider
 from grounded.instruments.finding import Finding, in_the_log
 from grounded.model import all_at_bounds
-from grounded.result import listed
+from grounded.result import listed, percent
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.validation.claims import Claims
@@ -34,7 +34,7 @@ def verdict(
     same: tuple[tuple[str, ...], ...] = (),
     most: int = 0,
     one_motion: bool = False,
-    given: Mapping[str, Sequence[str]] | None = None,
+    identified: Sequence[Identifiable] = (),
 ) -> Verdict:
     """Return the verdict (effect, several, none or unknown) with its sentences.
 
@@ -49,8 +49,7 @@ def verdict(
         same: those of `groups` that are equivalent in this model.
         most: the largest number of effects that was looked for; 0 for no limit.
         one_motion: whether all trials repeat one motion.
-        given: by parameter, the parameters that it is only known relative to
-            (`Identifiable.given`).
+        identified: how well the trials identify each parameter, and relative to which others.
     """
     from grounded.effects import like_a_load
 
@@ -62,7 +61,8 @@ def verdict(
     claimed = [row for row in ranking if row.claimed]
     row = furthest(rows)
     if claims.known.no_cause:
-        return _said("unknown", f"No cause is named: {claims.known.sentences[0]}.")
+        why = claims.known.sentences[0]
+        return replace(_said("unknown", f"No cause is named: {why}."), limit=why)
     if not claimed:
         if remainder:
             return _said("unknown", f"A gap remains that no known effect explains: {left}.", *once)
@@ -74,7 +74,7 @@ def verdict(
         else:
             text = explained(rows)
         return _said("none", text, *once)
-    causes = _causes(claims, ranking, credit, given or {})
+    causes = _causes(claims, ranking, credit, identified)
     told = clauses(
         [one.of for one in credit],
         causes,
@@ -85,7 +85,7 @@ def verdict(
     words = [sentence(told), improvement(rows), worsened(rows)]
     words += [runaway(rows), wider(claims.parameters())]
     words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed])
-    words += [f"{told_apart(group, same)}." for group in groups[:1]]
+    words += [f"{told_apart(group, same)}." for group in groups]
     words += [one.sentence() for one in claims.one_clock[:1]]
     more = 0
     if remainder and len(claims.names) == most:
@@ -132,17 +132,23 @@ def _causes(
     claims: Claims,
     ranking: Sequence[Ranked],
     credit: Sequence[Credit],
-    given: Mapping[str, Sequence[str]],
+    identified: Sequence[Identifiable],
 ) -> tuple[str, ...]:
     """Return one clause per cause, the largest first."""
+    from grounded.diagnosis.validation.claims import has_size
+    from grounded.diagnosis.validation.motions import KNOWN
+
     effects = {e.name: e for e in claims.best.hypothesis.effects}
+    given = {one.parameter: tuple(one.given) for one in identified}
     values = {row.effect: row.params for row in ranking}
     found = []
     for one in credit:
         if one.of in effects:
             text = meaning(effects[one.of], values[one.of])
+            text += UNSURE * (not has_size(effects[one.of], values[one.of], KNOWN))
         else:
             text = f"the model's own parameters are off: {_moved(claims)}"
+            text += _others(claims, identified)
             held = dict.fromkeys(other for n in _off(claims)[:NAMED] for other in given.get(n, ()))
             text += f", given {listed(held)} as in the model" * bool(held)
         found.append(text)
@@ -173,6 +179,28 @@ def _moved(claims: Claims) -> str:
         texts.append(f"{name} should be {give_or_take(known[name])}{part}")
     more = len(named) - NAMED
     return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
+
+
+UNSURE = ", but its size is uncertain: within 2 standard deviations of zero"
+
+
+def _others(claims: Claims, identified: Sequence[Identifiable]) -> str:
+    """Return a clause on the parameters that are adopted too, though they need not be off.
+
+    They were calibrated together with those that are off, whose values are only valid with them.
+    """
+    params, known, off = claims.data.model.params, claims.parameters(), _off(claims)
+    lost = {one.parameter for one in identified if one.verdict == "not identifiable"}
+    old = {name: params[name].value for name in known if name not in (*off, *lost)}
+    if not old:
+        return ""
+    one = len(old) == 1
+    by = ""
+    if all(old.values()):
+        most = max(abs(known[name].value / value - 1) for name, value in old.items())
+        by = f" by {'' if one else 'at most '}{percent(most)}"
+    others = f"{len(old)} other{'' if one else 's'}"
+    return f"; {others}, changed with {'it' if len(off) == 1 else 'them'}{by}, may be right"
 
 
 def next_trial(
@@ -208,7 +236,7 @@ def next_trial(
     if groups and groups[0] in same:
         return f"None helps: {told_apart(groups[0], same)}, so adopt either."
     if groups:
-        made = f"A trial made for it may tell {tied(groups[0])}."
+        made = f"A trial designed for it may tell {tied(groups[0])}."
         turns = bool(places.plane(claims.data.model))
         return " ".join([made, *distinguishing(groups[0], turns=turns)])
     if seen:
@@ -220,7 +248,7 @@ def next_trial(
             return f"Repeat trial {one.trial}: few others show {one.effect}."
         there = "" if one.region is None else f" that goes where {one.region.told}"
         better = f"run a gentler one{there}" if why == LOST else f"record another one{there}"
-        return f"Only {one.trial} clearly shows {one.effect}, and it {why}: {better}."
+        return f"Trial {one.trial} shows {one.effect} best, but it {why}: {better}."
     if not claims.names and look:
         return look
     if not claims.names and not claims.blamed:

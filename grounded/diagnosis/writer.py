@@ -131,7 +131,7 @@ class Writer:
             same,
             self.most,
             one_motion=moved == 1 < data.count,
-            given={one.parameter: tuple(one.given) for one in identified},
+            identified=identified,
         )
         further = said.look_for > 0
         return Diagnosis(

@@ -143,8 +143,8 @@ saturation = InputFamily(
 input_curve = InputFamily(
     name="input_curve",
     equation="u_eff = (1 + a sign(u) + b (|u| / U - 1/2)) u",
-    sentence="{target} acts[ {a%more|less} to its positive side than to its negative, and] "
-    "{b%more|less} at {U}, the most in the log, than near zero",
+    sentence="the gain of {target} is [{a%higher|lower} for positive commands than for negative "
+    "ones & {b%higher|lower} at {U}, its largest command in the log, than near zero]",
     ratio=_end_to_end,
     targets=places.inputs,
     quantities=_curve,
@@ -165,7 +165,8 @@ def _fade(site: Site) -> tuple[Quantity, ...]:
 input_fade = InputFamily(
     name="input_fade",
     equation="u_eff = (1 - k t) u",
-    sentence="{target} gets {k%weaker every second (a battery that sags)|stronger every second}",
+    sentence="the gain of {target} gets {k%lower every second (a battery that sags)|higher every "
+    "second}",
     targets=places.inputs,
     quantities=_fade,
     lookalikes=("input_gain", "trend", "input_bias"),

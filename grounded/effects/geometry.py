@@ -254,7 +254,7 @@ patch = RateFamily(
     name="patch",
     loose=True,
     equation="s' = model + c exp(-|q - q0|^2 / (2 radius^2))",
-    sentence="{target} differs by {c} at one place",
+    sentence="the rate of {target} differs by {c} at one place",
     targets=_patch_targets,
     quantities=_patch,
     lookalikes=("slope", "periodic", "trend"),

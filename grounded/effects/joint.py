@@ -240,7 +240,7 @@ joint_friction = LossFamily(
 load_friction = LossFamily(
     name="load_friction",
     equation="u_eff = u - (c + k |u - u_load| / 2) sign(w) - b w   (u<-w)",
-    sentence="{driven} loses {c} and {k%} of what its gear carries to dry friction[, and {b} times "
+    sentence="{driven} loses {c} plus {k%} of the load on its gear to dry friction[, and {b} times "
     "{source} to viscous friction]",
     targets=pairs_of,
     quantities=_loaded,

@@ -139,7 +139,7 @@ periodic = RateFamily(
 slew_limit = RateFamily(
     name="slew_limit",
     equation="s' = clip(model, -r, r)",
-    sentence="{target} moves by at most {r}",
+    sentence="{target} can't change faster than {r}",
     targets=places.following,
     quantities=lambda site: speed_limit(site, per(site.unit(site.target))),
     lookalikes=("rate_limit", "first_order_lag", "saturation"),

@@ -27,6 +27,7 @@ Slopes = Literal[
 ]
 
 LITTLE = 0.1  # fraction of the best cost below which a doubtful gain is no reason to continue
+SURE = 0.95  # probability of an improvement from which it counts as one
 UNLIKE = 0.2  # fraction of a predicted gain: a difference of the base's utility that matters
 
 if TYPE_CHECKING:
@@ -152,6 +153,7 @@ class Tried(Result):
     pieces: Array | None = None  # (runs, PIECES) parts of the utilities, see `scatter`; of repeats
     noise_cost: float = 0.0  # cost of sensor noise in its logs; of the best, and for `promised`
     deviation: float = float("nan")  # standard deviation of a single run, from repeats (`scatter`)
+    probability: float = float("nan")  # that it beats the best before it; NaN: nothing is repeated
 
     @cached_property
     def utility(self) -> float:
@@ -180,6 +182,9 @@ class Tried(Result):
     def verdict(self, last: bool = True) -> str:
         """Return the verdict: first, better, no better, crashed; or why it is undecided.
 
+        It is "maybe better" if its runs were better, but by so little that the scatter of repeats
+        may explain it.
+
         Args:
             last: whether it is the latest candidate; an earlier one without a trial gets "no
                 trial" instead of "waiting".
@@ -190,7 +195,9 @@ class Tried(Result):
             return "waiting" if last or self.trials else "no trial"
         if not self.accepted:
             return "crashed" if self.utility == -np.inf else "no better"
-        return "better" if self.candidate.base else "first"
+        if not self.candidate.base:
+            return "first"
+        return "maybe better" if self.probability < SURE else "better"
 
     def summary(self) -> str:
         """Return the id, the utility and the verdict."""
@@ -202,6 +209,7 @@ class Tried(Result):
         return self.candidate.to_json() | document(
             utility=self.utility,
             standard_error=self.standard_error,
+            probability=self.probability,
             noise_cost=self.noise_cost,
             trials=[trial.id for trial in self.trials],
             accepted=self.accepted,

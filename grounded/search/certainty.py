@@ -78,8 +78,10 @@ def judged(
         history.append(tried)
     best_one = incumbent and incumbent.candidate
     asked = [t.candidate is best_one or not t.candidate.grounded for t in history]
-    told = with_errors(
-        [_with_noise(task, t) if ask else t for ask, t in zip(asked, history, strict=True)]
+    told = with_chances(
+        with_errors(
+            [_with_noise(task, t) if ask else t for ask, t in zip(asked, history, strict=True)]
+        )
     )
     best = next((t for t in told if t.candidate is best_one), None)
     return told, best, iteration
@@ -116,6 +118,33 @@ def in_doubt(incumbent: Tried, loser: Tried, history: Sequence[Tried], most: int
     return not incumbent.utility - loser.utility > 2 * error
 
 
+def with_chances(history: Sequence[Tried]) -> tuple[Tried, ...]:
+    """Return the candidates; every improvement gets the probability that it is one."""
+    found, best = list(history), None
+    for k, tried in enumerate(history):
+        if tried.accepted and best is not None:
+            found[k] = replace(tried, probability=chance(best, tried, history))
+        best = tried if tried.accepted else best
+    return tuple(found)
+
+
+def chance(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
+    """Return the probability that a later candidate is better than an earlier one.
+
+    The part of the gain that is due to different start states does not count.
+
+    Returns:
+        The probability; NaN if no candidate of similar utility was repeated.
+    """
+    if not math.isfinite(before.utility):  # it failed
+        return 1.0
+    gain = after.utility - before.utility - owed_to_start(before, after, history)
+    error, freedom = error_between(before, after, history)
+    if not freedom:
+        return math.nan
+    return student(gain / error, freedom) if error else float(gain > 0)
+
+
 def last_improvement(history: Sequence[Tried], again: str = "run the best one again") -> str:
     """Return a sentence on how certain the last accepted improvement is; "" before there is one.
 
@@ -142,10 +171,9 @@ def last_improvement(history: Sequence[Tried], again: str = "run the best one ag
         )
     if error == 0:
         return f"the last gain is {gain:.3g}; repeated trials agree exactly"
-    probability = student(gain / error, freedom)
     return (
         f"the last gain is {gain:.3g} +- {error:.2g}: an improvement with probability "
-        f"{probability:.2f}" + ", from few repeats" * (freedom < FEW)
+        f"{chance(before, after, history):.2f}" + ", from few repeats" * (freedom < FEW)
     )
 
 

@@ -39,8 +39,9 @@ def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
     whole = _utility(now, tried, number, optimum)
     near = (_near(whole),) if whole.loss and len(tried) > NEAR else ()
     panels = (whole, *near, _steps(now, shown, number))
+    unsure = any(now.verdict(t) == "maybe better" for t in shown)
     key = [
-        Key("best", "first or better", "disc"),
+        Key("best", f"first{', maybe better' * unsure} or better", "disc"),
         Key("other", "no better", "ring"),
         *_undecided([now.verdict(t) for t in shown]),
         Key("predicted", "predicted by the model", "dash"),

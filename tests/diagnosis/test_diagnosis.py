@@ -246,14 +246,17 @@ def test_sentences_are_english():
         "has it so, set [log] scale = -1."
     )
     assert said("rate_gain:v", g=-2.0) == "The speed v changes the other way round."
-    assert said("input_fade:throttle", k=-0.05) == "The throttle gets 5 % stronger every second."
+    assert said("input_fade:throttle", k=-0.05) == (
+        "The gain of the throttle gets 5 % higher every second."
+    )
     assert said("input_fade:throttle", k=0.05) == (
-        "The throttle gets 5 % weaker every second (a battery that sags)."
+        "The gain of the throttle gets 5 % lower every second (a battery that sags)."
     )
     assert said("parameter:k", d=0.1) == "The parameter k should be 1.1 1/s instead of 1."
-    curve = "The throttle acts 40 % less at 1, the most in the log, than near zero."
+    bent = "40 % lower at 1, its largest command in the log, than near zero"
+    curve = f"The gain of the throttle is {bent}."
     assert said("input_curve:throttle", a=0.0, b=-0.5) == curve  # 0.75 of 1.25
-    assert "50 % more to its positive side than to its negative, and" in (
+    assert f"is 50 % higher for positive commands than for negative ones and {bent}" in (
         said("input_curve:throttle", a=0.2, b=-0.5)  # 1.2 of 0.8
     )
     dry, sticky = "0.4 N to dry friction", "0.1 N s/m times the speed v to viscous friction"

@@ -44,6 +44,7 @@ def test_what_is_farthest_above_its_noise_is_left_over_first():
         best=None,
         flexible={"x": (flexible, None)},
         units={"x": "m", "v": "m/s", "th": "rad"},
+        source="short horizon",
         at_most=False,
         with_region=lambda row, left: replace(row, evidence=left.gain if left else np.nan),
     )

@@ -243,7 +243,7 @@ def test_a_noise_of_which_only_a_bound_is_known_is_told_as_one():
 
     unknown, state = said(0.9, 0.89)
     assert unknown.kind == "unknown" and "at most" in unknown.sentence and state == "x"
-    assert "89 cm" not in unknown.sentence and "explains the data" not in unknown.sentence
+    assert "at most 89 cm" in unknown.sentence and "explains the data" not in unknown.sentence
     known, state = said(0.9, 0.89, bound=False)
     assert known.kind == "none" and "89 cm" in known.sentence and not state
     assert "at least 9 times" in said(0.9, 0.1)[0].sentence

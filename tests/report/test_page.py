@@ -110,7 +110,7 @@ def test_page_shows_what_the_issue_lists(cart):
         "whole run (2 s)",
         "By state, 1 s ahead",
         "Is there a pattern in the rest?",
-        "by 3.21, the diagnosed one by 0.0456",
+        "3.21 by the model, 0.0456 by the diagnosed one",
         "coulomb_friction:v",
         "96.0 %",
         "first or better",

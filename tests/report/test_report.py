@@ -283,7 +283,7 @@ def test_a_workspace_of_data_only_shows_the_model_against_the_data(cart, tmp_pat
     assert [Path(p).stem for p in done.json["paths"]["png"]] == names
     assert "t0001, crude" in Path(done.json["paths"]["html"]).read_text()
     out = grounded("-C", folder, "report").out
-    assert holds(out, "2 logs") and "set right every 1 s" in out
+    assert holds(out, "2 logs") and "1 s after each restart" in out
 
 
 @pytest.mark.extra("view", "png")
@@ -300,21 +300,22 @@ def test_text_says_what_was_calibrated(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     out = " ".join(grounded("-C", folder, "report").out.split())
     assert "mass 1.00 -> 1.40 kg" in out
-    assert re.search(r"\brms; .*\butilities\b.* 1\.50\b", out)
+    assert re.search(r"\brms error of the predicted utility\b.*\butilities\b.* 1\.50\b", out)
     assert "scatter" not in out
     one = DIAGNOSIS["utility_prediction"] | {"trials": 1, "spread": 0.0}
     document = DIAGNOSIS | {"utility_prediction": one}
     write_document(folder / "reports" / "diagnosis.json", document)
     out = " ".join(grounded("-C", folder, "report").out.split())
-    assert "(rms)" in out and "(rms;" not in out
+    assert "rms error of the predicted utility" in out and "utilities vary" not in out
 
 
-def test_at_most_three_parameters_are_named_the_most_changed_first():
+def test_all_calibrated_parameters_are_named_the_most_changed_first():
     table = {f"p{k}": {"value": 1.0 + 0.1 * k, "std": 0.01, "unit": "m"} for k in range(6)}
     found = Diagnosis.from_json(DIAGNOSIS | {"parameters": table})
     text = calibrated_sentence(found, dict.fromkeys(table, 1.0))
     assert text == (
-        "calibrated as well: p5 1.00 -> 1.50 m, p4 1.00 -> 1.40 m, p3 1.00 -> 1.30 m (and 2 more)"
+        "calibrated with the effects: p5 1.00 -> 1.50 m, p4 1.00 -> 1.40 m, p3 1.00 -> 1.30 m, "
+        "p2 1.00 -> 1.20 m, p1 1.00 -> 1.10 m"
     )
 
 

@@ -132,7 +132,7 @@ def test_what_an_adopted_curve_does_at_its_end_is_told_with_that_end(cart, tmp_p
     curve = 'effects = [{name = "input_curve:force", a = 0.0, b = 0.4, U = 3.5}]'
     toml.write_text(toml.read_text().replace("[model]\n", f"[model]\n{curve}\n"))
     (clause,) = grounded("-C", folder, "report", "--json").json["adopted"]["clauses"]
-    assert "50 % more at 3.5" in clause
+    assert "50 % higher at 3.5 N" in clause
 
 
 def test_a_gain_that_nobody_measured_is_not_claimed(cart, tmp_path):

@@ -8,7 +8,13 @@ from scipy.stats import t, ttest_ind
 
 from facts import holds
 from grounded.search.candidate import Tried
-from grounded.search.certainty import error_between, last_improvement, owed_to_start, student
+from grounded.search.certainty import (
+    error_between,
+    last_improvement,
+    owed_to_start,
+    student,
+    with_chances,
+)
 from grounded.search.standing import _hardly
 
 
@@ -109,6 +115,23 @@ def test_a_verdict_is_one_of_a_few_words(accepted, base, doubt, trials, last, wo
     candidate = SimpleNamespace(id="c", base=base, model="m", **nothing)
     tried = Tried(candidate, (None,) * trials, (), accepted, in_doubt=doubt)
     assert tried.verdict(last) == word
+
+
+@pytest.mark.parametrize(
+    ("utility", "repeats", "word"),
+    [
+        (-3.9, (-4.0, -4.2, -3.8), "maybe better"),  # within the scatter of later repeats
+        (-2.0, (-4.0, -4.2, -3.8), "better"),
+        (-3.9, (-4.0,), "better"),  # nothing was repeated: the noise is unknown
+        (-3.9, (-4.0, -4.0, -4.0), "better"),  # a system that repeats itself exactly
+    ],
+)
+def test_a_run_within_the_scatter_of_repeats_is_not_called_better(utility, repeats, word):
+    history = with_chances([tried(-90.0, base=""), tried(*repeats), tried(utility)])
+    assert [one.verdict() for one in history] == ["first", "better", word]
+    said = last_improvement(history)
+    if word == "maybe better":
+        assert holds(said, f"probability {history[-1].probability:.2f}")
 
 
 def test_what_a_start_is_worth_is_no_improvement():

@@ -117,10 +117,13 @@ RANKED = 12  # explanations that are listed
 SAME = 0.95  # share of a parameter's signal from which an effect is equivalent
 
 
-def has_size(effect: Effect, known: Mapping[str, Estimate]) -> bool:
-    """Check whether the strength of an effect is known: its coefficients, or else thresholds."""
+def has_size(effect: Effect, known: Mapping[str, Estimate], least: float = LEAST_TOLD) -> bool:
+    """Check whether the strength of an effect is known: its coefficients, or else thresholds.
+
+    It is if one of them differs from zero by `least` standard deviations.
+    """
     strengths = [q.name for q in effect.free if not q.grid] or list(known)
-    return not all(abs(known[n].value) < LEAST_TOLD * known[n].std for n in strengths)
+    return not all(abs(known[n].value) < least * known[n].std for n in strengths)
 
 
 class Claims:

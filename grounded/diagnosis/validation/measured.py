@@ -238,7 +238,7 @@ class Measured:
                 floor=floor,
                 horizon_s=ruler.steps[at] * data.dt,
                 error_unit=self.units[name],
-                floor_at_most=self.at_most,
+                floor_at_most=self.at_most or self.source == "alike",
             )
             found.append((-error / max(floor, float(fine[i])), i, left, row))
         found.sort(key=lambda each: each[:2])

@@ -57,7 +57,7 @@ _MEANINGS: dict[str, tuple[str, ...]] = {
     "brake": ("brake",),
     "torque": ("torque", "effort", "tau"),
 }
-_BY_UNIT: dict[str, tuple[str, ...]] = {  # further names of an input by its unit
+NAMES_BY_UNIT: dict[str, tuple[str, ...]] = {  # further names of an input by its unit
     "V": ("voltage", "volts", "volt"),
     "A": ("current", "amps", "ampere"),
     "N m": ("torque", "effort", "tau"),
@@ -126,7 +126,7 @@ def guess_mapping(
     taken = {guess.path for guess in found}
     rest = []
     for name in inputs:
-        meanings = (*_MEANINGS.get(name, (name,)), *_BY_UNIT.get(units.get(name, ""), ()))
+        meanings = (*_MEANINGS.get(name, (name,)), *NAMES_BY_UNIT.get(units.get(name, ""), ()))
         found_for = _candidates(log, name, meanings, is_input=True)
         candidates = [c for c in found_for if c.field.path not in taken]
         guess = _choose(log, name, candidates, {})

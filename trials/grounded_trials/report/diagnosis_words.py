@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from grounded.diagnosis.cause_words import with_share
 from grounded.diagnosis.error_report import Gap
-from grounded.diagnosis.report import Correction, Diagnosis, Estimate
+from grounded.diagnosis.report import Correction, Diagnosis, Estimate, TrialValue
 from grounded.diagnosis.stopped import ENDED
 from grounded.result import listed
 from grounded_trials.wording import changed, count, figure, percent, ranges, with_unit
 
-MOST = 3  # parameters named in one sentence
+MOST = 3  # parameters whose dependence on held ones is stated one by one
 
 
 def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple[str, str]]:
@@ -35,7 +36,7 @@ def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple
         found.append(("utility", text))
     for effect in dict.fromkeys(one.effect for one in diagnosis.lookalikes):
         like = [
-            f"{one.like} {'could make ' * (k == 0)}{percent(one.share)}"
+            f"{one.like} {'reproduces ' * (k == 0)}{percent(one.share)}"
             for k, one in enumerate(o for o in diagnosis.lookalikes if o.effect == effect)
         ]
         found.append(("alike", f"{', '.join(like)} of the signal of {effect}"))
@@ -61,8 +62,8 @@ def correction_line(correction: Correction) -> str:
 def in_vain(diagnosis: Diagnosis) -> list[str]:
     """Return a sentence for each effect that is likely but improves no held-out prediction."""
     return [
-        f"{row.effect} alone is likely ({figure(row.evidence, 3)} nats), but it does not improve "
-        "held-out predictions"
+        f"{row.effect} alone is likely ({figure(row.evidence, 3)} nats), but held-out predictions "
+        "do not improve with it"
         for row in diagnosis.ranking
         if row.no_better
     ]
@@ -91,14 +92,29 @@ def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         if not one.agrees:
             values = [v for v in diagnosis.per_trial if v.effect == one.effect]
             values = [v for v in values if v.quantity == one.quantity]
-            low, high = (f(values, key=lambda v: v.value) for f in (min, max))
-            highest = with_unit(figure(high.value, 3), one.estimate.unit)
+            low, high = _furthest_apart(values)
+            ends = (Estimate(v.value, v.std, unit=one.estimate.unit) for v in (low, high))
+            lowest, highest = map(_with_spread, ends)
             text = (
-                f"trials disagree on {one.quantity} of {one.effect}: {figure(low.value, 3)} in "
-                f"{low.trial}, {highest} in {high.trial}"
+                f"trials disagree on {one.quantity} of {one.effect}: {lowest} in {low.trial}, "
+                f"{highest} in {high.trial}"
             )
             found.append(("agreement", text + f"; it {one.goes_with}" * bool(one.goes_with)))
     return found
+
+
+def _furthest_apart(values: Sequence[TrialValue]) -> tuple[TrialValue, TrialValue]:
+    """Return the two values that differ by most standard deviations, the smaller one first.
+
+    The extremes are often values that a trial hardly determines, and prove nothing.
+    """
+
+    def apart(pair: tuple[TrialValue, TrialValue]) -> float:
+        std = math.hypot(pair[0].std, pair[1].std)
+        return abs(pair[1].value - pair[0].value) / std if std > 0 else 0.0
+
+    low, high = max(itertools.combinations(values, 2), key=apart)
+    return (low, high) if low.value <= high.value else (high, low)
 
 
 def _with_spread(estimate: Estimate) -> str:
@@ -118,20 +134,21 @@ def gap_sentence(gap: Gap) -> str:
 
 
 def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> str:
-    """List the model parameters that were calibrated together with the effects."""
+    """List all model parameters that were calibrated together with the effects."""
     if all(name.startswith("parameter:") for name in diagnosis.effects):
         return ""
     made = diagnosis.made
     moved, then = [], {**before, **(made.nominal if made is not None else {})}
+    known = diagnosis.known_parameters
     for name, e in diagnosis.parameters.items():
         old = then.get(name, math.nan)
         if abs(e.value - old) > 1e-6 * max(abs(e.value), abs(old)):
             change = abs(e.value - old) / abs(old) if old else math.inf
             more = "".join(f" ({text})" for text in ENDED[e.stopped])
+            more += " (not identified, not adopted)" * (name not in known)
             moved.append((-change, changed(name, old, e.value, e.unit) + more))
-    named = ", ".join(text for _, text in sorted(moved)[:MOST])
-    others = len(moved) - MOST
-    return f"calibrated as well: {named}{f' (and {others} more)' * (others > 0)}" * bool(moved)
+    named = ", ".join(text for _, text in sorted(moved))
+    return f"calibrated with the effects: {named}" * bool(moved)
 
 
 def held_sentence(diagnosis: Diagnosis) -> str:
@@ -161,18 +178,17 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
     if found is None or not found.trials:
         return ""
     without, better = (
-        f"by {figure(value, 3)}" if math.isfinite(value) else "without bound (it diverges)"
+        figure(value, 3) if math.isfinite(value) else "without bound (it diverges)"
         for value in (found.before, found.after)
     )
     whole = count(found.trials, "whole trial")
-    how = "open loop, without the feedback that holds a run to its path, " * found.feedback
-    text = f"{how}the model misses the utility of {whole} {without}"
+    text = f"rms error of the predicted utility of {whole}: {without} by the model"
     if diagnosis.effects:
-        text += f", the diagnosed one {better}"
-    if found.trials < 2:
-        return f"{text} (rms)"
-    spread = figure(found.spread, 3)
-    return f"{text} (rms; the utilities themselves vary by {spread} between policies)"
+        text += f", {better} by the diagnosed one"
+    if found.trials > 1:
+        text += f"; the measured utilities vary by {figure(found.spread, 3)}"
+    how = "; predicted open loop, though the trials ran with feedback"
+    return text + how * found.feedback
 
 
 def verdict_lines(diagnosis: Diagnosis) -> tuple[list[str], list[str]]:

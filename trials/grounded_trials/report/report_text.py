@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 
 from grounded.diagnosis.tables import effect_table, error_table
 from grounded.errors import NextCommand
-from grounded.search.candidate import Tried
+from grounded.search.candidate import SURE, Tried
+from grounded.search.certainty import chance
 from grounded.search.pictures import few
 from grounded_trials.report.diagnosis_words import error_lines, verdict_lines
 from grounded_trials.report.findings import (
@@ -101,7 +102,10 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     if first is not None and best is not None:
         text = f"model's policy {figure(first.utility)}, "
         text += f"best {best.candidate.id} {figure(best.utility)}"
-        if math.isfinite(first.utility) and first.utility < 0:
+        top = findings.standing.incumbent
+        if top is not None and top is not history[0] and chance(history[0], top, history) < SURE:
+            text += "; the scatter of repeats may explain its lead"
+        elif math.isfinite(first.utility) and first.utility < 0:
             text += f", {100 * (1 - best.utility / first.utility):.1f} % better"
         if findings.optimum is not None:
             text += f", optimum {figure(findings.optimum)}"
@@ -172,8 +176,13 @@ def _logs(findings: Findings, table: Table) -> str:
     ahead = findings.ahead_s
     columns = [forecast_error(findings.crude, log.trial, ahead) for log in logs]
     rows = by_state(findings.task.model, columns)
-    title = f"data: what the {findings.plain}, set right every {ahead:.3g} s, misses by then, rms\n"
-    return title + table(rows, ("state", "unit", *(log.trial.id for log in logs)))
+    title = (
+        f"data: rms error of the {findings.plain} {ahead:.3g} s after each restart from the "
+        "measured state, by log, not held out"
+    )
+    return "\n".join([*wrapped(title, "", "  "), ""]) + table(
+        rows, ("state", "unit", *(log.trial.id for log in logs))
+    )
 
 
 def _wrapped(text: str, indent: str) -> list[str]:

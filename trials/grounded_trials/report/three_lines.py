@@ -69,7 +69,9 @@ def gained(
     for names, what in _improved(after, first, task):
         unit = shown(row.unit_by_channel[names[0]])
         told = (after,) if now == before else (after, first)
-        ends = measured_alike([_together(errors, names) for errors in told], unit)
+        noise = [row.noise_floor.get(names[0], 0.0)] if len(names) == 1 else []  # as the verdict
+        ends = measured_alike([*(_together(errors, names) for errors in told), *noise], unit)
+        ends = ends[: len(told)]
         parts.append(f"{what} by {' instead of '.join(ends)}")
     held = "" if row.held_out != "no" else ", not held out"
     ahead = f"{'Over whole trials' if row.whole_trial else f'{row.horizon_s:.3g} s ahead'}{held}"
@@ -99,7 +101,7 @@ def _together(errors: Mapping[str, float], names: list[str]) -> float:
 
 def still_open(diagnosis: Diagnosis) -> str:
     """What ties, and what no known effect explains."""
-    found = [told_apart(group, diagnosis.equivalent) for group in diagnosis.indistinguishable[:1]]
+    found = [told_apart(group, diagnosis.equivalent) for group in diagnosis.indistinguishable]
     found += [one.sentence() for one in diagnosis.unconfirmed[:1]]
     if diagnosis.leftover:
         others = len(diagnosis.leftover) - 1
@@ -111,5 +113,7 @@ def still_open(diagnosis: Diagnosis) -> str:
     nothing = in_doubt(rows) or "nothing is left above the noise"
     if worsened(rows):  # which is said elsewhere
         nothing = "it is open why predictions get worse with it there"
-    text = "; ".join(found) or rest(rows) or nothing
+    if not diagnosis.leftover and (small := rest(rows)):
+        found.append(small)
+    text = "; ".join(found) or nothing
     return f"{text[:1].upper()}{text[1:]}."

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from grounded.errors import GroundedError, nearest
+from grounded_trials.logs.inspect_guess import NAMES_BY_UNIT
 from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
 from grounded_trials.logs.inspect_pairs import rates_among
 from grounded_trials.logs.joint_names import from_base, slides
@@ -38,7 +39,7 @@ COMMANDED = re.compile(
 )
 ACTUATOR = re.compile("servo|actuator")  # either a command or a measured position
 EFFORT = re.compile("force|thrust|power")  # an input if nothing else looks like one
-EFFORT_UNITS = {"N", "N m", "V"}
+EFFORT_UNITS = NAMES_BY_UNIT.keys() - {"A"}  # a current in a log is mostly a measured one
 
 HEADING = re.compile(r"(^|[/._])(yaw|psi|heading|theta|th|orientation)([/._\d]|$)")
 SENSED = re.compile(

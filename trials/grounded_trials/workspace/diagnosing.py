@@ -209,13 +209,22 @@ def read_diagnosis(folder: Path) -> Diagnosis | None:
     """
     path = folder / FILE
     try:
-        return Diagnosis.from_json(read_document(path))
+        return _with_limit(Diagnosis.from_json(read_document(path)))
     except FileNotFoundError:
         return None
     except (ValueError, RecursionError, GroundedError) as error:
         raise GroundedError(
             f"{path} can't be read ({error}): diagnose again", then=NextCommand("diagnose")
         ) from None
+
+
+def _with_limit(found: Diagnosis) -> Diagnosis:
+    """Add `Verdict.limit` to a diagnosis of an older version, which has it only in the sentence."""
+    said = found.verdict
+    if said.limit or said.kind != "unknown":
+        return found
+    why = next((text for text in found.unknowable if text in said.sentence), "")
+    return replace(found, verdict=replace(said, limit=why))
 
 
 def _chosen(workspace: Folder, names: Sequence[str]) -> list[Trial]:

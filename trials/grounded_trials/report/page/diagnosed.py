@@ -57,7 +57,7 @@ def gap_section(findings: Findings) -> list[Block]:
 def _details(diagnosis: Diagnosis, since: Since) -> list[Block]:
     found = drawn(where_figure(diagnosis), title=True)
     if diagnosis.ranking:
-        found += [Block("heading", "Effects that were weighed"), effect_table(diagnosis, since)]
+        found += [Block("heading", "Effects that were compared"), effect_table(diagnosis, since)]
         found += [Block("text", f"{text}.") for text in in_vain(diagnosis)]
     found += _alike(diagnosis) + _by_trial(diagnosis)
     found += leftover_table(diagnosis)
@@ -91,7 +91,12 @@ def _by_trial(diagnosis: Diagnosis) -> list[Block]:
     header = ("effect", "quantity ", "trial ", "value", "agrees with the others")
     strong = [i for i, p in enumerate(found) if not p.agrees]
     each = table("per-trial", header, rows, strong)
-    return [Block("folded", "Trial by trial", blocks=[each], wide=bool(strong))]
+    words = (
+        "Linear estimates from one trial each, all other values held. A trial that hardly shows an "
+        "effect may give a value that is not possible, with a large standard deviation."
+    )
+    blocks = [Block("soft", words), each]
+    return [Block("folded", "Trial by trial", blocks=blocks, wide=bool(strong))]
 
 
 def _unit(diagnosis: Diagnosis, value: TrialValue) -> str:
@@ -109,8 +114,8 @@ def _alike(diagnosis: Diagnosis) -> list[Block]:
     if diagnosis.lookalikes:
         rows = [(one.effect, one.like, percent(one.share)) for one in diagnosis.lookalikes]
         words = (
-            "In these trials the look-alike, by itself, would make this share of what the claimed "
-            "effect does. A trial in which the two differ settles it."
+            "In these trials the look-alike alone reproduces this share of the signal of the "
+            "claimed effect. Only a trial in which the two act differently tells them apart."
         )
         found += [Block("heading", "Look-alikes"), Block("text", words)]
         found.append(table("lookalikes", ("claimed effect", "look-alike ", "share"), rows))
@@ -121,7 +126,7 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     """The squared error in three parts: at each horizon in all, and by state."""
     if not splits:
         return []
-    bound = any(one.irreducible_from == "at most" for one in splits.values())
+    bound = any(one.bound for one in splits.values())
     header = ("ahead", "explained", "unexplained", "noise" + ", at most" * bound)
     named = {
         key: words.format(f"{one.horizon_s:.3g} s")
@@ -131,18 +136,19 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     rows = [(words, *_shares(splits[key], splits[key].whole)) for key, words in named.items()]
     main = "horizon" if "horizon" in named else next(iter(named))
     by_state = [(parts.name, *_shares(splits[main], parts)) for parts in splits[main].channels]
-    known = {"repeats": "repeated trials", "alike": "trials whose commands agree to 2 %"}
-    known["at most"] = "what one step leaves, and is at most that: no trial was repeated"
+    known = {"repeats": "the scatter of repeated trials"}
+    known["alike"] = "the scatter of trials whose commands agree to 2 %, and is at most that"
+    known["at most"] = "one-step errors, and is at most that: no trial was repeated"
     source = known.get(splits[main].irreducible_from, "the estimated noise")
     words = (
-        "Explained is the share of the squared error that the effects take away on trials that "
-        "were held out, unexplained what they leave above the noise; how large the noise is comes "
-        f"from {source}."
+        "Explained: the share of the squared error of held-out predictions that the effects "
+        f"remove. Unexplained: what they leave above the noise. The noise is taken from {source}."
     )
     if any("≤" in cell for row in [*rows, *by_state] for cell in row):
         words += (
-            f" ≤ and ≥: errors of up to {_doubts(splits)} times the noise, as it is known here, "
-            "are not told from it: what is unexplained may be noise too."
+            f" ≤ and ≥: the noise is not known well enough to tell errors of up to "
+            f"{_doubts(splits)} times its estimate from noise, so what is unexplained may be noise "
+            "too."
         )
     each = table("split-states", ("state", *header[1:]), by_state)
     return [

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from grounded.diagnosis.report import Diagnosis, Estimate, Ranked
+from grounded.diagnosis.tables import weighed_beside
 from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
 from grounded.search.pictures import MOST, few
@@ -134,17 +135,20 @@ def forecast_table(findings: Findings) -> list[Block]:
 
 def effect_table(diagnosis: Diagnosis, since: Since) -> Block:
     """Return the ranked effects with their parameters and 95 % intervals."""
+    beside = weighed_beside(diagnosis)
     rows = [
         (
             r.effect + " (adopted since)" * (r.effect in since.adopted),
-            figure(r.evidence, 3),
+            figure(r.evidence, 3) if r.effect in beside else "",
+            "" if r.effect in beside else figure(r.evidence, 3),
             figure(r.gap_after, 3),
-            percent(r.shrinkage),
+            percent(r.shrinkage) if not r.shrinkage < 0 else "none, it grows",
             _params(r),
         )
         for r in diagnosis.ranking
     ]
-    header = ("effect", "evidence [nats]", "gap after", "gap closed", "parameters, 95 % ")
+    evidence = ("evidence [nats]", "evidence alone [nats]")
+    header = ("effect", *evidence, "gap after", "gap closed", "parameters, 95 % ")
     strong = {i for i, r in enumerate(diagnosis.ranking) if r.effect in diagnosis.effects}
     return table("effects", header, rows, strong)
 
