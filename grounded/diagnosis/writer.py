@@ -29,7 +29,7 @@ from grounded.diagnosis.validation.agreement import by_trial
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import SLIGHT, SURE, Decision
 from grounded.diagnosis.validation.held_out import shrinkage, utility_prediction
-from grounded.diagnosis.validation.limits import Limits, identifiable
+from grounded.diagnosis.validation.limits import Limits, identifiable, joints_without_input
 from grounded.diagnosis.validation.measured import Measured, root_mean_square
 from grounded.diagnosis.validation.motions import how_many
 from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
@@ -177,7 +177,7 @@ class Writer:
                 further=further,
                 ended=at_bounds(self.claims),
             ),
-            unknowable=self.known.sentences,
+            unknowable=(*self.known.sentences, *joints_without_input(data.model, named)),
             noise=self.noise(),
             parameters=parameters,
             identifiable=identified,

@@ -10,7 +10,12 @@ from grounded import GroundedError, Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.validation.limits import knowable, still_states, switches
+from grounded.diagnosis.validation.limits import (
+    joints_without_input,
+    knowable,
+    still_states,
+    switches,
+)
 from grounded.effects import Library
 from grounded.models.pendulum import model as pendulum
 
@@ -73,3 +78,32 @@ def test_a_model_that_is_no_number_at_a_measured_state_says_where():
 def test_coloured_noise_is_offered_however_slow_the_system_is(dt, expected):
     trials = [replace(trial, dt=dt) for trial in swings(2, 40)]
     assert HypothesisSearch(prepare(pendulum, trials), ()).taus == pytest.approx(expected)
+
+
+def hanging(s, a, p):
+    """A pole on a cart: no input acts on the pole's own joint."""
+    return {"x": s.v, "q": s.w, "v": a.force, "w": -a.force * np.cos(s.q) - 9.81 * np.sin(s.q)}
+
+
+CART_POLE = Model(
+    states={"x": "m", "q": "rad", "v": "m/s", "w": "rad/s"},
+    inputs={"force": "N"},
+    params={},
+    derivative=hanging,
+)
+
+
+@pytest.mark.parametrize(
+    ("claimed", "said"),
+    [
+        (("viscous_friction:w", "coupling:v<-w"), True),
+        (("coulomb_friction:w", "input_gain:force", "coupling:v<-w"), True),
+        (("viscous_friction:w", "coupling:w<-v"), False),  # of two joints
+        (("viscous_friction:w", "coupling:v<-q"), False),  # a spring
+        (("viscous_friction:w", "delay:force"), False),
+    ],
+)
+def test_friction_of_a_joint_without_an_input_is_suspected_behind_two_effects(claimed, said):
+    found = joints_without_input(CART_POLE, claimed)
+    assert bool(found) == said
+    assert all(name in one for one in found for name in claimed if "input" not in name)

@@ -33,13 +33,16 @@ from grounded.effects.actuator import backlash
 from grounded.effects.places import told_by
 from grounded.filter import kalman
 from grounded.frozen import Array
+from grounded.instruments.kinematics import integrals
 from grounded.model import Model, Param
+from grounded.result import listed
 from grounded.trial import Trial
 
 FEW_STEPS = 30
 WEAK, UNKNOWN = 0.2, 0.6  # remaining fraction of a parameter's prior standard deviation
 DEPENDS = 2.0  # a value depends on held parameters if freeing them widens it by this factor,
 PART = 0.2  # namely on those that contribute at least this part of its variance
+FRICTIONS = ("viscous_friction", "coulomb_friction", "quadratic_drag", "stiction")
 QUIETER = 100.0  # factor by which effects may still reduce the noise variance
 
 
@@ -89,6 +92,32 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
     if {*unmoved, *empty, *(names[i] for i in data.hidden)} == {*names}:
         no_cause = True
     return Limits(tuple(found), no_cause)
+
+
+def joints_without_input(model: Model, claimed: Collection[str]) -> list[str]:
+    """Return a sentence for each joint whose friction is claimed as two effects on two axes.
+
+    Friction in a joint acts on every acceleration through the inertia matrix. Where no input acts
+    on the joint (a pole on its cart), that matrix is not known from the model, and the friction is
+    found as a damping of its own velocity and a coupling to another one.
+
+    Args:
+        model: its exact integrals show which states are velocities of joints.
+        claimed: names of the claimed effects.
+    """
+    rates = {model.state_names[one.j] for one in integrals(model) if one.exact}
+    found = []
+    for v in sorted(rates):
+        own = [f"{kind}:{v}" for kind in FRICTIONS if f"{kind}:{v}" in claimed]
+        onto = [name for w in sorted(rates - {v}) if (name := f"coupling:{w}<-{v}") in claimed]
+        if own and onto:
+            found.append(
+                f"{listed([*own, *onto])} may be one cause: friction in the joint of {v}, which "
+                "acts on both through the inertia. To test it, write this torque into model.py "
+                'with an uncertain parameter (such as "b": Param(0, "N m s/rad", std=...)) and '
+                "diagnose again"
+            )
+    return found
 
 
 def counted_once(trials: Sequence[Trial]) -> tuple[list[Trial], list[str]]:
