@@ -32,7 +32,9 @@ TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
 )
 @click.option("--laps", type=float, default=1.0, help="Laps of a circle or figure-8 (1).")
 @click.option("--hold", type=float, default=0.0, help="Time at rest at a path's end [s] (0).")
-@click.option("--to", multiple=True, metavar="STATE=VALUE", help="Where a line or step ends.")
+@click.option(
+    "--to", multiple=True, metavar="STATE=VALUE", help="Where a line, step or swing-up ends."
+)
 @click.option(
     "--seconds", type=float, help="Duration of a step or swing-up (5), or of a line to a STATE."
 )
@@ -55,7 +57,9 @@ def command(
     FILE is a log, read through [log], or a CSV with columns `t` and states. Paths start from rest
     and keep to the given speeds and accelerations. A line with --to, or of a robot with one axis,
     goes from [task] start to rest, in the states' own units; --seconds, --speed and --accel set
-    its pace. A step begins at [task] start. With --hold a path ends at rest and stays there.
+    its pace. A step begins at [task] start. A swing-up brings the first angle that hangs under its
+    weight upright; --to names another angle, or more states. With --hold a path ends at rest and
+    stays there.
 
     The previous target is kept as target.csv.bak. [task] horizon is updated, and so are the weights
     in [reward] state unless you chose them, and input_change of inputs with [limits] if it is
@@ -88,7 +92,7 @@ def command(
     elif shape == "step":
         columns = step_target(ends, model, dt, long, start)
     elif shape == "swing-up":
-        columns = swing_up(model, dt, long)
+        columns = swing_up(model, dt, long, ends, start)
     elif seconds is not None:
         raise click.UsageError(
             "--seconds is for a step, a swing-up or a line --to STATE=VALUE; use --speed and "

@@ -16,6 +16,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.frozen import Array
+from grounded.instruments.kinematics import integrals
 from grounded.model import Model
 from grounded_trials.logs.inspect_log import inspect_log
 from grounded_trials.logs.inspect_pairs import velocities
@@ -28,6 +29,8 @@ from grounded_trials.workspace.task_file import read_target
 PATHS = ("line", "circle", "figure-8")
 SHAPES = (*PATHS, "step", "swing-up")
 FINE = 2000  # number of points of a path
+AROUND = 720  # angles at which a hinge is tried
+BRIEF, SLIGHT = 1e-4, 1e-3  # [s] of the step there; [rad/s^2] smallest pull of its weight
 
 
 @dataclass(frozen=True)
@@ -245,18 +248,94 @@ def _check_states(to: Mapping[str, float], model: Model) -> None:
             raise GroundedError(f"'{name}' is not a state: {nearest(name, model.states)}")
 
 
-def swing_up(model: Model, dt: float, seconds: float) -> dict[str, Array]:
-    """Return columns with the first angle at pi and its rate at 0; other states are free.
+@dataclass(frozen=True)
+class Hinge:
+    """An angle that hangs under its weight.
+
+    Args:
+        angle: the state.
+        hangs: the angle at which it hangs at rest [rad].
+        stands: the angle near 0 at which it stands upright, 0 to a turn away from there [rad].
+    """
+
+    angle: str
+    hangs: float
+    stands: float
+
+
+def hinges(model: Model, start: Mapping[str, float] = MappingProxyType({})) -> list[Hinge]:
+    """Return the angles that hang under their weight and can stand upright.
+
+    Each angle is turned once around, all else at rest at `start` (0 where unset) without inputs.
+    Where its acceleration changes sign from plus to minus it hangs, from minus to plus it stands.
+    An arm that turns about a vertical axis, a heading or a spring-held angle has no such pair.
+    """
+    at = np.array([start.get(name, 0.0) for name in model.states])
+    units, names, found = list(model.states.values()), list(model.states), []
+    around = np.linspace(-np.pi, np.pi, AROUND, endpoint=False) + np.pi / AROUND
+    for one in integrals(model):
+        if not one.exact or units[one.i] != "rad":
+            continue
+        x = np.tile(at, (AROUND, 1))
+        x[:, one.i] = at[one.i] + around
+        with np.errstate(all="ignore"):
+            after = model.system.step(x, np.zeros((AROUND, model.m)), model.values, BRIEF)
+        pulled = (after[:, one.j] - x[:, one.j]) * one.c
+        if not np.isfinite(pulled).all() or np.ptp(pulled) < SLIGHT * BRIEF:
+            continue
+        other = np.roll(pulled, -1)
+        middle = x[:, one.i] + np.pi / AROUND
+        stable = middle[(pulled > 0) & (other <= 0)]
+        unstable = middle[(pulled < 0) & (other >= 0)]
+        if len(stable) and len(unstable):
+            hangs = float(stable[np.argmin(np.abs(stable - at[one.i]))])
+            up = hangs + float(((unstable - hangs) % (2 * np.pi)).min())
+            stands = up if abs(up) <= abs(up - 2 * np.pi) + SLIGHT else up - 2 * np.pi
+            found.append(Hinge(names[one.i], *_round(hangs, stands)))
+    return found
+
+
+def _round(*angles: float) -> list[float]:
+    """Return angles, those near a multiple of a quarter turn exactly so."""
+    near = [round(a / (np.pi / 2)) * (np.pi / 2) for a in angles]
+    return [n if abs(a - n) < 3 * np.pi / AROUND else a for a, n in zip(angles, near, strict=True)]
+
+
+def swing_up(
+    model: Model,
+    dt: float,
+    seconds: float,
+    to: Mapping[str, float] = MappingProxyType({}),
+    start: Mapping[str, float] = MappingProxyType({}),
+) -> dict[str, Array]:
+    """Return a column that takes the first angle that hangs to upright.
+
+    The first row is `start`, or hanging. Other states are free, also the angle's rate: a weight on
+    it would punish the swing, and an angle that stays upright is at rest.
+
+    Args:
+        model: whose angle swings.
+        dt: control interval [s].
+        seconds: duration [s].
+        to: more states and their values; an angle that hangs is then the one to swing up.
+        start: [task] start.
 
     Raises:
-        GroundedError: if the model has no state in radians.
+        GroundedError: if no angle of the model hangs under its weight and `to` names none.
     """
-    angle = next((name for name, unit in model.states.items() if unit == "rad"), None)
-    if angle is None:
-        raise GroundedError(f"model '{model.name}' has no state in rad to swing up")
-    rates = [name for name, unit in model.states.items() if unit == "rad/s"][:1]
-    rows = round(seconds / dt) + 1
-    return {angle: np.full(rows, np.pi)} | {rate: np.zeros(rows) for rate in rates}
+    hung = hinges(model, start)
+    chosen = [one for one in hung if one.angle in to] or hung[:1]
+    if not chosen and not any(model.states.get(name) == "rad" for name in to):
+        raise GroundedError(
+            f"no angle of model '{model.name}' hangs under its weight, so none can swing up; name "
+            "the angle and its value, such as --to q=3.1416"
+        )
+    first = np.arange(round(seconds / dt) + 1) < 1
+    columns = {}
+    for one in chosen:
+        hangs = start.get(one.angle, one.hangs)
+        columns[one.angle] = np.where(first, hangs, to.get(one.angle, one.stands))
+    return columns | (step_target(to, model, dt, seconds, start) if to else {}) | columns
 
 
 def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[str, Array]:
