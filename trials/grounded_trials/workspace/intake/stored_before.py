@@ -121,15 +121,13 @@ def estimated_otherwise(workspace: Folder, log: ForeignLog) -> tuple[str, ...]:
     other = [one for one in known if one.meta.get(ESTIMATED_WITH, "") != now]
     if not other or known[-1] is not other[-1]:
         return ()
-    names, before = (
-        ", ".join(one.stored.id for one in other),
-        other[-1].meta.get(ESTIMATED_WITH, ""),
-    )
-    with_, was = (", ".join(s.split(",")) or "no effect" for s in (now, before))
+    before = other[-1].meta.get(ESTIMATED_WITH, "")
+    names, states = listed(t.stored.id for t in other), log.source["estimated"].split(",")
+    now, before = (listed(s.split(",")) if s else "no effect" for s in (now, before))
     return (
-        f"{listed(log.source['estimated'].split(','))} is estimated with {with_} in the "
-        f"model, but in {names} with {was}: for consistent estimates, `discard` those and ingest "
-        "their logs again",
+        f"the model that estimates {listed(states)} has {now}; for {names} it had {before}. To "
+        f"have all estimates from one model, discard {names} and ingest "
+        f"{'that log' if len(other) == 1 else 'those logs'} again",
     )
 
 
