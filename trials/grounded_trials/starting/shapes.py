@@ -23,10 +23,11 @@ from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import position_names
-from grounded_trials.workspace.task_file import read_target
+from grounded_trials.workspace.task_file import ROW_LIMIT, read_target
 
 PATHS = ("line", "circle", "figure-8")
 SHAPES = (*PATHS, "step", "swing-up")
+FEWEST, MOST = 5, ROW_LIMIT - 2  # control steps of a target
 FINE = 2000  # number of points of a path
 
 
@@ -89,7 +90,22 @@ def _check(drive: Drive) -> None:
 
 
 def _grid(seconds: float, dt: float) -> Array:
-    return dt * np.arange(np.ceil(seconds / dt - 1e-6) + 1)
+    return dt * np.arange(_in_steps(seconds, dt, np.ceil(seconds / dt - 1e-6)) + 1)
+
+
+def _in_steps(seconds: float, dt: float, steps: float) -> int:
+    """Return a target's number of control steps as an integer.
+
+    Raises:
+        GroundedError: if there are fewer than FEWEST or more than MOST.
+    """
+    if FEWEST <= steps <= MOST:
+        return int(steps)
+    raise GroundedError(
+        f"a target of {seconds:.4g} s has {steps:.4g} control steps of [task] dt = {dt:g} s, "
+        f"expected {FEWEST} to {MOST}: check dt in grounded.toml, the time in seconds from one "
+        "command to the next, and how long the manoeuvre lasts"
+    )
 
 
 def line_target(
@@ -229,11 +245,11 @@ def step_target(
     """Return columns with given values from the second row on; the first row is `start`, or 0.
 
     Raises:
-        GroundedError: for an unknown state, or without a state or a duration.
+        GroundedError: for an unknown state, without a state, or for an unusable number of steps.
     """
-    rows = round(seconds / dt) + 1
-    if not to or rows < 2:
-        raise GroundedError("name a state and its value, such as --to x=1.0, and --seconds")
+    if not to:
+        raise GroundedError("name a state and its value, such as --to x=1.0")
+    rows = _in_steps(seconds, dt, np.round(seconds / dt)) + 1
     _check_states(to, model)
     first = np.arange(rows) < 1
     return {name: np.where(first, start.get(name, 0.0), value) for name, value in to.items()}
@@ -249,13 +265,13 @@ def swing_up(model: Model, dt: float, seconds: float) -> dict[str, Array]:
     """Return columns with the first angle at pi and its rate at 0; other states are free.
 
     Raises:
-        GroundedError: if the model has no state in radians.
+        GroundedError: if the model has no state in radians, or the number of steps is unusable.
     """
     angle = next((name for name, unit in model.states.items() if unit == "rad"), None)
     if angle is None:
         raise GroundedError(f"model '{model.name}' has no state in rad to swing up")
     rates = [name for name, unit in model.states.items() if unit == "rad/s"][:1]
-    rows = round(seconds / dt) + 1
+    rows = _in_steps(seconds, dt, np.round(seconds / dt)) + 1
     return {angle: np.full(rows, np.pi)} | {rate: np.zeros(rows) for rate in rates}
 
 
@@ -279,7 +295,8 @@ def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[st
         known = [name for name in names[1:] if name in model.states]
         if not known:
             raise GroundedError(f"{file} has no column named after a state: {', '.join(names)}")
-        t = np.arange(0.0, values[-1, 0] - values[0, 0] + 1e-9, dt)
+        lasts = values[-1, 0] - values[0, 0]
+        t = dt * np.arange(_in_steps(lasts, dt, np.floor((lasts + 1e-9) / dt)) + 1)
         at = values[:, 0] - values[0, 0]
         return {name: np.interp(t, at, values[:, names.index(name)]) for name in known}
     if mapping is None:

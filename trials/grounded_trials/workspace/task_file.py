@@ -233,6 +233,7 @@ def target_arrays(
     t = values[: horizon + 1, 0]
     off = np.abs(t - t[0] - dt * np.arange(horizon + 1))
     if off.max() > 0.01 * dt:
+        _check_interval(path, values[:, 0], dt)
         i = int(np.argmax(off > 0.01 * dt))
         raise GroundedError(
             f"{path.name} line {i + 2}: t = {t[i]:g} s, expected {t[0] + i * dt:g} s: rows must be "
@@ -248,6 +249,27 @@ def target_arrays(
         return target, None
     columns = [given.get(name, np.zeros(horizon + 1))[:horizon] for name in inputs]
     return target, np.stack(columns, axis=1)
+
+
+def _check_interval(path: Path, t: Array, dt: float) -> None:
+    """Raise an error that names [task] dt if the rows of a target have another, even interval.
+
+    A dt of at least the whole target is a mistake in dt, not in the target.
+    """
+    each, lasts = float(np.median(np.diff(t))), float(t[-1] - t[0])
+    if each <= 0 or np.abs(np.diff(t) - each).max() > 0.01 * each or abs(each - dt) < 0.01 * each:
+        return
+    rows = f"[task] dt = {dt:g} s, but the rows of {path.name} are {each:.4g} s apart"
+    if dt < lasts:
+        raise GroundedError(
+            f"{rows}: set dt = {each:.4g}, or resample the target with the command below",
+            NextCommand("target", (str(path),)),
+        )
+    unit = f" (in seconds: {dt:g} ms is {dt / 1000:g})" if dt / 1000 < lasts else ""
+    raise GroundedError(
+        f"{rows} and last {lasts:.4g} s in all: dt is the time from one command to the next{unit}; "
+        f"set dt = {each:.4g}"
+    )
 
 
 def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -> Path:
