@@ -193,7 +193,8 @@ class Search:
         """
         self._add(trial)
         if len(self._trials) == 1 and (odd := _odd_columns(self)):
-            warnings.warn(f"{odd}. Correct the function that runs the robot", stacklevel=2)
+            mend = "Correct the function that runs the robot and begin a new search"
+            warnings.warn(f"the first trial has wrong columns: {odd}. {mend}", stacklevel=2)
 
     def _add(self, trial: Trial) -> None:
         ids = [c.id for c in self._candidates]
@@ -257,8 +258,8 @@ def learn(
         search._add(replace(_run(run, candidate), candidate=candidate.id))
         if check and len(search.trials) == 1 and (odd := _odd_columns(search)):
             raise GroundedError(
-                f"{odd}. Correct the function that runs the robot, or pass check=False if this is "
-                "mistaken"
+                f"the first trial can't be used: {odd}. Correct the function that runs the robot, "
+                "or pass check=False if this is mistaken"
             )
 
 
@@ -292,13 +293,13 @@ def _odd_columns(search: Search) -> str:
     from grounded.instruments.finding import in_the_log
     from grounded.instruments.sound_trials import sound_trials
 
-    model, first = search.task.model, "the first trial can't be used"
+    model = search.task.model
     trial = interpolate_gaps(search.trials[0]).trial
     try:
         looked = sound_trials(model, [replace(trial, id="")])
     except GroundedError as error:
-        return f"{first}: {str(error).replace('in trial number 1 ', '').rstrip('.')}"
+        return str(error).replace("in trial number 1 ", "").rstrip(".")
     if odd := in_the_log(looked.findings):
-        return f"{first}: {'; '.join(f'{one.signal} {one.finding}' for one in odd)}"
+        return "; ".join(f"{one.signal} {one.finding}" for one in odd)
     policy = next(c.policy for c in search.candidates if c.id == trial.candidate)
-    return f"{first}: {unit}" if (unit := unit_fed_back(model, trial, policy)) else ""
+    return unit_fed_back(model, trial, policy)

@@ -224,7 +224,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         f"multiply the stamps by {slow:g} and ingest it again"
     )
     if candidate is not None:
-        seem = f"with {listed(units)} times {by:.6g} it would be its run: another unit, or sign?"
+        seem = f"with {listed(units)} times {by:.6g} it is its run: another unit, or sign?"
         doubts = [seem if units else pace or misled(log, workspace.task, own.policy) or why]
         if log and not (found and found.opens_alike):
             doubts.append(
