@@ -360,7 +360,7 @@ class Workspace(Folder):
         if form == "bag" or candidate.startswith("t"):
             from grounded_trials.report.ros_bag import export_run
 
-            return export_run(here, candidate, form, file)
+            return export_run(here, candidate, form, file, runner=runner)
         return export_candidate(here, candidate, form, file, runner=runner, anyway=anyway)
 
     def verify(self) -> Verified:

@@ -177,8 +177,15 @@ def quaternion(turn: Array) -> tuple[float, float, float, float]:
     return float(x), float(y), float(z), float(w)
 
 
-def export_run(workspace: Folder, identity: str, form: str | None, path: Path | None) -> Exported:
+def export_run(
+    workspace: Folder, identity: str, form: str | None, path: Path | None, *, runner: bool = False
+) -> Exported:
     """Write a trial, or a candidate's predicted run, see `Workspace.export`."""
+    if runner:
+        raise GroundedError(
+            "the runner runs a candidate, expected one without --format bag: not a trial, nor the "
+            "predicted run of a candidate"
+        )
     form = form or format_of(path, ("csv", "npz", *BAGS), "bag")
     form = "bag" if form in BAGS else form
     if form not in ("bag", "csv", "npz"):

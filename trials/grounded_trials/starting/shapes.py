@@ -24,6 +24,7 @@ from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import position_names
 from grounded_trials.workspace.task_file import ROW_LIMIT, read_target
+from grounded_trials.workspace.unknown_id import refuse_ids
 
 PATHS = ("line", "circle", "figure-8")
 SHAPES = (*PATHS, "step", "swing-up")
@@ -287,6 +288,7 @@ def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[st
         GroundedError: if there is no such file, or it can't be sampled.
     """
     model, dt = workspace.base_model, workspace.config.task.dt
+    refuse_ids(workspace, file, "target")
     if not Path(file).exists():
         raise GroundedError(f"'{file}' is neither a file nor a shape: {nearest(file, shapes)}")
     mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)

@@ -15,11 +15,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
+from grounded_trials.formats.mcap_walk import DamagedFile
 from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
 from grounded_trials.store.store import Damaged, Store, Stored
 from grounded_trials.workspace.unknown_id import unknown_trial
@@ -261,7 +262,14 @@ def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]
 def _proven(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
     """Decode a candidate, cached: one command decodes the same bytes up to three times."""
     name = f"candidates/{identity}.mcap"
-    policy, states, inputs, meta = read_candidate(data, name)
+    try:
+        policy, states, inputs, meta = read_candidate(data, name)
+    except DamagedFile as error:
+        raise GroundedError(
+            f"{name} is damaged: {error.found} (at byte {error.offset}). Delete it: a trial that ran "
+            "it carries a copy, and one that was not run is made again",
+            NextCommand("propose"),
+        ) from None
     try:
         about = {key: of((_ABSENT | meta)[key]) for key, of in _FIELDS.items() if key != "task"}
     except (KeyError, ValueError) as error:

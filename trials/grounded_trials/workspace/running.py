@@ -141,7 +141,10 @@ def _call(workspace: Folder, command: str, handed: Handed, path: Path) -> None:
     try:
         done = subprocess.run(parts, cwd=workspace.folder, stdout=2, check=False)
     except OSError as error:
-        raise GroundedError(f"[system] command '{parts[0]}' can't be run: {error}") from None
+        raise GroundedError(
+            f"[system] command '{parts[0]}' can't be run: {error.strerror}; expected a program on "
+            f"the PATH, or a path from the workspace: {command}"
+        ) from None
     if done.returncode != 0:
         hint = f"; what it wrote is kept in {path}" if path.exists() else ""
         raise GroundedError(

@@ -117,6 +117,7 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
     return Reward(**weights)
 
 
+DRAW = ": draw the manoeuvre, or write one row per control step, with columns t and states"
 ROW_LIMIT = 200_002
 LEAST = 0.1  # smallest range of a target column used for its weight
 # a column counts as constant if its range is below STILL of its size (of LEAST if that is less), or
@@ -139,6 +140,10 @@ def read_target(path: Path) -> tuple[list[str], Array]:
         with TextIOWrapper(open_file(path), encoding="utf-8-sig", newline="") as stream:
             reader = csv.reader(stream)
             names = [name.strip() for name in next(reader, [])]
+            if not names:
+                raise GroundedError(
+                    f"{path.name} is empty{DRAW}", NextCommand("target", ("SHAPE",))
+                )
             _check_header(path, names)
             rows: list[list[float]] = []
             for line, row in enumerate(reader, start=2):
@@ -163,10 +168,9 @@ def read_target(path: Path) -> tuple[list[str], Array]:
 
 
 def _check_header(path: Path, names: list[str]) -> None:
-    if not names or names[0] != "t":
-        found = names[0] if names else "nothing"
+    if names[0] != "t":
         raise GroundedError(
-            f"{path.name}: the first column must be 't', found '{found}'; columns are separated by "
+            f"{path.name}: the first column must be 't', found '{names[0]}'; columns are separated by "
             "commas"
         )
     twice = [name for name in names if names.count(name) > 1]
@@ -225,6 +229,11 @@ def target_arrays(
                 f"{path.name}: column '{name}' is neither a state nor an input of the model: "
                 + nearest(name, [*states, *inputs])
             )
+    if len(values) < 2:
+        rows = "one row" if len(values) else "no row"
+        raise GroundedError(
+            f"{path.name} has {rows} below its header{DRAW}", NextCommand("target", ("SHAPE",))
+        )
     if len(values) < horizon + 1:
         raise GroundedError(
             f"{path.name} has {len(values)} rows, but a horizon of {horizon} steps needs "

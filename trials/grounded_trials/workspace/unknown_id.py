@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from grounded.errors import GroundedError, NextCommand
@@ -68,6 +69,27 @@ def unusable_trial(workspace: Folder, name: str, usable: Sequence[str]) -> Groun
         f"{given} can't be used: it is too short, or has other states, inputs or dt than this "
         f"task; trials to use: {ranges(usable)}"
     )
+
+
+def refuse_ids(workspace: Folder, log: str | Path, verb: str) -> None:
+    """Raise an error if a trial or candidate was named in place of the file of a log.
+
+    Args:
+        workspace: the workspace.
+        log: what was given; a file or folder of that name is accepted.
+        verb: the command, such as "inspect".
+    """
+    given = str(log).lower()
+    if not _SHORT.fullmatch(given) or Path(log).exists():
+        return
+    for stored in workspace.store.list():
+        if stored.id == given:
+            raise GroundedError(
+                f"{log} is a stored trial, expected the file of a log"
+                + f": its own is {stored.path}" * (verb != "ingest")
+            )
+    if given in workspace.candidate_ids():
+        raise GroundedError(f"{log} is a candidate, expected the file of a log")
 
 
 def _there_is(given: str, letter: str, known: Sequence[str]) -> str:
