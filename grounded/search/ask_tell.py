@@ -295,11 +295,12 @@ def _odd_columns(search: Search) -> str:
 
     model = search.task.model
     trial = interpolate_gaps(search.trials[0]).trial
+    policy = next(c.policy for c in search.candidates if c.id == trial.candidate)
+    if unit := unit_fed_back(model, trial, policy):
+        return unit
     try:
         looked = sound_trials(model, [replace(trial, id="")])
     except GroundedError as error:
         return str(error).replace("in trial number 1 ", "").rstrip(".")
-    if odd := in_the_log(looked.findings):
-        return "; ".join(f"{one.signal} {one.finding}" for one in odd)
-    policy = next(c.policy for c in search.candidates if c.id == trial.candidate)
-    return unit_fed_back(model, trial, policy)
+    odd = in_the_log(looked.findings)
+    return "; ".join(f"{one.signal} {one.finding}" for one in odd)
