@@ -118,6 +118,7 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
 
 
 DRAW = ": draw the manoeuvre, or write one row per control step, with columns t and states"
+SHAPE = NextCommand("target", ("SHAPE",))
 ROW_LIMIT = 200_002
 LEAST = 0.1  # smallest range of a target column used for its weight
 # a column counts as constant if its range is below STILL of its size (of LEAST if that is less), or
@@ -141,9 +142,7 @@ def read_target(path: Path) -> tuple[list[str], Array]:
             reader = csv.reader(stream)
             names = [name.strip() for name in next(reader, [])]
             if not names:
-                raise GroundedError(
-                    f"{path.name} is empty{DRAW}", NextCommand("target", ("SHAPE",))
-                )
+                raise GroundedError(f"{path.name} is empty{DRAW}", SHAPE)
             _check_header(path, names)
             rows: list[list[float]] = []
             for line, row in enumerate(reader, start=2):
@@ -170,8 +169,8 @@ def read_target(path: Path) -> tuple[list[str], Array]:
 def _check_header(path: Path, names: list[str]) -> None:
     if names[0] != "t":
         raise GroundedError(
-            f"{path.name}: the first column must be 't', found '{names[0]}'; columns are separated by "
-            "commas"
+            f"{path.name}: the first column must be 't', found '{names[0]}'; columns are separated "
+            "by commas"
         )
     twice = [name for name in names if names.count(name) > 1]
     if twice:
@@ -231,9 +230,7 @@ def target_arrays(
             )
     if len(values) < 2:
         rows = "one row" if len(values) else "no row"
-        raise GroundedError(
-            f"{path.name} has {rows} below its header{DRAW}", NextCommand("target", ("SHAPE",))
-        )
+        raise GroundedError(f"{path.name} has {rows} below its header{DRAW}", SHAPE)
     if len(values) < horizon + 1:
         raise GroundedError(
             f"{path.name} has {len(values)} rows, but a horizon of {horizon} steps needs "
@@ -265,19 +262,20 @@ def _check_interval(path: Path, t: Array, dt: float) -> None:
 
     A dt of at least the whole target is a mistake in dt, not in the target.
     """
-    each, lasts = float(np.median(np.diff(t))), float(t[-1] - t[0])
+    lasts = float(t[-1] - t[0])
+    each = lasts / (len(t) - 1)
     if each <= 0 or np.abs(np.diff(t) - each).max() > 0.01 * each or abs(each - dt) < 0.01 * each:
         return
-    rows = f"[task] dt = {dt:g} s, but the rows of {path.name} are {each:.4g} s apart"
+    rows = f"[task] dt = {dt:g} s, but the rows of {path.name} are {each:.6g} s apart"
     if dt < lasts:
         raise GroundedError(
-            f"{rows}: set dt = {each:.4g}, or resample the target with the command below",
+            f"{rows}: set dt = {each:.6g}, or resample the target with the command below",
             NextCommand("target", (str(path),)),
         )
     unit = f" (in seconds: {dt:g} ms is {dt / 1000:g})" if dt / 1000 < lasts else ""
     raise GroundedError(
         f"{rows} and last {lasts:.4g} s in all: dt is the time from one command to the next{unit}; "
-        f"set dt = {each:.4g}"
+        f"set dt = {each:.6g}"
     )
 
 

@@ -98,4 +98,6 @@ def _there_is(given: str, letter: str, known: Sequence[str]) -> str:
     meant = f"{letter}{int(short[1]):04d}" if short else ""
     if meant in known:
         return f"did you mean '{meant}'?"
-    return f"there {'is' if len(known) == 1 else 'are'} {ranges(known)}" if known else ""
+    if len(known) == 1:
+        return f"the only one is {known[0]}"
+    return f"there are {ranges(known)}" if known else ""
