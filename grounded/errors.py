@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, TypeVar
 
+T = TypeVar("T")
 MOST, COMPARED = 40, 2000  # most names listed in a message; most names compared with a wrong one
 
 
@@ -38,6 +39,32 @@ class GroundedError(Exception):
     def __init__(self, message: str, then: NextCommand | None = None) -> None:
         super().__init__(message)
         self.then = then
+
+
+def type_of(value: object) -> str:
+    """Return the name of a value's type, for a message: "str", "Candidate"."""
+    return type(value).__name__
+
+
+def list_of(values: Iterable[T], kind: type | tuple[type, ...], name: str) -> list[T]:
+    """Return a collection as a list, whose elements must all be of a type.
+
+    Args:
+        values: what was given.
+        kind: the type of its elements, or several.
+        name: the name of the argument.
+
+    Raises:
+        GroundedError: if it is anything else.
+    """
+    found, kinds = type_of(values), kind if isinstance(kind, tuple) else (kind,)
+    if isinstance(values, Iterable) and not isinstance(values, str):
+        items = list(values)
+        other = [type_of(one) for one in items if not isinstance(one, kinds)]
+        if not other:
+            return items
+        found = f"{found} of {other[0]}"
+    raise GroundedError(f"{name} must be a list of {kinds[0].__name__}s, got a {found}")
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:

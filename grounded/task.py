@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from grounded.compile import Problem
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, type_of
 from grounded.frozen import Array, numbers, positive
 from grounded.model import Model
 from grounded.policy import Policy
@@ -273,7 +273,12 @@ class Task:
 
         It is -inf for a trial that ended early or is not finite. A recording that lacks the last
         step or two is extrapolated and does not count as ended early, see `Trial.whole`.
+
+        Raises:
+            GroundedError: if `trial` is not a `Trial`.
         """
+        if not isinstance(trial, Trial):
+            raise GroundedError(f"utility takes the Trial of a run, got a {type_of(trial)}")
         judge = lambda: self._utility(trial.whole(self.horizon))  # noqa: E731
         return trial.worth(f"{self.hash}{self.model.angles}whole", judge)
 

@@ -8,7 +8,7 @@ that stops one or two steps early is extrapolated to the end of the run (`Trial.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,7 +59,8 @@ class Trial:
         inputs = numbers(self.inputs, "trial: inputs")
         for kind in ("state_names", "input_names"):
             names = getattr(self, kind)
-            if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+            several = isinstance(names, Iterable) and not isinstance(names, str)
+            if not several or not all(isinstance(name, str) for name in names):
                 raise GroundedError(f"trial: {kind} must be a tuple of names, got {names!r:.60}")
             object.__setattr__(self, kind, tuple(names))
         positive("trial: dt", self.dt)

@@ -47,7 +47,12 @@ def _tell(done: SetAside, json_: bool) -> None:
         show_json(done.to_json())
         return
     for name in done.trials:
-        show(f"{name} {'is set aside' if name in done.discarded else 'counts'}")
+        if name not in done.unchanged:
+            show(f"{name} {'is set aside' if name in done.discarded else 'counts again'}")
+        elif name in done.discarded:
+            show(f"{name} was set aside before; nothing was changed")
+        else:
+            show(f"{name} was not set aside; nothing was changed")
     for name, why in done.discarded.items():
         show(field("discarded", f"{name}{why and ': ' + why}"))
     show(f"\n{next_line(NextCommand('status'))}")

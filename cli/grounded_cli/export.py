@@ -26,7 +26,7 @@ USES = {
     "--format",
     "form",
     type=click.Choice(list(USES)),
-    help="Default: the extension of FILE, else json. `grounded.policy.load` reads npz.",
+    help="Default: by the ending of FILE, without one json; of a trial a bag.",
 )
 @click.option(
     "-o",
@@ -60,7 +60,7 @@ def command(
     current [limits] and [safety].
     """
     named = Path(output or "").suffix.lstrip(".").lower()
-    run = candidate.startswith("t") or form == "bag"
+    run = candidate.lower().startswith("t") or form == "bag"
     if form is not None and named in USES and named != form:
         raise click.UsageError(f"-o {output} has the extension {named}, but --format is {form}")
     done = open_workspace().export(candidate, output, form=form, runner=runner, anyway=anyway)

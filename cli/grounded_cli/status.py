@@ -83,7 +83,8 @@ def summary(status: Status) -> str:
         lines.append(field("best", text + noise_share(best)))
     if status.off_target:
         lines.append(field("off target", "; ".join(one.summary() for one in status.off_target)))
-    again = f"run the best one again: `{rendered(status.again)}`"
+    then = ", then" if status.again.verb == "next" else ":"  # its file was exported
+    again = f"run the best one again{then} `{rendered(status.again)}`"
     if certainty := last_improvement(standing.history, again):
         lines.append(field("certainty", certainty))
     lines.append(field("phase", f"{standing.outcome}: {standing.sentence}"))

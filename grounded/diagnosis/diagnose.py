@@ -48,7 +48,7 @@ from grounded.diagnosis.writer import Writer
 from grounded.effects import Effect, Library
 from grounded.effects.actuator import delay_again
 from grounded.engine import Engine, running, steady
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, type_of
 from grounded.instruments.lag import whole_steps
 from grounded.instruments.sound_trials import sound_trials
 from grounded.model import Model
@@ -123,6 +123,8 @@ def diagnose(
             "diagnose(task, trials) takes a Task or a Model and a list of Trials, got "
             f"{type(subject).__name__} and {' of '.join([type(given).__name__, *loose[:1]])}"
         )
+    if not isinstance(options, DiagnosisOptions | None):
+        raise GroundedError(f"options must be DiagnosisOptions(...), got a {type_of(options)}")
     options, tick = options or DiagnosisOptions(), Stages(progress, USUAL)
     model = subject.model if isinstance(subject, Task) else subject
     if model.n + model.m > MOST_NAMES:

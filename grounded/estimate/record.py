@@ -23,7 +23,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError, list_of, nearest
 from grounded.estimate.measurement import Measurement
 from grounded.frozen import Array, readonly
 from grounded.model import Model
@@ -190,13 +190,8 @@ def records_of(model: Model, trials: Sequence[Trial | Record]) -> list[Record]:
     Raises:
         GroundedError: if there are none, or one does not match the model.
     """
-    trials = [trials] if isinstance(trials, Trial | Record) else list(trials)
-    for one in trials:
-        if not isinstance(one, Trial | Record):
-            raise GroundedError(
-                f"expected a list of Trials, one of them is of type {type(one).__name__}: use "
-                "Trial(states, inputs, dt, state_names, input_names)"
-            )
+    given = [trials] if isinstance(trials, Trial | Record) else trials
+    trials = list_of(given, (Trial, Record), "trials")
     records = [t if isinstance(t, Record) else record_of(model, t) for t in trials]
     if not records:
         raise GroundedError("there are no trials to estimate from; ingest at least one")

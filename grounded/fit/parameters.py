@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.engine import Engine, running, steady
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, type_of
 from grounded.estimate import Measurement, NoiseStd, Record, of_states
 from grounded.estimate.record import part, records_of
 from grounded.fit.prediction import PredictionError, prediction_error
@@ -70,6 +70,13 @@ def fit(
         GroundedError: for an unknown or constant parameter, trials that do not match the model or
             are too short, or a model with too many states.
     """
+    if not isinstance(model, Model | Task):
+        raise GroundedError(
+            "fit(model, trials) takes a Model or a Task and a list of Trials, got "
+            f"{type_of(model)} and {type_of(trials)}"
+        )
+    if isinstance(names, str) or not isinstance(names, Sequence | None):
+        raise GroundedError(f"names must be a list of parameters, got {names!r:.60}")
     if isinstance(model, Task):
         latency = model.latency if latency is None else latency
         model = model.model

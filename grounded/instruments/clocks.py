@@ -90,7 +90,7 @@ def one_clock(model: Model, shown: Sequence[int], early: Early) -> str:
     tables = listed(f"[log.state.{model.state_names[i]}]" for i in shown)
     return (
         f"Subtract {early.seconds:.3g} s from delay_s in {tables} (delay_s = -{early.seconds:.3g} "
-        "where none is set), or correct the commands' time stamps"
+        "if it has none), or correct the commands' time stamps"
     )
 
 

@@ -233,7 +233,7 @@ def stop_at(model: Model, trials: Sequence[Trial], found: Sequence[Mismatch]) ->
         others = tuple(c for c in others if not any(_within(c, o) for o in (first, *others)))
         texts = [_said(model, c) for c in (first, *others)]
         clauses.append(", or else ".join(texts))
-    scales = "the paths and scales in [log] (multiply the scale, 1 where none is set)"
+    scales = "the paths and scales in [log] (multiply the scale; a missing one is 1)"
     said = f"positions don't move as velocities and angles imply: {'; '.join(clauses)}"
     raise unusable(trials, stops[0].trials, said, f"Correct the log, or {scales}")
 

@@ -170,7 +170,7 @@ def mended_by(model: Model, told: Told) -> str:
     if turned := told.mistake.turned:
         tables = listed(f"[log.state.{model.state_names[i]}]" for i in turned)
         return (
-            f"Reverse the sign in {tables} (scale = -1 where none is set) and in the robot's "
+            f"Reverse the sign in {tables} (scale = -1 if it has none) and in the robot's "
             "program; or in the model, if the log is right"
         )
     if told.mistake.swap:
@@ -178,7 +178,7 @@ def mended_by(model: Model, told: Told) -> str:
     tables = listed(f"[log.input.{model.input_names[j]}]" for j in told.mistake.inputs)
     by = f"{1 / told.mistake.factor:.6g}"
     limits = "as well" if told.mistake.factor > 1 else "if they were taken from the log"
-    return f"Multiply the scale in {tables} by {by} (1 where none is set), and [limits] {limits}"
+    return f"Multiply the scale in {tables} by {by} (a missing scale is 1), and [limits] {limits}"
 
 
 def described(model: Model, told: Told) -> str:

@@ -26,7 +26,7 @@ from grounded.trial import Trial
 
 MILLION = STAMPS**2  # mm for m, and multiplied by a thousand instead of divided
 FACTORS = (MILLION, STAMPS, 100.0, 0.01, 1 / STAMPS, 1 / MILLION)  # position rate over velocity
-MEND = "Multiply the scale in [log] (1 where none is set), or correct the log"
+MEND = "Multiply the scale in [log] (a missing scale is 1), or correct the log"
 TOLD = 0.5  # of the velocity's change, and of the other's error: below it the model explains it
 ALIKE = 30.0  # factor within which a crude model predicts the size of a change
 PREFIXES = {1000.0: "m", 100.0: "c"}

@@ -295,7 +295,7 @@ def stop_at_units(plane: Plane, trials: Sequence[Trial]) -> None:
         f"positions move as speeds and {plane.names((plane.relation.k,))} imply: {some}"
     )
     mend = (
-        "Put these scales into [log] (multiply the scale, 1 where none is set) and into the "
+        "Put these scales into [log] (multiply the scale there; a missing one is 1) and into the "
         "robot's program"
     )
     raise unusable(trials, _concerned(told, (states, unit)), said, mend)

@@ -11,11 +11,13 @@ called as a function.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError, list_of, nearest, type_of
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.improve import propose
@@ -55,10 +57,13 @@ class Search:
         planner: Planner | None = None,
     ) -> None:
         if not isinstance(task, Task):
-            raise GroundedError(f"a Search needs a Task, got a {type(task).__name__}")
+            raise GroundedError(f"a Search needs a Task, got a {type_of(task)}")
+        if not isinstance(options, SearchOptions | None):
+            raise GroundedError(f"options must be gr.SearchOptions(...), got a {type_of(options)}")
         self.task, self.options = task, options or SearchOptions()
         self.planner = planner or Planner(task, task)
-        self._candidates, self._trials = list(candidates), list(trials)
+        self._candidates = list_of(candidates, Candidate, "candidates")
+        self._trials = list_of(trials, Trial, "trials")
         for trial in self._trials:
             self._fits(trial)
         self._planned: Proposal | None = None  # cache of `proposal`
@@ -142,6 +147,17 @@ class Search:
         Raises:
             GroundedError: for an unknown effect or parameter, or a missing quantity.
         """
+        if not isinstance(effects, Mapping) or not all(
+            isinstance(values, Mapping) for values in effects.values()
+        ):
+            raise GroundedError(
+                "adopt takes each effect with its values, as in Diagnosis.joining: "
+                f"{{'delay:steering': {{'d': 0.02}}}}; got {effects!r:.60}"
+            )
+        if not isinstance(params, Mapping | None):
+            raise GroundedError(
+                f"params must map parameters to values, such as {{'mass': 1.2}}; got {params!r:.60}"
+            )
         task = self.task.with_model(self.task.model.with_values(params or {}))
         planner = planner_with(task, list(effects.items()), library)
         return Search(
@@ -150,7 +166,11 @@ class Search:
 
     def _fits(self, trial: Trial) -> None:
         if not isinstance(trial, Trial):
-            raise GroundedError(f"expected a Trial of the run, got a {type(trial).__name__}")
+            told = " (grounded_trials.store.trial_file.read_trial reads a file)"
+            raise GroundedError(
+                f"expected a Trial of the run, got a {type_of(trial)}"
+                + told * isinstance(trial, str | Path)
+            )
         model = self.task.model
         has = (trial.state_names, trial.input_names, trial.dt)
         expected = (model.state_names, model.input_names, self.task.dt)
@@ -160,7 +180,7 @@ class Search:
             )
 
     def tell(self, trial: Trial) -> None:
-        """Add a trial of the real system.
+        """Add a trial of the real system; warn if the columns of the first are evidently wrong.
 
         Args:
             trial: the recorded run. Its `candidate` is the id of the candidate that was run; if it
@@ -171,6 +191,12 @@ class Search:
             GroundedError: if the trial's candidate is not one of this search, or its states, inputs
                 or dt differ from the task's.
         """
+        self._add(trial)
+        if len(self._trials) == 1 and (odd := _odd_columns(self)):
+            mend = "Correct the function that runs the robot and begin a new search"
+            warnings.warn(f"the first trial has wrong columns: {odd}. {mend}", stacklevel=2)
+
+    def _add(self, trial: Trial) -> None:
         ids = [c.id for c in self._candidates]
         self._fits(trial)
         if not trial.candidate:
@@ -215,6 +241,13 @@ def learn(
             data, or as `Search.ask` and `Search.tell`.
     """
     search = Search(task, options)
+    if not callable(run):
+        raise GroundedError(
+            "learn(task, run) needs a function that runs a candidate on the robot and returns its "
+            f"Trial, got a {type_of(run)}"
+        )
+    if not isinstance(max_iterations, int | None):
+        raise GroundedError(f"max_iterations must be a whole number, got {max_iterations!r:.60}")
     while True:
         proposal = search.proposal
         done = max_iterations is not None and proposal.standing.iteration >= max_iterations
@@ -222,24 +255,52 @@ def learn(
             return search
         candidate = search.ask()
         assert candidate is not None
+        search._add(replace(_run(run, candidate), candidate=candidate.id))
+        if check and len(search.trials) == 1 and (odd := _odd_columns(search)):
+            raise GroundedError(
+                f"the first trial can't be used: {odd}. Correct the function that runs the robot, "
+                "or pass check=False if this is mistaken"
+            )
+
+
+def _run(run: Callable[[Candidate], Trial], candidate: Candidate) -> Trial:
+    """Run a candidate and return the trial.
+
+    Raises:
+        GroundedError: if the function takes a policy instead of a candidate, or returns no trial.
+    """
+    try:
         trial = run(candidate)
-        search.tell(replace(trial, candidate=candidate.id) if isinstance(trial, Trial) else trial)
-        if check and len(search.trials) == 1:
-            _check_columns(task, search.trials[0])
+    except AttributeError as error:
+        if error.obj is not candidate or not hasattr(candidate.policy, error.name):
+            raise
+        raise GroundedError(
+            f"the function that runs the robot asks for '{error.name}', which a policy has: it is "
+            "called with a Candidate. Use its policy: learn(task, lambda c: robot(c.policy))"
+        ) from error
+    if not isinstance(trial, Trial):
+        raise GroundedError(
+            f"the function that runs the robot returned {'nothing' if trial is None else 'a '}"
+            f"{'' if trial is None else type_of(trial)}, expected the gr.Trial of the run: end it "
+            "with `return gr.Trial(...)`"
+        )
+    return trial
 
 
-def _check_columns(task: Task, trial: Trial) -> None:
-    """Raise GroundedError if the trial's columns have wrong units, signs or exchanged names."""
+def _odd_columns(search: Search) -> str:
+    """Return what is wrong with the columns of the first trial, in units, signs or names; or ""."""
+    from grounded.instruments.fed_back import unit_fed_back
     from grounded.instruments.finding import in_the_log
     from grounded.instruments.sound_trials import sound_trials
 
-    first = "the first trial can't be used"
-    mend = "Correct the function that runs the robot, or pass check=False if this is mistaken"
+    model = search.task.model
+    trial = interpolate_gaps(search.trials[0]).trial
+    policy = next(c.policy for c in search.candidates if c.id == trial.candidate)
+    if unit := unit_fed_back(model, trial, policy):
+        return unit
     try:
-        looked = sound_trials(task.model, [replace(interpolate_gaps(trial).trial, id="")])
+        looked = sound_trials(model, [replace(trial, id="")])
     except GroundedError as error:
-        said = str(error).replace("in trial number 1 ", "")
-        raise GroundedError(f"{first}: {said}. {mend}") from None
-    if odd := in_the_log(looked.findings):
-        said = "; ".join(f"{one.signal} {one.finding}" for one in odd)
-        raise GroundedError(f"{first}: {said}. {mend}")
+        return str(error).replace("in trial number 1 ", "").rstrip(".")
+    odd = in_the_log(looked.findings)
+    return "; ".join(f"{one.signal} {one.finding}" for one in odd)

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import GroundedError, NextCommand, list_of, type_of
 from grounded.model import Model
 from grounded.result import figure
 from grounded.search.candidate import Candidate, Tried
@@ -82,6 +82,14 @@ def propose(
     Raises:
         GroundedError: if the model gives no plan to start from; the message says where it fails.
     """
+    if not (isinstance(task, Task) and isinstance(options, SearchOptions)):
+        raise GroundedError(
+            "propose(task, candidates, trials, options) takes a Task, lists of Candidates and of "
+            f"Trials, and SearchOptions; got a {type_of(task)} and, as options, a "
+            f"{type_of(options)}"
+        )
+    candidates = list_of(candidates, Candidate, "candidates")
+    trials = list_of(trials, Trial, "trials")
     planner = planner or Planner(task, task)
     fingerprint = planner.fingerprint
     now = standing(task, candidates, trials, options, fingerprint)

@@ -323,7 +323,8 @@ def test_a_warning_of_the_model_is_no_failure(tmp_path):
 # target.csv
 
 TARGETS = {
-    "empty": ("", ["first column must be 't', found 'nothing'"]),
+    "empty": ("", ["target.csv is empty"]),
+    "header": ("t,x\n", ["has no row below its header"]),
     "no t": ("x,t\n0,0\n", ["first column must be 't', found 'x'"]),
     "unknown": ("t,xx\n0,0\n", ["column 'xx' is neither a state nor an input", "mean 'x'"]),
     "text": ("t,x\n0,fast\n", ["line 2: 'fast' in column 'x' is not a number"]),
@@ -332,7 +333,10 @@ TARGETS = {
     "short": ("t,x\n0,0\n0.05,0\n", ["has 2 rows", "needs 41", "horizon = 1"]),
     "twice": ("t,x,x\n" + "".join(f"{0.05 * i},0,1\n" for i in range(41)), ["'x'", "two columns"]),
     "only t": ("t\n" + "".join(f"{0.05 * i}\n" for i in range(41)), ["weighs state 'x'"]),
-    "grid": ("t,x\n" + "".join(f"{0.04 * i},0\n" for i in range(41)), ["line 3: t = 0.04 s"]),
+    "grid": (
+        "t,x\n" + "".join(f"{0.04 * i},0\n" for i in range(41)),
+        ["dt = 0.05 s, but", "0.04 s apart"],
+    ),
     "semicolons": ("t;x\n0;0\n", ["found 't;x'"]),
     "binary": ("\x00\x00", ["target.csv"]),
 }

@@ -796,7 +796,7 @@ def test_a_target_on_another_grid_is_brought_to_it_by_the_command_that_the_error
     before = read_target(made.folder / "target.csv")[1]
     file.write_text(file.read_text().replace("dt = 0.05", "dt = 0.025"))
     refused = grounded("-C", made.folder, "propose")
-    assert refused.code == 1 and "line 3" in refused.err
+    assert refused.code == 1 and "dt = 0.025 s, but" in refused.err
     named = refused.err.replace("\\\n", "").split("next: grounded ")[1].split()
     assert grounded(*named).code == 0
     after = read_target(made.folder / "target.csv")[1]

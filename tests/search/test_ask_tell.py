@@ -195,7 +195,36 @@ def test_what_a_user_gets_wrong_in_python_is_said():
             "in this order",
         ),
         (lambda: gr.Search(replace(TASK, model=two)).ask(), r"\(s, a, p\)"),
-        (lambda: gr.learn(TASK, lambda candidate: None), "expected a Trial"),
+        (lambda: gr.learn(TASK, lambda candidate: None), "returned nothing, expected the gr.Trial"),
+        (
+            lambda: gr.learn(TASK, lambda policy: policy.horizon),
+            r"called with a Candidate.*c\.policy",
+        ),
+        (lambda: gr.learn(TASK, lambda candidate: "run.mcap"), "returned a str"),
+        (lambda: gr.learn(TASK, "drive.py"), "needs a function.* got a str"),
+        (lambda: gr.learn(TASK, run, 5), "gr.SearchOptions.* got a int"),
+        (lambda: gr.learn(TASK, run, max_iterations="3"), "max_iterations"),
+        (lambda: gr.Search(TASK).tell("run.mcap"), "read_trial"),
+        (lambda: gr.Search(TASK, trials=trial), "trials must be a list of Trials, got a Trial"),
+        (lambda: gr.Search(TASK, candidates=[trial]), "list of Candidates, got a list of Trial"),
+        (lambda: gr.Search(TASK).adopt(["delay:u"]), "Diagnosis.joining"),
+        (lambda: gr.Search(TASK).adopt({"delay:u": 0.1}), "Diagnosis.joining"),
+        (lambda: gr.Search(TASK).adopt({}, [1.0]), "params must map"),
+        (lambda: gr.diagnose(TASK, [trial], 3), "DiagnosisOptions"),
+        (lambda: gr.fit([trial], TASK), "Model or a Task .* got list and Task"),
+        (lambda: gr.fit(model, None), "list of Trials, got a NoneType"),
+        (lambda: gr.fit(model, [trial], 3), "names must be a list of parameters"),
+        (lambda: propose(TASK, [], trial, OPTIONS), "list of Trials, got a Trial"),
+        (lambda: propose(TASK, [], [], None), "SearchOptions"),
+        (lambda: TASK.utility("run.mcap"), "takes the Trial of a run, got a str"),
+        (lambda: replace(trial, state_names=None), "state_names must be a tuple of names"),
     ):
         with pytest.raises(gr.GroundedError, match=told):
             mistake()
+
+
+def test_an_attribute_error_of_the_users_own_program_stays_what_it_is():
+    with pytest.raises(AttributeError, match="no attribute 'horizon'"):
+        gr.learn(TASK, lambda candidate: candidate.id.horizon)
+    with pytest.raises(AttributeError, match="no attribute 'colour'"):
+        gr.learn(TASK, lambda candidate: candidate.colour)

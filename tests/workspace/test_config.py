@@ -139,7 +139,11 @@ WRONG = [
     ("dt = 0.05", "dt = inf", ["[task] dt", "finite"]),
     ("dt = 0.05", "dt = true", ["[task] dt", "must be a number, found True"]),
     ("dt = 0.05", "dt = 1" + "0" * 400, ["[task] dt"]),
-    ("dt = 0.05", "dt = 0.06", ["target.csv line 3", "rows must be", "[task] dt = 0.06"]),
+    (
+        "dt = 0.05",
+        "dt = 0.06",
+        ["[task] dt = 0.06", "target.csv are 0.05 s apart", "set dt = 0.05"],
+    ),
     ("dt = 0.05", "DT = 0.05", ["[task] DT", "did you mean 'dt'"]),
     ("horizon = 40", "horizon = 0", ["[task] horizon", "at least 1"]),
     ("horizon = 40", "horizon = 4.5", ["[task] horizon", "whole number"]),

@@ -182,3 +182,23 @@ def test_only_the_candidates_own_export_counts_as_made(tmp_path, monkeypatch):
     assert to_run(mine, "c0001").verb == "export"
     (here / "c0001.mcap").write_bytes(mine.candidate_bytes("c0001"))
     assert to_run(mine, "c0001").verb == "next"
+
+
+def test_an_ending_that_names_no_format_is_refused_unless_the_format_is_named(tmp_path):
+    w = make(tmp_path / "w")
+    propose_in(w)
+    ingest_log(w, run_candidate(w, None).trial_file)
+    wrong = [("c0001", "a.xyz"), ("c0001", "a.mcap"), ("t0001", "a.foo"), ("t0001", "a.json")]
+    for name, file in wrong:
+        done = grounded("-C", w.folder, "export", name, "-o", tmp_path / file)
+        assert done.code == 1 and ".csv" in done.err and ".npz" in done.err, done.err
+        assert not (tmp_path / file).exists()
+    for options in (["t0001"], ["c0001", "--format", "bag"]):
+        done = grounded("-C", w.folder, "export", *options, "--runner", "-o", tmp_path / "b")
+        assert done.code == 1 and not (tmp_path / "b").exists()
+    named = grounded("-C", w.folder, "export", "c0001", "--format", "csv", "-o", tmp_path / "a.txt")
+    assert named.code == 0 and (tmp_path / "a.txt").read_text().startswith("# format")
+    plain_name = grounded("-C", w.folder, "export", "c0001", "-o", tmp_path / "plain")
+    assert plain_name.code == 0 and json.loads((tmp_path / "plain").read_text())["dt"] == 0.05
+    folder = grounded("-C", w.folder, "export", "c0001", "-o", ".")
+    assert folder.code == 1 and "is a folder" in folder.err

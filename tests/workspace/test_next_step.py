@@ -550,7 +550,7 @@ def test_a_single_run_asks_for_another_by_its_command(cart, tmp_path):
     config.write_text(config.read_text().partition("[system]")[0])
     out = " ".join(plain(grounded("-C", folder, "status").out).split())
     best = Workspace(folder).status().standing.incumbent.candidate.id
-    assert f"`grounded ingest LOG --candidate {best}`" in out  # another may be the best by then
+    assert f"`grounded export {best} --runner`" in out  # another may be the best by then
 
 
 def test_no_line_for_utilities_that_nothing_has(tmp_path):

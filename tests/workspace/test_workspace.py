@@ -109,8 +109,11 @@ def test_a_target_round_trips(tmp_path):
 def test_times_may_be_rounded_to_a_hundredth_of_a_step(tmp_path):
     (tmp_path / "t.csv").write_text("t,x\n0,0\n0.0333,0\n0.0667,0\n0.1,0\n")
     target_arrays(tmp_path / "t.csv", ["x"], ["u"], 1 / 30, 3)
-    with pytest.raises(GroundedError, match="line 3"):
+    with pytest.raises(GroundedError, match=r"set dt = 0\.0333333"):
         target_arrays(tmp_path / "t.csv", ["x"], ["u"], 0.035, 3)
+    (tmp_path / "u.csv").write_text("t,x\n0,0\n0.05,0\n0.08,0\n0.1,0\n")  # uneven
+    with pytest.raises(GroundedError, match="line 3"):
+        target_arrays(tmp_path / "u.csv", ["x"], ["u"], 1 / 30, 3)
 
 
 def test_a_copied_workspace_is_the_same_workspace(tmp_path):

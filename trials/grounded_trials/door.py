@@ -356,11 +356,11 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.exporting import export_candidate
 
-        file, here = Path(path) if path else None, self._afresh()
+        file, here, candidate = Path(path) if path else None, self._afresh(), candidate.lower()
         if form == "bag" or candidate.startswith("t"):
             from grounded_trials.report.ros_bag import export_run
 
-            return export_run(here, candidate, form, file)
+            return export_run(here, candidate, form, file, runner=runner)
         return export_candidate(here, candidate, form, file, runner=runner, anyway=anyway)
 
     def verify(self) -> Verified:

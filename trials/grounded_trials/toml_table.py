@@ -16,7 +16,13 @@ from grounded.errors import GroundedError, NextCommand, nearest
 from grounded_trials.plain_file import open_file
 
 SIZE_LIMIT = 2**22  # [bytes] of a file
-_WORDS = {str: "a text", bool: "true or false", float: "a number", int: "a whole number"}
+_WORDS = {
+    str: "a text",
+    bool: "true or false",
+    float: "a number",
+    int: "a whole number",
+    list: "a list in brackets",
+}
 _REQUIRED = object()
 
 
@@ -107,8 +113,9 @@ class Table:
         valid, found = list(names), {}
         for name in valid:
             if self.has(name):
-                value = self.take(name, list)
-                if len(value) != 2:
+                value = self._values[name]
+                self._taken.add(name)
+                if not isinstance(value, list) or len(value) != 2:
                     raise self.error(name, f"must be [low, high], found {value!r}")
                 low, high = (self._checked(name, v, float) for v in value)
                 found[name] = (low, high)

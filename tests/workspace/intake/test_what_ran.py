@@ -213,6 +213,7 @@ def test_a_discarded_trial_counts_nowhere_until_it_is_restored(waiting):
     done = grounded("-C", w.folder, "discard", "T0002", "--why", "a wheel was loose", "--json")
     assert done.code == 0 and done.json == {
         "trials": ["t0002"],
+        "unchanged": [],
         "discarded": {"t0002": "a wheel was loose"},
     }
     now = w.status()
@@ -237,7 +238,7 @@ def test_a_discarded_trial_that_is_ingested_again_stays_aside(waiting):
 
 def test_a_name_that_no_trial_has(waiting):
     w, _, _ = waiting
-    with pytest.raises(GroundedError, match="no file 't0009'"):
+    with pytest.raises(GroundedError, match="no trial 'T0009': the only one is t0001"):
         w.discard("t0001", "T0009")
     assert w.discarded() == {}
 

@@ -25,6 +25,7 @@ from grounded_trials.plain_file import open_file, read_file
 
 BAGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")  # files of a bag's folder
 KINDS = (*BAGS, ".bag", ".csv", ".npz", ".ulg")
+NEWEST = 3  # most logs named in place of one that does not exist
 EXPANDED = 4 * 2**30  # [bytes] largest size of a decompressed file
 LISTING_LIMIT = 2**24  # [bytes] of a metadata.yaml
 _ZSTD = b"\x28\xb5\x2f\xfd"
@@ -84,11 +85,23 @@ def _nearby(path: Path) -> str:
     """Return advice on a file that does not exist, to append to the message."""
     if not path.parent.is_dir():
         return f", nor does its folder {path.parent}: give a path relative to the current folder"
-    there = (p.name for p in path.parent.iterdir() if p.name.endswith(KINDS))
-    names = sorted(name for name in there if not _NO_LOG.fullmatch(name))
-    if names:
-        return f": {nearest(path.name, names)}"
+    there = [p for p in path.parent.iterdir() if p.name.endswith(KINDS)]
+    logs = sorted((p for p in there if not _NO_LOG.fullmatch(p.name)), key=lambda p: -_written(p))
+    if logs:
+        close = nearest(path.name, [p.name for p in logs])
+        if len(logs) <= NEWEST or close.startswith("did you mean"):
+            return f": {close}"
+        newest = listed([p.name for p in logs[:NEWEST]])
+        return f": the newest of the {len(logs)} logs in its folder are {newest}"
     return ": give the path of a log or of a bag's folder, relative to the current folder"
+
+
+def _written(path: Path) -> float:
+    """Return when a file was last written [s]; 0 if it is gone."""
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
 
 
 def _advice(folder: Path) -> str:
@@ -125,6 +138,14 @@ def open_log(path: Path) -> BinaryIO:
         raise GroundedError(f"{path} can't be read: {error.strerror}") from None
 
 
+def empty(path: Path) -> GroundedError:
+    """Return the error for a log without a single byte."""
+    return GroundedError(
+        f"{path} is empty (0 bytes): the recorder wrote nothing, or the copy is unfinished; copy "
+        "it again, or record again"
+    )
+
+
 def log_records(path: Path) -> Iterator[Record]:
     """Yield the records of one file of any supported format.
 
@@ -133,6 +154,8 @@ def log_records(path: Path) -> Iterator[Record]:
     """
     with open_log(path) as stream:
         head = stream.read(16)
+        if not head:
+            raise empty(path)
         if not head.startswith(_ZSTD):
             yield from _by_format(path, head, stream)
             return
@@ -144,7 +167,7 @@ def log_records(path: Path) -> Iterator[Record]:
 
 
 def _by_format(path: Path, head: bytes, stream: BinaryIO) -> Iterator[Record]:
-    if head.startswith(MAGIC[:5]) or path.name.endswith(".mcap") or not head:
+    if head.startswith(MAGIC[:5]) or path.name.endswith(".mcap"):
         yield from map(_plain, read_records(stream, str(path)))
         return
     from grounded_trials.formats import bags, tables, text_tables

@@ -27,7 +27,7 @@ from grounded_trials.formats.mcap_records import (
     Schema,
 )
 from grounded_trials.formats.mcap_writer import LIBRARY, CopyWriter
-from grounded_trials.logs.log_files import open_log
+from grounded_trials.logs.log_files import empty, open_log
 from grounded_trials.logs.salvage import Salvage
 from grounded_trials.store.candidate_file import read_candidate
 from grounded_trials.store.own_files import TRIAL
@@ -74,7 +74,14 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
     source, target = Path(source), Path(target)
     if target.exists():
         raise GroundedError(f"{target} exists already; choose another file name")
+    if target.suffix.lower() != ".mcap":
+        raise GroundedError(f"{target} does not end in .mcap, the format that is written: add it")
+    if not target.parent.is_dir():
+        raise GroundedError(f"{target} can't be written: its folder does not exist; create it")
     with open_log(source) as stream, budget(str(source), [source]):
+        if not stream.read(1):
+            raise empty(source)
+        stream.seek(0)
         salvage = Salvage(stream, str(source))
         try:
             with target.open("xb") as out:

@@ -23,18 +23,20 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded_trials.formats.bags import standard_types
 from grounded_trials.logs.inspect_pairs import velocities
 from grounded_trials.report.scene import Scene, scene_of
 from grounded_trials.store.store import write_atomically
-from grounded_trials.workspace.exporting import Exported
+from grounded_trials.workspace.exporting import Exported, format_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.proposing import candidate_named
+from grounded_trials.workspace.unknown_id import unknown_trial
 
 FRAME, BODY = "map", "robot"
+BAGS = ("bag", "db3", "mcap")  # endings of a bag's folder
 Message = tuple[str, str, int, Any]  # topic, type, time [ns], message
 
 
@@ -175,10 +177,17 @@ def quaternion(turn: Array) -> tuple[float, float, float, float]:
     return float(x), float(y), float(z), float(w)
 
 
-def export_run(workspace: Folder, identity: str, form: str | None, path: Path | None) -> Exported:
+def export_run(
+    workspace: Folder, identity: str, form: str | None, path: Path | None, *, runner: bool = False
+) -> Exported:
     """Write a trial, or a candidate's predicted run, see `Workspace.export`."""
-    named = path.suffix.lstrip(".").lower() if path else ""
-    form = form or (named if named in ("csv", "npz") else "bag")
+    if runner:
+        raise GroundedError(
+            "the runner runs a candidate, expected one without --format bag: not a trial, nor the "
+            "predicted run of a candidate"
+        )
+    form = form or format_of(path, ("csv", "npz", *BAGS), "bag")
+    form = "bag" if form in BAGS else form
     if form not in ("bag", "csv", "npz"):
         raise GroundedError(f"a run can be exported as bag, csv or npz, not {form}")
     states, inputs, dt = _run_of(workspace, identity)
@@ -205,7 +214,6 @@ def _run_of(workspace: Folder, identity: str) -> tuple[Array, Array, float]:
         if stored.trial.id == identity:
             return stored.trial.states, stored.trial.inputs, stored.trial.dt
     if identity.startswith("t"):
-        known = [stored.trial.id for stored in workspace.trials()]
-        raise GroundedError(f"there is no trial '{identity}': {nearest(identity, known)}")
+        raise unknown_trial(workspace, identity)
     found, _ = workspace.candidate(candidate_named(workspace, identity))
     return found.predicted_states, found.predicted_inputs, found.policy.dt

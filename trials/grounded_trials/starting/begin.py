@@ -18,7 +18,7 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.result import Result
+from grounded.result import Result, listed
 from grounded_trials.formats.text_tables import column_units
 from grounded_trials.logs.inspect_evidence import as_stated, weigh
 from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated, mapping_toml
@@ -41,6 +41,7 @@ from grounded_trials.workspace.model_file import load_module, model_in
 
 NONE: Mapping[str, Array] = {}  # no input was read
 SLOWEST = 0.5  # [Hz] smallest plausible row rate; below it, times may be in another unit
+NAMED = 5  # most columns named in an error
 HORIZON = 200  # largest number of steps of a target taken from a recorded run
 Ask = Callable[[Guess], str]
 
@@ -158,6 +159,13 @@ def _begin(
     report = inspect_log(log)
     if report.damage:
         raise GroundedError(report.damage, NextCommand("recover", (str(log),)))
+    if all(field.low is None for topic in report.topics for field in topic.fields):
+        there = [field.path for topic in report.topics for field in topic.fields]
+        words = f"only text in {listed(there[:NAMED])}" if there else "no column but the times"
+        raise GroundedError(
+            f"{log} holds no numbers, {words}: init needs a log with the robot's states and "
+            "commands as numbers"
+        )
     report, notes = _one_run(report)
     joints = joint_names(report)
     chosen, why = (kind, "as you specified") if kind else kind_in(report, joints)

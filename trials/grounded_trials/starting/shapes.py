@@ -24,10 +24,12 @@ from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import position_names
-from grounded_trials.workspace.task_file import read_target
+from grounded_trials.workspace.task_file import ROW_LIMIT, read_target
+from grounded_trials.workspace.unknown_id import refuse_ids
 
 PATHS = ("line", "circle", "figure-8")
 SHAPES = (*PATHS, "step", "swing-up")
+FEWEST, MOST = 5, ROW_LIMIT - 2  # control steps of a target
 FINE = 2000  # number of points of a path
 AROUND = 720  # angles at which a hinge is tried
 BRIEF, SLIGHT = 1e-4, 1e-3  # [s] of the step there; [rad/s^2] smallest pull of its weight
@@ -92,7 +94,22 @@ def _check(drive: Drive) -> None:
 
 
 def _grid(seconds: float, dt: float) -> Array:
-    return dt * np.arange(np.ceil(seconds / dt - 1e-6) + 1)
+    return dt * np.arange(_in_steps(seconds, dt, np.ceil(seconds / dt - 1e-6)) + 1)
+
+
+def _in_steps(seconds: float, dt: float, steps: float) -> int:
+    """Return a target's number of control steps as an integer.
+
+    Raises:
+        GroundedError: if there are fewer than FEWEST or more than MOST.
+    """
+    if FEWEST <= steps <= MOST:
+        return int(steps)
+    raise GroundedError(
+        f"a target of {seconds:.4g} s has {steps:.4g} control steps of [task] dt = {dt:g} s, "
+        f"expected {FEWEST} to {MOST}: check dt in grounded.toml, the time in seconds from one "
+        "command to the next, and how long the manoeuvre lasts"
+    )
 
 
 def line_target(
@@ -232,11 +249,11 @@ def step_target(
     """Return columns with given values from the second row on; the first row is `start`, or 0.
 
     Raises:
-        GroundedError: for an unknown state, or without a state or a duration.
+        GroundedError: for an unknown state, without a state, or for an unusable number of steps.
     """
-    rows = round(seconds / dt) + 1
-    if not to or rows < 2:
-        raise GroundedError("name a state and its value, such as --to x=1.0, and --seconds")
+    if not to:
+        raise GroundedError("name a state and its value, such as --to x=1.0")
+    rows = _in_steps(seconds, dt, np.round(seconds / dt)) + 1
     _check_states(to, model)
     first = np.arange(rows) < 1
     return {name: np.where(first, start.get(name, 0.0), value) for name, value in to.items()}
@@ -321,7 +338,8 @@ def swing_up(
         start: [task] start.
 
     Raises:
-        GroundedError: if no angle of the model hangs under its weight and `to` names none.
+        GroundedError: if no angle of the model hangs under its weight and `to` names none, or for an
+            unusable number of steps.
     """
     hung = hinges(model, start)
     chosen = [one for one in hung if one.angle in to] or hung[:1]
@@ -330,7 +348,7 @@ def swing_up(
             f"no angle of model '{model.name}' hangs under its weight, so none can swing up; name "
             "the angle and its value, such as --to q=3.1416"
         )
-    first = np.arange(round(seconds / dt) + 1) < 1
+    first = np.arange(_in_steps(seconds, dt, np.round(seconds / dt)) + 1) < 1
     columns = {}
     for one in chosen:
         hangs = start.get(one.angle, one.hangs)
@@ -350,6 +368,7 @@ def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[st
         GroundedError: if there is no such file, or it can't be sampled.
     """
     model, dt = workspace.base_model, workspace.config.task.dt
+    refuse_ids(workspace, file, "target")
     if not Path(file).exists():
         raise GroundedError(f"'{file}' is neither a file nor a shape: {nearest(file, shapes)}")
     mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
@@ -358,7 +377,8 @@ def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[st
         known = [name for name in names[1:] if name in model.states]
         if not known:
             raise GroundedError(f"{file} has no column named after a state: {', '.join(names)}")
-        t = np.arange(0.0, values[-1, 0] - values[0, 0] + 1e-9, dt)
+        lasts = values[-1, 0] - values[0, 0]
+        t = dt * np.arange(_in_steps(lasts, dt, np.floor((lasts + 1e-9) / dt)) + 1)
         at = values[:, 0] - values[0, 0]
         return {name: np.interp(t, at, values[:, names.index(name)]) for name in known}
     if mapping is None:

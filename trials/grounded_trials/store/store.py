@@ -119,17 +119,23 @@ class Store:
         Raises:
             GroundedError: if there is none, or more than one.
         """
-        entries = self.list()
-        hits = [s for s in entries if key in (s.id, s.path.name)]
-        if not hits and len(key) >= 4:
-            hits = [s for s in entries if s.digest.startswith(key[:DIGITS])]
+        hits = self.matching(key)
         if len(hits) == 1:
             return hits[0]
         if not hits:
+            entries = self.list()
             last = f"the last is {entries[-1].id}" if entries else "it is empty"
             raise GroundedError(f"{self.folder} has no file '{key}'; {last}")
         names = ", ".join(s.path.name for s in hits)
         raise GroundedError(f"'{key}' matches {names}; give more digits of the hash")
+
+    def matching(self, key: str) -> tuple[Stored, ...]:
+        """Return the files that `find` chooses from."""
+        entries = self.list()
+        hits = tuple(s for s in entries if key in (s.id, s.path.name))
+        if not hits and len(key) >= 4:
+            return tuple(s for s in entries if s.digest.startswith(key[:DIGITS]))
+        return hits
 
     def read(self, key: str | Stored) -> bytes:
         """Return the contents of a file, checked against its hash.
@@ -271,6 +277,8 @@ def write_atomically(path: Path, data: bytes) -> None:
     Raises:
         GroundedError: if it can't be written.
     """
+    if path.is_dir():
+        raise GroundedError(f"{path} is a folder, expected a file: name a file in it")
     # not named by process id: processes in two containers may have the same id
     temporary = path.with_name(f".{path.name}-{os.urandom(8).hex()}.tmp")
     try:

@@ -18,12 +18,13 @@ import numpy as np
 
 from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked
-from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.errors import GroundedError, NextCommand
 from grounded.instruments.finding import in_the_log
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.identity import ROWS
 from grounded_trials.workspace.intake.where_to_mend import where_to_mend
+from grounded_trials.workspace.unknown_id import unusable_trial
 
 if TYPE_CHECKING:
     from grounded.effects import Library
@@ -235,9 +236,10 @@ def _chosen(workspace: Folder, names: Sequence[str]) -> list[Trial]:
             "there is no trial to learn from: ingest runs of candidates, or other logs with --data"
         )
     known = [trial.id for trial in used]
+    names = [name.lower() for name in names]
     for name in names:
         if name not in known:
-            raise GroundedError(f"there is no usable trial '{name}': {nearest(name, known)}")
+            raise unusable_trial(workspace, name, known)
     guessed = {t.stored.id: t.meta.get("estimated", "") for t in workspace.trials()}
     return [
         _measured(trial, [name for name in guessed[trial.id].split(",") if name])

@@ -12,7 +12,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,11 +65,11 @@ def export_candidate(
 ) -> Exported:
     """Write a candidate to a file, see `Workspace.export`.
 
-    Without `form` the extension of `path` decides the format; else npz with `runner`, else json.
+    Without `form` the ending of `path` decides the format; without one it is npz with `runner`,
+    else json.
     """
     encoders = _encoders()
-    named = path.suffix.lstrip(".").lower() if path else ""
-    form = form or (named if named in encoders else "npz" if runner else "json")
+    form = form or format_of(path, tuple(encoders), "npz" if runner else "json")
     path = path or Path(f"{identity}.{form}")
     if form not in encoders:
         raise GroundedError(f"there is no format '{form}': {nearest(form, encoders)}")
@@ -86,6 +86,23 @@ def export_candidate(
     waiting = handed.check.standing.outstanding
     how = () if waiting and waiting.id == identity else ("--candidate", identity)
     return Exported(identity, path, form, program, handed.notes, handed.overridden, how)
+
+
+def format_of(path: Path | None, formats: Sequence[str], default: str) -> str:
+    """Return the format that a file's ending names; `default` without an ending.
+
+    Raises:
+        GroundedError: for any other ending.
+    """
+    ending = path.suffix.lstrip(".").lower() if path else ""
+    if ending in formats:
+        return ending
+    if ending:
+        raise GroundedError(
+            f"{path} ends in .{ending}, which is not a format here: expected "
+            f".{', .'.join(formats[:-1])} or .{formats[-1]}, or the format named with --format"
+        )
+    return default
 
 
 def void_exports(workspace: Folder, but: str = "") -> tuple[Path, ...]:

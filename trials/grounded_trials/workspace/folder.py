@@ -18,7 +18,7 @@ from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.search.candidate import Candidate
 from grounded.task import Task
@@ -41,6 +41,7 @@ from grounded_trials.workspace.identity import (
 )
 from grounded_trials.workspace.model_file import check_names, load_module, model_in
 from grounded_trials.workspace.task_file import build_task, read_target
+from grounded_trials.workspace.unknown_id import unknown_candidate
 
 if TYPE_CHECKING:
     from grounded.search.planner import Planner
@@ -230,9 +231,7 @@ class Folder:
         """
         for _, read in self._sources(identity):
             return read()
-        raise GroundedError(
-            f"there is no candidate '{identity}': {nearest(identity, self.candidate_ids())}"
-        )
+        raise unknown_candidate(self, identity)
 
     def names(self) -> frozenset[str]:
         """Return the file names of all trials and candidates."""

@@ -15,13 +15,15 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
+from grounded_trials.formats.mcap_walk import DamagedFile
 from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
 from grounded_trials.store.store import Damaged, Store, Stored
+from grounded_trials.workspace.unknown_id import unknown_trial
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -150,6 +152,7 @@ class SetAside(Result):
 
     trials: tuple[str, ...]
     discarded: dict[str, str]  # t0004 -> why
+    unchanged: tuple[str, ...] = ()  # those of `trials` that were in this state before
 
     def summary(self) -> str:
         """Return all trials that are set aside."""
@@ -157,20 +160,28 @@ class SetAside(Result):
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of `discard --json` and `restore --json`."""
-        return {"trials": list(self.trials), "discarded": self.discarded}
+        named = {"trials": list(self.trials), "unchanged": list(self.unchanged)}
+        return named | {"discarded": self.discarded}
 
 
 def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> SetAside:
     """Record that trials were discarded or restored, see `Workspace.discard`."""
+    for name in trials:
+        if not workspace.store.matching(name.lower()):
+            raise unknown_trial(workspace, name)
     found = [workspace.store.find(name.lower()) for name in trials]
+    same = []  # no change: discarded again for no other reason, or restored but never discarded
     digests = [stored.digest for stored in workspace.store.list()]
     for one in found:
-        if (workspace.noted.why_aside(one) is None) == (note == "discard"):
-            copied = digests.count(one.digest) > 1 and one.digest not in workspace.noted.aside
-            trial = one.path.stem if copied else one.digest
-            workspace.notes.add({"note": note, "trial": trial, "why": why})
+        before = workspace.noted.why_aside(one)
+        if before is None if note == "restore" else before is not None and why in ("", before):
+            same.append(one.id)
+            continue
+        copied = digests.count(one.digest) > 1 and one.digest not in workspace.noted.aside
+        trial = one.path.stem if copied else one.digest
+        workspace.notes.add({"note": note, "trial": trial, "why": why})
     workspace.forget_trials()
-    return SetAside(tuple(one.id for one in found), workspace.discarded())
+    return SetAside(tuple(one.id for one in found), workspace.discarded(), tuple(same))
 
 
 @lru_cache(maxsize=4)
@@ -251,7 +262,14 @@ def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]
 def _proven(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
     """Decode a candidate, cached: one command decodes the same bytes up to three times."""
     name = f"candidates/{identity}.mcap"
-    policy, states, inputs, meta = read_candidate(data, name)
+    try:
+        policy, states, inputs, meta = read_candidate(data, name)
+    except DamagedFile as error:
+        raise GroundedError(
+            f"{name} is damaged: {error.found} (at byte {error.offset}). Delete it: a trial that "
+            "ran it carries a copy, and one that was not run is made again",
+            NextCommand("propose"),
+        ) from None
     try:
         about = {key: of((_ABSENT | meta)[key]) for key, of in _FIELDS.items() if key != "task"}
     except (KeyError, ValueError) as error:

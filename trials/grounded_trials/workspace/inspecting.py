@@ -12,6 +12,7 @@ from grounded_trials.logs.inspect_log import LogReport, inspect_log
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.unknown_id import refuse_ids
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -89,6 +90,7 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     from grounded_trials.logs.unnamed import from_the_rest
     from grounded_trials.workspace.intake.log_faults import no_angles
 
+    refuse_ids(workspace, log, "inspect")
     report = inspect_log(log)
     if report.meta.get("format") or report.damage:
         return Inspected(str(log), report, "")

@@ -64,7 +64,7 @@ class Status(Result):
 
     standing: Standing
     then: NextCommand
-    again: NextCommand  # runs the best candidate once more, or ingests its log
+    again: NextCommand  # runs or exports the best candidate once more; `next` once it is exported
     outdated: str = ""  # why the last diagnosis is outdated
     notes: tuple[str, ...] = ()  # notes on the end of the search, and on trials that don't count
     discarded: dict[str, str] = field(default_factory=dict)  # t0004 -> why it is set aside
@@ -158,7 +158,7 @@ def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
     name = named[0] if named else candidate
     files = (path for at in (workspace.folder, Path()) for path in at.glob(f"{name}.*"))
     if any(is_export(workspace, candidate, path) for path in files):
-        return NextCommand("next", ("LOG",))
+        return NextCommand("next", ("LOG", "--candidate", candidate) if named else ("LOG",))
     return NextCommand("export", (name, "--runner"))
 
 
@@ -308,11 +308,11 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
 
 
 def again_best(workspace: Folder, now: Standing) -> NextCommand:
-    """Return the command for one more trial of the best: `run`, or `ingest` if run by hand."""
-    if workspace.config.system.reachable:
+    """Return the command for one more trial of the best candidate, see `to_run`."""
+    if now.incumbent is None or workspace.config.system.reachable:
         return NextCommand("run", ("best",))
-    best = now.incumbent.candidate.id if now.incumbent else "best"  # "best" may change meanwhile
-    return NextCommand("ingest", ("LOG", "--candidate", best))
+    best = now.incumbent.candidate.id  # "best" may be another one when the log comes in
+    return to_run(workspace, best, best)
 
 
 def uncounted(workspace: Folder, trials: Sequence[StoredTrial], now: Standing) -> list[str]:
@@ -371,7 +371,7 @@ def candidate_named(workspace: Folder, name: str | None, now: Standing | None = 
                 PROPOSE,
             )
         return waiting.id
-    if name != "best":
+    if (name := name.lower()) != "best":
         workspace.candidate_bytes(name)  # raises if there is none
         return name
     best = (now or standing_in(workspace)).incumbent

@@ -30,7 +30,7 @@ from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.handover import Handed, checked_candidate
 from grounded_trials.workspace.model_file import load_module, model_in
-from grounded_trials.workspace.proposing import candidate_named
+from grounded_trials.workspace.proposing import candidate_named, to_run
 
 TRIALS = 30  # limit of the search for the optimum
 
@@ -81,7 +81,7 @@ def run_candidate(
             "grounded.toml has no [system]: run the candidate "
             f"{workspace.candidate_path(identity)} on your robot by hand and ingest its log, or "
             'give [system] command = "python drive.py {candidate} {trial}"',
-            NextCommand("ingest", ("TRIAL.mcap",)),
+            to_run(workspace, identity, *(() if candidate is None else (candidate,))),
         )
     return Ran(identity, path, handed.notes, handed.overridden)
 
@@ -141,7 +141,10 @@ def _call(workspace: Folder, command: str, handed: Handed, path: Path) -> None:
     try:
         done = subprocess.run(parts, cwd=workspace.folder, stdout=2, check=False)
     except OSError as error:
-        raise GroundedError(f"[system] command '{parts[0]}' can't be run: {error}") from None
+        raise GroundedError(
+            f"[system] command '{parts[0]}' can't be run: {error.strerror}; expected a program on "
+            f"the PATH, or a path from the workspace: {command}"
+        ) from None
     if done.returncode != 0:
         hint = f"; what it wrote is kept in {path}" if path.exists() else ""
         raise GroundedError(

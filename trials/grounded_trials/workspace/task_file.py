@@ -117,6 +117,8 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
     return Reward(**weights)
 
 
+DRAW = ": draw the manoeuvre, or write one row per control step, with columns t and states"
+SHAPE = NextCommand("target", ("SHAPE",))
 ROW_LIMIT = 200_002
 LEAST = 0.1  # smallest range of a target column used for its weight
 # a column counts as constant if its range is below STILL of its size (of LEAST if that is less), or
@@ -139,6 +141,8 @@ def read_target(path: Path) -> tuple[list[str], Array]:
         with TextIOWrapper(open_file(path), encoding="utf-8-sig", newline="") as stream:
             reader = csv.reader(stream)
             names = [name.strip() for name in next(reader, [])]
+            if not names:
+                raise GroundedError(f"{path.name} is empty{DRAW}", SHAPE)
             _check_header(path, names)
             rows: list[list[float]] = []
             for line, row in enumerate(reader, start=2):
@@ -163,11 +167,10 @@ def read_target(path: Path) -> tuple[list[str], Array]:
 
 
 def _check_header(path: Path, names: list[str]) -> None:
-    if not names or names[0] != "t":
-        found = names[0] if names else "nothing"
+    if names[0] != "t":
         raise GroundedError(
-            f"{path.name}: the first column must be 't', found '{found}'; columns are separated by "
-            "commas"
+            f"{path.name}: the first column must be 't', found '{names[0]}'; columns are separated "
+            "by commas"
         )
     twice = [name for name in names if names.count(name) > 1]
     if twice:
@@ -225,6 +228,9 @@ def target_arrays(
                 f"{path.name}: column '{name}' is neither a state nor an input of the model: "
                 + nearest(name, [*states, *inputs])
             )
+    if len(values) < 2:
+        rows = "one row" if len(values) else "no row"
+        raise GroundedError(f"{path.name} has {rows} below its header{DRAW}", SHAPE)
     if len(values) < horizon + 1:
         raise GroundedError(
             f"{path.name} has {len(values)} rows, but a horizon of {horizon} steps needs "
@@ -233,6 +239,7 @@ def target_arrays(
     t = values[: horizon + 1, 0]
     off = np.abs(t - t[0] - dt * np.arange(horizon + 1))
     if off.max() > 0.01 * dt:
+        _check_interval(path, values[:, 0], dt)
         i = int(np.argmax(off > 0.01 * dt))
         raise GroundedError(
             f"{path.name} line {i + 2}: t = {t[i]:g} s, expected {t[0] + i * dt:g} s: rows must be "
@@ -248,6 +255,28 @@ def target_arrays(
         return target, None
     columns = [given.get(name, np.zeros(horizon + 1))[:horizon] for name in inputs]
     return target, np.stack(columns, axis=1)
+
+
+def _check_interval(path: Path, t: Array, dt: float) -> None:
+    """Raise an error that names [task] dt if the rows of a target have another, even interval.
+
+    A dt of at least the whole target is a mistake in dt, not in the target.
+    """
+    lasts = float(t[-1] - t[0])
+    each = lasts / (len(t) - 1)
+    if each <= 0 or np.abs(np.diff(t) - each).max() > 0.01 * each or abs(each - dt) < 0.01 * each:
+        return
+    rows = f"[task] dt = {dt:g} s, but the rows of {path.name} are {each:.6g} s apart"
+    if dt < lasts:
+        raise GroundedError(
+            f"{rows}: set dt = {each:.6g}, or resample the target with the command below",
+            NextCommand("target", (str(path),)),
+        )
+    unit = f" (in seconds: {dt:g} ms is {dt / 1000:g})" if dt / 1000 < lasts else ""
+    raise GroundedError(
+        f"{rows} and last {lasts:.4g} s in all: dt is the time from one command to the next{unit}; "
+        f"set dt = {each:.6g}"
+    )
 
 
 def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -> Path:

@@ -67,6 +67,7 @@ from grounded_trials.workspace.intake.who_drove import OTHERS, Following, suspic
 from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of
 from grounded_trials.workspace.proposing import candidate_named, latest_candidates, standing_in
+from grounded_trials.workspace.unknown_id import refuse_ids
 
 ASIDE = "set aside"  # the verdict on a run that does not count
 EXACT = 0.1  # largest difference, relative to the resolution of commands, of an exact match
@@ -84,6 +85,7 @@ def ingest_log(
 
     With `ahead` the next candidate is planned if the next command depends on it, see `standing_in`.
     """
+    refuse_ids(workspace, path, "ingest")
     candidate = candidate and candidate_named(workspace, candidate)
     kind = "" if path.is_dir() else kind_of(path)
     if kind == CANDIDATE:
@@ -127,7 +129,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         warnings = (*warnings, *afterwards(workspace.task, whole))
     if before:
         warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
-    if aside := added.known and added.id in workspace.discarded():
+    if aside := added.id in workspace.discarded():
         warnings = (*warnings, f"{added.id} stays set aside and does not count: {_undo(added.id)}")
     now = standing_in(workspace) if trial.candidate else None
     history = now.history if now else ()
@@ -224,7 +226,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         f"multiply the stamps by {slow:g} and ingest it again"
     )
     if candidate is not None:
-        seem = f"with {listed(units)} times {by:.6g} it would be its run: another unit, or sign?"
+        seem = f"with {listed(units)} times {by:.6g} it is its run: another unit, or sign?"
         doubts = [seem if units else pace or misled(log, workspace.task, own.policy) or why]
         if log and not (found and found.opens_alike):
             doubts.append(

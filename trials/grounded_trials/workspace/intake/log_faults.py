@@ -134,8 +134,8 @@ def _degrees(model: Model, known: Trial) -> list[Fault]:
     return [
         Fault(
             f"{one.signal} {one.finding}",
-            f"Multiply the scale in [log.state.{one.signal}] by {one.log.split(' = ')[1]} (1 "
-            "if none is given)",
+            f"Multiply the scale in [log.state.{one.signal}] by {one.log.split(' = ')[1]} (a "
+            "missing scale is 1)",
             f"write {model.states[one.signal]}",
         )
         for one in findings

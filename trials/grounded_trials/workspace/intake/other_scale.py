@@ -236,15 +236,15 @@ def units_told(names: Sequence[str], by: float, mapped: bool) -> str:
     which = listed(names)
     if by == -1:
         its = "its scale" if len(names) == 1 else "the scale of each"
-        mend = f"multiply {its} by -1 in {FILE}'s [log] (1 if none is given)"
-        alone = f"append {which} times -1 and run it again, or ingest it with --data"
+        mend = f"multiply {its} by -1 in {FILE}'s [log] (a missing scale is 1)"
+        alone = f"write {which} times -1 and run it again, or ingest it with --data"
         return f"with {which} of the other sign: {mend if mapped else alone}"
     size = f"{max(abs(by), 1 / abs(by)):.4g} times too {'large' if abs(by) < 1 else 'small'}"
     size += " and of the other sign" * (by < 0)
     told = next((text for factor, text in NAMED if np.isclose(by, factor, rtol=1e-6)), None)
-    mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (1 if none is given)"
+    mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (a missing scale is 1)"
     if told is None:
         mend += "; if the log is right, the robot's program measures it wrong"
     if not mapped:
-        mend = f"append {which} times {by:.6g} and run it again, or ingest it with --data"
+        mend = f"write {which} times {by:.6g} and run it again, or ingest it with --data"
     return f"with {which} {size}{told or ''}: {mend}"

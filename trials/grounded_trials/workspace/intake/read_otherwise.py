@@ -81,16 +81,16 @@ def misled(log: Recording | None, task: Task, policy: Policy) -> str:
         a, b = pair
         of = "state" if a in task.model.state_names else "input"
         return (
-            f"it would be, with {a} and {b} in each other's column: exchange the paths in "
+            f"{a} and {b} seem to be in each other's column: exchange the paths in "
             f"[log.{of}.{a}] and [log.{of}.{b}], or the column headers in the log"
         )
     if off := offset_in(log, task, policy):
         name, by = off
         much = with_unit(f"{abs(by):.3g}", task.model.states[name])
         return (
-            f"it would be, were {name} {much} {'less' if by > 0 else 'more'}: does its zero "
+            f"{name} seems to be {much} too {'large' if by > 0 else 'small'}: does its zero "
             f"differ from that of the program? Add {-by:.3g} to the offset in "
-            f"[log.state.{name}] (0 if none is given); if the log is right, the robot's program "
+            f"[log.state.{name}] (a missing offset is 0); if the log is right, the robot's program "
             "measures it wrong"
         )
     return ""
