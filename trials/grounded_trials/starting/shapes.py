@@ -338,8 +338,8 @@ def swing_up(
         start: [task] start.
 
     Raises:
-        GroundedError: if no angle of the model hangs under its weight and `to` names none, or for an
-            unusable number of steps.
+        GroundedError: if no angle of the model hangs under its weight and `to` names none, or for
+            an unusable number of steps.
     """
     hung = hinges(model, start)
     chosen = [one for one in hung if one.angle in to] or hung[:1]
