@@ -91,7 +91,8 @@ def _check(drive: Drive) -> None:
 
 
 def _grid(seconds: float, dt: float) -> Array:
-    return dt * np.arange(_in_steps(seconds, dt, np.ceil(seconds / dt - 1e-6)) + 1)
+    t: Array = dt * np.arange(_in_steps(seconds, dt, np.ceil(seconds / dt - 1e-6)) + 1)
+    return t
 
 
 def _in_steps(seconds: float, dt: float, steps: float) -> int:
