@@ -165,11 +165,12 @@ class Search:
         )
 
     def _fits(self, trial: Trial) -> None:
-        if not isinstance(trial, Trial):
+        given: Any = trial
+        if not isinstance(given, Trial):
             told = " (grounded_trials.store.trial_file.read_trial reads a file)"
             raise GroundedError(
-                f"expected a Trial of the run, got a {type_of(trial)}"
-                + told * isinstance(trial, str | Path)
+                f"expected a Trial of the run, got a {type_of(given)}"
+                + told * isinstance(given, str | Path)
             )
         model = self.task.model
         has = (trial.state_names, trial.input_names, trial.dt)
@@ -272,7 +273,7 @@ def _run(run: Callable[[Candidate], Trial], candidate: Candidate) -> Trial:
     try:
         trial = run(candidate)
     except AttributeError as error:
-        if error.obj is not candidate or not hasattr(candidate.policy, error.name):
+        if error.obj is not candidate or not hasattr(candidate.policy, error.name or ""):
             raise
         raise GroundedError(
             f"the function that runs the robot asks for '{error.name}', which a policy has: it is "

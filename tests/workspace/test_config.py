@@ -142,7 +142,7 @@ WRONG = [
     (
         "dt = 0.05",
         "dt = 0.06",
-        ["[task] dt = 0.06", "target.csv are 0.05 s apart", "set dt = 0.05"],
+        ["[task] dt = 0.06", "are 0.05 s apart", "set dt = 0.05"],
     ),
     ("dt = 0.05", "DT = 0.05", ["[task] DT", "did you mean 'dt'"]),
     ("horizon = 40", "horizon = 0", ["[task] horizon", "at least 1"]),

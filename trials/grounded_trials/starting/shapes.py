@@ -94,7 +94,8 @@ def _check(drive: Drive) -> None:
 
 
 def _grid(seconds: float, dt: float) -> Array:
-    return dt * np.arange(_in_steps(seconds, dt, np.ceil(seconds / dt - 1e-6)) + 1)
+    steps = _in_steps(seconds, dt, float(np.ceil(seconds / dt - 1e-6)))
+    return dt * np.arange(steps + 1.0)
 
 
 def _in_steps(seconds: float, dt: float, steps: float) -> int:
