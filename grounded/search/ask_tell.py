@@ -21,8 +21,8 @@ from grounded.errors import GroundedError, list_of, nearest, type_of
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.improve import propose
-from grounded.search.making import Proposal
 from grounded.search.planner import Planner, planner_with
+from grounded.search.proposal import Proposal
 from grounded.search.standing import SearchOptions, Standing
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps

@@ -24,6 +24,8 @@ Way = Literal[
 Slopes = Literal[
     "",  # the model's own
     "corrected",  # from the mispredictions of earlier trials, see `mispredictions`
+    "original",  # those of the model without adopted effects, see `original`
+    "original, corrected",
 ]
 
 LITTLE = 0.1  # fraction of the best cost below which a doubtful gain is no reason to continue

@@ -32,8 +32,10 @@ from grounded.errors import GroundedError, NextCommand, list_of, type_of
 from grounded.model import Model
 from grounded.result import figure
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.making import About, Maker, Proposal
+from grounded.search.making import About, Maker
+from grounded.search.original import keeping_promises
 from grounded.search.planner import Planner
+from grounded.search.proposal import Proposal
 from grounded.search.standing import (
     Ending,
     Phase,
@@ -162,13 +164,14 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
         if step is None:
             continue
         about = About(make, incumbent, options, way)
-        found = about.step_from(step, promised)
-        least = options.tolerance * abs(about.already)
+        stepping = keeping_promises(about)
+        found = stepping.step_from(step, promised)
+        least = options.tolerance * abs(stepping.already)
         if way == ways[0] and (own := about.own_plan(found)) is not None:
             found = own
         if found is not None and found.candidate is not None:
             return found
-        unsafe, ruinous = unsafe or found, ruinous or about.ruinous
+        unsafe, ruinous = unsafe or found, ruinous or stepping.ruinous
         lost = losers_of(now.history, incumbent.candidate.id, make.fingerprint)
         if promised and not lost and 0 <= max(promised) <= least:
             break  # at the model's optimum: no trial is spent on another way

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from grounded.compile import Problem
 from grounded.policy import Policy
-from grounded.result import Result, document
 from grounded.rollout import Rollout, apart
 from grounded.search.candidate import LITTLE, Candidate, Slopes, Tried, Way
 from grounded.search.directions import base_columns, direction
 from grounded.search.limit_cycle import between_limits, limit_cycle
 from grounded.search.margin import steadied
 from grounded.search.planner import Planner, predicted
+from grounded.search.proposal import Proposal
 from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
 from grounded.search.step_size import KEPT, Step
@@ -40,11 +40,19 @@ class About:
 
     If a trial did not start at s_0, its utility can't be compared with predicted runs from s_0. So
     gains are relative to theta's own run in the grounded model (`already`), which equals the trial
-    if it started at s_0.
+    if it started at s_0. `original`: whether `make` plans without the adopted effects.
     """
 
-    def __init__(self, make: Maker, incumbent: Tried, options: SearchOptions, way: Way) -> None:
+    def __init__(
+        self,
+        make: Maker,
+        incumbent: Tried,
+        options: SearchOptions,
+        way: Way,
+        original: bool = False,
+    ) -> None:
         self.make, self.incumbent, self.options, self.way = make, incumbent, options, way
+        self.original = original
         planner, plan = make.planner, make.planner.plan
         own = planner.lift(mean_trial(incumbent.trials, planner.task.model.angle_mask))
         plan.model.system.check(own.states[:-1], own.inputs, plan.model.values, plan.dt)
@@ -79,6 +87,8 @@ class About:
     @property
     def slopes(self) -> Slopes:
         """Which derivatives the model uses."""
+        if self.original:
+            return "original, corrected" if self.corrected else "original"
         return "corrected" if self.corrected else ""
 
     def _kept(self) -> bool:
@@ -95,7 +105,8 @@ class About:
         """Count the steps with corrected derivatives that lost by more than their likely error."""
         best, model = self.incumbent, self.make.fingerprint
         lost = losers_of(self.make.now.history, best.candidate.id, model)
-        corrected = {candidate.id for candidate in lost if candidate.slopes}
+        kind = "original, corrected" if self.original else "corrected"
+        corrected = {candidate.id for candidate in lost if candidate.slopes == kind}
         return sum(
             tried.utility - best.utility < tried.candidate.expected_gain
             for tried in self.make.now.history
@@ -362,38 +373,6 @@ class Maker:
             return Proposal(self.now, made, is_new=True)
         stopped = replace(self.now, phase="stopped", sentence=found[0], ending="not allowed")
         return Proposal(stopped, None, is_new=False, notes=tuple(found), refused=made)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Proposal(Result):
-    """What to run next, or why there is nothing: `candidate` is None if the search has ended."""
-
-    standing: Standing
-    candidate: Candidate | None
-    is_new: bool  # whether the candidate was made by this call
-    notes: tuple[str, ...] = ()
-    refused: Candidate | None = None  # a candidate that was refused for the reasons in `notes`
-
-    def summary(self) -> str:
-        """Return the summary of the candidate, or of the standing if there is none."""
-        return self.candidate.summary() if self.candidate else self.standing.summary()
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of `grounded propose --json`; the command fills in `file`."""
-        now, made = self.standing, self.candidate
-        known = document(
-            candidate=made and made.id,
-            file=None,
-            iteration=made.iteration if made else now.iteration,
-            alpha=made and made.alpha,
-            damping=made.damping if made and made.base else None,
-            predicted_utility=made and made.predicted_utility,
-            phase="await-trial" if made else now.phase,
-            sentence=now.sentence,
-            notes=self.notes,
-        )
-        best = document(best_utility=now.incumbent and now.incumbent.utility, new=self.is_new)
-        return known | best if made else known
 
 
 def _gain(policy: Policy) -> float:
