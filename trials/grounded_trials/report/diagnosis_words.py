@@ -61,8 +61,8 @@ def correction_line(correction: Correction) -> str:
 def in_vain(diagnosis: Diagnosis) -> list[str]:
     """Return a sentence for each effect that is likely but improves no held-out prediction."""
     return [
-        f"{row.effect} alone is likely ({figure(row.evidence, 3)} nats), but it does not improve "
-        "held-out predictions"
+        f"{row.effect} alone is likely ({figure(row.evidence, 3)} nats), but held-out predictions "
+        "don't clearly improve with it"
         for row in diagnosis.ranking
         if row.no_better
     ]
