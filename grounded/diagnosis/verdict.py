@@ -35,6 +35,7 @@ def verdict(
     most: int = 0,
     one_motion: bool = False,
     given: Mapping[str, Sequence[str]] | None = None,
+    lost: Collection[str] = (),
 ) -> Verdict:
     """Return the verdict (effect, several, none or unknown) with its sentences.
 
@@ -51,6 +52,7 @@ def verdict(
         one_motion: whether all trials repeat one motion.
         given: by parameter, the parameters that it is only known relative to
             (`Identifiable.given`).
+        lost: parameters that the trials do not identify, which `adopt` leaves as they are.
     """
     from grounded.effects import like_a_load
 
@@ -74,7 +76,7 @@ def verdict(
         else:
             text = explained(rows)
         return _said("none", text, *once)
-    causes = _causes(claims, ranking, credit, given or {})
+    causes = _causes(claims, ranking, credit, given or {}, lost)
     told = clauses(
         [one.of for one in credit],
         causes,
@@ -133,6 +135,7 @@ def _causes(
     ranking: Sequence[Ranked],
     credit: Sequence[Credit],
     given: Mapping[str, Sequence[str]],
+    lost: Collection[str],
 ) -> tuple[str, ...]:
     """Return one clause per cause, the largest first."""
     effects = {e.name: e for e in claims.best.hypothesis.effects}
@@ -145,6 +148,8 @@ def _causes(
             text = f"the model's own parameters are off: {_moved(claims)}"
             held = dict.fromkeys(other for n in _off(claims)[:NAMED] for other in given.get(n, ()))
             text += f", given {listed(held)} as in the model" * bool(held)
+            vague = [n for n in _off(claims)[:NAMED] if n in lost]
+            text += f", but these trials do not determine {listed(vague)}" * bool(vague)
         found.append(text)
     return tuple(found)
 

@@ -132,6 +132,7 @@ class Writer:
             self.most,
             one_motion=moved == 1 < data.count,
             given={one.parameter: tuple(one.given) for one in identified},
+            lost={i.parameter for i in identified if i.verdict == "not identifiable"},
         )
         further = said.look_for > 0
         return Diagnosis(
