@@ -204,8 +204,14 @@ class Model:
             raise GroundedError("substeps only apply to derivative=; a step= chooses its own")
         if self.step is None and self.jacobian is not None:
             raise GroundedError("jacobian= is only for step=; derivative= is differentiated here")
-        if not self.states or not self.inputs:
-            raise GroundedError(f"model '{self.name}' needs at least one state and one input")
+        if not self.states:
+            raise GroundedError(f"model '{self.name}' has no states; it needs at least one")
+        if not self.inputs:
+            raise GroundedError(
+                f"model '{self.name}' has no inputs; it needs at least one. For a free motion, "
+                "such as a pendulum that was let go, add the force or torque that nobody applied, "
+                "and to the log a column of zeros for it"
+            )
         if self.n + self.m > MAX_SIZE:
             raise GroundedError(
                 f"model '{self.name}' has {self.n} states and {self.m} inputs; at most {MAX_SIZE} "

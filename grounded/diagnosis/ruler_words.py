@@ -192,8 +192,8 @@ def rest(rows: Sequence[RulerRow]) -> str:
     if share < MATTERS:
         of = f"{100 * share:.1g} % of the crude model's error"
         return f"{text}, but that is only {of}: too little to look for a cause"
-    beside = f"compared with how far {name} moves or how much the trials differ"
-    return f"{text}: too little to look for a cause, {beside}"
+    small = f"too little compared with how far {name} moves"
+    return f"{text}; no cause is looked for, as that is {small}, or differs too much by trial"
 
 
 def _when(row: RulerRow) -> str:

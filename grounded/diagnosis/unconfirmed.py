@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.cause_words import meaning
+from grounded.diagnosis.hypotheses.explored import CLAIM
 from grounded.diagnosis.report import Ranked, Unconfirmed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Doubtful
@@ -47,9 +48,12 @@ def unconfirmed(
 def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
     data, acts = claims.data, acting(claims.predictor, one.fit, one.name)
     few = one.repeats or few_trials(data, acts)
-    if not few:
+    if not few and one.alone is None:
         return None
     trial = int(np.bincount(data.trial_of, acts.sum(axis=0), data.count).argmax())
+    if not few and one.alone is not None:  # it acts in all, but predictions improve in one only
+        few, trial = 1, int(data.used[one.alone])
+        acts = acts * (data.trial_of == trial)
     own = np.flatnonzero(data.trial_of == trial)
     run = int(own[acts[:, own].sum(axis=0).argmax()])
     start, end = (t * data.dt for t in _stretch(acts[:, run] - acts.mean()))
@@ -74,7 +78,10 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
 
 def marked(ranking: Sequence[Ranked], likely: Collection[str]) -> tuple[Ranked, ...]:
     """Mark effects that are likely and yet do not improve held-out predictions."""
-    return tuple(replace(r, no_better=r.effect in likely and not r.claimed) for r in ranking)
+    return tuple(
+        replace(r, no_better=r.effect in likely and not r.claimed and not r.evidence < CLAIM)
+        for r in ranking
+    )
 
 
 def unrepeatable(task: Task, trials: Sequence[Trial]) -> dict[str, str]:

@@ -140,6 +140,7 @@ def _causes(
 
     effects = {e.name: e for e in claims.best.hypothesis.effects}
     given = {one.parameter: tuple(one.given) for one in identified}
+    lost = {one.parameter for one in identified if one.verdict == "not identifiable"}
     values = {row.effect: row.params for row in ranking}
     found = []
     for one in credit:
@@ -151,6 +152,8 @@ def _causes(
             text += _others(claims, identified)
             held = dict.fromkeys(other for n in _off(claims)[:NAMED] for other in given.get(n, ()))
             text += f", given {listed(held)} as in the model" * bool(held)
+            vague = [n for n in _off(claims)[:NAMED] if n in lost]
+            text += f", but these trials do not determine {listed(vague)}" * bool(vague)
         found.append(text)
     return tuple(found)
 

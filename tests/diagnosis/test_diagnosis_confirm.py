@@ -273,10 +273,15 @@ def test_what_one_trial_shows_is_told_with_its_place_and_is_no_cause(rare, neede
     found = unconfirmed(claims, decision.doubtful)
     if needed == "saturation:u":
         assert not found  # every trial shows the friction
+        (dropped,) = decision.doubtful
+        (one,) = unconfirmed(claims, [replace(dropped, alone=2)])
+        assert one.trial == "t2" and one.seen == (1, 5) and 0 <= one.start < one.end <= 10
         rows = marked(
             [Ranked(n, claimed=n == needed) for n in best.hypothesis.names], best.hypothesis.names
         )
         assert {r.effect for r in rows if r.no_better} == {"viscous_friction:v"}
+        unlikely = replace(rows[0], effect="viscous_friction:v", claimed=False, evidence=-4.9)
+        assert not marked([unlikely], ["viscous_friction:v"])[0].no_better
         (said,) = in_vain(Diagnosis(Verdict("unknown"), ranking=rows))
         assert "viscous_friction:v" in said
         return
@@ -296,6 +301,10 @@ def test_trials_that_each_gain_outweigh_one_that_rules_the_sums():
     assert gain([0.3, 0.2, 0.4, 0.3, 0.2]).pays(2.0, 0.01)
     assert not gain([1.5, 0.0, -0.1, 0.1, 0.0]).pays(2.0, 0.01)
     assert gain([0.3]).chance == gain([0.0, 0.0, 0.0]).chance == 1.0
+    assert gain([0.0, -0.2, 0.0, 0.7]).alone == 3
+    for own in ([0.0, 0.3, 0.0, 0.7], [0.0, 0.0, 0.0, 0.05], [0.0, 0.0, 0.7], [0.0]):
+        assert gain(own).alone is None
+    assert replace(gain([0.0, -0.8, 0.0, 0.7]), mean=-0.1).alone is None
 
 
 @pytest.mark.slow

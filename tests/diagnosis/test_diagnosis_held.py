@@ -8,7 +8,10 @@ import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.error_report import Credit
 from grounded.diagnosis.report import Estimate, Identifiable
+from grounded.diagnosis.validation.claims import Blame
+from grounded.diagnosis.verdict import _causes
 from grounded.effects import Library
 from grounded_trials.report.diagnosis_words import error_lines, held_sentence
 
@@ -83,6 +86,20 @@ def test_a_value_that_its_std_stopped_is_told_with_what_to_widen():
     beside = replace(again, verdict=replace(again.verdict, effects=("delay:u",)))
     text = dict(error_lines(beside, {"k": 1.0, "b": 0.5}))["parameters"]
     assert "N/V (at the limit of its std" in text and text.count("std") == 1
+
+
+def test_a_value_that_adopt_leaves_alone_is_told_as_not_determined():
+    """The verdict gave a new value, and `adopt` kept the old one, as not determined."""
+    model, _ = motor(1)
+    claims = SimpleNamespace(
+        best=SimpleNamespace(hypothesis=SimpleNamespace(effects=())),
+        data=SimpleNamespace(model=model),
+        moved=(Blame(model.param_names.index("k"), 9.0),),
+        parameters=lambda: {"k": Estimate(1.3, 0.4, None, "N/V")},
+    )
+    told = [_causes(claims, (), [Credit("calibration")], {}, lost)[0] for lost in ("", {"k"})]
+    assert told[1].startswith(told[0]) and told[1].endswith("do not determine k")
+    assert "determine" not in told[0]
 
 
 def test_a_line_names_no_twenty_parameters():

@@ -13,6 +13,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.validation.limits import (
     joints_without_input,
     knowable,
+    limits,
     still_states,
     switches,
 )
@@ -44,6 +45,39 @@ def test_what_acts_on_a_state_that_never_moved_is_not_offered():
     offered = {e.name for e in knowable(data, Library().candidates(pendulum, data.scales))}
     assert "rate_gain:theta" in offered and "sensor_scale:theta" in offered
     assert not {"viscous_friction:omega", "sensor_delay:omega", "sensor_bias:omega"} & offered
+
+
+def let_go(friction, trials=2, steps=300, seed=3):
+    """Free swings of the pendulum with additional friction, measured with noise."""
+    values = pendulum.values.copy()
+    values[pendulum.param_names.index("b")] += friction
+    rng, found = np.random.default_rng(seed), []
+    for start in rng.uniform(1.0, 1.8, trials):
+        states = [np.array([start, 0.0])]
+        for _ in range(steps):
+            states.append(pendulum.system.step(states[-1][None], np.zeros((1, 1)), values, 0.02)[0])
+        y = np.array(states) + np.array([2e-4, 2e-3]) * rng.standard_normal((steps + 1, 2))
+        found.append(Trial(y, np.zeros((steps, 1)), 0.02, ("theta", "omega"), ("torque",)))
+    return found
+
+
+def test_a_free_motion_shows_causes_and_a_held_command_does_not():
+    free = let_go(0.0)
+    held = [replace(t, inputs=np.full_like(t.inputs, 0.3)) for t in free]
+    assert [limits(prepare(pendulum, some)).no_cause for some in (free, held)] == [False, True]
+
+
+def test_the_friction_of_a_free_swing_is_named():
+    """No cause was named, since no input ever changed."""
+    nominal = replace(
+        pendulum, params={n: Param(p.value, p.unit) for n, p in pendulum.params.items()}
+    )
+    found = diagnose(nominal, let_go(0.05))
+    inertia = pendulum.params["m"].value * pendulum.params["l"].value ** 2
+    (row,) = (r for r in found.ranking if r.claimed)
+    assert row.effect == "viscous_friction:omega"
+    assert row.values["k"] == pytest.approx(0.05 / inertia, rel=0.05)
+    assert not any(r.effect.endswith(":torque") for r in found.ranking)
 
 
 def test_how_much_a_switch_is_on_is_not_doubted():

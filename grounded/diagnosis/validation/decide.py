@@ -66,6 +66,7 @@ class Doubtful:
     nats: float
     fit: Fitted  # including the effect
     repeats: int = 0  # trials of the only motion that shows it; 0: dropped for another reason
+    alone: int | None = None  # the only trial, in `data.used`, that is predicted better with it
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,7 +327,7 @@ def _pruned(
         name = _least_needed(search, ruler, without, min(idle, key=lambda n: gains[n].mean), idle)
         nats = search.score(fit) - search.score(without[name])
         if nats > LIKELY and name in _effects(fit) and name not in undone:
-            doubtful.append(Doubtful(name, nats, fit, repeated[name]))
+            doubtful.append(Doubtful(name, nats, fit, repeated[name], gains[name].alone))
         fit = without[name]
 
 

@@ -20,7 +20,9 @@ import numpy as np
 
 from grounded.frozen import Array
 
+MOST, FEW = 0.8, 4  # one of FEW trials that holds MOST of what trials gain stands alone
 AGAIN = 2.0  # scatters that the gain of all pieces must have without the best trial
+CLEAR = 0.1  # log gain of a trial (10 % smaller errors) from which it shows an effect
 CHANCE = 0.01  # p-value of the gains of single trials below which they are significant
 
 
@@ -68,6 +70,19 @@ class Gain:
         each = self.pieces[self.trial != int(by.argmax())]
         scatter = np.sqrt(len(each) * each.var()) if len(each) > 1 else 0.0
         return float(each.sum() / scatter) if scatter > 0 else 0.0
+
+    @property
+    def alone(self) -> int | None:
+        """The trial, by its place in `own`, that makes nearly all of the gain; None if none does.
+
+        Few trials need show an effect (a free swing among driven runs). Its gain there is as large
+        as its scatter, so it can't be told from chance, but it is not nothing either.
+        """
+        gains = np.maximum(self.own, 0.0)
+        if len(gains) < FEW or not self.mean > 0:
+            return None
+        best = int(gains.argmax())
+        return best if gains[best] > max(MOST * gains.sum(), CLEAR) else None
 
     def beyond(self, scatters: float, least: float) -> bool:
         """Check whether the gain exceeds `scatters` of its scatter, and `least` in some channel."""

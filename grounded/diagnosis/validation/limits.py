@@ -74,7 +74,7 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
     still = constant_inputs(data)
     for name in still:
         found.append(f"input {name} never changed, so effects of its actuator can't be identified")
-    if len(still) == data.model.m:
+    if len(still) == data.model.m and not released(data):
         no_cause = True
     unmoved = still_states(data)
     for name in unmoved:
@@ -114,8 +114,8 @@ def joints_without_input(model: Model, claimed: Collection[str]) -> list[str]:
             found.append(
                 f"{listed([*own, *onto])} may be one cause: friction in the joint of {v}, which "
                 "acts on both through the inertia. To test it, write this torque into model.py "
-                'with an uncertain parameter (such as "b": Param(0, "N m s/rad", std=...)) and '
-                "diagnose again"
+                'with an uncertain parameter (such as "b": Param(0, "N m s/rad", std=...)), or as '
+                "an input with a column of zeros in the log, and diagnose again"
             )
     return found
 
@@ -150,6 +150,14 @@ def constant_inputs(data: Data) -> list[str]:
         )
         <= 1e-9 * max(data.scales.peak(name), 1e-12)
     ]
+
+
+def released(data: Data) -> bool:
+    """Check whether all commands were 0 throughout, as in a free swing or when coasting to rest.
+
+    No actuator can stand behind what such a motion shows, so its causes can be named.
+    """
+    return not any(np.any(data.commands[i, :T]) for i, T in enumerate(data.lengths))
 
 
 def switches(data: Data) -> set[str]:

@@ -1,14 +1,15 @@
-"""Angles that [log] reads from one number of a quaternion."""
+"""Angles that [log] reads from one number of a quaternion, and commands in degrees."""
 
+import numpy as np
 import pytest
 
 from cli import grounded
 from facts import holds
-from grounded import Model
+from grounded import Model, Trial
 from grounded_trials import Workspace
 from grounded_trials.logs.log_table import LogMapping
 from grounded_trials.logs.signals import SignalSpec
-from grounded_trials.workspace.intake.log_faults import no_angles
+from grounded_trials.workspace.intake.log_faults import _degrees, no_angles
 from ros_bags import rover_bag
 
 CAR = Model(
@@ -56,3 +57,22 @@ def test_a_part_of_a_quaternion_is_told_wherever_it_is_read(tmp_path):
     (warning,) = (s for s in Workspace(w).ingest(log, data=True).warnings if part in s)
     assert holds(warning, "psi", "quaternion", angle)
     assert told() == [True, True]
+
+
+def test_a_command_in_degrees_is_named_with_its_own_table():
+    """The fault was looked up among the states, which ended ingest with a KeyError."""
+    boat = Model(
+        states={"psi": "rad", "r": "rad/s"},
+        inputs={"rudder": "rad"},
+        derivative=lambda s, a, p: {"psi": s.r, "r": (0.6 * a.rudder - s.r) / 0.8},
+        angles=("psi",),
+    )
+    rudder = 0.3 * np.sign(np.sin(0.9 * np.arange(400) * 0.1))[:, None]
+    x = [np.zeros(2)]
+    for u in rudder:
+        x.append(boat.system.step(x[-1][None], u[None], boat.values, 0.1)[0])
+    y = np.array(x) + 1e-3 * np.random.default_rng(1).standard_normal((401, 2))
+    trial = Trial(y, np.degrees(rudder), 0.1, ("psi", "r"), ("rudder",))
+    (fault,) = _degrees(boat, trial)
+    assert fault.said.startswith("rudder ")
+    assert holds(fault.mend, "[log.input.rudder]", "0.017453293") and "rad" in fault.program

@@ -63,7 +63,7 @@ def in_vain(diagnosis: Diagnosis) -> list[str]:
     """Return a sentence for each effect that is likely but improves no held-out prediction."""
     return [
         f"{row.effect} alone is likely ({figure(row.evidence, 3)} nats), but held-out predictions "
-        "do not improve with it"
+        "do not clearly improve with it"
         for row in diagnosis.ranking
         if row.no_better
     ]

@@ -131,12 +131,14 @@ def _degrees(model: Model, known: Trial) -> list[Fault]:
         findings = preflight(model, [replace(known, id="")]).findings
     except GroundedError:  # the diagnosis reports it
         return []
+    units = {**model.states, **model.inputs}
     return [
         Fault(
             f"{one.signal} {one.finding}",
-            f"Multiply the scale in [log.state.{one.signal}] by {one.log.split(' = ')[1]} (a "
+            f"Multiply the scale in [log.{'state' if one.signal in model.states else 'input'}."
+            f"{one.signal}] by {one.log.split(' = ')[1]} (a "
             "missing scale is 1)",
-            f"write {model.states[one.signal]}",
+            f"write {units[one.signal]}",
         )
         for one in findings
         if one.kind == "degrees" and one.log
