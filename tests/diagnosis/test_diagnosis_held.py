@@ -97,7 +97,8 @@ def test_a_value_that_adopt_leaves_alone_is_told_as_not_determined():
         moved=(Blame(model.param_names.index("k"), 9.0),),
         parameters=lambda: {"k": Estimate(1.3, 0.4, None, "N/V")},
     )
-    told = [_causes(claims, (), [Credit("calibration")], {}, lost)[0] for lost in ("", {"k"})]
+    parts = [Identifiable("k", verdict, 1.0, 1.0, {}) for verdict in ("weak", "not identifiable")]
+    told = [_causes(claims, (), [Credit("calibration")], [part])[0] for part in parts]
     assert told[1].startswith(told[0]) and told[1].endswith("do not determine k")
     assert "determine" not in told[0]
 
