@@ -219,7 +219,7 @@ class _Context(SentOnce):
         for name, amount, values in self._tried(effect, grid):
             h = self.fit.hypothesis.plus(effect, values)
             acts = isinstance(effect.family, InputFamily | MemoryFamily)
-            received = data.runs(predictor.received(h)) if acts else self.u
+            received = predictor.inputs(h) if acts else self.u
             after = predictor.advance(h, self.x, received, data.time)
             d = data.model.difference(after, base) / amount
             found.append(_Column(i, point, name, d, _EMPTY))
