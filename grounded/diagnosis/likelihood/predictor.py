@@ -95,7 +95,7 @@ class Predictor(SentOnce):
         def make() -> Array:
             return self.data.runs_in_use(arriving(on_it, self.data, j))
 
-        return self._kept(f"input {j}", on_it, self.data.step_at.size, make)
+        return self._kept(f"input {j}", on_it, self.data.valid.size, make)
 
     def received(self, h: Hypothesis) -> Array:
         """Return the received inputs of whole trials, (S, T_max, m); zero if no run is kept."""
@@ -116,12 +116,8 @@ class Predictor(SentOnce):
         """
         if not (self.data.hidden and self.acting(h)):
             return None
-        acting = self.acting(h)
-
-        def make() -> Array:
-            return memories_moved(acting, self.data)
-
-        return self._kept("begun", acting, self.data.valid.size, make)
+        acting, data = self.acting(h), self.data
+        return self._kept("begun", acting, data.valid.size, lambda: memories_moved(acting, data))
 
     def _kept(self, what: str, acting: Acting, size: int, make: Callable[[], Array]) -> Array:
         """Return the cached result, of about `size` numbers, for the same effects, or make it."""
