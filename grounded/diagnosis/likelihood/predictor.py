@@ -10,7 +10,7 @@ compared with the log. The equations are those of `grounded.effects.wrap`, evalu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b
@@ -355,18 +355,23 @@ class Predictor(SentOnce):
         `own` are the model's own rates by name, for families that need them. If the model already
         has a moving medium, the rates act on velocities through it, at the nominal values.
         """
-        names, s = self.seen, self.named(x)
+        names, total = self.seen, np.zeros_like(x)
+        for name, value in self.each_added(rates, x, u, t, own):
+            total[..., names.index(name)] += value
+        return total
+
+    def each_added(
+        self, rates: Any, x: Array, u: Array, t: Array, own: Any
+    ) -> Iterator[tuple[str, Any]]:
+        """Yield the state and the rate of each part of `added_rate`."""
+        s = self.named(x)
         if medium := medium_of(self.data.model):
             s = through_it(medium, s, quantities_of(medium, self._nominal))
         inputs = self.data.model.input_names
         a = Named("input", inputs, [u[..., j] for j in range(len(inputs))])
-        total = np.zeros_like(x)
         for effect, values in rates:
             added = effect.family.rate(s, a, own, t, values, effect.site)
-            added = braked(effect, s, added, 0.5 * self.data.dt)
-            for name, value in added.items():
-                total[..., names.index(name)] += value
-        return total
+            yield from braked(effect, s, added, 0.5 * self.data.dt).items()
 
     @cached_property
     def _nominal(self) -> dict[str, float]:
