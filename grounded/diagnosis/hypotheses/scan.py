@@ -250,8 +250,7 @@ class _Context(SentOnce):
         """Whiten a block of columns; store their products with residual, base and each other."""
         L, B, n = self.white.shape
         wide = kalman.whole(len(block), n)
-        unknowns = self.base_white.shape[-1]
-        products, own = np.zeros((wide, 1 + unknowns)), np.zeros((wide, wide))
+        products, own = np.zeros((wide, 1 + self.base_white.shape[-1])), np.zeros((wide, wide))
         delays = any(column.r.size for column in block)
         for runs, gains, beside in self._parts:
             count = len(range(B)[runs])

@@ -52,7 +52,7 @@ from grounded.engine import SentOnce
 from grounded.frozen import Array
 from grounded.rollout import each_stepped
 
-MOST_KEPT = 4_000_000  # numbers in the cache of one received input, and of those of whole trials
+MOST_KEPT = 4_000_000  # numbers in the cache of one received input, or of whole trials
 STEPS_KEPT = 16  # simulator steps in the cache
 LOADS_KEPT = 32_000  # states in the cache of `loads`
 
@@ -92,10 +92,8 @@ class Predictor(SentOnce):
         name = self.data.model.input_names[j]
         on_it = [one for one in acting if name in one[0].site.targets]
 
-        def make() -> Array:
-            return self.data.runs_in_use(arriving(on_it, self.data, j))
-
-        return self._kept(f"input {j}", on_it, self.data.valid.size, make)
+        data = self.data
+        return self._kept(f"input {j}", on_it, lambda: data.runs_in_use(arriving(on_it, data, j)))
 
     def received(self, h: Hypothesis) -> Array:
         """Return the received inputs of whole trials, (S, T_max, m); zero if no run is kept."""
@@ -107,7 +105,7 @@ class Predictor(SentOnce):
                 whole[data.used, :, j] = arriving(acting, data, j)
             return whole
 
-        return self._kept("trials", acting, self.data.commands.size, make)
+        return self._kept("trials", acting, make)
 
     def begun(self, h: Hypothesis) -> Array | None:
         """Return what effects on inputs add to the initial memory states, by run (B, n).
@@ -116,18 +114,18 @@ class Predictor(SentOnce):
         """
         if not (self.data.hidden and self.acting(h)):
             return None
-        acting, data = self.acting(h), self.data
-        return self._kept("begun", acting, data.valid.size, lambda: memories_moved(acting, data))
+        acting = self.acting(h)
+        return self._kept("begun", acting, lambda: memories_moved(acting, self.data))
 
-    def _kept(self, what: str, acting: Acting, size: int, make: Callable[[], Array]) -> Array:
-        """Return the cached result, of about `size` numbers, for the same effects, or make it."""
+    def _kept(self, what: str, acting: Acting, make: Callable[[], Array]) -> Array:
+        """Return the cached result for the same effects and values, or make it."""
         found = self._inputs.setdefault(what, {})
         key = tuple((e.name, tuple(sorted(v.items()))) for e, v in acting)
         if (one := found.get(key)) is None:
-            if len(found) > max(64, MOST_KEPT // size):
+            one = make()
+            if len(found) > max(64, MOST_KEPT // max(one.size, 1)):
                 found.clear()
-            one = found[key] = make()
-        return one
+        return found.setdefault(key, one)
 
     @staticmethod
     def acting(h: Hypothesis) -> list[tuple[Effect, Mapping[str, float]]]:
@@ -244,8 +242,8 @@ class Predictor(SentOnce):
 
     def left(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Left:
         """Return inputs u (..., m) less the losses at x (..., n), and position terms (`ahead`)."""
-        pairs, names = losses_of(h), self.data.model.input_names
-        if not pairs:
+        names = self.data.model.input_names
+        if not (pairs := losses_of(h)):
             return u, {}
         found, at, dt = u.copy(), self.loads(h, x, u, dt), dt or self.data.dt
         taken = solved(pairs, at, dt)
@@ -350,20 +348,18 @@ class Predictor(SentOnce):
         return [(int(i), int(j)) for i, j in known[()]]
 
     def added_rate(self, rates: Any, x: Array, u: Array, t: Array, own: Any) -> Array:
-        """Return the total rate that (effect, values) pairs add at x (..., n), (..., n) [1/s].
-
-        `own` are the model's own rates by name, for families that need them. If the model already
-        has a moving medium, the rates act on velocities through it, at the nominal values.
-        """
+        """Return the total rate that (effect, values) pairs add at x (..., n), (..., n) [1/s]."""
         names, total = self.seen, np.zeros_like(x)
         for name, value in self.each_added(rates, x, u, t, own):
             total[..., names.index(name)] += value
         return total
 
-    def each_added(
-        self, rates: Any, x: Array, u: Array, t: Array, own: Any
-    ) -> Iterator[tuple[str, Any]]:
-        """Yield the state and the rate of each part of `added_rate`."""
+    def each_added(self, rates: Any, x: Array, u: Array, t: Array, own: Any) -> Iterator[Any]:
+        """Yield the state and the rate [1/s] of each part of `added_rate`.
+
+        `own` are the model's own rates by name, for families that need them. If the model already
+        has a moving medium, the rates act on velocities through it, at the nominal values.
+        """
         s = self.named(x)
         if medium := medium_of(self.data.model):
             s = through_it(medium, s, quantities_of(medium, self._nominal))
