@@ -130,7 +130,7 @@ class Data:
 
     def runs(self, per_step: Array) -> Array:
         """Cut per-step values of whole trials (S, T_max, m) into runs (L, B, m)."""
-        return per_step[self._of_runs]
+        return np.asarray(per_step[self._of_runs])
 
     @cached_property
     def _in_use(self) -> Any:
@@ -140,7 +140,7 @@ class Data:
 
     def runs_in_use(self, per_step: Array) -> Array:
         """Cut per-step values of the `used` trials (S, T_max) into runs (L, B)."""
-        return per_step.reshape(-1).take(self._in_use)
+        return np.asarray(per_step.reshape(-1).take(self._in_use))
 
 
 def prepare(
