@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,12 +64,14 @@ def each_stepped(model: Model, x: Array, u: Array, p: Array, dt: float) -> Array
     together = getattr(model.step, "rows", None)  # simulators step all rows at once
     if together is not None:
         return np.asarray(together(x, u, p, dt))
-    alike: dict[bytes, list[int]] = {}
-    for i, one in enumerate(p):
-        alike.setdefault(one.tobytes(), []).append(i)
+    alike: dict[bytes, list[slice]] = {}
+    edges = np.flatnonzero((p[1:] != p[:-1]).any(axis=1)) + 1
+    for first, end in itertools.pairwise([0, *edges.tolist(), len(p)]):
+        alike.setdefault(p[first].tobytes(), []).append(slice(first, end))
     after = np.empty_like(x)
-    for own in alike.values():
-        after[own] = model.system.step(x[own], u[own], p[own[0]], dt)
+    for parts in alike.values():
+        own = parts[0] if len(parts) == 1 else np.r_[tuple(parts)]
+        after[own] = model.system.step(x[own], u[own], p[parts[0].start], dt)
     return after
 
 

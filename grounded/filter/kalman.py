@@ -79,15 +79,19 @@ class Gains:
         return np.asarray(self.P - self.k.swapaxes(-1, -2) @ self.k)
 
     def of_runs(self, which: Any) -> Gains:
-        """The same of some runs, by their indices."""
+        """The same of some runs, by their indices or a slice, in memory of their own."""
+
+        def some(a: Array) -> Array:
+            return np.ascontiguousarray(a[:, which])
+
         late, rows = self.delayed, self.system._asdict()
         start = rows.pop("start")[which]
-        rows = {name: None if a is None else a[:, which] for name, a in rows.items()}
+        rows = {name: None if a is None else some(a) for name, a in rows.items()}
         system = LinearSystem(**rows, start=start)
         if late is not None:
             late = replace(late, channel=late.channel[which], weights=late.weights[which])
-        P = None if self.P is None else self.P[:, which]
-        return Gains(system, self.k[:, which], self.weight[:, which], P, late)
+        P = None if self.P is None else some(self.P)
+        return Gains(system, some(self.k), some(self.weight), P, late)
 
     @cached_property
     def measured(self) -> Array:

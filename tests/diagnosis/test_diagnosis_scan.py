@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param
+from grounded.diagnosis.hypotheses import scan
 from grounded.diagnosis.hypotheses.scan import elsewhere, faint
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
@@ -92,3 +93,26 @@ def test_the_dry_friction_of_one_motion_is_claimed_once():
     names = {look.effect.name for look in search.shortlist(fit, 100)}
     assert "viscous_friction:omega" in names
     assert not names & {"coulomb_friction:omega", "joint_friction:torque<-omega"}
+
+
+def test_a_scan_of_a_few_runs_at_a_time_is_that_of_all_at_once(monkeypatch):
+    rng, (B, T) = np.random.default_rng(2), (5, 60)
+    names = (car.state_names, car.input_names)
+    trials = [
+        Trial(0.1 * rng.normal(size=(T + 1, car.n)), rng.normal(size=(T, car.m)), 0.05, *names)
+        for _ in range(B)
+    ]
+    data = prepare(car, trials)
+    candidates = Library().candidates(car, data.scales)
+    search = HypothesisSearch(data, candidates)
+    kinds = (Hypothesis(), Hypothesis().plus(Library().effect("sensor_delay:x", car), {"d": 0.07}))
+    fits = search.refined([search.fresh(kinds[0])], 2) + search.refined([search.fresh(kinds[1])], 2)
+    for fit in fits:
+        found = []
+        for most in (1, 1e9):
+            monkeypatch.setattr(scan, "CACHED", most)
+            found.append(scan.scan_candidates(search.predictor, fit, candidates))
+        gains = np.array([[look.gain for look in looks] for looks in found])
+        np.testing.assert_allclose(*gains, rtol=1e-6, atol=1e-6)
+        assert (gains[0] > 0.1).sum() > 10
+    assert len(fits) == 2

@@ -1,8 +1,11 @@
 """Several effects together: diagnosis, probe and adopted model agree which of them acts first."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+import grounded.diagnosis.likelihood.predictor as predictor_module
 from grounded import Trial
 from grounded.diagnosis.excitation import _run
 from grounded.diagnosis.likelihood.data import prepare
@@ -230,3 +233,39 @@ def test_what_is_wrapped_last_acts_first():
     families = [Library().family(name.partition(":")[0]) for name, _ in (DELAY, LAG, PULL, ZONE)]
     assert acting_order(families) == [1, 3, 0]
     assert wrapping_order(families) == [2, 0, 3, 1]
+
+
+def test_inputs_by_run_are_those_of_whole_trials():
+    """Each input is computed by itself, for the trials in use, and cut into runs."""
+    names, rng = (car.state_names, car.input_names), np.random.default_rng(3)
+    trials = [
+        Trial(rng.normal(size=(T + 1, car.n)), rng.normal(size=(T, 2)), DT, *names)
+        for T in (230, 450, 60)
+    ]
+    data = prepare(car, trials, latency=np.array([0.4 * DT, 0.0]))
+    data = replace(data, **{k: getattr(data, k)[1:] for k in ("state_at", "step_at", "valid")})
+    data = replace(data, trial_of=data.trial_of[1:])  # its start still has to be filtered
+    predictor = Predictor(data)
+    for parts in ([], [LAG], [LIMIT, WEAK, PART], [BIAS, THROTTLE]):
+        h = hypothesis(parts)
+        whole = data.runs(predictor.received(h))
+        np.testing.assert_array_equal(predictor.inputs(h), whole)
+    assert np.ptp(whole[..., 1]) > 0
+    at = int(data.trial_of[-1]), int(data.step_at[-1, 5] - data.lengths[:2].sum())
+    np.testing.assert_array_equal(whole[5, -1], predictor.received(h)[at])
+
+
+def test_an_effect_on_one_input_leaves_the_cached_other(monkeypatch):
+    names = (car.state_names, car.input_names)
+    trial = Trial(np.full((STEPS + 1, car.n), 0.1), commands(), DT, *names, start_inputs=HELD)
+    made, own = [], predictor_module.arriving
+
+    def counted(acting, data, j):
+        made.append(j)
+        return own(acting, data, j)
+
+    monkeypatch.setattr(predictor_module, "arriving", counted)
+    predictor = Predictor(prepare(car, [trial]))
+    for parts in ([], [LAG], [ZONE], [LAG]):
+        predictor.inputs(hypothesis(parts))
+    assert sorted(made) == [0, 0, 0, 1]

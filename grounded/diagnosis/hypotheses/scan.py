@@ -41,14 +41,15 @@ from grounded.effects import (
     SensorFamily,
     SensorLagFamily,
 )
+from grounded.effects.sensed import behind_logs
 from grounded.engine import SentOnce, each
 from grounded.filter import kalman
 from grounded.frozen import Array
 
 BLOCK = 160  # most columns filtered at once
 MOST_NUMBERS = 2.5e5  # size of one block of whitened columns; what fits in the cache is fastest
-CACHED = 2e4  # numbers copied at once
-_EMPTY: Array = np.zeros(0)
+CACHED = 6e4  # numbers of the columns of some runs that are whitened at once
+_EMPTY: Array = np.zeros((0, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,13 +80,12 @@ def scan_candidates(predictor: Predictor, fit: Fitted, candidates: Sequence[Effe
     """Scan every candidate beside what `fit` already holds; return looks in the same order."""
     context = _Context(predictor, fit)
     results: _Results = {}
-    size = max(8, min(BLOCK, int(MOST_NUMBERS / fit.white.size)))
     blocks: list[list[_Point]] = [[]]
     held = 0
     for i, effect in enumerate(candidates):
         together = max(1, sum(not q.grid for q in effect.free))
         for point, grid in enumerate(grid_points(effect)):
-            if held + together > size and blocks[-1]:
+            if held + together > context.together and blocks[-1]:
                 blocks.append([])
                 held = 0
             blocks[-1].append((i, point, effect, grid))
@@ -120,6 +120,8 @@ class _Context(SentOnce):
         self.G, self.gains = system.G, kalman.gains(system, delayed)
         self.delays = delays_of(h, data)
         self.white = fit.white
+        self.together = max(8, min(BLOCK, int(MOST_NUMBERS / fit.white.size)))
+        self._zeros: dict[tuple[int, int], Array] = {}
         self.base = fit.covariance if fit.gram.shape[-1] else np.zeros((0, 0))
 
     def columns(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
@@ -147,22 +149,26 @@ class _Context(SentOnce):
             yield "", 1.0, values
 
     def _rate(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
-        predictor, dt = self.predictor, self.predictor.data.dt
-        found = []
+        predictor, seen, found = self.predictor, self.predictor.seen, []
         for name, amount, values in self._tried(effect, grid):
-            before = self._rates_at(effect, values, 0)
-            later = self._rates_at(effect, values, 1)
-            d = 0.5 * dt * (self._passed(before) + later)
-            d = predictor.logged(self.fit.hypothesis, np.zeros_like(d), d)
+            before, later = (self._rates_at(effect, values, when) for when in (0, 1))
+            part, d = 0.5 * predictor.data.dt / amount, np.zeros_like(self.x)
+            for state, rate in before:
+                d += self._by_state[seen.index(state)] * np.multiply(part, rate)[..., None]
+            for state, rate in later:
+                d[..., seen.index(state)] += part * rate
+            if behind_logs(predictor.data.model) is not None:
+                d = predictor.logged(self.fit.hypothesis, np.zeros_like(d), d)
             for a, b in predictor.tied():
-                assert self.G is not None
-                slope = self.G[..., b, :].copy()
-                slope[..., b] = 0.0
                 if effect.family.needs_own:  # type: ignore[attr-defined]
-                    before = self._rates_at(effect, values, 0, instant=True)
-                    later = self._rates_at(effect, values, 1, instant=True)
-                d[..., b] = (slope * d).sum(axis=-1) + later[..., a] - before[..., a]
-            found.append(_Column(i, point, name, d / amount, _EMPTY))
+                    before, later = (
+                        self._rates_at(effect, values, k, instant=True) for k in (0, 1)
+                    )
+                d[..., b] = (self._entering[b] * d).sum(axis=-1)
+                for sign, rates in ((-1, before), (1, later)):
+                    for rate in (rate for state, rate in rates if state == seen[a]):
+                        d[..., b] += sign * rate / amount
+            found.append(_Column(i, point, name, d, _EMPTY))
         return found
 
     @cached_property
@@ -170,17 +176,20 @@ class _Context(SentOnce):
         """F with its columns first, (n, L, B, n), since one effect changes only a few states."""
         return np.ascontiguousarray(np.moveaxis(self.F, -1, 0))
 
-    def _passed(self, change: Array) -> Array:
-        """Return F times a change of the states (L, B, n)."""
-        found = np.zeros_like(change)
-        for k in np.flatnonzero(change.reshape(-1, change.shape[-1]).any(axis=0)):
-            found += self._by_state[k] * change[..., k, None]
+    @cached_property
+    def _entering(self) -> dict[int, Array]:
+        """How changes of the other states enter each carried heading rate, (L, B, n)."""
+        found = {}
+        for _, b in self.predictor.tied():
+            assert self.G is not None
+            found[b] = self.G[..., b, :].copy()
+            found[b][..., b] = 0.0
         return found
 
     def _rates_at(
         self, effect: Effect, values: dict[str, float], when: int, instant: bool = False
-    ) -> Array:
-        """Return the added rate at the start (0) or the end (1) of every step."""
+    ) -> list[tuple[str, Any]]:
+        """Return added rates with their states at the start (0) or the end (1) of every step."""
         data = self.predictor.data
         x = self.x if when == 0 else self.after
         if medium := moving(self.fit.hypothesis, self.predictor.seen):
@@ -189,7 +198,7 @@ class _Context(SentOnce):
         own: Any = {}
         if effect.family.needs_own:  # type: ignore[attr-defined]
             own = self.instants[when] if instant else self.mean
-        return self.predictor.added_rate([(effect, values)], x, self.u, t, own)
+        return list(self.predictor.each_added([(effect, values)], x, self.u, t, own))
 
     @cached_property
     def mean(self) -> Named:
@@ -219,7 +228,7 @@ class _Context(SentOnce):
         for name, amount, values in self._tried(effect, grid):
             h = self.fit.hypothesis.plus(effect, values)
             acts = isinstance(effect.family, InputFamily | MemoryFamily)
-            received = data.runs(predictor.received(h)) if acts else self.u
+            received = predictor.inputs(h) if acts else self.u
             after = predictor.advance(h, self.x, received, data.time)
             d = data.model.difference(after, base) / amount
             found.append(_Column(i, point, name, d, _EMPTY))
@@ -241,18 +250,42 @@ class _Context(SentOnce):
         """Whiten a block of columns; store their products with residual, base and each other."""
         L, B, n = self.white.shape
         wide = kalman.whole(len(block), n)
-        d = _side_by_side([column.d for column in block], (L, B, n, wide))
-        r = _side_by_side([column.r for column in block], (L + 1, B, n, wide))
-        white, _ = kalman.innovations(self.gains, d, r)
-        flat = white.reshape(-1, wide)
-        against = flat.T @ self.white.reshape(-1)
-        cross = flat.T @ self.base_white
-        own = flat.T @ flat
+        products, own = np.zeros((wide, 1 + self.base_white.shape[-1])), np.zeros((wide, wide))
+        delays = any(column.r.size for column in block)
+        for runs, gains, beside in self._parts:
+            count = len(range(B)[runs])
+            d = _side_by_side([c.d[:, runs] for c in block], (L, count, n, wide))
+            r = self._still(count, wide)
+            if delays:
+                r = _side_by_side([c.r[:, runs] for c in block], (L + 1, count, n, wide))
+            flat = kalman.innovations(gains, d, r)[0].reshape(-1, wide)
+            products += flat.T @ beside
+            own += flat.T @ flat
+        against, cross = products[:, 0], products[:, 1:]
         places = [(column.effect, column.point) for column in block]
         for j, (column, place) in enumerate(zip(block, places, strict=True)):
             mates = [k for k, other in enumerate(places) if other == place]
             entry = (column.name, float(against[j]), cross[j], own[j, mates])
             results.setdefault(place, []).append(entry)
+
+    @cached_property
+    def _parts(self) -> list[tuple[slice, kalman.Gains, Array]]:
+        """A few runs at a time: which, their gains, and their residual and base by row."""
+        L, B, n = self.white.shape
+        some = max(1, int(CACHED / (L * n * kalman.whole(self.together, n))))
+        base = self.base_white.reshape(L, B, n, -1)
+        columns = np.concatenate([self.white[..., None], base], axis=-1)
+        return [
+            (cut, self.gains.of_runs(cut), columns[:, cut].reshape(-1, columns.shape[-1]))
+            for cut in (slice(at, at + some) for at in range(0, B, some))
+        ]
+
+    def _still(self, count: int, wide: int) -> Array:
+        """Return zeros (L + 1, count, n, wide), which nobody writes to."""
+        L, _, n = self.white.shape
+        if (count, wide) not in self._zeros:
+            self._zeros[count, wide] = np.zeros((L + 1, count, n, wide))
+        return self._zeros[count, wide]
 
     @cached_property
     def base_white(self) -> Array:
@@ -303,15 +336,12 @@ class _Context(SentOnce):
 
 
 def _side_by_side(columns: Sequence[Array], shape: tuple[int, ...]) -> Array:
-    """Stack columns of one shape (empty ones: zero) along the last axis, in cached parts."""
-    found = np.zeros(shape)
-    there = [(j, column) for j, column in enumerate(columns) if column.size]
-    some = max(1, int(CACHED / np.prod(shape[1:])))
-    for at in range(0, shape[0] if there else 0, some):
-        part = slice(at, at + some)
-        for j, column in there:
-            found[part, ..., j] = column[part]
-    return found
+    """Stack columns of one shape (empty ones: zero) along the last axis."""
+    rows = np.zeros((shape[-1], *shape[:-1]))
+    for row, column in zip(rows, columns, strict=False):
+        if column.size:
+            row[:] = column
+    return np.ascontiguousarray(rows.reshape(len(rows), -1).T).reshape(shape)
 
 
 def inside(effect: Effect, names: Sequence[str], value: Array) -> Array:

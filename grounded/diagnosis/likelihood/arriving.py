@@ -13,27 +13,32 @@ import numpy as np
 from grounded.compile import Named
 from grounded.diagnosis.likelihood.data import Data
 from grounded.effects import Effect, InputFamily, MemoryFamily
-from grounded.effects.memory import late_inputs, settled
+from grounded.effects.memory import settled, shifted
 from grounded.frozen import Array
 
 Acting = Sequence[tuple[Effect, Mapping[str, float]]]
 
 
-def arriving(acting: Acting, data: Data) -> Array:
-    """Return the inputs (S, T, m) received after all effects, in their order, and all delays."""
-    latency = data.latency.copy()
+def arriving(acting: Acting, data: Data, j: int) -> Array:
+    """Return input j (S, T) received in the trials in use, after all effects on it and all delays.
+
+    Effects on one input do not depend on the others, so each is computed and cached by itself.
+    """
+    name, late = data.model.input_names[j], float(data.latency[j])
     for effect, values in acting:
-        if effect.family.name == "delay":
-            latency[[data.model.input_names.index(n) for n in effect.site.targets]] += values["d"]
-    return late_inputs(*_sent_on(acting, data), np.maximum(latency, 0.0), data.dt)
+        if effect.family.name == "delay" and name in effect.site.targets:
+            late += values["d"]
+    sent, held = _sent_on(acting, data, j)
+    return shifted(sent, held, late / data.dt) if late > 0 else sent
 
 
-def _sent_on(acting: Acting, data: Data) -> tuple[Array, Array]:
-    """Return the inputs (S, T, m) after all effects but delays, and those held before (S, m)."""
-    u, held = data.commands, data.held
+def _sent_on(acting: Acting, data: Data, j: int) -> tuple[Array, Array]:
+    """Return input j (S, T) after all effects on it but delays, and that held before (S,)."""
+    name = data.model.input_names[j]
+    u, held = data.commands[data.used, :, j], data.held[data.used, j]
     for effect, values in acting:
-        if effect.family.name != "delay":
-            u, held = _transformed(effect, values, u, held, data)
+        if effect.family.name != "delay" and name in effect.site.targets:
+            u, held = _transformed(effect, values, u, held, data.dt)
     return u, held
 
 
@@ -44,7 +49,9 @@ def memories_moved(acting: Acting, data: Data) -> Array:
     it (a gain) changes that input. The result is zero for runs that do not begin a trial.
     """
     model, found = data.model, np.zeros((len(data.valid), data.model.n))
-    _, held = _sent_on(acting, data)
+    held = data.held.copy()
+    for j in range(model.m):
+        held[data.used, j] = _sent_on(acting, data, j)[1]
     p = Named("parameter", model.param_names, list(model.values))
     before, after = (
         settled(model, Named("input", model.input_names, list(one.T)), p)
@@ -60,21 +67,19 @@ def memories_moved(acting: Acting, data: Data) -> Array:
 
 
 def _transformed(
-    effect: Effect, values: Mapping[str, float], u: Array, held: Array, data: Data
+    effect: Effect, values: Mapping[str, float], u: Array, held: Array, dt: float
 ) -> tuple[Array, Array]:
-    """Apply an input or memory effect to commands (S, T, m) and to the inputs held before (S, m).
+    """Apply an input or memory effect to commands (S, T) and to the input held before (S,).
 
     A memory starts settled at the held input.
     """
-    family, names = effect.family, data.model.input_names
-    out, before = u.copy(), held.copy()
-    for target in effect.site.targets:
-        j = names.index(target)
-        if isinstance(family, InputFamily):
-            t = np.arange(u.shape[1]) * data.dt
-            out[:, :, j] = family.effect(u[:, :, j], t[None, :], values)
-            before[:, j] = family.effect(held[:, j], 0.0, values)
-        elif isinstance(family, MemoryFamily):
-            z = family.along(u[:, :, j], held[:, j], values, data.dt)
-            out[:, :, j], _ = family.advance(u[:, :, j], (z,), values, data.dt)
-    return out, before
+    family = effect.family
+    if isinstance(family, InputFamily):
+        t = np.arange(u.shape[1]) * dt
+        sent = np.asarray(family.effect(u, t[None, :], values), float)
+        before = np.asarray(family.effect(held, 0.0, values), float)
+        return np.broadcast_to(sent, u.shape), np.broadcast_to(before, held.shape)
+    if isinstance(family, MemoryFamily):
+        z = family.along(u, held, values, dt)
+        u, _ = family.advance(u, (z,), values, dt)
+    return u, held

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -123,14 +123,24 @@ class Data:
         return np.unique(self.trial_of)
 
     @cached_property
-    def in_use(self) -> Data:
-        """The same data with the commands of the `used` trials alone."""
-        return replace(self, commands=self.commands[self.used], held=self.held[self.used])
+    def _of_runs(self) -> tuple[Any, Any]:
+        """Trial (B,) and step within the trial (L, B) of each step of the runs, of int."""
+        begins = np.cumsum([0, *self.lengths[:-1]])
+        return self.trial_of, np.ascontiguousarray((self.step_at - begins[self.trial_of, None]).T)
 
     def runs(self, per_step: Array) -> Array:
         """Cut per-step values of whole trials (S, T_max, m) into runs (L, B, m)."""
-        flat = np.concatenate([per_step[i, :T] for i, T in enumerate(self.lengths)])
-        return np.ascontiguousarray(flat[self.step_at].swapaxes(0, 1))
+        return np.asarray(per_step[self._of_runs])
+
+    @cached_property
+    def _in_use(self) -> Any:
+        """Indices of the steps of the runs (L, B) in flat values of the `used` trials."""
+        trial, step = self._of_runs
+        return np.searchsorted(self.used, trial) * self.commands.shape[1] + step
+
+    def runs_in_use(self, per_step: Array) -> Array:
+        """Cut per-step values of the `used` trials (S, T_max) into runs (L, B)."""
+        return np.asarray(per_step.reshape(-1).take(self._in_use))
 
 
 def prepare(

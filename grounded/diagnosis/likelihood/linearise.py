@@ -94,7 +94,11 @@ def linearise(
     r[..., 0] = model.difference(y - here, np.asarray(offset))
     if (begun := predictor.begun(h)) is not None:
         r[0, ..., 0] += begun
-    F, of_shifts = _sensitivities(predictor, h, x, u, after)
+    F, f_p = (
+        sensitivities_of(predictor, h, x, u, after)
+        if h.spread
+        else (step_jacobian(predictor, h, x, after), None)
+    )
     theta, near = h.theta, tangent(predictor, h, x, u) if h.effects else predictor
     base = after if near is predictor else near.advance(h, x, u, data.time)
     for j, sizes in enumerate(_tried(h)):
@@ -112,21 +116,12 @@ def linearise(
             d[..., 1 + j], r[..., 1 + j] = by_d, by_r
             if by_d.any() or by_r.any():
                 break
-    d[..., 1 + len(theta) : count] = of_shifts
+    if f_p is not None:
+        for j, i in enumerate(calibrated(data), start=1 + len(theta)):
+            np.multiply(f_p[..., i], param_scale(model)[i], out=d[..., j])
     if data.idle.any():  # padding is never measured: identity, so that nothing grows there
         F, d[data.idle] = np.where(data.idle[..., None, None], np.eye(model.n), F), 0.0
     return F, d, r
-
-
-def _sensitivities(
-    predictor: Predictor, h: Hypothesis, x: Array, u: Array, after: Array
-) -> tuple[Array, Array]:
-    """Return F (L, B, n, n) and the step's slope in each shift (L, B, n, k); k = 0 without any."""
-    if h.spread == 0:
-        return step_jacobian(predictor, h, x, after), np.zeros((*x.shape, 0))
-    which = calibrated(predictor.data)
-    F, f_p = sensitivities_of(predictor, h, x, u, after)
-    return F, f_p[..., which] * param_scale(predictor.data.model)[which]
 
 
 def sensitivities_of(
@@ -277,6 +272,7 @@ def _nudged(h: Hypothesis, theta: Array, j: int, size: float) -> tuple[Hypothesi
     return other, moved
 
 
+SOME = 10  # samples that show at once of most parameters that they have a slope
 PART = 0.05  # fraction of a parameter's size, to each side, of the step for thresholds
 
 
@@ -289,7 +285,9 @@ def sensitivities(
         f_x (N, n, n), f_u (N, n, m), f_p (N, n, k).
     """
     f_x, f_u, f_p = model.system.sensitivities(x, u, p, dt)
-    flat = np.flatnonzero(~f_p.any(axis=(0, 1)) & (param_scale(model) > 0))
+    few = f_p[:SOME].any(axis=(0, 1))
+    flat = np.flatnonzero(~few & (param_scale(model) > 0))
+    flat = flat[~f_p[:, :, flat].any(axis=(0, 1))] if len(flat) else flat
     for i in flat:
         size = PART * param_scale(model)[i]
         ends = []

@@ -279,4 +279,4 @@ def _scaled(log_variance: Array, weight: Array | float, adjoint: Array) -> Array
 def average(white: Array) -> Array:
     """Return the average information (K, K) from the whitened columns of `working`."""
     flat = white.reshape(-1, white.shape[-1])
-    return np.asarray(0.5 * flat.T @ flat)
+    return np.asarray(0.5 * (flat.T @ flat))  # of one matrix: half the products

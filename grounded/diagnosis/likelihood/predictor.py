@@ -10,7 +10,7 @@ compared with the log. The equations are those of `grounded.effects.wrap`, evalu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from grounded.compile import Named
-from grounded.diagnosis.likelihood.arriving import arriving, memories_moved
+from grounded.diagnosis.likelihood.arriving import Acting, arriving, memories_moved
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import filter_lag, sensor_offset
 from grounded.diagnosis.likelihood.hypothesis import (
@@ -52,7 +52,7 @@ from grounded.engine import SentOnce
 from grounded.frozen import Array
 from grounded.rollout import each_stepped
 
-MOST_KEPT = 8_000_000  # numbers in the cache of received inputs
+MOST_KEPT = 4_000_000  # numbers in the cache of one received input, or of whole trials
 STEPS_KEPT = 16  # simulator steps in the cache
 LOADS_KEPT = 32_000  # states in the cache of `loads`
 
@@ -62,7 +62,7 @@ class Predictor(SentOnce):
     """Evaluate hypotheses on one `Data`. Shapes: tracks (L + 1, B, n), inputs (L, B, m)."""
 
     data: Data
-    _inputs: dict[Any, Array] = field(default_factory=dict)
+    _inputs: dict[str, dict[Any, Array]] = field(default_factory=dict)
     _steps: dict[bytes, Array] = field(default_factory=dict)
     _loads: dict[Any, Loads] = field(default_factory=dict)
     marches: dict[tuple[str, ...], March | None] = field(default_factory=dict)
@@ -84,17 +84,28 @@ class Predictor(SentOnce):
 
     def inputs(self, h: Hypothesis) -> Array:
         """Return the inputs that the actuators receive under a hypothesis, by run (L, B, m)."""
-        return self._kept("runs", h, lambda: self.data.runs(self.received(h)))
+        acting = self.acting(h)
+        return np.stack([self._input(acting, j) for j in range(self.data.model.m)], axis=-1)
+
+    def _input(self, acting: Acting, j: int) -> Array:
+        """Return one of `inputs`, (L, B); cached, since most effects act on few inputs."""
+        name = self.data.model.input_names[j]
+        on_it = [one for one in acting if name in one[0].site.targets]
+
+        data = self.data
+        return self._kept(f"input {j}", on_it, lambda: data.runs_in_use(arriving(on_it, data, j)))
 
     def received(self, h: Hypothesis) -> Array:
         """Return the received inputs of whole trials, (S, T_max, m); zero if no run is kept."""
+        acting = self.acting(h)
 
-        def found() -> Array:
-            data, whole = self.data.in_use, np.zeros_like(self.data.commands)
-            whole[data.used] = arriving(self.acting(h), data)
+        def make() -> Array:
+            data, whole = self.data, np.zeros_like(self.data.commands)
+            for j in range(data.model.m):
+                whole[data.used, :, j] = arriving(acting, data, j)
             return whole
 
-        return self._kept("trials", h, found)
+        return self._kept("trials", acting, make)
 
     def begun(self, h: Hypothesis) -> Array | None:
         """Return what effects on inputs add to the initial memory states, by run (B, n).
@@ -103,17 +114,18 @@ class Predictor(SentOnce):
         """
         if not (self.data.hidden and self.acting(h)):
             return None
-        return self._kept("begun", h, lambda: memories_moved(self.acting(h), self.data))
-
-    def _kept(self, what: str, h: Hypothesis, make: Callable[[], Array]) -> Array:
-        """Return the cached result for the same effects and values, or make it."""
         acting = self.acting(h)
-        key = (what, *((e.name, tuple(sorted(v.items()))) for e, v in acting))
-        if (found := self._inputs.get(key)) is None:
-            if len(self._inputs) > max(64, MOST_KEPT // self.data.commands.size):
-                self._inputs.clear()
-            found = self._inputs[key] = make()
-        return found
+        return self._kept("begun", acting, lambda: memories_moved(acting, self.data))
+
+    def _kept(self, what: str, acting: Acting, make: Callable[[], Array]) -> Array:
+        """Return the cached result for the same effects and values, or make it."""
+        found = self._inputs.setdefault(what, {})
+        key = tuple((e.name, tuple(sorted(v.items()))) for e, v in acting)
+        if (one := found.get(key)) is None:
+            one = make()
+            if len(found) > max(64, MOST_KEPT // max(one.size, 1)):
+                found.clear()
+        return found.setdefault(key, one)
 
     @staticmethod
     def acting(h: Hypothesis) -> list[tuple[Effect, Mapping[str, float]]]:
@@ -230,8 +242,8 @@ class Predictor(SentOnce):
 
     def left(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Left:
         """Return inputs u (..., m) less the losses at x (..., n), and position terms (`ahead`)."""
-        pairs, names = losses_of(h), self.data.model.input_names
-        if not pairs:
+        names = self.data.model.input_names
+        if not (pairs := losses_of(h)):
             return u, {}
         found, at, dt = u.copy(), self.loads(h, x, u, dt), dt or self.data.dt
         taken = solved(pairs, at, dt)
@@ -329,30 +341,33 @@ class Predictor(SentOnce):
     def tied(self) -> list[tuple[int, int]]:
         """Return pairs (heading, heading rate) of rates that are only carried along."""
         names, model = self.seen, moved_model(self.data.model)
-        key = ("tied",)
-        if key not in self._inputs:
+        known = self._inputs.setdefault("tied", {})
+        if () not in known:
             found = [(names.index(n), k) for n in model.state_names if (k := partner(model, n))]
-            self._inputs[key] = np.array([(i, names.index(k)) for i, k in found]).reshape(-1, 2)
-        return [(int(i), int(j)) for i, j in self._inputs[key]]
+            known[()] = np.array([(i, names.index(k)) for i, k in found]).reshape(-1, 2)
+        return [(int(i), int(j)) for i, j in known[()]]
 
     def added_rate(self, rates: Any, x: Array, u: Array, t: Array, own: Any) -> Array:
-        """Return the total rate that (effect, values) pairs add at x (..., n), (..., n) [1/s].
+        """Return the total rate that (effect, values) pairs add at x (..., n), (..., n) [1/s]."""
+        names, total = self.seen, np.zeros_like(x)
+        for name, value in self.each_added(rates, x, u, t, own):
+            total[..., names.index(name)] += value
+        return total
+
+    def each_added(self, rates: Any, x: Array, u: Array, t: Array, own: Any) -> Iterator[Any]:
+        """Yield the state and the rate [1/s] of each part of `added_rate`.
 
         `own` are the model's own rates by name, for families that need them. If the model already
         has a moving medium, the rates act on velocities through it, at the nominal values.
         """
-        names, s = self.seen, self.named(x)
+        s = self.named(x)
         if medium := medium_of(self.data.model):
             s = through_it(medium, s, quantities_of(medium, self._nominal))
         inputs = self.data.model.input_names
         a = Named("input", inputs, [u[..., j] for j in range(len(inputs))])
-        total = np.zeros_like(x)
         for effect, values in rates:
             added = effect.family.rate(s, a, own, t, values, effect.site)
-            added = braked(effect, s, added, 0.5 * self.data.dt)
-            for name, value in added.items():
-                total[..., names.index(name)] += value
-        return total
+            yield from braked(effect, s, added, 0.5 * self.data.dt).items()
 
     @cached_property
     def _nominal(self) -> dict[str, float]:

@@ -266,7 +266,7 @@ def _iterate(
         steps = _climbed(data, up, *of_up, g, residual)
     for i, work, step in zip(rises, up, steps, strict=True):
         assert work.best is not None
-        work.step = proposed(data, work.best, filtered[:, own[i], :, : counts[i]], *step)
+        work.step = proposed(data, work.best, filtered[:, own[i]], *step)
         work.still = work.still or (rises[i] < LEAST and work.step.promise < NOTHING)
         work.go(data)
 
@@ -293,7 +293,7 @@ def _climbed(
     columns = kalman.innovations(g, d, r)[0]
     found = []
     for i, (work, delays, adjoint) in enumerate(zip(works, delays_each, adjoints, strict=True)):
-        info = average(columns[:, i * B : (i + 1) * B, :, :K])
+        info = average(columns[:, i * B : (i + 1) * B])[:K, :K]
         in_log = adjoint if delays is None else delays.restored(adjoint)
         slope = likelihood_slopes(work.noise, in_log, data.dt)
         noise = climbed(work.noise, slope, info, int(data.valid.sum()))
@@ -349,13 +349,10 @@ def _scored(
 ) -> Fitted:
     """Return a fit for the current point, from its whitened columns (residual first)."""
     data, h = predictor.data, work.h
-    residual, columns = white[..., 0], white[..., 1:]
-    L, B, n, C = columns.shape
-    by_run = np.ascontiguousarray(columns.swapaxes(0, 1)).reshape(B, L * n, C)
-    flat = np.ascontiguousarray(residual.swapaxes(0, 1)).reshape(B, L * n)
-    gram = by_run.swapaxes(1, 2) @ by_run
-    score = (by_run.swapaxes(1, 2) @ flat[:, :, None])[:, :, 0]
-    rss = (flat**2).sum(axis=1)
+    residual, (L, B, n, C) = white[..., 0], white[..., 1:].shape
+    by_run = np.ascontiguousarray(white.swapaxes(0, 1)).reshape(B, L * n, 1 + C)
+    products = by_run.swapaxes(1, 2) @ by_run
+    gram, score, rss = products[:, 1:, 1:].copy(), products[:, 1:, 0].copy(), products[:, 0, 0]
     run_logdet = logdet.sum(axis=0)
     count = data.seen[1:].sum()
     loglik = -0.5 * float(rss.sum() + run_logdet.sum() + count * np.log(2 * np.pi)) + before
@@ -375,7 +372,7 @@ def _scored(
         evidence=evidence,
         gram=gram,
         score=score,
-        rss=rss,
+        rss=rss.copy(),
         logdet=run_logdet,
         white=residual.copy(),  # a view would keep all columns in memory
         states=work.track + error,

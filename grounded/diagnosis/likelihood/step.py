@@ -43,22 +43,31 @@ def proposed(
         data: the data.
         fit: the best point so far.
         filtered: the filtered columns (L + 1, B, n, 1 + C): the track's correction, and its
-            derivatives by the values and shifts.
+            derivatives by the values and shifts; further columns are ignored.
         noise: the noise after its scoring step.
         promise: the gain expected of the step in the noise [nats].
     """
     h = fit.hypothesis
     G = fit.gram.sum(axis=0) + np.diag(fit.prior)
     slope = fit.score.sum(axis=0) + fit.prior_pull(data)
-    track, delta = filtered[..., 0], np.zeros(len(slope))
+    delta = np.zeros(len(slope))
     if len(slope):
         low, high = room(data, h, len(slope))
         far = _far(h, len(slope))
         delta = bounded(G, slope, np.maximum(low, -far), np.minimum(high, far))
-        by = delta != 0
-        track = track + filtered[..., 1:][..., by] @ delta[by]
     promise -= float(slope @ delta + 0.5 * delta @ G @ delta)
-    return ProposedStep(delta, track, noise, promise)
+    return ProposedStep(delta, _moved(filtered, delta), noise, promise)
+
+
+def _moved(filtered: Array, delta: Array) -> Array:
+    """Return the track's correction by a step; columns of what does not move may overflow."""
+    parts = np.zeros(filtered.shape[-1])
+    parts[0], parts[1 : 1 + len(delta)] = 1.0, delta
+    flat = filtered.reshape(-1, len(parts))
+    found = flat @ parts
+    if not np.isfinite(found).all():
+        found = flat[:, parts != 0] @ parts[parts != 0]
+    return np.asarray(found.reshape(filtered.shape[:-1]))
 
 
 def bounded(G: Array, slope: Array, low: Array, high: Array) -> Array:
