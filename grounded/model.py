@@ -205,11 +205,11 @@ class Model:
         if self.step is None and self.jacobian is not None:
             raise GroundedError("jacobian= is only for step=; derivative= is differentiated here")
         if not self.states:
-            raise GroundedError(f"model '{self.name}' has no states; it needs at least one")
+            raise GroundedError(f"model '{self.name}' needs at least one state")
         if not self.inputs:
             raise GroundedError(
-                f"model '{self.name}' has no inputs; it needs at least one. For a free motion, "
-                "such as a pendulum that was let go, add the force or torque that nobody applied, "
+                f"model '{self.name}' needs at least one input. For a free motion, such "
+                "as a pendulum that was let go, add the force or torque that nobody applied, "
                 "and to the log a column of zeros for it"
             )
         if self.n + self.m > MAX_SIZE:

@@ -35,7 +35,10 @@ SCALED = (
     "[log.state.{state}] scale, and the scale in the robot's program"
 )
 DRAW = "draw the manoeuvre first (`grounded target --help`), or propose anyway to repeat that drive"
-REMEASURE = "the changed model was not compared with the trials yet: `grounded diagnose` does that"
+REMEASURE = (
+    "the changed model was not compared with the trials yet: `grounded diagnose` does that; "
+    "`grounded fit` fits the parameters beside the effects"
+)
 
 
 @click.command("adopt")

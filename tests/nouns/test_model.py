@@ -44,7 +44,7 @@ def test_differences_of_angles_wrap_and_the_arguments_stay():
         ({"step": cart_dynamics}, "exactly one of derivative"),
         ({"integrator": "heun"}, "'rk4' or 'euler', got 'heun'"),
         ({"states": {}}, holding("state")),
-        ({"inputs": {}}, holding("input")),
+        ({"inputs": {}}, holding("input", "free motion", "column of zeros")),
         ({"inputs": {"x": "N"}}, holding("'x'", "twice")),
         ({"params": {"mass": 1.0}}, holding("'mass'", "Param(value, unit)")),
         ({"params": {"v": Param(1.0)}}, holding("'v'", "twice")),
