@@ -6,13 +6,14 @@ ask_tell        the loop around the proposals
 standing        the state of the search, and why it ended
 certainty       how certain an improvement is, from `scatter`, the noise of utilities
 first_policy    the first policy: DDP from many starts, the first of them from `first_guess`
-step_size       damping and alpha of the next step
+step_size       damping and alpha of the next step, and the settings of a search
 directions      the direction of the step, by DDP or policy gradient
 making          builds a `candidate`
 limit_cycle     detects feedback that makes the inputs oscillate
 margin          checks gains under noise and with old samples
-mispredictions  corrects the model's derivatives from earlier trials; `corrected` is that model
-feedback        compares gains in several models that explain the trials
+mispredictions  corrects the model's derivatives from earlier trials (`corrected`), and compares
+                gains in several models that explain the trials
+original        steps with the model as it was, if adopted effects broke their promises
 planner         the model used for planning, with adopted effects
 safety          checks a candidate before it is handed out
 pictures        figures of the search

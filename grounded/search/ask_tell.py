@@ -23,7 +23,8 @@ from grounded.search.candidate import Candidate, Tried
 from grounded.search.improve import propose
 from grounded.search.planner import Planner, planner_with
 from grounded.search.proposal import Proposal
-from grounded.search.standing import SearchOptions, Standing
+from grounded.search.standing import Standing
+from grounded.search.step_size import SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 

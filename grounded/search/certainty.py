@@ -23,7 +23,7 @@ from grounded.task import Task
 from grounded.trial import Trial, scattered
 
 if TYPE_CHECKING:
-    from grounded.search.standing import SearchOptions
+    from grounded.search.step_size import SearchOptions
 
 FAR = 1e100  # bound on the noise of a diverged run, in the state's unit
 PART = 0.3  # share of a gain due to different start states from which on it is reported

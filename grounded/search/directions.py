@@ -10,7 +10,7 @@ import numpy as np
 from grounded.compile import DescentOptions, Problem
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.search.standing import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.solve import ddp
 from grounded.solve.measured import measured_gains
 from grounded.task import Task

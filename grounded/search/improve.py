@@ -36,15 +36,8 @@ from grounded.search.making import About, Maker
 from grounded.search.original import keeping_promises
 from grounded.search.planner import Planner
 from grounded.search.proposal import Proposal
-from grounded.search.standing import (
-    Ending,
-    Phase,
-    SearchOptions,
-    Standing,
-    losers_of,
-    standing,
-)
-from grounded.search.step_size import Step
+from grounded.search.standing import Ending, Phase, Standing, standing
+from grounded.search.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
 from grounded.trial import Trial
 

@@ -18,15 +18,15 @@ from grounded.search.margin import steadied
 from grounded.search.planner import Planner, predicted
 from grounded.search.proposal import Proposal
 from grounded.search.safety import objections, spread
-from grounded.search.standing import SearchOptions, Standing, losers_of, wild
-from grounded.search.step_size import KEPT, Step
+from grounded.search.standing import Standing, wild
+from grounded.search.step_size import KEPT, SearchOptions, Step, losers_of
 from grounded.solve import ddp
 from grounded.solve.measured import measured_gains
 from grounded.trial import mean_trial
 
 if TYPE_CHECKING:
     from grounded.search.corrected import Corrected
-    from grounded.search.feedback import Alternative
+    from grounded.search.mispredictions import Alternative
 
 GENTLER = 1e3  # factor on the input weights for each unit of caution
 HALF, FINE = 0.5, 12  # share of the mean gain to fall below; parts of a unit of caution

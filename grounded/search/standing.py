@@ -16,15 +16,15 @@ The same candidates and trials give the same state, at any time and in any proce
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import NextCommand
 from grounded.result import Result, document
-from grounded.search.candidate import Candidate, Slopes, Tried, Way
+from grounded.search.candidate import Candidate, Tried, Way
 from grounded.search.certainty import error_between, judged, last_improvement
-from grounded.search.step_size import Step, after_failure, after_success
+from grounded.search.step_size import SearchOptions, Step
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -44,114 +44,10 @@ Ending = Literal[
     "too little gained",  # by the last candidates
     "trials used up",
 ]
-BOLDER = 3  # factors of 10 below the due damping, tried if the due step and all after it lose
-OTHER_WAY = 2  # losses of the way that comes second, before it is given up
 PATIENCE = 4  # candidates in a row that may gain less than the tolerance each
 LOST = 2  # steps in a row without improvement after which a diagnosis is suggested
 WILD = 100.0  # a first trial worse than predicted by this factor suggests a diagnosis
 MAX_CAUTION = 3  # times the first policy is made again, each time more gently, after a crash
-
-
-@dataclass(frozen=True)
-class SearchOptions:
-    """Settings of a search; the [search] table of grounded.toml (docs/configuration.md).
-
-    Args:
-        method: algorithm that makes a direction: "ddp" or "policy-gradient".
-        step: "damped" raises the damping before alpha is halved; "full" only halves alpha, as in
-            the paper.
-        refit: fit the model's uncertain parameters to all trials before each proposal.
-        match_inputs: attribute what shifted inputs explain to the inputs, and only the rest to the
-            bias; False for the paper's bias alone.
-        max_halvings: smallest step size is alpha = 2^-max_halvings, 0 to 30.
-        repeats: trials of each candidate, 1 to 100.
-        rerun_incumbent: run the best candidate again if a loss to it may be due to noise.
-        max_trials: the search stops after this many trials.
-        tolerance: the search ends when the model predicts a smaller relative gain, 0 to below 1.
-
-    Raises:
-        GroundedError: if a setting is out of range.
-    """
-
-    method: Literal["ddp", "policy-gradient"] = "ddp"
-    step: Literal["damped", "full"] = "damped"
-    refit: bool = False
-    match_inputs: bool = True
-    max_halvings: int = 6
-    repeats: int = 1
-    rerun_incumbent: bool = True
-    max_trials: int = 40
-    tolerance: float = 1e-3
-
-    def __post_init__(self) -> None:
-        bounds = {"max_halvings": (0, 30), "repeats": (1, 100), "max_trials": (1, 100_000)}
-        for name, (low, high) in bounds.items():
-            if not low <= getattr(self, name) <= high:
-                raise GroundedError(
-                    f"[search] {name} must be {low} to {high}, got {getattr(self, name)}"
-                )
-        if self.repeats > self.max_trials:
-            raise GroundedError(
-                f"[search] repeats = {self.repeats} is more than max_trials = {self.max_trials}"
-            )
-        if not 0 <= self.tolerance < 1:
-            raise GroundedError(f"[search] tolerance must be in [0, 1), got {self.tolerance}")
-
-    @property
-    def damps(self) -> bool:
-        """Whether steps are also damped (see `step_size`), not only halved as in the paper."""
-        return self.method == "ddp" and self.step == "damped"
-
-    def first_step(self) -> Step:
-        """Return the first step along a new direction, before any prediction was tested."""
-        return Step(damping=1.0 if self.damps else 0.0)
-
-    def next_step(self, step: Step) -> Step | None:
-        """Return the step after one that did not improve; None if no smaller one is left."""
-        return after_failure(step, self.max_halvings, damps=self.damps)
-
-    def ways(self, incumbent: Candidate) -> tuple[Way, ...]:
-        """Return the ways to make a direction, first the one that made the incumbent."""
-        if not (self.damps and self.match_inputs):
-            return ("",)
-        recorded = incumbent.way == "recorded inputs"
-        return ("recorded inputs", "") if recorded else ("", "recorded inputs")
-
-    def due(
-        self,
-        history: Sequence[Tried],
-        incumbent: Tried,
-        model: str,
-        way: Way,
-        slopes: Slopes | None = None,
-    ) -> Step | None:
-        """Return the next step from the incumbent in one way; None if the way is exhausted.
-
-        Only losses of the same model (and of the same kind of derivatives, `slopes`, if given)
-        count: a direction belongs to one model.
-        """
-        made = incumbent.candidate
-        losers = losers_of(history, made.id, model, way)
-        if slopes is not None:
-            losers = [candidate for candidate in losers if candidate.slopes == slopes]
-        if way != self.ways(made)[0] and (incumbent.standard_error > 0 or len(losers) >= OTHER_WAY):
-            return None  # where trials scatter, one way is enough to be told from luck
-        if losers:
-            return self.next_step(Step(losers[-1].damping, losers[-1].alpha))
-        base = next((t for t in history if t.candidate.id == made.base), None)
-        if base is None or made.model != model or made.way != way or not self.damps:
-            return self.first_step()
-        real = incumbent.utility - base.utility
-        return after_success(Step(made.damping, made.alpha), made.predicted_gain, real)
-
-    def steps_from(self, step: Step | None) -> Iterator[Step]:
-        """Yield the due step, then ever more cautious steps, then steps bolder than the first."""
-        first = step
-        while step is not None:
-            yield step
-            step = self.next_step(step)
-        if first is not None and self.damps:
-            yield from (Step(first.damping / 10.0**k) for k in range(1, BOLDER + 1))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -377,22 +273,6 @@ def _waiting(now: Standing, model: str) -> Tried | None:
         if made.base not in undecided and (made.base or made.caution <= failed):
             return tried
     return None
-
-
-def losers_of(
-    history: Sequence[Tried], base: str, model: str, way: Way | None = None
-) -> list[Candidate]:
-    """Return the candidates derived from `base` in this model that did not improve on it.
-
-    Args:
-        history: all candidates with their trials.
-        base: id of the candidate that they started from.
-        model: fingerprint of the model.
-        way: only candidates made in this way; None for all.
-    """
-    tried = [t for t in history if t.candidate.base == base and t.candidate.model == model]
-    lost = [t.candidate for t in tried if t.accepted is False]
-    return [c for c in lost if way is None or c.way == way]
 
 
 def _next_step(

@@ -33,13 +33,19 @@ trials so far. A step is also skipped if its predicted run leaves the safe regio
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
+from grounded.errors import GroundedError
 from grounded.result import figure
+from grounded.search.candidate import Candidate, Slopes, Tried, Way
 
 KEPT, BROKEN = 0.9, 0.25
 EASED, RAISED = 30.0, 10.0
 LEAST, MOST = 1e-6, 1e3
+BOLDER = 3  # factors of 10 below the due damping, tried if the due step and all after it lose
+OTHER_WAY = 2  # losses of the way that comes second, before it is given up
 
 
 @dataclass(frozen=True)
@@ -82,3 +88,121 @@ def after_failure(step: Step, max_halvings: int, *, damps: bool = True) -> Step 
         return replace(step, damping=min(step.damping * RAISED, MOST))
     alpha = step.alpha / 2
     return replace(step, alpha=alpha) if alpha >= 2.0**-max_halvings * (1 - 1e-12) else None
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """Settings of a search; the [search] table of grounded.toml (docs/configuration.md).
+
+    Args:
+        method: algorithm that makes a direction: "ddp" or "policy-gradient".
+        step: "damped" raises the damping before alpha is halved; "full" only halves alpha, as in
+            the paper.
+        refit: fit the model's uncertain parameters to all trials before each proposal.
+        match_inputs: attribute what shifted inputs explain to the inputs, and only the rest to the
+            bias; False for the paper's bias alone.
+        max_halvings: smallest step size is alpha = 2^-max_halvings, 0 to 30.
+        repeats: trials of each candidate, 1 to 100.
+        rerun_incumbent: run the best candidate again if a loss to it may be due to noise.
+        max_trials: the search stops after this many trials.
+        tolerance: the search ends when the model predicts a smaller relative gain, 0 to below 1.
+
+    Raises:
+        GroundedError: if a setting is out of range.
+    """
+
+    method: Literal["ddp", "policy-gradient"] = "ddp"
+    step: Literal["damped", "full"] = "damped"
+    refit: bool = False
+    match_inputs: bool = True
+    max_halvings: int = 6
+    repeats: int = 1
+    rerun_incumbent: bool = True
+    max_trials: int = 40
+    tolerance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        bounds = {"max_halvings": (0, 30), "repeats": (1, 100), "max_trials": (1, 100_000)}
+        for name, (low, high) in bounds.items():
+            if not low <= getattr(self, name) <= high:
+                raise GroundedError(
+                    f"[search] {name} must be {low} to {high}, got {getattr(self, name)}"
+                )
+        if self.repeats > self.max_trials:
+            raise GroundedError(
+                f"[search] repeats = {self.repeats} is more than max_trials = {self.max_trials}"
+            )
+        if not 0 <= self.tolerance < 1:
+            raise GroundedError(f"[search] tolerance must be in [0, 1), got {self.tolerance}")
+
+    @property
+    def damps(self) -> bool:
+        """Whether steps are also damped (see `step_size`), not only halved as in the paper."""
+        return self.method == "ddp" and self.step == "damped"
+
+    def first_step(self) -> Step:
+        """Return the first step along a new direction, before any prediction was tested."""
+        return Step(damping=1.0 if self.damps else 0.0)
+
+    def next_step(self, step: Step) -> Step | None:
+        """Return the step after one that did not improve; None if no smaller one is left."""
+        return after_failure(step, self.max_halvings, damps=self.damps)
+
+    def ways(self, incumbent: Candidate) -> tuple[Way, ...]:
+        """Return the ways to make a direction, first the one that made the incumbent."""
+        if not (self.damps and self.match_inputs):
+            return ("",)
+        recorded = incumbent.way == "recorded inputs"
+        return ("recorded inputs", "") if recorded else ("", "recorded inputs")
+
+    def due(
+        self,
+        history: Sequence[Tried],
+        incumbent: Tried,
+        model: str,
+        way: Way,
+        slopes: Slopes | None = None,
+    ) -> Step | None:
+        """Return the next step from the incumbent in one way; None if the way is exhausted.
+
+        Only losses of the same model (and of the same kind of derivatives, `slopes`, if given)
+        count: a direction belongs to one model.
+        """
+        made = incumbent.candidate
+        losers = losers_of(history, made.id, model, way)
+        if slopes is not None:
+            losers = [candidate for candidate in losers if candidate.slopes == slopes]
+        if way != self.ways(made)[0] and (incumbent.standard_error > 0 or len(losers) >= OTHER_WAY):
+            return None  # where trials scatter, one way is enough to be told from luck
+        if losers:
+            return self.next_step(Step(losers[-1].damping, losers[-1].alpha))
+        base = next((t for t in history if t.candidate.id == made.base), None)
+        if base is None or made.model != model or made.way != way or not self.damps:
+            return self.first_step()
+        real = incumbent.utility - base.utility
+        return after_success(Step(made.damping, made.alpha), made.predicted_gain, real)
+
+    def steps_from(self, step: Step | None) -> Iterator[Step]:
+        """Yield the due step, then ever more cautious steps, then steps bolder than the first."""
+        first = step
+        while step is not None:
+            yield step
+            step = self.next_step(step)
+        if first is not None and self.damps:
+            yield from (Step(first.damping / 10.0**k) for k in range(1, BOLDER + 1))
+
+
+def losers_of(
+    history: Sequence[Tried], base: str, model: str, way: Way | None = None
+) -> list[Candidate]:
+    """Return the candidates derived from `base` in this model that did not improve on it.
+
+    Args:
+        history: all candidates with their trials.
+        base: id of the candidate that they started from.
+        model: fingerprint of the model.
+        way: only candidates made in this way; None for all.
+    """
+    tried = [t for t in history if t.candidate.base == base and t.candidate.model == model]
+    lost = [t.candidate for t in tried if t.accepted is False]
+    return [c for c in lost if way is None or c.way == way]

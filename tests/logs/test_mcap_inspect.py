@@ -15,7 +15,8 @@ from grounded.errors import GroundedError
 from grounded_trials.formats.messages import Dynamic
 from grounded_trials.formats.path_walk import FIELD_LIMIT, number_paths
 from grounded_trials.formats.schemas import parse_ros
-from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated, mapping_toml
+from grounded_trials.logs.guessed_table import mapping_toml
+from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated
 from grounded_trials.logs.inspect_log import inspect_log
 from grounded_trials.logs.log_table import LogMapping, read_log
 from grounded_trials.logs.signals import SignalSpec

@@ -15,8 +15,8 @@ from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
 from grounded.search.making import About, Maker
 from grounded.search.planner import Planner, model_fingerprint, planner_for, predicted
-from grounded.search.standing import SearchOptions, standing
-from grounded.search.step_size import Step
+from grounded.search.standing import standing
+from grounded.search.step_size import SearchOptions, Step
 from grounded.trial import Trial
 from grounded.utility import Reward
 from grounded_trials.workspace.adopted import planner_of

@@ -23,7 +23,7 @@ from grounded.search.directions import damped, direction
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
 from grounded.search.planner import model_fingerprint
-from grounded.search.standing import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.solve.bias import ground
 from grounded.task import Task
 from grounded.trial import Trial

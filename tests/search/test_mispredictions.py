@@ -13,7 +13,7 @@ from grounded.search.making import About, Maker
 from grounded.search.margin import AGES, worse_costs
 from grounded.search.mispredictions import apart, believed, shared
 from grounded.search.planner import Planner, predicted
-from grounded.search.standing import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.solve import ddp
 from grounded.solve.bias import ground
 from small_tasks import cart_task, drive, other, rover_task

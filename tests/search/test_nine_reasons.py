@@ -25,7 +25,7 @@ from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
 from grounded.search.mispredictions import Believed
 from grounded.search.planner import planner_for
-from grounded.search.standing import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.solve import ddp
 from small_tasks import cart_task, drive, other
 

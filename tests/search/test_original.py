@@ -9,7 +9,7 @@ from grounded.plant import Plant
 from grounded.search.improve import propose
 from grounded.search.original import Promises, promises
 from grounded.search.planner import Planner, planner_with
-from grounded.search.standing import SearchOptions
+from grounded.search.step_size import SearchOptions
 from small_tasks import cart_task, drive, other, rover_task
 
 

@@ -11,7 +11,8 @@ from grounded.search.candidate import Tried
 from grounded.search.certainty import error_between, in_doubt
 from grounded.search.improve import propose
 from grounded.search.scatter import PIECES, Repeats, by_pieces, noise_cost, with_errors
-from grounded.search.standing import SearchOptions, standing
+from grounded.search.standing import standing
+from grounded.search.step_size import SearchOptions
 from small_tasks import cart_task, drive, other
 
 

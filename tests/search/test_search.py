@@ -13,8 +13,8 @@ from grounded.plant import Noise, Plant
 from grounded.search.ask_tell import learn
 from grounded.search.improve import propose
 from grounded.search.planner import model_fingerprint
-from grounded.search.standing import MAX_CAUTION, OTHER_WAY, SearchOptions, standing
-from grounded.search.step_size import Step
+from grounded.search.standing import MAX_CAUTION, standing
+from grounded.search.step_size import OTHER_WAY, SearchOptions, Step
 from grounded.trial import Trial, mean_trial
 from grounded.utility import Reward
 from small_tasks import cart_task, drive, other, rover_task

@@ -16,7 +16,8 @@ from grounded.experiments.figure8 import flight_task
 from grounded.models import aircraft
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
-from grounded.search.standing import SearchOptions, standing
+from grounded.search.standing import standing
+from grounded.search.step_size import SearchOptions
 from grounded.solve.bias import residuals
 from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Run

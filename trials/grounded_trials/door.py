@@ -48,10 +48,7 @@ class Workspace(Folder):
     file, an unknown name, a system that fails.
 
     Args:
-        folder: the folder of grounded.toml.
-
-    Raises:
-        GroundedError: if there is no grounded.toml, or it is invalid.
+        folder: the folder of grounded.toml, which must exist and be valid.
     """
 
     def __init__(self, folder: str | Path = ".") -> None:

@@ -17,13 +17,11 @@ import numpy as np
 
 from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
 from grounded_trials.logs.stated_units import bare_command, may_be, unit_of, without_unit
-from grounded_trials.toml_table import key
 
 FEW = 8  # alternatives listed in [log]
 SURE = 1.5  # lead in score over the next candidate, to be sure
 AS_OFTEN = 0.5  # of the wheel odometry's rate: a pose at this rate is preferred to the odometry's
 LEAST = 2.0  # below this score nothing is proposed
-DRIFT = 2e-4  # of a signal's range: the smallest standard deviation proposed for it
 SIMULATED_S = 1.0  # header stamps further from the log's clock are simulation time
 
 _YAW = ("@rpy.yaw", "yaw", "heading", "theta", "psi")
@@ -339,70 +337,3 @@ def _rate(candidate: _Candidate) -> float:
 def is_simulated(log: LogReport) -> bool:
     """Check whether header stamps are on another clock than the log, as in a simulation."""
     return any(t.skew_s is not None and abs(t.skew_s) > SIMULATED_S for t in log.topics)
-
-
-def mapping_toml(
-    states: Sequence[Guess], inputs: Sequence[Guess], *, simulated: bool = False
-) -> str:
-    """Format guesses as a [log] table, with comments where a person should check."""
-    clock = "log" if simulated else "header"
-    lines = ["[log]", f'clock = "{clock}"']
-    if simulated:
-        lines[-1] += "  # header stamps are on another clock than the log (simulation time?)"
-    for kind, guesses in (("state", states), ("input", inputs)):
-        for guess in guesses:
-            lines += ["", *_table(kind, guess, clock)]
-    lines += _estimate(states)
-    return "\n".join(lines) + "\n"
-
-
-def _table(kind: str, guess: Guess, clock: str) -> list[str]:
-    head = f"[log.{kind}.{key(guess.name)}]"
-    others = f"; or {', '.join(guess.others[:FEW])}" if guess.others else ""
-    if not guess.path and not guess.others:
-        return [f"# {head}  # nothing in the log fits"]
-    if not guess.path:
-        rest = f"  # or {', '.join(guess.others[1:FEW])}" * (len(guess.others) > 1)
-        what = "no name in the log fits; to use one of these, remove both #"
-        return [f"# {head}  # {what}", f"# path = {_quote(guess.others[0])}{rest}"]
-    lines = [head if guess.sure else f"{head}  # unsure{others}"]
-    lines.append(f"path = {_quote(guess.path)}")
-    if guess.field is not None and guess.field.low is not None:
-        lines[-1] += f"  # {guess.field.low:.4g} to {guess.field.high:.4g} in this log"
-    if guess.reasons:
-        lines.insert(1, f"# {'; '.join(guess.reasons)}")
-    if guess.scale != 1.0:
-        lines.append(f"scale = {guess.scale:.10g}")
-    if guess.clock != clock:
-        lines.append(f'clock = "{guess.clock}"')
-    if guess.is_angle and guess.path.endswith("yaw"):
-        lines.append("unwrap = true")
-    return lines
-
-
-def _estimate(states: Sequence[Guess]) -> list[str]:
-    """Return an [estimate] table for the states that the log does not contain."""
-    missing = [guess.name for guess in states if not guess.path]
-    known = [guess for guess in states if guess.path and guess.field is not None]
-    if not missing or not known:
-        return []
-    deviations = ", ".join(
-        f"{guess.name} = {abs(guess.scale) * _deviation(guess):.1g}" for guess in known
-    )
-    return [
-        "",
-        f"[estimate]  # the smoother estimates {', '.join(missing)}",
-        f"measured = {{ {deviations} }}  # standard deviations, in the model's units; check them",
-        f"# add {' or '.join(missing)} if the log contains it after all",
-    ]
-
-
-def _deviation(guess: Guess) -> float:
-    """Return its noise in this log, at least a small part of its range, since sensors drift."""
-    assert guess.field is not None
-    low, high = guess.field.low or 0.0, guess.field.high or 0.0
-    return max(guess.field.noise, DRIFT * (high - low), 1e-6)
-
-
-def _quote(path: str) -> str:
-    return f"'{path}'" if '"' in path and "'" not in path else '"' + path.replace('"', '\\"') + '"'

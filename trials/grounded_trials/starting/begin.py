@@ -20,8 +20,9 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Result, listed
 from grounded_trials.formats.text_tables import column_units
+from grounded_trials.logs.guessed_table import mapping_toml
 from grounded_trials.logs.inspect_evidence import as_stated, weigh
-from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated, mapping_toml
+from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated
 from grounded_trials.logs.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.inspect_pairs import velocities
 from grounded_trials.logs.joint_names import joint_names, joint_units, wide_joints

@@ -83,8 +83,9 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     Raises:
         GroundedError: if the log can't be read at all.
     """
+    from grounded_trials.logs.guessed_table import mapping_toml
     from grounded_trials.logs.inspect_evidence import weigh
-    from grounded_trials.logs.inspect_guess import guess_mapping, is_simulated, mapping_toml
+    from grounded_trials.logs.inspect_guess import guess_mapping, is_simulated
     from grounded_trials.logs.joint_names import joint_names, joint_units, wide_joints
     from grounded_trials.logs.log_table import log_mapping
     from grounded_trials.logs.unnamed import from_the_rest

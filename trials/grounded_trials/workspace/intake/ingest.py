@@ -396,5 +396,5 @@ def _sooner(log: ForeignLog, stored: ForeignLog) -> float:
 def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:
     if tried is None:
         return "probe" if trial.candidate else ""
-    ran = [one.id for one in tried.trials[:repeats]]
-    return "run again" if tried.accepted and trial.id not in ran else tried.verdict()
+    again = tried.accepted and trial.id not in [one.id for one in tried.trials[:repeats]]
+    return "run again" if again else tried.verdict()
