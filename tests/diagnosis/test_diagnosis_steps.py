@@ -188,6 +188,20 @@ def test_calibration_takes_the_place_of_a_further_effect_unless_that_is_beyond_d
     assert decide._calibrated_instead(search, alone, Coarse(0.0)) is alone
 
 
+def test_calibration_takes_the_place_of_several_effects_that_are_not_each_beyond_doubt(
+    search, calibrated
+):
+    """A gain of both inputs and a friction stood for parameters that were 5 % off."""
+    free = calibrated[1]
+    limit = next(e for e in search.candidates if e.name == LIMIT)
+    fit = fit_of(search, FRICTION, "input_gain:u")
+    three = replace(fit, hypothesis=fit.hypothesis.plus(limit, {"c": 1.5}))
+    nats = search.score(free) - search.score(three)
+    near, sure = (more_likely(search, three, nats + more) for more in (14.0, 18.0))
+    assert decide._calibrated_instead(search, near, Coarse(0.0)) is free
+    assert decide._calibrated_instead(search, sure, Coarse(0.0)) is sure
+
+
 def test_effects_are_also_fitted_with_parameters_that_seem_right_without_them():
     """An offset and an input that is 5 % off hid each other: neither was likely alone."""
     model, trials = sled()
