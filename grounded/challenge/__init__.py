@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from grounded.challenge.cases import KINDS, Case, make, sealed
 from grounded.challenge.mechanism import simulator
-from grounded.challenge.score import Oracle, judge, oracle, summary, task_of
+from grounded.challenge.score import Oracle, judge, of_crude, oracle, summary, task_of
 
 __all__ = [
     "KINDS",
@@ -21,6 +21,7 @@ __all__ = [
     "Oracle",
     "judge",
     "make",
+    "of_crude",
     "oracle",
     "sealed",
     "simulator",

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.challenge import systems
 from grounded.challenge.cases import Case
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
@@ -187,6 +188,22 @@ def judge(
         marks["units_ratio"] = _ratio(diagnosis, known.errors)
     marks |= _values(label, diagnosis)
     return marks
+
+
+def of_crude(label: Mapping[str, Any], model: Model) -> dict[str, Any]:
+    """Return a label whose parameter shifts are relative to the crude model, as in a diagnosis.
+
+    A drawn shift is relative to the system's own value, which the crude model may not have.
+    """
+    true = systems.SYSTEMS[label["system"]]().model if label["param_error"] else model
+    effects = []
+    for entry in label["effects"]:
+        name = entry["effect"].removeprefix("parameter:")
+        if name != entry["effect"]:
+            apart = float(true.params[name].value) - float(model.params[name].value)
+            entry = {**entry, "params": {"d": entry["params"]["d"] + apart}}
+        effects.append(entry)
+    return {**label, "effects": effects}
 
 
 def _physical(named: Sequence[str], label: Mapping[str, Any]) -> list[str]:

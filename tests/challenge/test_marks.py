@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from grounded.challenge import judge, make, summary
+from grounded.challenge import judge, make, of_crude, summary
 from grounded.challenge.cases import _shares
 from grounded.challenge.mechanism import Mechanism, arm_built, cart_built
 from grounded.challenge.score import Oracle, share
@@ -146,6 +146,18 @@ def test_beside_parameters_that_are_off_the_effect_has_to_be_first_of_the_others
     assert not marks_of("delay:a", named)["first"]  # the model's parameters are right
     assert not marks_of("delay:a", ["parameter:L"], param_error=0.05)["first"]
     assert not marks_of("parameter:a1", named, param_error=0.05)["first"]
+
+
+def test_a_shift_of_a_parameter_is_counted_from_the_crude_value():
+    effects = [{"effect": "parameter:L", "params": {"d": 0.1}}]
+    effects.append({"effect": "delay:steering", "params": {"d": 0.1}})
+    label = {"effects": effects, "param_error": 0.05, "system": "car"}
+    true = SYSTEMS["car"]().model
+    crude = true.with_values({"L": true.params["L"].value * 1.04})
+    parameter, delay = of_crude(label, crude)["effects"]
+    assert parameter["params"]["d"] == pytest.approx(0.1 - 0.04 * true.params["L"].value)
+    assert delay == effects[1]
+    assert of_crude(label | {"param_error": 0.0}, true)["effects"] == effects
 
 
 def test_wrong_places_worse_predictions_and_false_effects_are_counted():

@@ -14,7 +14,8 @@ from grounded.diagnosis.report import Diagnosis, Ranked, Unconfirmed, Verdict
 from grounded.diagnosis.unconfirmed import marked, unconfirmed
 from grounded.diagnosis.validation import decide as decide_module
 from grounded.diagnosis.validation.claims import Claims
-from grounded.diagnosis.validation.decide import Decision, _likelier, causes, decide, shares
+from grounded.diagnosis.validation.credit import shares
+from grounded.diagnosis.validation.decide import Decision, _likelier, causes, decide
 from grounded.diagnosis.validation.gain import Gain
 from grounded.diagnosis.validation.limits import limits
 from grounded.diagnosis.validation.ruler import Ruler, folds

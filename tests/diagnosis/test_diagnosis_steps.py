@@ -188,6 +188,34 @@ def test_calibration_takes_the_place_of_a_further_effect_unless_that_is_beyond_d
     assert decide._calibrated_instead(search, alone, Coarse(0.0)) is alone
 
 
+def test_calibration_takes_the_place_of_several_effects_that_are_not_each_beyond_doubt(
+    search, calibrated
+):
+    """A gain of both inputs and a friction stood for parameters that were 5 % off."""
+    free = calibrated[1]
+    limit = next(e for e in search.candidates if e.name == LIMIT)
+    fit = fit_of(search, FRICTION, "input_gain:u")
+    three = replace(fit, hypothesis=fit.hypothesis.plus(limit, {"c": 1.5}))
+    nats = search.score(free) - search.score(three)
+    near, sure = (more_likely(search, three, nats + more) for more in (14.0, 18.0))
+    assert decide._calibrated_instead(search, near, Coarse(0.0)) is free
+    assert decide._calibrated_instead(search, sure, Coarse(0.0)) is sure
+
+
+def test_effects_are_also_fitted_with_parameters_that_seem_right_without_them():
+    """An offset and an input that is 5 % off hid each other: neither was likely alone."""
+    model, trials = sled()
+    data = prepare(model, trials, np.zeros(1))
+    offered = [e for e in Library().candidates(model, data.scales) if e.name == FRICTION]
+    found = HypothesisSearch(data, offered)
+    with np.errstate(all="ignore"):
+        found.refined([found.fresh(Hypothesis())], 20)
+        found.refined([found.fresh(Hypothesis().plus(offered[0], {"k": 0.4}))], 20)
+        assert not found.calibrates()
+        found.beside_parameters()
+    assert {w for _, w, names in found.fits if names == (FRICTION,)} > {0.0}
+
+
 def test_of_causes_that_can_each_be_spared_evidence_says_which(search, calibrated):
     fit, free = calibrated
     without = {"calibration": more_likely(search, fit, 20.0), FRICTION: free}

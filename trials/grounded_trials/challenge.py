@@ -166,7 +166,7 @@ def score_case(
     Raises:
         GroundedError: if it was not diagnosed, or a trial or label was changed.
     """
-    from grounded.challenge import judge, oracle
+    from grounded.challenge import judge, of_crude, oracle
 
     workspace = Folder(Path(folder) / name)
     hashes = [hashlib.sha256(workspace.store.read(s)).hexdigest() for s in workspace.store.list()]
@@ -179,8 +179,8 @@ def score_case(
         raise GroundedError(
             f"{workspace.folder} was not diagnosed", NextCommand("challenge", ("run", str(folder)))
         ) from None
-    label = open_label(Path(labels), name, entry)
     task = workspace.task
+    label = of_crude(open_label(Path(labels), name, entry), task.model)
     latency = np.zeros(task.model.m) if task.latency is None else task.latency
     known = oracle(task.model, workspace.task_trials(), latency, label, diagnosis["ranking"])
     return judge(label, diagnosis, known)

@@ -304,7 +304,7 @@ class _Context(SentOnce):
 
     def best(self, i: int, effect: Effect, results: _Results) -> Look:
         """Return the grid point with the largest gain, with its linear values solved."""
-        looks = []
+        looks, changes = [], []
         for point, grid in enumerate(grid_points(effect)):
             entries = results.get((i, point), [])
             if not entries:
@@ -317,9 +317,7 @@ class _Context(SentOnce):
             gram = gram - cross @ self.base @ cross.T
             size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
             if names == [""]:
-                part = faint(effect, grid, float(score[0]), float(gram[0, 0]))
-                gain = -part * float(score[0]) - 0.5 * part**2 * float(gram[0, 0])
-                looks.append((gain, {name: part * value for name, value in grid.items()}))
+                changes.append((grid, float(score[0]), float(gram[0, 0])))
                 continue
             if not np.isfinite(size).all() or (size < 1e-8).any():
                 looks.append((0.0, {**grid, **dict.fromkeys(names, 0.0)}))
@@ -329,6 +327,7 @@ class _Context(SentOnce):
             value = inside(effect, names, value)
             gain = -float(value @ score) - 0.5 * float(value @ gram @ value)
             looks.append((gain, {**grid, **dict(zip(names, value.tolist(), strict=True))}))
+        looks += between(effect, changes)
         if not looks:
             return Look(effect, {}, 0.0)
         looks.sort(key=lambda look: -look[0])
@@ -387,13 +386,33 @@ def apart(effect: Effect, one: dict[str, float], other: dict[str, float]) -> boo
     return False
 
 
-def faint(effect: Effect, grid: dict[str, float], score: float, gram: float) -> float:
-    """Return the fraction of the smallest grid value that fits best, 1.0 at other grid points.
+def between(
+    effect: Effect, changes: Sequence[tuple[dict[str, float], float, float]]
+) -> list[tuple[float, dict[str, float]]]:
+    """Return the best gain and value between each grid point and the next weaker one.
 
-    Below the smallest value, an effect that vanishes at zero is taken as linear.
+    A change is taken as linear between two grid points, and between the weakest and none. So a
+    threshold is found that a few samples exceed, where one grid point does nothing and the next too
+    much.
+
+    Args:
+        effect: an effect with one scanned quantity.
+        changes: each grid point, its score (the gain's slope, negated) and its squared size.
     """
-    (scanned,) = (q for q in effect.free if q.grid)
-    least = min(map(abs, scanned.grid))
-    if scanned.start != 0 or abs(grid[scanned.name]) > least or gram <= 0:
-        return 1.0
-    return float(np.clip(-score / gram, 0.05, 1.0))
+    found = []
+    for grid, score, gram in changes:
+        ((name, value),) = grid.items()
+        (none,) = (q.start for q in effect.free if q.name == name)
+        away = {other[name]: size for other, _, size in changes}
+        weaker = [c for c in away if 0 <= (c - none) / (value - none) < 1]
+        below = min(weaker, key=lambda c: abs(c - value), default=none)
+        size = away.get(below, 0.0)
+        least = float(np.sqrt(size / gram)) if 0 < size < gram else 0.0
+        part = float(np.clip(-score / gram, least, 1.0)) if gram > 0 else 1.0
+        way = max((part - least) / (1 - least), FAINT)
+        gain = -part * score - 0.5 * part**2 * gram
+        found.append((gain, {name: below + way * (value - below)}))
+    return found
+
+
+FAINT = 0.05  # least way from a weaker grid point, so that a fit has a slope to start from

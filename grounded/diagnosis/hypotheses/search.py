@@ -194,20 +194,19 @@ class HypothesisSearch(FittedHypotheses):
         return bool((np.abs(h.shift) > h.spread * unit).any())
 
     def beside_parameters(self) -> None:
-        """If the parameters are off, refit the likeliest effects with the parameters free.
+        """Refit the likeliest effects with the parameters free.
 
-        They start from the fit with exact parameters, in which the effect has its full size.
-        Started from parameters that already absorbed it, an effect would not grow.
+        They start from fits with exact parameters, in which effects have their full size: beside
+        parameters that absorbed it, an effect would not grow. Either can hide the other.
         """
-        if not self.calibrates():
-            return
         exact = [
             f
             for (structure, spread, names), f in self.fits.items()
             if len(names) == 1 and spread == 0 and structure.tau is None and not parametric(f)
         ]
-        likely = sorted(exact, key=lambda f: -self.score(f))[: self.beside]
-        for fit in self.refined(likely, 12):
+        exact.sort(key=lambda f: -self.score(f))
+        count = self.beside if self.calibrates() else self.beside // 2
+        for fit in self.refined(exact[:count], 12):
             self.calibrated(fit)
 
     def _empty(self) -> HypothesisSearch:

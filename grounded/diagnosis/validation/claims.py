@@ -34,7 +34,8 @@ from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.report import Estimate, Likeness, Ranked
 from grounded.diagnosis.validation.averaged import averaged
-from grounded.diagnosis.validation.decide import BETTER, SLIGHT, Decision, ordered
+from grounded.diagnosis.validation.credit import ordered
+from grounded.diagnosis.validation.decide import BETTER, SLIGHT, Decision
 from grounded.diagnosis.validation.held_out import gaps_of, held_out_errors
 from grounded.diagnosis.validation.limits import Limits
 from grounded.diagnosis.validation.prediction_error import normalised

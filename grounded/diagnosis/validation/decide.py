@@ -18,14 +18,13 @@ under every other noise structure, are compared by the `ruler`:
     6. A hypothesis that predicts no better than the crude model is not claimed.
     7. A likely effect that was dropped is reported as doubtful; perhaps too few trials show it.
 
-A cause is an effect or the calibration of the model's own parameters. Its credit is the loss of
-accuracy without it, with the others fitted again.
+A cause is an effect or the calibration of the model's own parameters.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -151,24 +150,32 @@ def _own_numbers(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
 
 
 def _calibrated_instead(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
-    """Replace a further effect by calibration of all parameters, unless it is much likelier.
+    """Replace further effects by calibration of all parameters, unless they are much likelier.
 
     If all parameters are slightly off, no single shift equals an effect with two values, but all
-    shifts together do. So an effect beside another cause must be likelier by SURE nats.
+    shifts together do. So each effect beside another cause must be worth SURE nats.
     """
     h, score, names = fit.hypothesis, search.score, _effects(fit)
-    rests = [tuple(sorted({*h.names} - {name})) for name in names if len(names) > 1]
-    if h.spread > 0 or not rests:
+    if h.spread > 0 or len(h.names) < 2:
         return fit
+    rests = {
+        tuple(sorted({*h.names} - {*some})): SURE * count
+        for count in range(1, min(len(names), len(h.names) - 1) + 1)
+        for some in combinations(names, count)
+    }
 
-    def likeliest() -> Fitted:
+    def lacks(other: Fitted) -> float:
+        """Return the nats that another fit lacks to replace this one; below zero, it does."""
+        return score(fit) - score(other) - rests[tuple(sorted(other.hypothesis.names))]
+
+    def nearest() -> Fitted:
         free = [f for (_, w, some), f in search.fits.items() if w and some in rests]
-        return max(free, key=score, default=fit)
+        return min(free, key=lacks, default=fit)
 
-    if score(fit) - score(likeliest()) < 2 * SURE:
-        search.finished([likeliest()], TO_THE_TOP)
-    other = likeliest()
-    as_good = other is not fit and score(fit) - score(other) < SURE
+    if (other := nearest()) is not fit and lacks(other) < SURE:
+        search.finished([other], TO_THE_TOP)
+        other = nearest()
+    as_good = other is not fit and lacks(other) < 0
     return fit if not as_good or ruler.gain(other, fit).beyond(*BETTER) else other
 
 
@@ -386,19 +393,3 @@ def plain(search: HypothesisSearch, fit: Fitted) -> Fitted:
     noise = fit.noise.allowing(Structure(), search.data.dt)
     found = [known] if known else search.refined([(h, noise, fit.track)], REFIT)
     return found[0] if found else fit
-
-
-def shares(ruler: Ruler, decision: Decision) -> dict[str, float]:
-    """Return the share of the total gain (in log error) that is lost without each cause.
-
-    If causes overlap, the shares sum to less than 1. If they depend on one another, so that the
-    losses sum to more than the total gain, the shares are normalised to 1.
-    """
-    whole = ruler.gain(decision.crude, decision.fit).mean
-    lost = {n: max(ruler.gain(f, decision.fit).mean, 0.0) for n, f in decision.without.items()}
-    return {name: loss / max(whole, sum(lost.values()), 1e-12) for name, loss in lost.items()}
-
-
-def ordered(shares_: dict[str, float], names: Sequence[str]) -> list[str]:
-    """Return names by their credit, largest first."""
-    return sorted(names, key=lambda name: -shares_.get(name, 0.0))

@@ -26,7 +26,8 @@ from grounded.diagnosis.error_report import (
 from grounded.diagnosis.hypotheses.leftover import Leftover, leftovers, whiteness
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.validation.decide import Decision, ordered, plain, shares
+from grounded.diagnosis.validation.credit import ordered, shares
+from grounded.diagnosis.validation.decide import Decision, plain
 from grounded.diagnosis.validation.gain import Errors
 from grounded.diagnosis.validation.prediction_error import by_region, horizon
 from grounded.diagnosis.validation.ruler import Ruler, repeated
