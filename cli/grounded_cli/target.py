@@ -24,7 +24,9 @@ TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
 
 @click.command("target")
 @click.argument("shape", metavar="SHAPE|FILE")
-@click.option("--size", type=float, default=2.0, help="Length, or radius [m] (2).")
+@click.option(
+    "--size", type=float, default=2.0, help="Length, or radius of a circle or loop [m] (2)."
+)
 @click.option("--speed", type=float, help="Maximum speed [m/s] (1).")
 @click.option("--accel", type=float, help="Maximum acceleration along the path [m/s^2] (1).")
 @click.option(
@@ -126,7 +128,7 @@ def command(
     if free:
         show(field("free", _free(free, reward, _rest_of(model, free) * (shape == "line")), "  "))
     for kind, by in (
-        ("state", "1 for an error as large as a range here, a position's smaller one"),
+        ("state", "1 / (range in the target)^2, of a position the smaller of its ranges"),
         ("input_change", "0.04 / (range of [limits])^2"),
     ):
         if (weights := reward.get(kind, {})) != before.get(kind, {}):

@@ -72,8 +72,8 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
         found.append(f"[limits] has none for {', '.join(free)}: plans may send values of any size")
     if log := seen_in(workspace.config):
         found.append(
-            f"[limits] are only the range used in {log}, and a target written by `init` is the run "
-            "in that log: enter the robot's real limits, and draw the manoeuvre (`target`)"
+            f"[limits] are only the range used in {log}: enter the robot's real limits, then delete "
+            "`seen_in`"
         )
     if first is not None and first.predicted_utility < 0:
         none = np.zeros(task.model.n)
