@@ -71,9 +71,10 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
     if free:
         found.append(f"[limits] has none for {', '.join(free)}: plans may send values of any size")
     if log := seen_in(workspace.config):
+        drawn = (workspace.folder / f"{workspace.config.task.target}.bak").exists()
         found.append(
-            f"[limits] are only the range used in {log}: enter the robot's real limits, then delete "
-            "`seen_in`"
+            f"[limits] are only the range used in {log}: enter the robot's real limits"
+            + ", and draw the manoeuvre (`target`): target.csv is the run in that log" * (not drawn)
         )
     if first is not None and first.predicted_utility < 0:
         none = np.zeros(task.model.n)
