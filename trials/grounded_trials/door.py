@@ -163,9 +163,9 @@ class Workspace(Folder):
 
         Args:
             columns: the desired values of each state, (H + 1,), one per control step. The functions
-                of `starting.shapes` return such columns.
+                of `starting.shapes` return such columns. They are checked before a file is changed.
         """
-        from grounded_trials.workspace.task_file import replace_target
+        from grounded_trials.workspace.new_target import replace_target
 
         here = self._afresh()
         path = replace_target(here.config, columns, here.base_model)
