@@ -14,10 +14,10 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.policy import Policy, z_difference
+from grounded.result import with_unit
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.wording import with_unit
 
 LEAST = 10  # smallest number of steps that can be judged
 UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
