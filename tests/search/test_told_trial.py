@@ -107,3 +107,11 @@ def test_adopted_values_must_lie_within_the_bounds():
     for value in (2.5, 0.1, float("nan"), "1"):
         with pytest.raises(gr.GroundedError, match=holding(name, str(value))):
             search.adopt({}, {name: value})
+
+
+def test_a_reward_without_a_weight_gives_nothing_to_plan():
+    reward = TASK.reward
+    none = {name: 0 * getattr(reward, name) for name in ("state", "terminal", "input")}
+    idle = replace(TASK, reward=replace(reward, **none, input_change=0 * reward.input_change))
+    with pytest.raises(gr.GroundedError, match=holding("weight", "0")):
+        gr.Search(idle).ask()
