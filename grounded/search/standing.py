@@ -170,8 +170,8 @@ def standing(
             )
         now = replace(now, step=options.first_step(), caution=failed)
         if failed:
-            last = history[-1].candidate.id
-            now = replace(now, sentence=f"{last} crashed: the next first policy is gentler")
+            gone = history[-1].candidate.id
+            now = replace(now, sentence=f"{gone} crashed: the next first policy is gentler")
         if failed < LOST or history[-1].candidate.model != model:
             return now
         why = f"{failed} policies crashed in a row: a diagnosis may show what the model lacks"

@@ -70,13 +70,13 @@ def checked(columns: Any, model: Model) -> dict[str, Array]:
             finite numbers, columns of different lengths, or too few or too many rows.
     """
     if not isinstance(columns, Mapping) or not columns:
-        found = "none" if isinstance(columns, Mapping) else f"a {type_of(columns)}"
+        got = "none" if isinstance(columns, Mapping) else f"a {type_of(columns)}"
         first = model.state_names[0]
         raise GroundedError(
-            f"a target needs the desired values of at least one state, got {found}: pass columns "
+            f"a target needs the desired values of at least one state, got {got}: pass columns "
             f"such as {{'{first}': numpy.linspace(0, 1, 101)}}"
         )
-    found = {}
+    found: dict[str, Array] = {}
     for name, given in columns.items():
         if name not in model.states:
             an_input = name in model.inputs
