@@ -43,6 +43,20 @@ def positive(what: str, value: Any) -> None:
         raise GroundedError(f"{what} must be a positive number of seconds, got {value!r:.60}")
 
 
+def whole_number(what: str, value: Any, low: int, high: int) -> None:
+    """Check that user input is a whole number from `low` to `high`.
+
+    Raises:
+        GroundedError: if it is not; the message begins with `what`.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise GroundedError(
+            f"{what} must be a whole number from {low} to {high}, got {value!r:.60}"
+        )
+    if not low <= value <= high:
+        raise GroundedError(f"{what} must be {low} to {high}, got {value}")
+
+
 def median(values: Array) -> Array:
     """Return the median over the first axis, like `np.median`, which imports numpy.ma (8 ms)."""
     ordered = np.sort(values, axis=0)

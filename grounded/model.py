@@ -89,6 +89,22 @@ class Param:
         ends = [end for end in (self.low, self.high) if self.uncertain and end is not None]
         return any(abs(value - end) <= 1e-6 * self.spread for end in ends)
 
+    def within(self, name: str, value: Any) -> None:
+        """Check that a new value of the parameter lies within its bounds.
+
+        Raises:
+            GroundedError: if it does not, or is not a finite number.
+        """
+        if not isinstance(value, int | float | np.number) or not np.isfinite(value):
+            raise GroundedError(f"{name} must be a finite number, got {value!r:.60}")
+        low = -np.inf if self.low is None else self.low
+        high = np.inf if self.high is None else self.high
+        if not (low <= value <= high or self.at_bound(float(value))):
+            raise GroundedError(
+                f"{name} = {value:g} lies outside its bounds, {low:g} to {high:g}: correct the "
+                "value, or widen the bounds of its Param"
+            )
+
     @property
     def reach(self) -> tuple[float, float]:
         """Lowest and highest value that an estimate may take.

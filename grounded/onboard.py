@@ -49,9 +49,18 @@ class Runner:
 
     Attributes:
         blind: number of calls so far whose state or time could not be used.
+
+    Raises:
+        ValueError: if `policy` is a file or something else without these fields.
     """
 
     def __init__(self, policy: Any) -> None:
+        if isinstance(policy, (str, Path)):
+            raise ValueError(f"Runner takes a policy, not a file: use load({str(policy)!r})")
+        if not hasattr(policy, "feedforward"):
+            kind = type(policy).__name__
+            hint = ": pass its policy" if hasattr(policy, "policy") else ""
+            raise ValueError(f"Runner takes a policy, got a {kind}{hint}")
         self.policy = policy
         self.blind = 0  # calls whose state or time could not be used
         self._H = len(policy.feedforward)

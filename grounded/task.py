@@ -72,6 +72,8 @@ class Task:
             if not isinstance(getattr(self, name), kind):
                 found = type(getattr(self, name)).__name__
                 raise GroundedError(f"task: {name} must be a {kind.__name__}, got a {found}")
+        if not isinstance(self.feedback, bool | np.bool_):
+            raise GroundedError(f"task: feedback must be True or False, got {self.feedback!r:.60}")
         n, m = self.model.n, self.model.m
         target = numbers(self.target, "task: target")
         if target.ndim != 2 or target.shape[1] != n:

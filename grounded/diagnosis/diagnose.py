@@ -49,6 +49,7 @@ from grounded.effects import Effect, Library
 from grounded.effects.actuator import delay_again
 from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError, type_of
+from grounded.frozen import positive, whole_number
 from grounded.instruments.lag import whole_steps
 from grounded.instruments.sound_trials import sound_trials
 from grounded.model import Model
@@ -63,8 +64,8 @@ class DiagnosisOptions:
 
     Args:
         library: the families that may be blamed.
-        max_effects: largest number of effects at once; None: 3, or more while the errors are above
-            the noise.
+        max_effects: largest number of effects at once, 1 to 6; None: 3, or more while the errors
+            are above the noise.
         horizon: how far ahead the gap is measured [s].
         hidden: names of states without a sensor, such as the memory of adopted effects.
         but: names of effects that are not blamed, such as adopted ones, whose values are now
@@ -73,6 +74,9 @@ class DiagnosisOptions:
             turn out longer or shorter.
         origin: the task before anything was adopted. Improvements are measured relative to the
             errors of its model, so that later diagnoses use the same scale as the first.
+
+    Raises:
+        GroundedError: if `library`, `max_effects` or `horizon` has another type or is out of range.
     """
 
     library: Library = field(default_factory=Library)
@@ -82,6 +86,13 @@ class DiagnosisOptions:
     but: Collection[str] = ()
     delays: Mapping[str, float] = field(default_factory=dict)
     origin: Task | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.library, Library):
+            raise GroundedError(f"library must be a Library, got a {type_of(self.library)}")
+        if self.max_effects is not None:
+            whole_number("max_effects", self.max_effects, 1, MOST_EFFECTS)
+        positive("horizon", self.horizon)
 
 
 @steady()

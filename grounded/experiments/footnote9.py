@@ -119,7 +119,7 @@ def _solved(b: float) -> tuple[float, int]:
         a = candidate.policy.feedforward
         return Trial(np.vstack([np.zeros((1, 1)), a]), a, 1.0, ("s",), ("a",))
 
-    found = learn(task, real, SearchOptions(step="full"), max_iterations=1)
+    found = learn(task, real, SearchOptions(step="full"), max_iterations=1, check=False)
     return math.exp(found.standing.utilities[-1]), len(found.trials)
 
 

@@ -86,7 +86,23 @@ def units_apart(model: Model, trial: Trial, shown: Sequence[int]) -> list[str]:
     return [_clause(model, [trial], ratios, one, found, shown) for one in found]
 
 
-def unusable(trials: Sequence[Trial], odd: Sequence[int], clauses: str, mend: str) -> GroundedError:
+class UnusableTrials(GroundedError):
+    """Raised for trials that must be corrected.
+
+    Args:
+        message: the whole message.
+        clauses: only what is wrong with them.
+        then: the command that discards them.
+    """
+
+    def __init__(self, message: str, clauses: str, then: NextCommand | None = None) -> None:
+        super().__init__(message, then)
+        self.clauses = clauses
+
+
+def unusable(
+    trials: Sequence[Trial], odd: Sequence[int], clauses: str, mend: str
+) -> UnusableTrials:
     """Return the error that some trials must be corrected and ingested again, with its command.
 
     Args:
@@ -98,9 +114,10 @@ def unusable(trials: Sequence[Trial], odd: Sequence[int], clauses: str, mend: st
     names = [trials[k].id or f"number {k + 1}" for k in odd]
     one, every = len(odd) == 1, len(odd) == len(trials) > 1
     where = "in every trial" if every else f"in trial{'s' * (not one)} {', '.join(names)}"
-    return GroundedError(
+    return UnusableTrials(
         f"{where} {clauses}. {mend}; then discard {'this trial' if one else 'these trials'} and "
         "ingest the log again",
+        clauses,
         then=NextCommand("discard", tuple(names)) if trials[0].id else None,
     )
 

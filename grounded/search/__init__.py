@@ -16,5 +16,7 @@ mispredictions  corrects the model's derivatives from earlier trials (`corrected
 original        steps with the model as it was, if adopted effects broke their promises
 planner         the model used for planning, with adopted effects
 safety          checks a candidate before it is handed out
+who_drove       checks by a trial's commands whether it ran its candidate, `other_scale` whether it
+                did with a column multiplied; `told_trial` does so for trials told in Python
 pictures        figures of the search
 """

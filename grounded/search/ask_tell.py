@@ -25,11 +25,28 @@ from grounded.search.planner import Planner, planner_with
 from grounded.search.proposal import Proposal
 from grounded.search.standing import Standing
 from grounded.search.step_size import SearchOptions
+from grounded.search.told_trial import crashed, odd_trial
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 
 if TYPE_CHECKING:
     from grounded.effects import Library
+
+
+MEND = "Correct the function that runs the robot"
+
+
+class TrialRefused(GroundedError):
+    """Raised by `learn` for a trial that is not its candidate's run.
+
+    Args:
+        message: what is wrong with the trial.
+        search: the search without this trial; `ask` and `tell` continue it.
+    """
+
+    def __init__(self, message: str, search: Search) -> None:
+        super().__init__(message)
+        self.search = search
 
 
 class Search:
@@ -146,7 +163,8 @@ class Search:
             library: the library of effect families; None for the built-in families.
 
         Raises:
-            GroundedError: for an unknown effect or parameter, or a missing quantity.
+            GroundedError: for an unknown effect or parameter, a value outside a parameter's
+                bounds, or a missing quantity.
         """
         if not isinstance(effects, Mapping) or not all(
             isinstance(values, Mapping) for values in effects.values()
@@ -159,7 +177,10 @@ class Search:
             raise GroundedError(
                 f"params must map parameters to values, such as {{'mass': 1.2}}; got {params!r:.60}"
             )
-        task = self.task.with_model(self.task.model.with_values(params or {}))
+        model, values = self.task.model, params or {}
+        for name in values.keys() & model.params.keys():
+            model.params[name].within(name, values[name])
+        task = self.task.with_model(model.with_values(values))
         planner = planner_with(task, list(effects.items()), library)
         return Search(
             task, self.options, candidates=self._candidates, trials=self._trials, planner=planner
@@ -173,16 +194,28 @@ class Search:
                 f"expected a Trial of the run, got a {type_of(given)}"
                 + told * isinstance(given, str | Path)
             )
-        model = self.task.model
-        has = (trial.state_names, trial.input_names, trial.dt)
-        expected = (model.state_names, model.input_names, self.task.dt)
-        if has != expected:
+        model, task_dt = self.task.model, self.task.dt
+        for kind, has, expected in (
+            ("states", trial.state_names, model.state_names),
+            ("inputs", trial.input_names, model.input_names),
+        ):
+            if has != expected:
+                order = " in this order" * (sorted(has) == sorted(expected))
+                raise GroundedError(
+                    f"the trial does not fit the task: its {kind} are {', '.join(has)}; the task "
+                    f"has {', '.join(expected)}{order}"
+                )
+        if trial.dt != task_dt:
             raise GroundedError(
-                f"a trial of this task has states, inputs and dt {expected}, found {has}"
+                f"the trial does not fit the task: its dt is {trial.dt:g} s; the task has "
+                f"{task_dt:g} s"
             )
 
     def tell(self, trial: Trial) -> None:
-        """Add a trial of the real system; warn if the columns of the first are evidently wrong.
+        """Add a trial of the real system; warn if it is evidently not its candidate's run.
+
+        Its commands are compared with what the policy sends on its states, and the columns of the
+        first trial with each other. A trial that counts as a crash is reported as well.
 
         Args:
             trial: the recorded run. Its `candidate` is the id of the candidate that was run; if it
@@ -194,9 +227,22 @@ class Search:
                 or dt differ from the task's.
         """
         self._add(trial)
-        if len(self._trials) == 1 and (odd := _odd_columns(self)):
-            mend = "Correct the function that runs the robot and begin a new search"
-            warnings.warn(f"the first trial has wrong columns: {odd}. {mend}", stacklevel=2)
+        trial = self._trials[-1]
+        if odd := self._odd():
+            told = f"the trial of {trial.candidate} looks wrong: {odd}. {MEND}, and begin a new "
+            warnings.warn(f"{told}search without this trial", stacklevel=2)
+        elif crash := crashed(self.task, trial):
+            warnings.warn(crash, stacklevel=2)
+
+    def _odd(self) -> str:
+        """Return what is wrong with the last trial, or ""."""
+        first = len(self._trials) == 1
+        return odd_trial(self.task, self._candidates, self._trials[-1], first=first)
+
+    def _forget_last(self) -> None:
+        """Forget the last trial."""
+        del self._trials[-1]
+        self._planned = None
 
     def _add(self, trial: Trial) -> None:
         ids = [c.id for c in self._candidates]
@@ -232,15 +278,17 @@ def learn(
         run: executes a candidate once and returns the trial; its `candidate` field is set here.
         options: settings of the search; None for the defaults.
         max_iterations: stop after this many accepted improvements; None for no limit.
-        check: check the columns of the first trial for wrong units, signs or exchanged names.
+        check: check that the commands of each trial are those of its candidate on its states, and
+            the columns of the first for wrong units, signs or exchanged names; warn of crashes.
 
     Returns:
         The finished search; `best` and `policy` are its result, `standing.sentence` says why it
         ended.
 
     Raises:
-        GroundedError: if that check finds an error, since all further plans would rest on wrong
-            data, or as `Search.ask` and `Search.tell`.
+        TrialRefused: if that check finds an error, since all further plans would rest on wrong
+            data. Its `search` has the trials before.
+        GroundedError: as `Search.ask` and `Search.tell`.
     """
     search = Search(task, options)
     if not callable(run):
@@ -258,11 +306,16 @@ def learn(
         candidate = search.ask()
         assert candidate is not None
         search._add(replace(_run(run, candidate), candidate=candidate.id))
-        if check and len(search.trials) == 1 and (odd := _odd_columns(search)):
-            raise GroundedError(
-                f"the first trial can't be used: {odd}. Correct the function that runs the robot, "
-                "or pass check=False if this is mistaken"
+        trial = search.trials[-1]
+        if check and (odd := search._odd()):
+            search._forget_last()
+            raise TrialRefused(
+                f"the trial of {trial.candidate} can't be used: {odd}. {MEND}, or pass check=False "
+                "if this is mistaken",
+                search,
             )
+        if check and (crash := crashed(task, trial)):
+            warnings.warn(crash, stacklevel=2)
 
 
 def _run(run: Callable[[Candidate], Trial], candidate: Candidate) -> Trial:
@@ -287,22 +340,3 @@ def _run(run: Callable[[Candidate], Trial], candidate: Candidate) -> Trial:
             "with `return gr.Trial(...)`"
         )
     return trial
-
-
-def _odd_columns(search: Search) -> str:
-    """Return what is wrong with the columns of the first trial, in units, signs or names; or ""."""
-    from grounded.instruments.fed_back import unit_fed_back
-    from grounded.instruments.finding import in_the_log
-    from grounded.instruments.sound_trials import sound_trials
-
-    model = search.task.model
-    trial = interpolate_gaps(search.trials[0]).trial
-    policy = next(c.policy for c in search.candidates if c.id == trial.candidate)
-    if unit := unit_fed_back(model, trial, policy):
-        return unit
-    try:
-        looked = sound_trials(model, [replace(trial, id="")])
-    except GroundedError as error:
-        return str(error).replace("in trial number 1 ", "").rstrip(".")
-    odd = in_the_log(looked.findings)
-    return "; ".join(f"{one.signal} {one.finding}" for one in odd)

@@ -75,13 +75,20 @@ def propose(
         A `Proposal`: its `candidate` is None if the search has ended, and its `standing` says why.
 
     Raises:
-        GroundedError: if the model gives no plan to start from; the message says where it fails.
+        GroundedError: if the model gives no plan to start from (the message says where it fails),
+            or no weight of the reward is above 0.
     """
     if not (isinstance(task, Task) and isinstance(options, SearchOptions)):
         raise GroundedError(
             "propose(task, candidates, trials, options) takes a Task, lists of Candidates and of "
             f"Trials, and SearchOptions; got a {type_of(task)} and, as options, a "
             f"{type_of(options)}"
+        )
+    reward = task.reward
+    if not any(w.any() for w in (reward.state, reward.terminal, reward.input, reward.input_change)):
+        raise GroundedError(
+            "no weight of the reward is above 0, so there is nothing to improve: set a weight "
+            f"for a state that the target gives, such as {task.model.state_names[0]}"
         )
     candidates = list_of(candidates, Candidate, "candidates")
     trials = list_of(trials, Trial, "trials")

@@ -169,6 +169,9 @@ def standing(
                 then=NextCommand("diagnose"),
             )
         now = replace(now, step=options.first_step(), caution=failed)
+        if failed:
+            gone = history[-1].candidate.id
+            now = replace(now, sentence=f"{gone} crashed: the next first policy is gentler")
         if failed < LOST or history[-1].candidate.model != model:
             return now
         why = f"{failed} policies crashed in a row: a diagnosis may show what the model lacks"
@@ -185,7 +188,9 @@ def standing(
         ending, why = hardly
         why = f"{why}: {own} is the result"
         return replace(now, phase="converged", sentence=why, ending=ending)
-    sentence = f"improve on {own} with {step}"
+    last = history[-1]
+    lost = f", since {last.candidate.id} crashed" * (last.accepted is False and bool(last.failed))
+    sentence = f"improve on {own} with {step}{lost}"
     if why := _suspicion(history, incumbent, model):
         then, sentence = NextCommand("diagnose"), f"{sentence}; {why}"
         return replace(now, step=step, way=way, sentence=sentence, then=then, doubt=why)

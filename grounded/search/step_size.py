@@ -35,9 +35,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal, get_args
 
-from grounded.errors import GroundedError
+import numpy as np
+
+from grounded.errors import GroundedError, nearest
+from grounded.frozen import whole_number
 from grounded.result import figure
 from grounded.search.candidate import Candidate, Slopes, Tried, Way
 
@@ -45,6 +48,9 @@ KEPT, BROKEN = 0.9, 0.25
 EASED, RAISED = 30.0, 10.0
 LEAST, MOST = 1e-6, 1e3
 BOLDER = 3  # factors of 10 below the due damping, tried if the due step and all after it lose
+Method = Literal["ddp", "policy-gradient"]
+Stepping = Literal["damped", "full"]
+METHODS, STEPS = get_args(Method), get_args(Stepping)
 OTHER_WAY = 2  # losses of the way that comes second, before it is given up
 
 
@@ -108,11 +114,11 @@ class SearchOptions:
         tolerance: the search ends when the model predicts a smaller relative gain, 0 to below 1.
 
     Raises:
-        GroundedError: if a setting is out of range.
+        GroundedError: if a setting has another type, is not one of the choices, or out of range.
     """
 
-    method: Literal["ddp", "policy-gradient"] = "ddp"
-    step: Literal["damped", "full"] = "damped"
+    method: Method = "ddp"
+    step: Stepping = "damped"
     refit: bool = False
     match_inputs: bool = True
     max_halvings: int = 6
@@ -122,18 +128,25 @@ class SearchOptions:
     tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
+        for name, valid in (("method", METHODS), ("step", STEPS)):
+            if (given := getattr(self, name)) not in valid:
+                raise GroundedError(
+                    f"[search] {name}: {given!r} is not one of the choices: "
+                    + nearest(str(given), valid)
+                )
+        for name in ("refit", "match_inputs", "rerun_incumbent"):
+            if not isinstance(given := getattr(self, name), bool | np.bool_):
+                raise GroundedError(f"[search] {name} must be True or False, got {given!r:.60}")
         bounds = {"max_halvings": (0, 30), "repeats": (1, 100), "max_trials": (1, 100_000)}
         for name, (low, high) in bounds.items():
-            if not low <= getattr(self, name) <= high:
-                raise GroundedError(
-                    f"[search] {name} must be {low} to {high}, got {getattr(self, name)}"
-                )
+            whole_number(f"[search] {name}", getattr(self, name), low, high)
         if self.repeats > self.max_trials:
             raise GroundedError(
                 f"[search] repeats = {self.repeats} is more than max_trials = {self.max_trials}"
             )
-        if not 0 <= self.tolerance < 1:
-            raise GroundedError(f"[search] tolerance must be in [0, 1), got {self.tolerance}")
+        tolerance: Any = self.tolerance
+        if not isinstance(tolerance, int | float | np.number) or not 0 <= tolerance < 1:
+            raise GroundedError(f"[search] tolerance must be in [0, 1), got {tolerance!r:.60}")
 
     @property
     def damps(self) -> bool:

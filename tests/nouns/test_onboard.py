@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -150,3 +151,13 @@ def test_what_a_file_holds_is_shown(exported):
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     lines = done.stdout.splitlines()
     assert lines[0] == "5 steps of 0.1 s" and lines[-1] == "input   force, limits -1 to 0.45"
+
+
+def test_a_runner_of_something_else_than_a_policy():
+    for given, told in (
+        ("nofile.npz", r"load\('nofile.npz'\)"),
+        (SimpleNamespace(policy=policy()), "pass its policy"),
+        (None, "NoneType"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            Runner(given)

@@ -39,6 +39,7 @@ REWARD = Reward(np.array([10.0, 0.0]), np.zeros(2), np.array([0.01]), np.array([
         ({"latency": np.array([2.6])}, "latency of force"),
         ({"latency": np.array([np.nan])}, "latency of force"),
         ({"target": np.zeros((1, 2))}, "horizon must be 1 to"),
+        ({"feedback": "no"}, "feedback must be True or False, got 'no'"),
         ({"target": np.zeros((0, 2))}, "horizon must be 1 to"),
         ({"input_target": np.zeros((41, 1))}, r"input_target must have shape \(40, 1\)"),
         (

@@ -180,3 +180,24 @@ effects = [
     w.fit(["mass"], latency=True, apply=True)  # the whole delay: it is not counted twice
     assert "delay:force" not in {effect["name"] for effect in w.config.model.effects}
     assert w.planner.plan.latency == pytest.approx(before, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("call", "facts"),
+    [
+        (lambda w: w.ingest(5), ("path", "int")),
+        (lambda w: w.ingest(w.trials()[0]), ("path",)),
+        (lambda w: w.next(None), ("path", "NoneType")),
+        (lambda w: w.inspect(5), ("path", "int")),
+        (lambda w: w.learn(trials="3"), ("trials", "'3'")),
+        (lambda w: w.learn(trials=-1), ("trials", "-1")),
+        (lambda w: w.diagnose("t0001"), ("['t0001']",)),
+        (lambda w: w.diagnose([1]), ("trials", "int")),
+        (lambda w: w.preflight("t0001"), ("['t0001']",)),
+        (lambda w: w.diagnose(max_effects=9), ("max_effects", "6")),
+    ],
+)
+def test_arguments_of_another_type(cart, tmp_path, call, facts):
+    w = Workspace(copied(cart, tmp_path / "w"))
+    with pytest.raises(GroundedError, match=holding(*facts)):
+        call(w)

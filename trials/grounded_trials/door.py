@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from grounded.errors import GroundedError
+from grounded_trials.plain_file import path_of
 from grounded_trials.workspace.folder import Folder
 
 if TYPE_CHECKING:
@@ -44,8 +45,7 @@ if TYPE_CHECKING:
 class Workspace(Folder):
     """A folder with a task, its trials and its candidates, with a method for every command.
 
-    Every method raises a GroundedError for problems that the user can fix: a missing or damaged
-    file, an unknown name, a system that fails.
+    Every method raises a GroundedError for problems that the user can fix, such as a missing file.
 
     Args:
         folder: the folder of grounded.toml, which must exist and be valid.
@@ -142,7 +142,7 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.intake.ingest import ingest_log
 
-        return ingest_log(self._afresh(), Path(path), candidate, data=data, ahead=True)
+        return ingest_log(self._afresh(), path_of(path), candidate, data=data, ahead=True)
 
     def next(
         self, log: str | Path, *, candidate: str | None = None, runner: bool = True
@@ -156,16 +156,16 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.looping import next_in
 
-        return next_in(self._afresh(), Path(log), candidate, runner=runner)
+        return next_in(self._afresh(), path_of(log), candidate, runner=runner)
 
     def target(self, columns: Mapping[str, Array]) -> Path:
         """Write target.csv and set the horizon in grounded.toml; the old target is kept as .bak.
 
         Args:
             columns: the desired values of each state, (H + 1,), one per control step. The functions
-                of `starting.shapes` return such columns.
+                of `starting.shapes` return such columns. They are checked before a file is changed.
         """
-        from grounded_trials.workspace.task_file import replace_target
+        from grounded_trials.workspace.new_target import replace_target
 
         here = self._afresh()
         path = replace_target(here.config, columns, here.base_model)
@@ -392,7 +392,7 @@ class Workspace(Folder):
         """List the signals of a log, and guess a [log] table for this workspace's model."""
         from grounded_trials.workspace.inspecting import inspect_in
 
-        return inspect_in(self._afresh(), log)
+        return inspect_in(self._afresh(), path_of(log))
 
     def _afresh(self) -> Self:
         """Drop cached contents and return self: files may have changed since the last call."""

@@ -10,7 +10,7 @@ import stat
 from pathlib import Path
 from typing import BinaryIO
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, type_of
 
 
 def open_file(path: Path, *, follow: bool = True) -> BinaryIO:
@@ -57,3 +57,14 @@ def read_file(path: Path, limit: int) -> bytes:
     if len(data) > limit:
         raise GroundedError(f"{path} is larger than {limit} bytes, the limit for such a file")
     return data
+
+
+def path_of(given: object) -> Path:
+    """Return the path of a file that the user named.
+
+    Raises:
+        GroundedError: if it is not a text or a path.
+    """
+    if not isinstance(given, str | Path):
+        raise GroundedError(f"expected the path of a file, got a {type_of(given)}")
+    return Path(given)

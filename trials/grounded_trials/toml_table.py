@@ -149,11 +149,12 @@ def read_toml(path: Path) -> Table:
         near = sorted(str(one.parent) for one in path.parent.glob(f"*/{path.name}"))
         if near:
             raise GroundedError(
-                f"{path} does not exist: this is not a workspace; name one with -C, such as "
-                f"-C {near[0]}"
+                f"{path} does not exist: this is not a workspace; name one, such as {near[0]} (-C "
+                f"{near[0]}, in Python Workspace({near[0]!r}))"
             ) from None
         raise GroundedError(
-            f"{path} does not exist: this is not a workspace; name one with -C DIR, or make one",
+            f"{path} does not exist: this is not a workspace; name its folder (-C DIR, in Python "
+            "Workspace(DIR)), or make one",
             NextCommand("init", ("DIR", "--example", "car-turn")),
         ) from None
     except NotADirectoryError:

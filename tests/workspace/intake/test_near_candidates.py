@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from grounded.errors import GroundedError
+from grounded.search.who_drove import evidence, follows, suspicion
 from grounded.trial import Trial
 from grounded_trials.formats.mcap_writer import LogWriter, encode_doubles
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.intake.acted_on import acted_on, sender_of
 from grounded_trials.workspace.intake.foreign import mapping_of, read_foreign
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.intake.who_drove import evidence, follows, suspicion
 from grounded_trials.workspace.proposing import propose_in
 from grounded_trials.workspace.running import run_candidate
 from recorded import follow

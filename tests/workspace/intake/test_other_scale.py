@@ -9,10 +9,10 @@ from facts import holds
 from grounded import Model
 from grounded.errors import GroundedError
 from grounded.result import listed
+from grounded.search.other_scale import other_units, units_tried
+from grounded.search.who_drove import follows, latest
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
-from grounded_trials.workspace.intake.other_scale import other_units, units_tried
-from grounded_trials.workspace.intake.who_drove import follows, latest
 from recorded import LOGGED, record, waiting
 from workspaces import MODEL, make
 

@@ -14,11 +14,11 @@ import pytest
 from cli import grounded
 from facts import holding, holds
 from grounded.errors import GroundedError, NextCommand
+from grounded.search.who_drove import suspicion
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.intake.who_drove import suspicion
 from grounded_trials.workspace.proposing import propose_in, standing_in
 from grounded_trials.workspace.running import run_candidate
 from workspaces import CONFIG, make

@@ -18,7 +18,7 @@ import numpy as np
 
 from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import GroundedError, NextCommand, list_of
 from grounded.instruments.finding import in_the_log
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.wording import rendered
@@ -230,6 +230,9 @@ def _with_limit(found: Diagnosis) -> Diagnosis:
 
 def _chosen(workspace: Folder, names: Sequence[str]) -> list[Trial]:
     """Return the trials to diagnose; states filled in by a smoother are no evidence: NaN again."""
+    if isinstance(names, str):
+        raise GroundedError(f"trials must be a list of names, such as ['{names}'], got '{names}'")
+    names = list_of(names, str, "trials")
     used = diagnosable(workspace)
     if not used:
         raise GroundedError(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from grounded.errors import NextCommand
+from grounded.frozen import whole_number
 from grounded.result import Result
 from grounded.search.candidate import Candidate
 from grounded_trials.workspace.exporting import Exported, export_candidate, void_exports
@@ -22,6 +23,7 @@ from grounded_trials.workspace.proposing import (
     status_of,
 )
 
+MOST_TRIALS = 100_000
 STOPS = (
     "learn stops here, since the next plan would be based on this log: fix it first, or run "
     "`learn` again if the warning is wrong"
@@ -61,6 +63,8 @@ def learn_in(
     """Propose, run and ingest until the search ends, see `Workspace.learn`."""
     from grounded_trials.workspace.running import run_candidate
 
+    if trials is not None:
+        whole_number("trials", trials, 0, MOST_TRIALS)
     tell, done, odd = progress or (lambda stage: None), 0, _odd_before(workspace)
     while trials is None or done < trials:
         tell("planning")

@@ -197,5 +197,5 @@ def optimum(workspace: Folder) -> float | None:
     def run(candidate: Candidate) -> Trial:
         return plant.run(candidate.policy, start, np.random.default_rng(0))
 
-    best = learn(truth, run, SearchOptions(max_trials=TRIALS, tolerance=1e-4)).best
+    best = learn(truth, run, SearchOptions(max_trials=TRIALS, tolerance=1e-4), check=False).best
     return best.utility if best else None

@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable, Collection, Mapping
-from contextlib import suppress
 from io import TextIOWrapper
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from grounded.model import Model
 from grounded.task import Task
 from grounded.utility import Reward
 from grounded_trials.plain_file import open_file
-from grounded_trials.workspace.config import Config, set_target
+from grounded_trials.workspace.config import Config
 from grounded_trials.workspace.model_file import check_names
 
 Reader = Callable[[Path], tuple[list[str], Array]]  # reads a target, as `read_target` does
@@ -277,28 +276,6 @@ def _check_interval(path: Path, t: Array, dt: float) -> None:
         f"{rows} and last {lasts:.4g} s in all: dt is the time from one command to the next{unit}; "
         f"set dt = {each:.6g}"
     )
-
-
-def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -> Path:
-    """Write target.csv, and its length and weights to grounded.toml, see `Workspace.target`."""
-    from grounded_trials.workspace.off_target import position_names
-
-    units, place = model.states, position_names(model)
-    name = config.task.target or "target.csv"
-    path = config.file.parent / name
-    before: dict[str, float] = {}
-    if path.is_file():
-        with suppress(GroundedError, ValueError):  # an unreadable target is replaced
-            names, values = read_target(path)
-            given = dict(zip(names[1:], values.T[1:], strict=True))
-            before = equal_weights(given, units, place)
-        path.replace(path.with_name(path.name + ".bak"))
-    write_target(path, config.task.dt, dict(columns))
-    equal = equal_weights(columns, units, place)
-    weights = {state: round(w, 6) for state, w in equal.items()}
-    rows = len(next(iter(columns.values())))
-    set_target(config.file, name, rows - 1, weights, before, limited_changes(config, model))
-    return path
 
 
 def limited_changes(config: Config, model: Model) -> dict[str, tuple[float, float]]:

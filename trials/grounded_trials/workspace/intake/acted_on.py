@@ -19,10 +19,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
-from grounded.trial import Trial
-from grounded_trials.formats.messages import Ints
-from grounded_trials.logs.samples import Samples, tidy
-from grounded_trials.workspace.intake.who_drove import (
+from grounded.search.who_drove import (
     FINE,
     LEAST,
     SAME,
@@ -31,6 +28,9 @@ from grounded_trials.workspace.intake.who_drove import (
     follows,
     steps_alike,
 )
+from grounded.trial import Trial
+from grounded_trials.formats.messages import Ints
+from grounded_trials.logs.samples import Samples, tidy
 
 if TYPE_CHECKING:
     from grounded_trials.workspace.intake.run_start import Recording, Start

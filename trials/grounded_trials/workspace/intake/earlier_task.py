@@ -9,10 +9,10 @@ from __future__ import annotations
 from contextlib import suppress
 
 from grounded.errors import GroundedError
+from grounded.search.who_drove import OTHERS, follows, latest
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.run_start import Recording
-from grounded_trials.workspace.intake.who_drove import OTHERS, follows, latest
 
 NEAR = 0.05  # largest mean difference from the policy's commands, relative to an input's size
 

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.search.candidate import Candidate
+from grounded.search.who_drove import FINE, LEAST, SAME, Following
 from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.wording import with_unit
 from grounded_trials.workspace.intake.acted_on import acted_on
 from grounded_trials.workspace.intake.run_start import Recording, Start
-from grounded_trials.workspace.intake.who_drove import FINE, LEAST, SAME, Following
 
 
 @dataclass(frozen=True)

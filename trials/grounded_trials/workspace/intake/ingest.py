@@ -20,7 +20,9 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import listed
 from grounded.search.candidate import Candidate, Tried
+from grounded.search.other_scale import other_units
 from grounded.search.safety import COASTS
+from grounded.search.who_drove import OTHERS, Following, suspicion
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of
@@ -36,8 +38,7 @@ from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.intake.log_faults import dead_sensors, log_faults, mistaken_in
 from grounded_trials.workspace.intake.missed_steps import not_sent
 from grounded_trials.workspace.intake.odd_run import odd_run
-from grounded_trials.workspace.intake.other_scale import other_units, units_told
-from grounded_trials.workspace.intake.read_otherwise import misled, pace_of, unit_of
+from grounded_trials.workspace.intake.read_otherwise import misled, pace_of, unit_of, units_told
 from grounded_trials.workspace.intake.reading import (
     NoneWaits,
     Read,
@@ -63,7 +64,6 @@ from grounded_trials.workspace.intake.stored_before import (
     what_repeats,
 )
 from grounded_trials.workspace.intake.trial_check import afterwards, warnings_about
-from grounded_trials.workspace.intake.who_drove import OTHERS, Following, suspicion
 from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of
 from grounded_trials.workspace.proposing import candidate_named, latest_candidates, standing_in

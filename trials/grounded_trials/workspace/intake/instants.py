@@ -13,9 +13,9 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.policy import Policy
+from grounded.search.who_drove import LEAST
 from grounded.trial import LAST
 from grounded_trials.logs.resample import Gridded
-from grounded_trials.workspace.intake.who_drove import LEAST
 
 QUIET_S = 1.0  # time without a change of commands before a run that is cut short in the log
 SHORT = 4  # at least 1 / SHORT of a run must be in the log

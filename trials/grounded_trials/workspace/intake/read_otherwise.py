@@ -5,27 +5,38 @@ Tried are: another rate, another unit, two signals in each other's columns, and 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
 from grounded.policy import Policy
-from grounded.task import Task
-from grounded.trial import Trial
-from grounded_trials.logs.signals import Series
-from grounded_trials.wording import with_unit
-from grounded_trials.workspace.intake.other_scale import (
+from grounded.result import listed
+from grounded.search.other_scale import (
     NEARLY,
+    THOUSAND,
     any_factor,
     any_offset,
     units_tried,
 )
+from grounded.search.who_drove import follows
+from grounded.task import Task
+from grounded.trial import Trial
+from grounded_trials.logs.signals import Series
+from grounded_trials.wording import with_unit
+from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.intake.run_start import TRIED, Recording, recording
-from grounded_trials.workspace.intake.who_drove import follows
 
 PAIRS = 28  # largest number of pairs of states, and of inputs, that are tried exchanged
 PACES = (2.0, 0.5)  # rates of a recording that are tried
+NAMED = (  # factor of a column and its meaning
+    (np.pi / 180, " (in degrees)"),
+    (180 / np.pi, " (radians for degrees)"),
+    (1e-2, " (in percent)"),
+    (1e2, " (not in percent)"),
+    *((factor, "") for factor in THOUSAND),
+)
 
 
 def pace_of(log: Recording, task: Task, policy: Policy) -> float | None:
@@ -145,3 +156,28 @@ def _paced(series: Series, pace: float) -> Series:
         for at in (series.t, series.log_times)
     )
     return replace(series, t=t, log_times=log)
+
+
+def units_told(names: Sequence[str], by: float, mapped: bool) -> str:
+    """Describe a wrong unit or sign in a log and how to correct it.
+
+    Args:
+        names: the signals.
+        by: the factor that corrects them.
+        mapped: whether the log is read through a [log] table.
+    """
+    which = listed(names)
+    if by == -1:
+        its = "its scale" if len(names) == 1 else "the scale of each"
+        mend = f"multiply {its} by -1 in {FILE}'s [log] (a missing scale is 1)"
+        alone = f"write {which} times -1 and run it again, or ingest it with --data"
+        return f"with {which} of the other sign: {mend if mapped else alone}"
+    size = f"{max(abs(by), 1 / abs(by)):.4g} times too {'large' if abs(by) < 1 else 'small'}"
+    size += " and of the other sign" * (by < 0)
+    told = next((text for factor, text in NAMED if np.isclose(by, factor, rtol=1e-6)), None)
+    mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (a missing scale is 1)"
+    if told is None:
+        mend += "; if the log is right, the robot's program measures it wrong"
+    if not mapped:
+        mend = f"write {which} times {by:.6g} and run it again, or ingest it with --data"
+    return f"with {which} {size}{told or ''}: {mend}"

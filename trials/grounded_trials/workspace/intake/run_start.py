@@ -22,6 +22,13 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.policy import Policy
+from grounded.search.who_drove import (
+    FINE,
+    LEAST,
+    SAME,
+    UNLIKE,
+    follows,
+)
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.command_steps import changes_of, phase_of
@@ -30,13 +37,6 @@ from grounded_trials.logs.signals import Series
 from grounded_trials.workspace.intake.acted_on import acted_on
 from grounded_trials.workspace.intake.instants import instants_apart, least_of
 from grounded_trials.workspace.intake.missed_steps import missed_steps
-from grounded_trials.workspace.intake.who_drove import (
-    FINE,
-    LEAST,
-    SAME,
-    UNLIKE,
-    follows,
-)
 
 TRIED = 5  # number of best-fitting instants that are examined
 BESIDE = 4  # steps before the best of them that are checked for an exact fit

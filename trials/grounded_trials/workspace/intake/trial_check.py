@@ -1,7 +1,7 @@
 """Warnings about a trial that the user should know before relying on it.
 
-`who_drove.py` checks whether it ran its candidate at all, `log_faults.py` whether its columns
-contain what their names say.
+`grounded.search.who_drove` checks whether it ran its candidate at all, `log_faults.py` whether its
+columns contain what their names say.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.result import measured_alike
 from grounded.search.candidate import Candidate
+from grounded.search.who_drove import UNLIKE, follows, latest, second_differences
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
 from grounded_trials.wording import count, in_digits_apart, with_unit
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.who_drove import UNLIKE, follows, latest, second_differences
 from grounded_trials.workspace.off_target import reaches, weighed_groups
 
 # share of the mean cost of a step above which a start away from s_0 brings a warning; for a state

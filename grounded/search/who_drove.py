@@ -14,10 +14,10 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.policy import Policy, z_difference
+from grounded.result import with_unit
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.wording import with_unit
 
 LEAST = 10  # smallest number of steps that can be judged
 UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
@@ -69,7 +69,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     size = np.maximum(np.abs(free).max(axis=1), np.abs(sent).max(axis=0))
     size = size + np.where(np.isfinite(width), 0.1 * width, 1e-12)
     fits = {}
-    for late in range(-1, latest + 1):
+    for late in range(-1, min(latest, T - LEAST) + 1):
         a, b = free[:, max(0, -late) : T - max(0, late)], sent[max(0, late) : T - max(0, -late)]
         squares = (((a - b) / size[:, None]) ** 2).mean(axis=2)
         usual, mean = np.median(squares, axis=1), squares.mean(axis=1)

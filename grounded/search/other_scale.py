@@ -17,12 +17,8 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
-from grounded.result import listed
 from grounded.search.candidate import Candidate
-from grounded.task import Task
-from grounded.trial import Trial
-from grounded_trials.workspace.config import FILE
-from grounded_trials.workspace.intake.who_drove import (
+from grounded.search.who_drove import (
     DECISIVE,
     FINE,
     Following,
@@ -30,18 +26,13 @@ from grounded_trials.workspace.intake.who_drove import (
     follows,
     latest,
 )
+from grounded.task import Task
+from grounded.trial import Trial
 
 THOUSAND, PERCENT = (1e-3, 1e3), (1e-2, 1e2)
 ANGULAR = (("rad", "rad/s"), ("rad",), ("rad/s",))  # groups of units that may be in degrees
 IN_DEGREES = ("deg", "deg/s")  # units that may be in radians
 LENGTHS = (("m", "m/s"), ("m",), ("m/s",))  # units of what one wheel measures
-NAMED = (  # factor of a column and its meaning
-    (np.pi / 180, " (in degrees)"),
-    (180 / np.pi, " (radians for degrees)"),
-    (1e-2, " (in percent)"),
-    (1e2, " (not in percent)"),
-    *((factor, "") for factor in THOUSAND),
-)
 NEARLY = 0.1  # largest difference of commands with another unit, relative to an input's size
 EXACT, CLOSE = 0.01, 0.05  # the same for a unit that is certain, and for any factor
 # largest share of the original difference left by a unit, and by any factor (many are tried)
@@ -223,28 +214,3 @@ def units_tried(model: Model) -> Iterator[tuple[Sequence[str], float]]:
     yield from ((pure, f) for f in PERCENT if pure)
     together = [*single, *_of_one_unit(model), *_of_one_sensor(model)]
     yield from ((names, f) for f in (*THOUSAND, -1.0) for names in together)
-
-
-def units_told(names: Sequence[str], by: float, mapped: bool) -> str:
-    """Describe a wrong unit or sign in a log and how to correct it.
-
-    Args:
-        names: the signals.
-        by: the factor that corrects them.
-        mapped: whether the log is read through a [log] table.
-    """
-    which = listed(names)
-    if by == -1:
-        its = "its scale" if len(names) == 1 else "the scale of each"
-        mend = f"multiply {its} by -1 in {FILE}'s [log] (a missing scale is 1)"
-        alone = f"write {which} times -1 and run it again, or ingest it with --data"
-        return f"with {which} of the other sign: {mend if mapped else alone}"
-    size = f"{max(abs(by), 1 / abs(by)):.4g} times too {'large' if abs(by) < 1 else 'small'}"
-    size += " and of the other sign" * (by < 0)
-    told = next((text for factor, text in NAMED if np.isclose(by, factor, rtol=1e-6)), None)
-    mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (a missing scale is 1)"
-    if told is None:
-        mend += "; if the log is right, the robot's program measures it wrong"
-    if not mapped:
-        mend = f"write {which} times {by:.6g} and run it again, or ingest it with --data"
-    return f"with {which} {size}{told or ''}: {mend}"

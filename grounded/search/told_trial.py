@@ -1,0 +1,99 @@
+"""Check a trial that was told in Python: whether it ran its candidate, and its columns.
+
+The same checks as `grounded ingest` makes, worded for a program: there is no log to ingest again.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.instruments.fed_back import unit_fed_back
+from grounded.instruments.finding import in_the_log
+from grounded.instruments.other_units import UnusableTrials
+from grounded.instruments.sound_trials import sound_trials
+from grounded.model import Model
+from grounded.result import listed, with_unit
+from grounded.search.candidate import Candidate
+from grounded.search.other_scale import other_units
+from grounded.search.who_drove import suspicion
+from grounded.task import Task
+from grounded.trial import Trial, interpolate_gaps
+
+BEYOND = 0.1  # mean excess of an input over its limits, in ranges, that is reported as such
+LOG_KEY = re.compile(r", corrected by \[log\.\w+\.[^]]+\] scale = ([^\s,;]+)")
+
+
+def odd_trial(task: Task, candidates: Sequence[Candidate], trial: Trial, *, first: bool) -> str:
+    """Return why a trial can't be a run of its candidate as it is, or "".
+
+    Args:
+        task: the task of the candidates.
+        candidates: those proposed so far, one of which the trial names.
+        trial: the trial as it was told.
+        first: whether its columns are also checked against each other and the model.
+    """
+    whole = interpolate_gaps(trial).trial
+    own = next(one for one in candidates if one.id == trial.candidate)
+    if whole.finite_steps < 1 and (unknown := _unknown(trial)):
+        return f"{listed(unknown)} {'is' if len(unknown) == 1 else 'are'} NaN from the start"
+    if unit := unit_fed_back(task.model, whole, own.policy):
+        return unit
+    columns = _odd_columns(task.model, whole) if first else ""
+    return columns or _not_its_run(task, candidates, whole, own)
+
+
+def crashed(task: Task, trial: Trial) -> str:
+    """Return that a trial counts as a crash, and why; "" if it does not."""
+    if np.isfinite(task.utility(whole := interpolate_gaps(trial).trial)):
+        return ""
+    until, steps = whole.finite_steps, task.horizon
+    why = "it has values that are too large"
+    if until < min(whole.steps, steps):
+        why = f"it has no known values after {max(until, 0)} of {steps} steps"
+    elif whole.steps < steps:
+        why = f"it ends after {whole.steps} of {steps} steps"
+    return f"the trial of {trial.candidate} counts as a crash: {why}"
+
+
+def _unknown(trial: Trial) -> list[str]:
+    """Return the signals without a value at the start."""
+    known = [*np.isfinite(trial.states[0])]
+    known += [*np.isfinite(trial.inputs[0])] if trial.steps else []
+    names = (*trial.state_names, *trial.input_names)
+    return [name for name, is_known in zip(names, known, strict=False) if not is_known]
+
+
+def _odd_columns(model: Model, trial: Trial) -> str:
+    """Return what is wrong with the columns of a trial, in units, signs or names; or ""."""
+    try:
+        looked = sound_trials(model, [replace(trial, id="")])
+    except UnusableTrials as error:
+        return LOG_KEY.sub(r" (multiply it by \1)", error.clauses)
+    except GroundedError as error:
+        return str(error).rstrip(".")
+    return "; ".join(f"{one.signal} {one.finding}" for one in in_the_log(looked.findings))
+
+
+def _not_its_run(task: Task, candidates: Sequence[Candidate], trial: Trial, own: Candidate) -> str:
+    """Return why the commands are not those of the candidate on the trial's states, or ""."""
+    seen = suspicion(task, trial, own, candidates)
+    if not seen.why:
+        return ""
+    names, by = other_units(task, trial, own, seen.ran)
+    if names:
+        return f"only with {listed(names)} times {by:.4g} are its commands those of {own.id}"
+    inputs = trial.inputs[: task.horizon]
+    for name, sent, low, high in zip(trial.input_names, inputs.T, task.low, task.high, strict=True):
+        beyond = np.abs(sent - np.clip(sent, low, high)).mean()
+        if np.isfinite(high - low) and beyond > BEYOND * (high - low):
+            most = with_unit(f"{sent.max() + 0:.4g}", task.model.inputs[name])
+            return (
+                f"{name} is {sent.min() + 0:.4g} to {most}, outside its "
+                f"limits, {low:g} to {high:g}: it is not what {own.id} sends"
+            )
+    return seen.why

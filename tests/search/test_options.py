@@ -1,0 +1,48 @@
+"""Options given in Python are checked as those in grounded.toml and on the command line."""
+
+import numpy as np
+import pytest
+
+import grounded as gr
+from facts import holding
+from grounded.diagnosis.diagnose import DiagnosisOptions
+
+
+@pytest.mark.parametrize(
+    ("given", "facts"),
+    [
+        ({"method": "dpp"}, ("method", "'dpp'", "'ddp'")),
+        ({"step": "ful"}, ("step", "'ful'", "'full'")),
+        ({"step": None}, ("step", "damped", "full")),
+        ({"repeats": "2"}, ("repeats", "'2'", "100")),
+        ({"repeats": 2.5}, ("repeats", "2.5")),
+        ({"repeats": True}, ("repeats", "True")),
+        ({"max_trials": 0}, ("max_trials", "1", "0")),
+        ({"tolerance": "a"}, ("tolerance", "'a'", "[0, 1)")),
+        ({"tolerance": float("nan")}, ("tolerance", "nan")),
+        ({"refit": "no"}, ("refit", "'no'", "False")),
+    ],
+)
+def test_wrong_options_of_a_search(given, facts):
+    with pytest.raises(gr.GroundedError, match=holding(*facts)):
+        gr.SearchOptions(**given)
+
+
+def test_numbers_of_numpy_are_options():
+    options = gr.SearchOptions(repeats=np.int64(2), tolerance=np.float32(0.5), refit=np.bool_(1))
+    assert options.repeats == 2
+
+
+@pytest.mark.parametrize(
+    ("given", "facts"),
+    [
+        ({"max_effects": 9}, ("max_effects", "1", "6", "9")),
+        ({"max_effects": 0}, ("max_effects", "1", "6", "0")),
+        ({"max_effects": "1"}, ("max_effects", "'1'")),
+        ({"horizon": -1.0}, ("horizon", "-1.0")),
+        ({"library": ["delay"]}, ("library", "list")),
+    ],
+)
+def test_wrong_options_of_a_diagnosis(given, facts):
+    with pytest.raises(gr.GroundedError, match=holding(*facts)):
+        DiagnosisOptions(**given)

@@ -1,0 +1,117 @@
+"""Trials told in Python are checked as a log is on ingest: did they run their candidate?"""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import grounded as gr
+from facts import holding, holds
+from grounded.plant import Plant
+from grounded.search.ask_tell import TrialRefused
+from small_tasks import drive, other, rover_task
+
+TASK = rover_task()
+PLANT = Plant(other(TASK.model, 1.15), latency={"speed": 0.06, "turn": 0.06})
+ONE = gr.SearchOptions(max_trials=1)
+
+
+def run(candidate):
+    return drive(TASK, PLANT, candidate)
+
+
+def scaled(trial, *by):
+    return replace(trial, inputs=trial.inputs * np.array(by))
+
+
+def nan(trial):
+    return replace(trial, states=np.full_like(trial.states, np.nan))
+
+
+WRONG = [
+    (lambda t: scaled(t, 1, -1), ("turn", "-1")),
+    (lambda t: scaled(t, -1, -1), ("c0001",)),
+    (lambda t: replace(t, inputs=t.inputs + 50), ("outside", "limits", "c0001")),
+    (lambda t: replace(t, inputs=0 * t.inputs + 0.3), ("c0001", "rms")),
+    (lambda t: replace(t, states=0 * t.states), ("c0001", "rms")),
+    (lambda t: replace(t, states=t.states + 5), ("c0001", "rms")),
+    (nan, ("x", "NaN")),
+]
+
+
+@pytest.mark.parametrize(("change", "facts"), WRONG)
+def test_a_trial_that_is_not_its_candidate_s_run(change, facts):
+    """`learn` refuses it and says how to override that; `tell` takes it and warns."""
+    with pytest.raises(TrialRefused, match=holding(*facts, "check=False")) as refused:
+        gr.learn(TASK, lambda c: change(run(c)), ONE)
+    assert refused.value.search.trials == ()
+    assert "ingest" not in str(refused.value) and "[log" not in str(refused.value)
+    assert len(gr.learn(TASK, lambda c: change(run(c)), ONE, check=False).trials) == 1
+    search = gr.Search(TASK)
+    with pytest.warns(UserWarning, match=holding(*facts)):
+        search.tell(change(run(search.ask())))
+    assert len(search.trials) == 1
+
+
+def test_a_later_trial_is_checked_too_and_the_earlier_ones_are_kept():
+    def turned(candidate):
+        trial = run(candidate)
+        return trial if candidate.id == "c0001" else scaled(trial, 1, -1)
+
+    with pytest.raises(TrialRefused, match=holding("c0002", "turn")) as refused:
+        gr.learn(TASK, turned, gr.SearchOptions(max_trials=3))
+    search = refused.value.search
+    assert len(search.trials) == 1 and search.ask().id == "c0002"
+    search.tell(run(search.ask()))
+    assert len(search.trials) == 2
+
+
+def test_runs_of_their_candidates_under_noise_are_no_reason_to_warn():
+    rng, search = np.random.default_rng(0), gr.Search(TASK)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(3):
+            trial = run(search.ask())
+            off = rng.normal(0, 1e-3, trial.states.shape)
+            search.tell(replace(trial, states=trial.states + off))
+
+
+def test_a_crash_is_reported():
+    search = gr.Search(TASK)
+    with pytest.warns(UserWarning, match=holding("c0001", "crash", "30", TASK.horizon)):
+        search.tell(run(search.ask()).until(30))
+    assert holds(search.standing.sentence, "c0001", "crashed")
+    assert search.standing.history[0].verdict() == "crashed"
+
+
+def test_a_trial_of_another_order_or_interval_says_what_differs():
+    search = gr.Search(TASK)
+    trial = run(search.ask())
+    names = trial.state_names
+    for change, facts in (
+        ({"state_names": names[::-1]}, (", ".join(names[::-1]), ", ".join(names), "order")),
+        ({"state_names": ("a", *names[1:])}, ("a", "states")),
+        ({"dt": 0.1}, ("dt", "0.1 s", "0.05 s")),
+    ):
+        with pytest.raises(gr.GroundedError, match=holding(*facts)) as refused:
+            search.tell(replace(trial, **change))
+        assert "(" not in str(refused.value)
+
+
+def test_adopted_values_must_lie_within_the_bounds():
+    name = next(iter(TASK.model.params))
+    bounded = replace(TASK.model, params=TASK.model.params | {name: gr.Param(1.0, "1", 0.5, 2.0)})
+    search = gr.Search(TASK.with_model(bounded))
+    assert search.adopt({}, {name: 2.0}).planner.task.model.params[name].value == 2.0
+    for value in (2.5, 0.1, float("nan"), "1"):
+        with pytest.raises(gr.GroundedError, match=holding(name, str(value))):
+            search.adopt({}, {name: value})
+
+
+def test_a_reward_without_a_weight_gives_nothing_to_plan():
+    reward = TASK.reward
+    none = {name: 0 * getattr(reward, name) for name in ("state", "terminal", "input")}
+    idle = replace(TASK, reward=replace(reward, **none, input_change=0 * reward.input_change))
+    with pytest.raises(gr.GroundedError, match=holding("weight", "0")):
+        gr.Search(idle).ask()

@@ -1,0 +1,110 @@
+"""Replace the target of a workspace, once its columns are checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from grounded.errors import GroundedError, nearest, type_of
+from grounded.frozen import Array, numbers
+from grounded.model import Model
+from grounded.task import MAX_HORIZON
+from grounded_trials.store.store import write_atomically
+from grounded_trials.workspace.config import Config, set_target
+from grounded_trials.workspace.task_file import (
+    equal_weights,
+    limited_changes,
+    read_target,
+    write_target,
+)
+
+
+def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -> Path:
+    """Write target.csv, and its length and weights to grounded.toml, see `Workspace.target`.
+
+    Raises:
+        GroundedError: if the columns are no target of the model, see `checked`; or a file can't be
+            written. The files are then as before.
+    """
+    from grounded_trials.workspace.off_target import position_names
+
+    columns = checked(columns, model)
+    units, place = model.states, position_names(model)
+    weights = {name: round(w, 6) for name, w in equal_weights(columns, units, place).items()}
+    rows = len(next(iter(columns.values())))
+    name = config.task.target or "target.csv"
+    path = config.file.parent / name
+    before: dict[str, float] = {}
+    old = None
+    if path.is_file():
+        try:
+            old = path.read_bytes()
+        except OSError as error:
+            raise GroundedError(f"{path} can't be read: {error.strerror}") from None
+        with suppress(GroundedError, ValueError):  # an unreadable target is replaced
+            names, values = read_target(path)
+            given = dict(zip(names[1:], values.T[1:], strict=True))
+            before = equal_weights(given, units, place)
+        write_atomically(path.with_name(path.name + ".bak"), old)
+    write_target(path, config.task.dt, columns)
+    try:
+        set_target(config.file, name, rows - 1, weights, before, limited_changes(config, model))
+    except BaseException:
+        if old is None:
+            path.unlink(missing_ok=True)
+        else:
+            write_atomically(path, old)
+        raise
+    return path
+
+
+def checked(columns: Any, model: Model) -> dict[str, Array]:
+    """Return the columns of a target as arrays of equal length, (H + 1,).
+
+    Raises:
+        GroundedError: for a name that is not a state of the model, a column that is not a row of
+            finite numbers, columns of different lengths, or too few or too many rows.
+    """
+    if not isinstance(columns, Mapping) or not columns:
+        got = "none" if isinstance(columns, Mapping) else f"a {type_of(columns)}"
+        first = model.state_names[0]
+        raise GroundedError(
+            f"a target needs the desired values of at least one state, got {got}: pass columns "
+            f"such as {{'{first}': numpy.linspace(0, 1, 101)}}"
+        )
+    found: dict[str, Array] = {}
+    for name, given in columns.items():
+        if name not in model.states:
+            an_input = name in model.inputs
+            raise GroundedError(
+                f"target: '{name}' is {'an input' if an_input else 'not a state'} of the model: "
+                + nearest(str(name), model.state_names)
+            )
+        values = numbers(given, f"target: column '{name}'")
+        if values.ndim != 1:
+            raise GroundedError(
+                f"target: column '{name}' must be a list of values, one for each control step and "
+                f"one for the end, got an array of shape {values.shape}"
+            )
+        if not np.isfinite(values).all():
+            row = int(np.argmin(np.isfinite(values)))
+            raise GroundedError(
+                f"target: column '{name}' is {values[row]:g} in row {row}; every tracked value "
+                "must be finite; omit the column if the state is free"
+            )
+        found[str(name)] = values
+    rows = {name: len(values) for name, values in found.items()}
+    if len({*rows.values()}) > 1:
+        told = ", ".join(f"{name} {count}" for name, count in rows.items())
+        raise GroundedError(f"target: all columns must have the same number of rows, got {told}")
+    count = next(iter(rows.values()))
+    if not 2 <= count <= MAX_HORIZON + 1:
+        raise GroundedError(
+            f"a target needs 2 to {MAX_HORIZON + 1} rows, one for each control step and one for "
+            f"the end, got {count}"
+        )
+    return found
