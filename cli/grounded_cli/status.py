@@ -93,6 +93,7 @@ def summary(status: Status) -> str:
 
 def _gained(standing: Standing) -> str:
     """Return by how much the best candidate beats the model's own policy, as a sentence's end."""
+    from grounded.result import percent
     from grounded.search.candidate import SURE
     from grounded.search.certainty import chance, owed_to_start
 
@@ -105,10 +106,11 @@ def _gained(standing: Standing) -> str:
         return ""
     if chance(own, best, standing.history) < SURE:
         return "; the scatter of repeats may explain its lead on the model's own policy"
-    percent = 100 / abs(own.utility)
-    gain = f", {percent * (best.utility - own.utility):.1f} % better than the model's own policy"
+    share = (best.utility - own.utility) / abs(own.utility)
+    gain = f", {percent(share)} better than the model's own policy"
     if start := owed_to_start(own, best, standing.history):
-        return f"{gain}; {percent * start:.1f} % is due to different start states, by the model"
+        share = start / abs(own.utility)
+        return f"{gain}; {percent(share)} is due to different start states, by the model"
     return gain
 
 

@@ -91,8 +91,10 @@ def _few(workspace: Workspace, status: Status) -> list[str]:
 
 
 def _tell(document: dict[str, Any], verdict: list[str]) -> None:
+    from grounded.result import percent
+
     first, last = document["utilities"][0], document["utilities"][-1]
-    gain = f"{100 * (1 - last / first):.1f} % better after {count(document['trials'], 'trial')}"
+    gain = f"{percent(1 - last / first)} better after {count(document['trials'], 'trial')}"
     show(
         "\n"
         + field("learned", f"{number(first)} by the model's own policy, {number(last)} now: {gain}")
