@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from grounded.instruments.finding import Finding
 
 Cells = tuple[str, ...]
+WIDEST = 1e4  # an interval wider than this times the value, and than UNBOUNDED, says nothing
+UNBOUNDED = 1e6
+INTERVAL = 2 * 1.96  # width of a 95 % interval in standard deviations
 EFFECTS = 8  # rows of the table of effects, more if more are claimed or tied
 
 
@@ -122,10 +125,24 @@ def _evidence(row: Ranked) -> str:
 
 def _values(row: Ranked) -> str:
     """Format the quantities of an effect with their standard deviations and units."""
+    unknown = {
+        name
+        for name, e in row.params.items()
+        if math.isfinite(e.std) and undetermined(INTERVAL * e.std, e.value)
+    }
+    if unknown and unknown == set(row.params):
+        return "its values are not determined"
     return ", ".join(
-        with_unit(f"{name} = {figure(e.value, 3)}{_spread(e.std)}", e.unit)
+        f"{name} is not determined"
+        if name in unknown
+        else with_unit(f"{name} = {figure(e.value, 3)}{_spread(e.std)}", e.unit)
         for name, e in row.params.items()
     )
+
+
+def undetermined(width: float, value: float) -> bool:
+    """Return whether a 95 % interval is so wide that the value means nothing."""
+    return width > max(WIDEST * abs(value), UNBOUNDED)
 
 
 def _spread(std: float) -> str:
