@@ -246,6 +246,17 @@ def plain(value: Any) -> Any:
     return value if isinstance(value, int) else str(value)
 
 
+def html_table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:
+    """Return an HTML table of texts, for notebooks."""
+    from html import escape
+
+    head = "".join(f"<th style='text-align:left'>{escape(cell)}</th>" for cell in header)
+    body = "".join(
+        f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows
+    )
+    return f"<table><tr>{head}</tr>{body}</table>"
+
+
 def _table(value: Any) -> str:
     from html import escape
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from html import escape
 from typing import TYPE_CHECKING
 
 from grounded.diagnosis.error_report import RulerRow, furthest
-from grounded.result import figure, percent, shown, with_unit
+from grounded.result import figure, html_table, percent, shown, with_unit
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis, Ranked
@@ -163,18 +163,10 @@ def as_html(diagnosis: Diagnosis, everything: str) -> str:
     if sensors := instrument_lines(diagnosis.preflight):
         parts.append(f"<b>Sensors</b><ul>{''.join(f'<li>{escape(s)}</li>' for s in sensors)}</ul>")
     if diagnosis.prediction_error and not diagnosis.no_cause:
-        parts.append(_html_table(*error_table(diagnosis)))
+        parts.append(html_table(*error_table(diagnosis)))
     if diagnosis.ranking and not diagnosis.no_cause:
-        parts.append(_html_table(*effect_table(diagnosis)))
+        parts.append(html_table(*effect_table(diagnosis)))
     if diagnosis.next_trial:
         parts.append(f"<p><b>Next trial</b>: {escape(diagnosis.next_trial)}</p>")
     parts.append(f"<details><summary>The whole document</summary>{everything}</details>")
     return "".join(parts)
-
-
-def _html_table(rows: Sequence[Cells], header: Cells) -> str:
-    head = "".join(f"<th style='text-align:left'>{escape(cell)}</th>" for cell in header)
-    body = "".join(
-        f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows
-    )
-    return f"<table><tr>{head}</tr>{body}</table>"
