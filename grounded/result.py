@@ -47,13 +47,13 @@ def listed(names: Iterable[str]) -> str:
 
 
 def percent(share: float) -> str:
-    """Format a share as a percentage, with one decimal below 10 % and above 90 %."""
+    """Format a share as a percentage, with one decimal below 10 % and from 90 to 100 %."""
     if math.isnan(share):
         return "-"
     value = 100 * share if abs(share) >= 5e-4 or share > 0 else 0.0
     if 0 < value < 0.05 or 99.95 <= value < 100:
         return "< 0.1 %" if value < 50 else "> 99.9 %"
-    return f"{value:.0f} %" if 10 <= value <= 90 else f"{value:.1f} %"
+    return f"{value:.0f} %" if 10 <= value <= 90 or value >= 100 else f"{value:.1f} %"
 
 
 def number(value: float) -> str:
@@ -244,6 +244,17 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if isinstance(value, int) else str(value)
+
+
+def html_table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:
+    """Return an HTML table of texts, for notebooks."""
+    from html import escape
+
+    head = "".join(f"<th style='text-align:left'>{escape(cell)}</th>" for cell in header)
+    body = "".join(
+        f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows
+    )
+    return f"<table><tr>{head}</tr>{body}</table>"
 
 
 def _table(value: Any) -> str:

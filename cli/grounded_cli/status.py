@@ -13,7 +13,6 @@ from grounded_cli.terminal import field, number, progress, remark, show, show_js
 from grounded_trials.wording import count, legend, rendered, wrapped
 
 if TYPE_CHECKING:
-    from grounded.search.candidate import Tried
     from grounded.search.standing import Standing
     from grounded_trials.workspace.proposing import Status
 
@@ -71,8 +70,7 @@ def summary(status: Status) -> str:
 
     standing, lines = status.standing, []
     if standing.history:
-        header = ("id", "iter", "alpha", "damp", "predicted", "utility", "+-", "runs", "")
-        lines.append(table([_row(t, standing.verdict(t)) for t in standing.history], header))
+        lines.append(table(*standing.table()))
         words = legend(LEGEND, [t.candidate.iteration for t in standing.history])
         lines += wrapped(words, "  ", "  ")
         bars = sparkline([t.utility for t in standing.history if t.utilities])
@@ -93,6 +91,7 @@ def summary(status: Status) -> str:
 
 def _gained(standing: Standing) -> str:
     """Return by how much the best candidate beats the model's own policy, as a sentence's end."""
+    from grounded.result import percent
     from grounded.search.candidate import SURE
     from grounded.search.certainty import chance, owed_to_start
 
@@ -105,23 +104,9 @@ def _gained(standing: Standing) -> str:
         return ""
     if chance(own, best, standing.history) < SURE:
         return "; the scatter of repeats may explain its lead on the model's own policy"
-    percent = 100 / abs(own.utility)
-    gain = f", {percent * (best.utility - own.utility):.1f} % better than the model's own policy"
+    share = (best.utility - own.utility) / abs(own.utility)
+    gain = f", {percent(share)} better than the model's own policy"
     if start := owed_to_start(own, best, standing.history):
-        return f"{gain}; {percent * start:.1f} % is due to different start states, by the model"
+        share = start / abs(own.utility)
+        return f"{gain}; {percent(share)} is due to different start states, by the model"
     return gain
-
-
-def _row(tried: Tried, verdict: str) -> tuple[str, ...]:
-    error = tried.standard_error
-    return (
-        tried.candidate.id,
-        str(tried.candidate.iteration),
-        f"{tried.candidate.alpha:g}",
-        number(tried.candidate.damping, 2) if tried.candidate.base else "-",
-        number(tried.candidate.predicted_utility),
-        number(tried.utility),
-        number(error, 2),
-        str(len(tried.trials)),
-        verdict,
-    )

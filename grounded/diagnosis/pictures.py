@@ -14,6 +14,8 @@ from grounded.result import measured, measured_alike, number, percent, shown
 
 MOST = 12  # bars
 APART = 0.01  # relative difference of errors below which curves coincide
+WHOLE = "whole trial"
+APART_BY = 2.0  # where errors over whole trials are drawn, in units of the longest horizon
 SHOWS = 1.02  # ratio of errors without and with a cause from which bars show its worth
 CREDIT_S = 1.0  # horizon at which an effect's worth is measured [s]
 MODELS = {  # keys of a prediction error: role, name
@@ -65,7 +67,8 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
         panels: list[Panel | Bars] = [_shrinkage(diagnosis)] if diagnosis.gap.measured else []
         held = diagnosis.gap.held_out
     else:
-        panels = _over_horizons(errors) if len(errors) > 1 else _by_channel(errors[0])
+        apart = any(not e.whole_trial for e in errors) and len(errors) > 1
+        panels = _over_horizons(errors) if apart else _by_channel(errors[0])
         held = errors[0].held_out != "no"
     if not panels:
         return None
@@ -77,21 +80,28 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
 
 
 def _over_horizons(errors: Sequence[RulerRow]) -> list[Panel | Bars]:
-    """Return one panel per state: its error over the horizon."""
+    """Return one panel per state: its error over the horizon, and apart, that of whole trials."""
     units = errors[0].unit_by_channel
     panels: list[Panel | Bars] = []
-    ahead = np.array([error.horizon_s for error in errors])
+    ahead = np.array([e.horizon_s for e in errors if not e.whole_trial])
+    at = np.array([APART_BY * ahead.max() if e.whole_trial else e.horizon_s for e in errors])
+    whole = np.array([e.whole_trial for e in errors])
+    ticks = [(float(x), WHOLE if w else f"{x:.3g}") for x, w in zip(at, whole, strict=True)]
     for channel, unit in units.items():
         curves = []
         for key, (role, name) in _told_apart(errors).items():
-            values = [getattr(e, key).get(channel, math.nan) for e in errors]
-            if np.isfinite(values).any():
-                curves.append(Curve(ahead, np.array(values, float), role, name, 2.0))
+            values = np.array([getattr(e, key).get(channel, math.nan) for e in errors], float)
+            for rows, note in ((~whole, ""), (whole, WHOLE)):
+                if np.isfinite(values[rows]).any():
+                    style = "line" if rows.sum() > 1 and not note else "points"
+                    curves.append(
+                        Curve(at[rows], values[rows], role, name, 2.0, style=style, note=note)
+                    )
         if curves:
             curves.sort(key=lambda curve: curve.role != "other")  # noise is drawn behind
             unit = shown(unit)
-            label = f"{channel} [{unit}]" if unit else channel
-            panels.append(Panel(label, "predicted ahead [s]", unit, tuple(curves), log=True))
+            label, across = f"{channel} [{unit}]" if unit else channel, "predicted ahead [s]"
+            panels.append(Panel(label, across, unit, tuple(curves), log=True, x_ticks=tuple(ticks)))
     return panels
 
 
@@ -104,7 +114,8 @@ def _by_channel(error: RulerRow) -> list[Panel | Bars]:
             if math.isfinite(value):
                 bars.append((name, value, role))
         if bars:
-            panels.append(Bars(f"{channel}, {error.horizon_s:g} s ahead", _in_unit(bars, unit)))
+            when = WHOLE if error.whole_trial else f"{error.horizon_s:g} s ahead"
+            panels.append(Bars(f"{channel}, {when}", _in_unit(bars, unit)))
     return panels
 
 

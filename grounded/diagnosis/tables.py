@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from html import escape
 from typing import TYPE_CHECKING
 
 from grounded.diagnosis.error_report import RulerRow, furthest
-from grounded.result import figure, percent, shown, with_unit
+from grounded.result import figure, html_table, percent, shown, with_unit
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis, Ranked
     from grounded.instruments.finding import Finding
 
 Cells = tuple[str, ...]
+WIDEST = 1e4  # an interval wider than this times the value, and than UNBOUNDED, says nothing
+UNBOUNDED = 1e6
+INTERVAL = 2 * 1.96  # width of a 95 % interval in standard deviations
 EFFECTS = 8  # rows of the table of effects, more if more are claimed or tied
 
 
@@ -122,10 +125,24 @@ def _evidence(row: Ranked) -> str:
 
 def _values(row: Ranked) -> str:
     """Format the quantities of an effect with their standard deviations and units."""
+    unknown = {
+        name
+        for name, e in row.params.items()
+        if math.isfinite(e.std) and undetermined(INTERVAL * e.std, e.value)
+    }
+    if unknown and unknown == set(row.params):
+        return "its values are not determined"
     return ", ".join(
-        with_unit(f"{name} = {figure(e.value, 3)}{_spread(e.std)}", e.unit)
+        f"{name} is not determined"
+        if name in unknown
+        else with_unit(f"{name} = {figure(e.value, 3)}{_spread(e.std)}", e.unit)
         for name, e in row.params.items()
     )
+
+
+def undetermined(width: float, value: float) -> bool:
+    """Return whether a 95 % interval is so wide that the value means nothing."""
+    return width > max(WIDEST * abs(value), UNBOUNDED)
 
 
 def _spread(std: float) -> str:
@@ -146,18 +163,10 @@ def as_html(diagnosis: Diagnosis, everything: str) -> str:
     if sensors := instrument_lines(diagnosis.preflight):
         parts.append(f"<b>Sensors</b><ul>{''.join(f'<li>{escape(s)}</li>' for s in sensors)}</ul>")
     if diagnosis.prediction_error and not diagnosis.no_cause:
-        parts.append(_html_table(*error_table(diagnosis)))
+        parts.append(html_table(*error_table(diagnosis)))
     if diagnosis.ranking and not diagnosis.no_cause:
-        parts.append(_html_table(*effect_table(diagnosis)))
+        parts.append(html_table(*effect_table(diagnosis)))
     if diagnosis.next_trial:
         parts.append(f"<p><b>Next trial</b>: {escape(diagnosis.next_trial)}</p>")
     parts.append(f"<details><summary>The whole document</summary>{everything}</details>")
     return "".join(parts)
-
-
-def _html_table(rows: Sequence[Cells], header: Cells) -> str:
-    head = "".join(f"<th style='text-align:left'>{escape(cell)}</th>" for cell in header)
-    body = "".join(
-        f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows
-    )
-    return f"<table><tr>{head}</tr>{body}</table>"

@@ -82,6 +82,7 @@ class Curve:
     style: str = "line"  # line, steps (each y holds until the next x), points,
     # or ghost: not drawn, only used by the animation
     motion: Motion | None = None
+    note: str = ""  # text shown before y on hovering
 
     def spread(self, axis: int) -> list[Array]:
         """Return the values that must fit on the x axis (0) or the y axis (1)."""

@@ -64,13 +64,13 @@ def plotted(panel: Panel | Bars, axis: str = "") -> dict[str, Any]:
     up: dict[str, Any] = {"title": {"text": panel.y_name}, "range": [low, high]}
     if panel.whole:
         across |= {"tickformat": "d", "dtick": max(1, round((right - left) / 8))}
-    if panel.x_ticks:
-        at, labels = zip(*panel.x_ticks, strict=True)
-        across |= {"tickvals": list(at), "ticktext": list(labels)}
     if panel.log:
         for each in (across, up):
             ticks = log_ticks(*each["range"])
             each |= {"type": "log", "tickvals": ticks, "ticktext": [f"{v:g}" for v in ticks]}
+    if panel.x_ticks:
+        at, labels = zip(*panel.x_ticks, strict=True)
+        across |= {"tickvals": list(at), "ticktext": list(labels)}
     if panel.equal:
         up |= {"scaleanchor": f"x{axis}"}
     if panel.loss:
@@ -110,6 +110,8 @@ def _curve(panel: Panel, curve: Curve) -> dict[str, Any]:
         known = curve.y > 0
         x, y = (values[known].tolist() for values in (curve.x, curve.y))
         trace |= {"x": x, "y": y, "mode": "lines+markers"}
+    if curve.note:
+        trace["hovertemplate"] = f"{curve.note}: {trace['hovertemplate']}"
     if curve.role in DASHES:
         trace["line"]["dash"] = " ".join(f"{v:g}px" for v in DASHES[curve.role]).replace(" ", ",")
     if curve.times is not None:

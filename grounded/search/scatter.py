@@ -125,9 +125,10 @@ class Repeats:
         self.rows = np.array(rows).reshape(len(rows), 3 + PIECES)
 
     def near(self, utility: float) -> Scatter:
-        """Return the scatter of runs of about this utility."""
+        """Return the scatter of runs of about this utility; none if all repeats agree exactly."""
         cost, each = abs(utility), np.abs(self.rows[:, 0])
-        some = self.rows[(each <= FAR * cost) & (cost <= FAR * each)]
+        exact = not self.rows[:, 2:].any()  # then no run scatters, at whatever utility
+        some = self.rows[exact | ((each <= FAR * cost) & (cost <= FAR * each))]
         nu, total = float(some[:, 1].sum()), float(some[:, 2].sum())
         parts = some[:, 3:].sum(axis=0)
         if not (nu and math.isfinite(total + parts.sum())):
@@ -149,7 +150,9 @@ def _repeated(tried: Tried) -> bool:
 
 def _sums(tried: Tried) -> Array:
     """Return the utility, degrees of freedom, sum of squares, and sums of squares of the parts."""
-    parts = np.zeros(PIECES)
+    parts, total = np.zeros(PIECES), 0.0
+    if len(set(tried.utilities)) == 1:  # exactly 0, which a rounded mean may miss
+        return np.array([tried.utility, len(tried.utilities) - 1.0, total, *parts])
     with np.errstate(over="ignore", invalid="ignore"):  # diverged runs
         if tried.pieces is not None:
             parts = ((tried.pieces - tried.pieces.mean(axis=0)) ** 2).sum(axis=0)

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from grounded.errors import NextCommand
-from grounded.result import Result, document
+from grounded.result import Result, document, figure, html_table
 from grounded.search.candidate import Candidate, Tried, Way
 from grounded.search.certainty import error_between, judged, last_improvement
 from grounded.search.step_size import SearchOptions, Step
@@ -108,12 +108,39 @@ class Standing(Result):
             history=[t.to_json() | {"verdict": self.verdict(t)} for t in self.history],
         )
 
+    def table(self) -> tuple[list[tuple[str, ...]], tuple[str, ...]]:
+        """Return (rows, header) of all candidates, as `grounded status` prints them."""
+        header = ("id", "iter", "alpha", "damp", "predicted", "utility", "+-", "runs", "")
+        return [_row(one, self.verdict(one)) for one in self.history], header
+
+    def _repr_html_(self) -> str:
+        """Return the candidates as a table and the phase as a sentence, for Jupyter."""
+        from html import escape
+
+        phase = f"<p>{escape(self.outcome)}: {escape(self.sentence)}</p>"
+        whole = f"<details><summary>The whole document</summary>{super()._repr_html_()}</details>"
+        return f"<b>Search</b>{html_table(*self.table())}{phase}{whole}"
+
     def figures(self) -> Sequence[Figure]:
         """Return the figure of utilities by candidate and step sizes."""
         from grounded.search.pictures import search_figure
 
         found = search_figure(self)
         return () if found is None else (found,)
+
+
+def _row(tried: Tried, verdict: str) -> tuple[str, ...]:
+    return (
+        tried.candidate.id,
+        str(tried.candidate.iteration),
+        f"{tried.candidate.alpha:g}",
+        figure(tried.candidate.damping, 2) if tried.candidate.base else "-",
+        figure(tried.candidate.predicted_utility),
+        figure(tried.utility),
+        figure(tried.standard_error, 2),
+        str(len(tried.trials)),
+        verdict,
+    )
 
 
 def standing(

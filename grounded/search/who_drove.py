@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.frozen import Array
+from grounded.instruments.inputs import limits_of, span
 from grounded.policy import Policy, z_difference
 from grounded.result import with_unit
 from grounded.search.candidate import Candidate
@@ -37,6 +38,7 @@ class Following:
     """The comparison of a trial's commands with what a policy sends on its states."""
 
     alike: bool
+    beyond: str  # the input that is beyond its limits by more than their width on average, or ""
     error: float  # rms over steps and inputs, in units of each input's largest value
     input: str  # the input that differs most
     rms: float  # its rms difference, in its unit
@@ -94,10 +96,12 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     first = parts[bad.index(True)] if any(bad) else parts[0][:1]
     left = first[int(np.argmax((off[first] > 2 * room[first]).any(axis=1)))]
     beyond = np.abs(trial.inputs[:T] - np.clip(trial.inputs[:T], policy.low, policy.high))
-    sane = not (beyond.mean(axis=0) > width).any()  # such commands are only alike due to clipping
+    past_limits = beyond.mean(axis=0) - width  # > 0: such commands are only alike due to clipping
+    sane = not (past_limits > 0).any()
     alike, j = bool(sane and share.max() <= 1 and not any(bad)), int(np.argmax(share))
     return Following(
         alike=alike,
+        beyond="" if sane else policy.input_names[int(np.argmax(past_limits > 0))],
         error=float(np.sqrt((off / size**2).mean())),
         input=policy.input_names[j],
         rms=float(np.sqrt(off[:, j].mean())),
@@ -175,11 +179,16 @@ def suspicion(task: Task, trial: Trial, own: Candidate, others: Sequence[Candida
     else:
         looks = "somebody, or another controller, drove"
     name = name if nats > DECISIVE else ""
-    differs = with_unit(f"{found.rms:.3g}", task.model.inputs[found.input])
-    why = (
-        f"its commands are not what {own.id} sends on the logged states: {found.input} differs by "
-        f"{differs} (rms); {looks}"
-    )
+    if found.beyond:
+        j = trial.input_names.index(found.beyond)
+        logged, unit = span(trial.inputs[:, j]), task.model.inputs[found.beyond]
+        differs = f"{found.beyond} is {with_unit(logged, unit)} in the log, beyond its [limits], "
+        differs += limits_of(task, j)
+        looks = f"check its unit and offset in [log]; if they are right, {looks}"
+    else:
+        rms = with_unit(f"{found.rms:.3g}", task.model.inputs[found.input])
+        differs = f"{found.input} differs by {rms} (rms)"
+    why = f"its commands are not what {own.id} sends on the logged states: {differs}; {looks}"
     return Suspicion(found, why, name)
 
 

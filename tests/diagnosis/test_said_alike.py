@@ -94,6 +94,22 @@ def test_evidence_that_a_rival_gains_alone_has_its_own_column():
     assert all(len(row) == len(header) for row in rows)
 
 
+def test_a_value_that_anything_fits_has_no_digits():
+    """A tied friction with c = 285 +- 2e7 is neither 285 nor known to +- 2e7."""
+    wide, near, small = Estimate(285.0, 2e7), Estimate(0.4, 0.1), Estimate(1e-6, 0.01)
+    ranking = (
+        Ranked("a:v", {"c": wide}, {}, 120.0, claimed=True),
+        Ranked("b:v", {"c": wide, "k": near}, {}, 118.0),
+        Ranked("c:v", {"c": small}, {}, 117.0),
+    )
+    values = [row[-1] for row in effect_table(Diagnosis(Verdict("effect"), ranking=ranking))[0]]
+    assert values == [
+        "its values are not determined",
+        "c is not determined, k = 0.400 +- 0.10",
+        "c = 1.00e-06 +- 0.010",
+    ]
+
+
 def test_noise_from_trials_that_are_merely_alike_is_a_bound_everywhere():
     """Their scatter also holds the difference of their commands."""
     for source, bound in (("repeats", False), ("alike", True)):

@@ -20,6 +20,7 @@ from grounded_trials.wording import changed, in_digits_apart, legend
 from grounded_trials.workspace.adopted import better_model
 from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.next_step import Since
 from reported import DIAGNOSIS, cart, copied
 
 __all__ = ["cart"]
@@ -179,6 +180,16 @@ def test_a_new_diagnosis_measures_model_py_beside_what_plans_now(adopted):
     assert lines[0].startswith("Found and adopted") and "1.2 cm instead of 25 cm" in lines[1]
     assert lines[-1] == "Down to the noise." and lines.count("Down to the noise.") == 1
     assert "model.py" in words(adopted, "report") and "now" in words(adopted, "report")
+
+
+def test_the_answer_says_if_only_some_of_the_trials_were_diagnosed(adopted):
+    """A demo diagnoses 8 of its 16 trials."""
+    found = gather(Folder(adopted))
+    lines = {
+        used: told(found.diagnosis, found.task, replace(Since(usable=4), used=used), None)
+        for used in (2, 4)
+    }
+    assert lines[2] == [*lines[4], "Diagnosed with 2 of 4 trials."]
 
 
 def test_nothing_adopted_nothing_said(cart):

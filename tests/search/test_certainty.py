@@ -9,6 +9,7 @@ from scipy.stats import t, ttest_ind
 from facts import holds
 from grounded.search.candidate import Tried
 from grounded.search.certainty import (
+    chance,
     error_between,
     last_improvement,
     owed_to_start,
@@ -88,6 +89,15 @@ def test_failed_runs_are_left_out_and_trials_that_agree_say_so():
     assert error_between(tried(-5.0), tried(-4.0), [failed])[1] == 0
     found = last_improvement([tried(-5.0, -5.0), tried(-4.0, -4.0)])
     assert holds(found, 1, "exactly") and "+-" not in found and "probability" not in found
+
+
+def test_exact_repeats_show_at_any_utility_that_nothing_scatters():
+    """Two identical runs of the first policy: the noise of its successors was called unknown."""
+    first, a, b = tried(-9000.1, -9000.1, -9000.1, base=""), tried(-5.0), tried(-4.0)
+    assert holds(last_improvement([first, a, b]), "exactly")
+    assert chance(a, b, [first, a, b]) == 1.0
+    noisy = tried(-9000.1, -9000.2, base="")
+    assert error_between(a, b, [noisy, a, b])[1] == 0
 
 
 def test_a_crash_is_called_a_crash():

@@ -99,3 +99,17 @@ def test_what_noise_in_a_log_costs_is_no_doubt_in_the_model():
     assert 0.3 < told / lost < 1.4  # from 41 rows of one log
     assert not now.doubt
     assert now.incumbent.promised == pytest.approx(made.predicted_utility - told)
+
+
+def test_a_notebook_shows_the_candidates_and_the_phase():
+    """It showed the keys of the JSON document under the title "Standing"."""
+    task = cart_task()
+    first = propose(task, [], [], SearchOptions()).candidate
+    run = drive(task, Plant(task.model), first)
+    now = standing(task, [first], [run], SearchOptions(), first.model)
+    (row,), header = now.table()
+    assert len(row) == len(header) and row[0] == first.id and row[-1] == "first"
+    shown = now._repr_html_()
+    cells = [f"<td>{cell}</td>" for cell in row]
+    assert "".join(cells) in shown and shown.index(row[0]) < shown.index(now.sentence)
+    assert shown.index(now.sentence) < shown.index("<details>")

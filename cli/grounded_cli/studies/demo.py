@@ -66,6 +66,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
         "phase": status.standing.phase,
         "optimum": best,
         "verdict": diagnosed.verdict.to_json(),
+        "diagnosed_trials": len(diagnosed.made.trials if diagnosed.made else ()),
         "paths": report.to_json()["paths"],
     }
     if json_:
@@ -91,8 +92,10 @@ def _few(workspace: Workspace, status: Status) -> list[str]:
 
 
 def _tell(document: dict[str, Any], verdict: list[str]) -> None:
+    from grounded.result import percent
+
     first, last = document["utilities"][0], document["utilities"][-1]
-    gain = f"{100 * (1 - last / first):.1f} % better after {count(document['trials'], 'trial')}"
+    gain = f"{percent(1 - last / first)} better after {count(document['trials'], 'trial')}"
     show(
         "\n"
         + field("learned", f"{number(first)} by the model's own policy, {number(last)} now: {gain}")
@@ -100,6 +103,9 @@ def _tell(document: dict[str, Any], verdict: list[str]) -> None:
     if document["optimum"] is not None:
         known = "planned with the true model, which the search never saw"
         show(field("optimum", f"{number(document['optimum'])}, {known}"))
+    used, trials = document["diagnosed_trials"], document["trials"]
+    if 0 < used < trials:
+        verdict = [*verdict, f"Diagnosed with {used} of {trials} trials."]
     for k, line in enumerate(verdict):
         show(field("gap" if k == 0 else "", line))
     for kind, path in document["paths"].items():

@@ -253,3 +253,16 @@ def test_a_run_that_the_others_contradict_says_what_it_did(ladder, tmp_path):
     done = ingest_log(w, tmp_path / "a.mcap", first)
     (note,) = done.notes
     assert first in note and f"discard {done.trial}" in note
+
+
+def test_commands_far_beyond_the_limits_are_reported_as_logged(tmp_path):
+    """With an offset of 50 N they are 45 to 55 N: clipped to the limits they would look near."""
+    w = make(tmp_path / "w")
+    ingest_log(w, run_candidate(w, propose_in(w).candidate.id).trial_file)
+    contents = w.read()
+    own, trial = contents.candidates[0], contents.trials[0].trial
+    seen = suspicion(w.task, replace(trial, inputs=trial.inputs + 50), own, [own])
+    low, high = trial.inputs.min() + 50, trial.inputs.max() + 50
+    assert seen.ran.beyond == "force"
+    assert f"{low:.4g} to {high:.4g} N" in seen.why and "-5 to 5 N" in seen.why
+    assert suspicion(w.task, trial, own, [own]).ran.beyond == ""

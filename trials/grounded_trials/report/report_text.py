@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 from grounded.diagnosis.tables import effect_table, error_table
 from grounded.errors import NextCommand
+from grounded.result import percent
 from grounded.search.candidate import SURE, Tried
 from grounded.search.certainty import chance
 from grounded.search.pictures import few
@@ -106,7 +107,7 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
         if top is not None and top is not history[0] and chance(history[0], top, history) < SURE:
             text += "; the scatter of repeats may explain its lead"
         elif math.isfinite(first.utility) and first.utility < 0:
-            text += f", {100 * (1 - best.utility / first.utility):.1f} % better"
+            text += f", {percent(1 - best.utility / first.utility)} better"
         if findings.optimum is not None:
             text += f", optimum {figure(findings.optimum)}"
         lines += _wrapped(text, "  ")

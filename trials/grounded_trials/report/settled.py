@@ -96,7 +96,9 @@ def told(diagnosis: Diagnosis, task: Task, since: Since, settled: Settled | None
     lines = so_far(diagnosis, since, settled)
     if settled is not None and settled.closed:
         return lines[:-1]
-    return [*lines, *three_lines(diagnosis, task)]
+    part = not since.newer and 0 < since.used < since.usable
+    some = [f"Diagnosed with {since.used} of {since.usable} trials."] * part
+    return [*lines, *three_lines(diagnosis, task), *some]
 
 
 def so_far(diagnosis: Diagnosis, since: Since, settled: Settled | None) -> list[str]:

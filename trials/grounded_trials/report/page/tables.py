@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from grounded.diagnosis.report import Diagnosis, Estimate, Ranked
-from grounded.diagnosis.tables import weighed_beside
+from grounded.diagnosis.tables import undetermined, weighed_beside
 from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
 from grounded.search.pictures import MOST, few
@@ -26,7 +26,6 @@ from grounded_trials.report.forecast import forecast_error
 from grounded_trials.wording import figure, legend, percent, rendered, shown, with_unit
 from grounded_trials.workspace.next_step import Since
 
-WIDEST = 1e6  # an interval wider than this times max(|value|, 1) counts as unknown
 UNKNOWN = "–, not determined by these trials"
 
 
@@ -166,7 +165,7 @@ def _interval(v: Estimate) -> str:
     if v.interval is None:
         return figure(v.value)
     low, high = v.interval
-    known = low <= v.value <= high and high - low < WIDEST * max(abs(v.value), 1.0)
+    known = low <= v.value <= high and not undetermined(high - low, v.value)
     return f"{figure(v.value)} ({figure(low, 3)} to {figure(high, 3)})" if known else UNKNOWN
 
 

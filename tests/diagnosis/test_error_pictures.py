@@ -1,0 +1,26 @@
+"""Figures of prediction errors."""
+
+from grounded.diagnosis.error_report import RulerRow
+from grounded.diagnosis.pictures import accuracy_figure
+from grounded.diagnosis.report import Diagnosis, Verdict
+from grounded.figures.interactive import plotted
+
+
+def test_the_error_over_whole_trials_is_no_error_at_a_horizon():
+    """It was drawn on the line, at the trial's length, as if it were the error 2 s ahead."""
+
+    def row(seconds, error, whole=False):
+        return RulerRow(seconds, whole, {"x": "m"}, crude={"x": error}, with_effects={"x": error})
+
+    rows = (row(0.5, 1.0), row(1.0, 2.0), row(2.0, 0.3, whole=True))
+    (panel,) = accuracy_figure(Diagnosis(Verdict("none"), prediction_error=rows)).panels
+    line, apart = panel.curves
+    assert (line.style, list(line.x), list(line.y)) == ("line", [0.5, 1.0], [1.0, 2.0])
+    assert (apart.style, list(apart.y), line.name) == ("points", [0.3], apart.name)
+    assert [label for _, label in panel.x_ticks] == ["0.5", "1", "whole trial"]
+    drawn = plotted(panel)
+    assert drawn["data"][1]["mode"] == "markers"
+    assert "whole trial" in drawn["data"][1]["hovertemplate"]
+    assert drawn["layout"]["xaxis"]["ticktext"][-1] == "whole trial"
+    (bars,) = accuracy_figure(Diagnosis(Verdict("none"), prediction_error=rows[2:])).panels
+    assert bars.title == "x, whole trial"
