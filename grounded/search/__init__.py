@@ -19,4 +19,5 @@ safety          checks a candidate before it is handed out
 who_drove       checks by a trial's commands whether it ran its candidate, `other_scale` whether it
                 did with a column multiplied; `told_trial` does so for trials told in Python
 pictures        figures of the search
+returned/       checks of a trial that came back
 """

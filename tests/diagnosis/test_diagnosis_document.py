@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_diagnosis import cart
 from test_diagnosis_split import task_of
@@ -82,6 +82,7 @@ def diagnoses() -> st.SearchStrategy[Diagnosis]:
     )
 
 
+@settings(suppress_health_check=[HealthCheck.too_slow])  # on a busy machine
 @given(diagnoses())
 def test_whatever_the_numbers_nothing_is_lost(found):
     read = again(found)

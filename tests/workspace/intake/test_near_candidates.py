@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from grounded.errors import GroundedError
-from grounded.search.who_drove import evidence, follows, suspicion
+from grounded.search.returned.who_drove import evidence, follows, suspicion
 from grounded.trial import Trial
 from grounded_trials.formats.mcap_writer import LogWriter, encode_doubles
 from grounded_trials.store.trial_file import write_trial

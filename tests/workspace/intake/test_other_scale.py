@@ -9,8 +9,8 @@ from facts import holds
 from grounded import Model
 from grounded.errors import GroundedError
 from grounded.result import listed
-from grounded.search.other_scale import other_units, units_tried
-from grounded.search.who_drove import follows, latest
+from grounded.search.returned.other_scale import other_units, units_tried
+from grounded.search.returned.who_drove import follows, latest
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
 from recorded import LOGGED, record, waiting

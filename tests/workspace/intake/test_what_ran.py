@@ -14,7 +14,7 @@ import pytest
 from cli import grounded
 from facts import holding, holds
 from grounded.errors import GroundedError, NextCommand
-from grounded.search.who_drove import suspicion
+from grounded.search.returned.who_drove import suspicion
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial

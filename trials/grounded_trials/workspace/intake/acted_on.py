@@ -19,7 +19,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
-from grounded.search.who_drove import (
+from grounded.search.returned.who_drove import (
     FINE,
     LEAST,
     SAME,

@@ -9,7 +9,7 @@ from __future__ import annotations
 from contextlib import suppress
 
 from grounded.errors import GroundedError
-from grounded.search.who_drove import OTHERS, follows, latest
+from grounded.search.returned.who_drove import OTHERS, follows, latest
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.run_start import Recording

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.search.candidate import Candidate
-from grounded.search.who_drove import FINE, LEAST, SAME, Following
+from grounded.search.returned.who_drove import FINE, LEAST, SAME, Following
 from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.wording import with_unit

@@ -20,9 +20,9 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import listed
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.other_scale import other_units
+from grounded.search.returned.other_scale import other_units
+from grounded.search.returned.who_drove import OTHERS, Following, suspicion
 from grounded.search.safety import COASTS
-from grounded.search.who_drove import OTHERS, Following, suspicion
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of

@@ -13,7 +13,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.search.who_drove import LEAST
+from grounded.search.returned.who_drove import LEAST
 from grounded.trial import LAST
 from grounded_trials.logs.resample import Gridded
 

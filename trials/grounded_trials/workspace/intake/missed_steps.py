@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded.policy import Policy
 from grounded.result import listed
-from grounded.search.who_drove import LEAST, follows
+from grounded.search.returned.who_drove import LEAST, follows
 from grounded.task import Task
 from grounded_trials.wording import count, with_unit
 from grounded_trials.workspace.intake.acted_on import acted_on

@@ -13,14 +13,14 @@ import numpy as np
 
 from grounded.policy import Policy
 from grounded.result import listed
-from grounded.search.other_scale import (
+from grounded.search.returned.other_scale import (
     NEARLY,
     THOUSAND,
     any_factor,
     any_offset,
     units_tried,
 )
-from grounded.search.who_drove import follows
+from grounded.search.returned.who_drove import follows
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.logs.signals import Series

@@ -22,7 +22,7 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.search.who_drove import (
+from grounded.search.returned.who_drove import (
     FINE,
     LEAST,
     SAME,

@@ -1,6 +1,6 @@
 """Warnings about a trial that the user should know before relying on it.
 
-`grounded.search.who_drove` checks whether it ran its candidate at all, `log_faults.py` whether its
+`grounded.search.returned.who_drove` checks whether it ran its candidate at all, `log_faults.py` whether its
 columns contain what their names say.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.result import measured_alike
 from grounded.search.candidate import Candidate
-from grounded.search.who_drove import UNLIKE, follows, latest, second_differences
+from grounded.search.returned.who_drove import UNLIKE, follows, latest, second_differences
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
 from grounded_trials.wording import count, in_digits_apart, with_unit

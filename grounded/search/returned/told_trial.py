@@ -19,8 +19,8 @@ from grounded.instruments.sound_trials import sound_trials
 from grounded.model import Model
 from grounded.result import listed, with_unit
 from grounded.search.candidate import Candidate
-from grounded.search.other_scale import other_units
-from grounded.search.who_drove import suspicion
+from grounded.search.returned.other_scale import other_units
+from grounded.search.returned.who_drove import suspicion
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 

@@ -18,7 +18,7 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
-from grounded.search.who_drove import (
+from grounded.search.returned.who_drove import (
     DECISIVE,
     FINE,
     Following,

@@ -1,0 +1,6 @@
+"""Checks of a trial that came back: did its candidate drive it, and in the model's units?
+
+who_drove    START HERE: compares the logged commands with what the policy sends on these states
+other_scale  finds the scale of a state with which they agree
+told_trial   both checks as Python's `tell` and `learn` word them
+"""
