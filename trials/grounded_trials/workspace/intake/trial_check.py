@@ -1,7 +1,7 @@
 """Warnings about a trial that the user should know before relying on it.
 
-`grounded.search.returned.who_drove` checks whether it ran its candidate at all, `log_faults.py` whether its
-columns contain what their names say.
+`grounded.search.returned.who_drove` checks whether it ran its candidate at all, `log_faults.py`
+whether its columns contain what their names say.
 """
 
 from __future__ import annotations
