@@ -1,4 +1,4 @@
-"""Logs of a wheeled robot whose positions are both in another unit, with and without a candidate."""
+"""Logs of a wheeled robot whose positions are both in another unit: by hand, of a candidate."""
 
 import numpy as np
 import pytest

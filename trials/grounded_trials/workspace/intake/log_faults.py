@@ -53,9 +53,8 @@ class Fault:
             return f"{self.said}. Fix the program that writes the trials{should}{again}"
         if not self.mend:
             return self.said
-        return f"{self.said}. {self.mend}, and ingest it again" + f", without {trial.id}" * bool(
-            trial.id
-        )
+        again = f"then discard {trial.id} and ingest the log again" if trial.id else ""
+        return f"{self.said}. {self.mend}, {again or 'and ingest it again'}"
 
 
 def log_faults(workspace: Folder, trial: Trial) -> tuple[Fault, ...]:
