@@ -151,7 +151,7 @@ def _tell(begun: Begun) -> None:
         look = "; map its inputs in [log] to numbers of the log"
     show()
     sentence(f"read {begun.workspace}/model.py and grounded.toml{look}")
-    show(next_line(begun.then, begun.workspace))
+    show(next_line(begun.then, None if begun.again else begun.workspace))
 
 
 def _list(json_: bool) -> None:

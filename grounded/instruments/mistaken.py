@@ -174,7 +174,7 @@ def mended_by(model: Model, told: Told) -> str:
             "program; or in the model, if the log is right"
         )
     if told.mistake.swap:
-        return "Correct the log, or the paths in [log]; or the model, if the log is right"
+        return "Correct the paths in [log] (or the model, if the log is right)"
     tables = listed(f"[log.input.{model.input_names[j]}]" for j in told.mistake.inputs)
     by = f"{1 / told.mistake.factor:.6g}"
     limits = "as well" if told.mistake.factor > 1 else "if they were taken from the log"

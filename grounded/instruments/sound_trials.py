@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from grounded.instruments.clocks import judge_clocks
 from grounded.instruments.finding import Preflight
 from grounded.instruments.mistaken import judge_commands
+from grounded.instruments.plane_units import judge_positions
 from grounded.instruments.preflight import preflight
 from grounded.model import Model
 from grounded.task import Task
@@ -35,6 +36,7 @@ def sound_trials(
     names = (model.state_names, model.input_names)
     fit = [(trial.state_names, trial.input_names) == names for trial in looked.trials]
     if fit and all(fit):
+        judge_positions(model, looked.trials, hidden)
         judge_clocks(model, looked.trials, hidden)
         judge_commands(model, looked.trials, hidden, looked.findings)
     return looked

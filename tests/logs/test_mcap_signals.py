@@ -228,6 +228,9 @@ def test_a_log_that_is_missing_is_none_of_the_candidates_beside_it(tmp_path):
     (tmp_path / "s2.csv").touch()
     with pytest.raises(GroundedError, match=r"did you mean 's2\.csv'"):
         log_files(tmp_path / "s1.csv")
+    with pytest.raises(GroundedError, match=r"the folder has s2\.csv") as unlike:
+        log_files(tmp_path / "monday_afternoon.mcap")
+    assert "valid names" not in str(unlike.value)
 
 
 def one_message(path: Path, encoding: str, schema: tuple[str, str, bytes], body: bytes) -> Path:

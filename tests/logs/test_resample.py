@@ -158,7 +158,7 @@ def test_repeated_and_shuffled_stamps() -> None:
     np.testing.assert_array_equal(found.states, grid(x).states)
     report = found.reports[0]
     assert (report.repeated, report.out_of_order) == (2, 9)
-    assert any(re.search(r"\b9 stamps\b.*\b2 repeated", w) for w in found.warnings)
+    assert any(re.search(r"\b9 stamps\b.*\b2 stamps repeated", w) for w in found.warnings)
 
 
 def test_clocks_that_jump_or_differ_are_refused() -> None:

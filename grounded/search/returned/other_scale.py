@@ -214,3 +214,5 @@ def units_tried(model: Model) -> Iterator[tuple[Sequence[str], float]]:
     yield from ((pure, f) for f in PERCENT if pure)
     together = [*single, *_of_one_unit(model), *_of_one_sensor(model)]
     yield from ((names, f) for f in (*THOUSAND, -1.0) for names in together)
+    lengths = [[n for n, u in model.states.items() if u in units] for units in LENGTHS]
+    yield from ((names, f) for f in THOUSAND for names in lengths if len(names) > 1)

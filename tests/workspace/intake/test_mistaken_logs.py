@@ -75,7 +75,13 @@ def test_exchanged_commands_are_told_at_once_and_stop_a_diagnosis(w, tmp_path):
     for k in range(2):
         path = log(w, tmp_path / f"{k}.csv", columns=("starboard", "port"), seed=k)
         (warning,) = w.ingest(path, data=True).warnings
-        assert holds(warning, "port and starboard", "exchanged", "paths in [log]", f"t000{k + 1}")
+        assert holds(
+            warning,
+            "port and starboard",
+            "exchanged",
+            "paths in [log]",
+            f"then discard t000{k + 1}",
+        )
     done = grounded("-C", w.folder, "diagnose")
     said = " ".join(done.err.replace("\\\n", " ").split())  # wherever the command was wrapped
     assert done.code == 1 and holds(said, "port and starboard", "discard t0001 t0002")

@@ -90,7 +90,8 @@ def _nearby(path: Path) -> str:
     if logs:
         close = nearest(path.name, [p.name for p in logs])
         if len(logs) <= NEWEST or close.startswith("did you mean"):
-            return f": {close}"
+            said = close.startswith("did you mean")
+            return f": {close}" if said else f"; the folder has {listed(p.name for p in logs)}"
         newest = listed([p.name for p in logs[:NEWEST]])
         return f": the newest of the {len(logs)} logs in its folder are {newest}"
     return ": give the path of a log or of a bag's folder, relative to the current folder"

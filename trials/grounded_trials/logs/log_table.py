@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from grounded.errors import GroundedError
+from grounded.result import listed
 from grounded_trials.formats.message_path import parse_path
 from grounded_trials.logs.resample import Crossing, Gridded, Span, to_grid
 from grounded_trials.logs.signals import Clock, Series, SignalSpec, read_signals
@@ -156,8 +157,11 @@ def mapped_signals(
     Raises:
         GroundedError: see `signals.read_signals`.
     """
-    if not states or not inputs:
-        raise GroundedError("[log] maps no state or no input; a trial needs one of each")
+    if missing := ["state"] * (not states) + ["input"] * (not inputs):
+        raise GroundedError(
+            f"[log] maps no {' and no '.join(missing)}; a trial needs at least one of each: add "
+            f"{listed(f'[log.{one}.NAME]' for one in missing)} with its path"
+        )
     specs = {name: mapping.states[name] for name in states}
     specs |= {name: mapping.inputs[name] for name in inputs}
     return read_signals(paths, {**specs, **mapping.span.signals()})

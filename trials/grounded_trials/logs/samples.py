@@ -175,7 +175,10 @@ def tidy(name: str, series: Series, *, unwrap: bool) -> Samples:
     if not (t != 0).any() and len(t) > 1:
         raise _unusable(name, spec, f"all its {spec.clock} stamps are 0; use another clock")
     nearest = np.abs(t[t != 0]).min(initial=2**62)
-    stamped = (t != 0) | (nearest < NEAR_0_S * 1e9)  # simulation time runs through 0
+    apart = np.abs(np.diff(t[t != 0]))
+    usual = float(np.median(apart)) if len(apart) else 0.0
+    near = max(NEAR_0_S * 1e9, 2 * usual)  # simulation time runs through 0, a slow log from 0
+    stamped = (t != 0) | (nearest < near)
     good = finite & stamped
     if not good.any():
         raise _unusable(name, spec, f"none of its {len(t)} values is a finite number")

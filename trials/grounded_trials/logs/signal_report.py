@@ -164,10 +164,9 @@ def warnings_of(reports: tuple[SignalReport, ...], late: float) -> tuple[str, ..
                 f"{r.largest_gap_s:.3f} s at {r.largest_gap_at_s:.3f} s"
             )
         if r.out_of_order or r.repeated or r.unstamped:
-            found.append(
-                f"'{r.name}': {r.out_of_order} stamps out of order, {r.repeated} repeated, "
-                f"{r.unstamped} zero"
-            )
+            kinds = ("out of order", r.out_of_order), ("repeated", r.repeated), ("0", r.unstamped)
+            counts = [f"{n} stamp{'s' * (n > 1)} {kind}" for kind, n in kinds if n]
+            found.append(f"'{r.name}': {', '.join(counts)}")
         if r.samples == 1:
             found.append(f"'{r.name}': held from a single sample")
     low, high, apart = _furthest({r.name: r.skew_s for r in reports})

@@ -61,6 +61,7 @@ class Begun(Result):
     inputs: tuple[Guess, ...]
     target: str  # description of target.csv
     notes: tuple[str, ...] = ()
+    again: tuple[str, ...] = ()  # arguments of `init` once the log's time column is renamed
 
     @property
     def unsure(self) -> tuple[Guess, ...]:
@@ -69,7 +70,12 @@ class Begun(Result):
 
     @property
     def then(self) -> NextCommand:
-        """The next command: ingest the log as data, or inspect it if an input is missing."""
+        """The next command: ingest the log as data, or inspect it if an input is missing.
+
+        It is `init` for another folder if the log's times seem to be in another unit.
+        """
+        if self.again:
+            return NextCommand("init", self.again)
         whole = all(g.path for g in self.inputs) and any(g.path for g in self.states)
         return NextCommand("ingest", ("--data", self.log)) if whole else self.look
 
@@ -141,8 +147,11 @@ def begin(
         raise GroundedError("--inputs needs a skeleton of kind generic: others have fixed inputs")
     own = own_model(model) if model is not None else None
     files = (FILE, "target.csv", *(own.missing(folder) if own else ("model.py",)))
+    options = {"--model": model, "--kind": kind, "--dt": dt, "--inputs": ",".join(inputs)}
+    given = [str(part) for key, value in options.items() if value for part in (key, value)]
+    again = (f"{folder}-2", "--from", str(log), *given)
     with fresh_folder(folder, files):
-        return _begin(folder, log, own, "generic" if inputs else kind, dt, inputs, ask)
+        return _begin(folder, log, own, "generic" if inputs else kind, dt, inputs, ask, again)
 
 
 def _begin(
@@ -153,6 +162,7 @@ def _begin(
     dt: float | None,
     named: Sequence[str],
     ask: Ask | None,
+    again: tuple[str, ...],
 ) -> Begun:
     files = log_files(log)
     if kind_of(files[0]):
@@ -196,7 +206,8 @@ def _begin(
             tuple(_asked(g, ask, partial(as_stated, said, units[g.name])) for g in some)
             for some in (states, inputs)
         )
-    notes = (*notes, *_in_seconds(report), *wide_joints(states, units, joints, report))
+    slow = _in_seconds(report)
+    notes = (*notes, *slow, *wide_joints(states, units, joints, report))
     step, whose, note = (dt, "", "") if dt else interval_of(report, inputs, states)
     ranges = {g.name: _range(report, g) for g in (*states, *inputs)}
     if chosen != "drone":  # zero is sent after a run, so the limits must include it
@@ -222,6 +233,7 @@ def _begin(
         inputs=inputs,
         target=target,
         notes=(*notes, *[note] * bool(note), *more),
+        again=again if slow else (),
     )
 
 
@@ -297,7 +309,8 @@ def _in_seconds(report: LogReport) -> tuple[str, ...]:
     slow = [t for t in report.topics if t.topic == "/csv" and 0 < t.rate_hz < SLOWEST]
     return tuple(
         f"read as seconds, the rows are {1 / t.rate_hz:.3g} s apart: are the times in ms or us? "
-        "If so, end that column's name with _ms or _us, and create the workspace again"
+        "If so, end that column's name with _ms or _us, and create the workspace again in another "
+        "folder; if they are in seconds, `ingest` the log"
         for t in slow
     )
 

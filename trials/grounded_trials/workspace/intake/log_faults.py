@@ -53,9 +53,8 @@ class Fault:
             return f"{self.said}. Fix the program that writes the trials{should}{again}"
         if not self.mend:
             return self.said
-        return f"{self.said}. {self.mend}, and ingest it again" + f", without {trial.id}" * bool(
-            trial.id
-        )
+        again = f"then discard {trial.id} and ingest the log again" if trial.id else ""
+        return f"{self.said}. {self.mend}, {again or 'and ingest it again'}"
 
 
 def log_faults(workspace: Folder, trial: Trial) -> tuple[Fault, ...]:
@@ -67,7 +66,7 @@ def log_faults(workspace: Folder, trial: Trial) -> tuple[Fault, ...]:
     """
     model, known = workspace.base_model, trial.until(trial.known_steps)
     found = [*_exchanged(model, known), *dead_sensors(model, trial), *_thousands(model, known)]
-    found += way_faults(model, known)
+    found += [*way_faults(model, known), *positions_faults(model, known)]
     said = {fault.said for fault in found}
     degrees = [one for one in _degrees(model, known) if one.said not in said]
     found += degrees or _beyond_safety(workspace.task, trial)
@@ -121,6 +120,14 @@ def way_faults(model: Model, known: Trial) -> list[Fault]:
         Fault(f"{one.signal} {one.finding}", f"Set {one.log} in [log.state.{one.signal}]")
         for one in odd
     ]
+
+
+def positions_faults(model: Model, known: Trial) -> list[Fault]:
+    """Return a fault for positions that move a power of ten as far as the commands say."""
+    from grounded.instruments.plane_units import positions_off
+
+    off = positions_off(model, known, range(model.n))
+    return [Fault(off.described, off.mend, "write positions in the model's unit")] if off else []
 
 
 def _degrees(model: Model, known: Trial) -> list[Fault]:

@@ -1,0 +1,81 @@
+"""Positions in another unit, where only the commands say how far a robot moves."""
+
+import numpy as np
+import pytest
+
+from grounded import GroundedError, Model, Param, Trial
+from grounded.instruments.plane_units import judge_positions, positions_off
+from grounded.instruments.sound_trials import sound_trials
+
+DT = 0.02
+
+
+def cart(s, a, p):
+    v = p.r * (a.left + a.right) / 2
+    turn = p.r * (a.right - a.left) / p.track
+    return {"x": v * np.cos(s.psi), "y": v * np.sin(s.psi), "psi": turn}
+
+
+MODEL = Model(
+    states={"x": "m", "y": "m", "psi": "rad"},
+    inputs={"left": "rad/s", "right": "rad/s"},
+    params={"r": Param(0.05, "m", 0.045, 0.055), "track": Param(0.28, "m", 0.24, 0.36)},
+    angles=("psi",),
+    derivative=cart,
+)
+
+
+def driven(slip=1.0, left=0.88, lag=0.08, delay=2, seed=0, steps=900):
+    """A log of a robot whose wheels are weaker and later than the model's, with sensor noise."""
+    rng = np.random.default_rng(seed)
+    sent = np.repeat(rng.uniform(-2, 10, (steps // 30, 2)), 30, axis=0)
+    s, wheel, rows = np.zeros(3), np.zeros(2), [np.zeros(3)]
+    for k in range(steps):
+        wheel += DT / lag * (sent[max(0, k - delay)] * [left, 1.0] - wheel)
+        v, w = slip * 0.05 * wheel.mean(), 0.05 * (wheel[1] - wheel[0]) / 0.30
+        s = s + DT * np.array([v * np.cos(s[2]), v * np.sin(s[2]), w])
+        rows.append(s)
+    x = np.array(rows) + rng.normal(0, [1e-3, 1e-3, 4e-3], (steps + 1, 3))
+    return Trial(x, sent, DT, MODEL.state_names, MODEL.input_names)
+
+
+def scaled(trial, *factors):
+    return Trial(trial.states * factors, trial.inputs, DT, MODEL.state_names, MODEL.input_names)
+
+
+@pytest.mark.parametrize("factor", [1000.0, 100.0, 0.01, 0.001])
+def test_both_positions_in_another_unit_are_named_with_the_scale(factor):
+    found = positions_off(MODEL, scaled(driven(), factor, factor, 1.0), range(3))
+    assert found is not None and found.names == ("x", "y") and found.factor == factor
+    assert f"by {1 / factor:.6g} " in found.mend and "[log.state.y]" in found.mend
+
+
+def test_one_position_in_another_unit_is_named_alone():
+    found = positions_off(MODEL, scaled(driven(), 1.0, 0.001, 1.0), range(3))
+    assert found is not None and found.names == ("y",) and found.factor == 0.001
+
+
+@pytest.mark.parametrize(
+    "log",
+    [
+        driven(),
+        driven(slip=0.4),  # on ice
+        driven(slip=0.01),  # the wheels turn it, but hardly move it: the noise is larger
+        driven(slip=0.0),
+        driven(slip=-1.0),
+        driven(left=0.3),
+        driven(left=0.0),
+        scaled(driven(), 0.0, 0.0, 0.0),  # it stands
+        scaled(driven(), 0.001, 0.001, 0.001),  # nothing moves as the commands say
+        scaled(driven(), 0.03, 0.03, 1.0),  # no unit
+    ],
+)
+def test_real_robots_are_not(log):
+    assert positions_off(MODEL, log, range(3)) is None
+
+
+def test_a_diagnosis_stops_at_the_trial():
+    trials = [driven(), scaled(driven(seed=1), 0.001, 0.001, 1.0)]
+    judge_positions(MODEL, trials[:1])
+    with pytest.raises(GroundedError, match=r"trial number 2 x and y.*by 1000"):
+        sound_trials(MODEL, trials)

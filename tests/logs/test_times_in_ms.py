@@ -1,0 +1,47 @@
+"""Tables whose times are in ms under a header that says seconds, and [log] without a signal."""
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from grounded.errors import GroundedError
+from grounded_trials.logs.log_table import LogMapping, mapped_signals, read_log
+from grounded_trials.logs.signals import SignalSpec
+from grounded_trials.starting.begin import begin
+
+
+def table(path, column="t", seconds=1e-3):
+    """20 s of a cart at 100 Hz, whose first row is at 0; times in units of `seconds`."""
+    t = np.arange(2000) * 0.01
+    u = np.where((t % 2) < 1, 1.0, -1.0)
+    rows = np.column_stack([t / seconds, np.cumsum(u) * 0.01, u])
+    np.savetxt(path, rows, "%.6g", ",", header=f"{column},v,force", comments="")
+    return path
+
+
+def test_times_in_ms_are_asked_about_and_next_is_to_begin_again(tmp_path):
+    log = table(tmp_path / "a.csv")
+    made = begin(tmp_path / "w", log, kind="generic", inputs=["force"])
+    assert made.then.verb == "init" and made.then.arguments[0] == str(tmp_path / "w-2")
+    assert not any("stamp" in note for note in made.notes)  # the row at 0 is no fault
+    done = grounded("init", tmp_path / "v", "--from", log, "--inputs", "force", "--yes")
+    told = " ".join(done.out.replace("\\\n", " ").split())
+    assert f"init {tmp_path / 'v-2'} --from {log} --inputs force" in told.partition("next: ")[2]
+    renamed = table(tmp_path / "b.csv", column="t_ms")
+    again = begin(tmp_path / "w-2", renamed, kind="generic", inputs=["force"])
+    assert again.dt < 2 and again.then.verb == "ingest"
+
+
+def test_the_first_row_at_0_of_a_slow_log_is_kept(tmp_path):
+    log = table(tmp_path / "a.csv")
+    specs = SignalSpec("/csv.v"), SignalSpec("/csv.force")
+    mapping = LogMapping({"v": specs[0]}, {"force": specs[1]})
+    found = read_log(log, mapping, 10.0)
+    assert [one.unstamped for one in found.reports] == [0, 0]
+
+
+def test_a_log_table_without_inputs_says_so(tmp_path):
+    mapping = LogMapping({"v": SignalSpec("/csv.v")}, {})
+    with pytest.raises(GroundedError, match=r"maps no input;.*\[log\.input\.NAME\]") as refused:
+        mapped_signals(table(tmp_path / "a.csv"), mapping, ["v"], [])
+    assert "no state" not in str(refused.value)
