@@ -18,6 +18,7 @@ from grounded.result import listed, percent
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.validation.claims import Claims
 
+UNEXPLAINED = "A gap remains that no known effect explains: "
 LOG, LOST = "is a log that no candidate made", "failed"  # why a trial can't be repeated
 MOST_EFFECTS, FURTHER = 6, 2  # most effects blamed at once; how many more the next search allows
 NAMED = 3  # parameters, channels or leftovers named in one sentence
@@ -65,7 +66,7 @@ def verdict(
         return replace(_said("unknown", f"No cause is named: {why}."), limit=why)
     if not claimed:
         if remainder:
-            return _said("unknown", f"A gap remains that no known effect explains: {left}.", *once)
+            return _said("unknown", f"{UNEXPLAINED}{left}.", *once)
         if above := rest(rows):
             text = f"The model explains what these trials show: {above}."
         elif row is not None and row.floor_at_most:
@@ -92,7 +93,7 @@ def verdict(
         words.append(f"A gap remains: {left}; no more than {most} effects were looked for.")
         more = min(most + FURTHER, MOST_EFFECTS) * any(one.above for one in remainder)
     elif remainder:
-        words.append(f"A gap remains that no known effect explains: {left}.")
+        words.append(f"{UNEXPLAINED}{left}.")
     elif above := rest(rows):
         words.append(sentence([above]))
     if one_motion and (remainder or seen):

@@ -54,6 +54,7 @@ class Writer:
         tick: Callable[[str], None],
         task: Task | None,
         trials: Sequence[Trial],
+        first: int,
         exact: bool,
         uncertain: Predictor,
     ) -> None:
@@ -63,7 +64,7 @@ class Writer:
         self.search, self.best = decision.search, decision.fit
         self.predictor, self.data = self.search.predictor, self.search.data
         self.shown = list(zip(ruler.shown, ruler.names, strict=True))
-        self.measured = Measured(decision, ruler, trials, exact)
+        self.measured = Measured(decision, ruler, trials, first, exact)
         self.claims = Claims(decision, self.measured.credit, known, ruler)
         self.left, self.uncertain = self.measured.left, uncertain
 

@@ -28,7 +28,13 @@ from grounded_trials.workspace.adopting import diagnosed_again
 from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.diagnosing import _in_vain, read_diagnosis
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.next_step import DIAGNOSE, EXPORT, after_diagnosis, since_diagnosis
+from grounded_trials.workspace.next_step import (
+    DIAGNOSE,
+    EXPORT,
+    after_diagnosis,
+    since_diagnosis,
+    to_adopt,
+)
 from grounded_trials.workspace.proposing import standing_in
 from recorded import LOGGED, record
 from reported import DIAGNOSIS, cart, copied
@@ -813,3 +819,16 @@ def test_who_goes_on_after_steps_that_lost_is_told_of_a_diagnosis(tmp_path, monk
     assert Workspace(folder).status().then.verb == "adopt"
     notes = Workspace(folder).propose().proposal.notes
     assert not any("2 steps were lost" in note for note in notes), notes
+
+
+def test_what_differs_between_two_robots_is_not_adopted(cart, tmp_path):
+    w = Workspace(copied(cart, tmp_path / "w"))
+    both = ["t0001", "t0002"]
+    value = {"value": 0.1, "std": 0.01}
+    one = {"effect": "parameter:m", "quantity": "m", "first": value, "second": value}
+    made = {"trials": both, "named": ["t0002"], "compared": ["t0001"]}
+    for changed, follows in (([one], True), ([], False)):
+        found = Diagnosis.from_json({**DIAGNOSIS, "changed": changed, "diagnosed": made})
+        then = to_adopt(w, found)
+        assert then is not None
+        assert (then == NextCommand("diagnose", ("--trials", "t0002"))) == follows

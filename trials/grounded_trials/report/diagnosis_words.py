@@ -7,8 +7,9 @@ import math
 from collections.abc import Mapping, Sequence
 
 from grounded.diagnosis.cause_words import with_share
+from grounded.diagnosis.comparison import value_of
 from grounded.diagnosis.error_report import Gap
-from grounded.diagnosis.report import Correction, Diagnosis, Estimate, TrialValue
+from grounded.diagnosis.report import Changed, Correction, Diagnosis, Estimate, TrialValue
 from grounded.diagnosis.stopped import ENDED
 from grounded.result import listed
 from grounded_trials.wording import changed, count, figure, percent, ranges, with_unit
@@ -72,18 +73,18 @@ def in_vain(diagnosis: Diagnosis) -> list[str]:
 def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Return what changed between two groups of trials, or where trials disagree."""
     if diagnosis.changed is not None:
+        adopted = diagnosis.made.effects if diagnosis.made is not None else ()
         rows = [
             (
                 "changed",
-                f"{one.effect}: {one.quantity} = {_with_spread(one.first)} in the first trials, "
+                f"{value_of(one, adopted)} = {_with_spread(one.first)} in the first trials, "
                 f"{_with_spread(one.second)} in the second ({figure(one.evidence, 3)} nats)",
             )
             for one in diagnosis.changed
         ]
         rows = rows or [("changed", "nothing that these trials could show")]
         same = [
-            f"{one.effect}: {one.quantity}, by {figure(one.second.value - one.first.value, 2)} "
-            f"+- {figure(math.hypot(one.first.std, one.second.std), 2)}"
+            f"{value_of(one, adopted)}, by {_with_spread(_difference(one))}"
             for one in diagnosis.unchanged
         ]
         return [*rows, ("unchanged", f"within +-: {'; '.join(same)}")] if same else rows
@@ -101,6 +102,11 @@ def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
             )
             found.append(("agreement", text + f"; it {one.goes_with}" * bool(one.goes_with)))
     return found
+
+
+def _difference(one: Changed) -> Estimate:
+    by, std = one.second.value - one.first.value, math.hypot(one.first.std, one.second.std)
+    return Estimate(by, std, unit=one.first.unit)
 
 
 def _furthest_apart(values: Sequence[TrialValue]) -> tuple[TrialValue, TrialValue]:
@@ -192,10 +198,15 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
 
 
 def verdict_lines(diagnosis: Diagnosis) -> tuple[list[str], list[str]]:
-    """Return the causes with their shares if there are several, then the other sentences."""
+    """Return the causes with their shares if there are several, then the other sentences.
+
+    What changed between two groups of trials comes before the causes.
+    """
     causes, told = diagnosis.verdict.causes, list(diagnosis.verdict.lines)
     if len(causes) < 2:
         return [], told
     each = zip(causes, diagnosis.credit, strict=True)
     clauses = diagnosis.verdict.clauses or tuple(with_share(c, one.share) for c, one in each)
-    return [f"{clause[:1].upper()}{clause[1:]}" for clause in clauses], told[1:]
+    first = [text for text in [diagnosis.verdict.comparison] if text]
+    first += [f"{clause[:1].upper()}{clause[1:]}" for clause in clauses]
+    return first, told[1 + bool(diagnosis.verdict.comparison) :]

@@ -267,6 +267,8 @@ def _probe(
     none = f"{found.next_trial.rstrip('.')}. No probe is written"
     if found.no_cause:
         return "", f"{none}: these trials can't identify any cause." * write
+    if found.changed and not write:
+        return "", ""  # of one of the two robots, which is to be diagnosed alone
     from grounded.diagnosis.excitation import NOTHING, probe
     from grounded.diagnosis.verdict import sentence
     from grounded.search.safety import objections, spread

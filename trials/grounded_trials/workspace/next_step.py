@@ -228,6 +228,10 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     from grounded_trials.workspace.adopting import declined
 
     new = diagnosis.open(workspace.config.model.effects, workspace.config.model.params)
+    if diagnosis.changed:  # values of two robots together fit neither
+        made = diagnosis.made or Made()
+        newer = max(made.named, made.compared, key=lambda group: max(group, default=""))
+        return NextCommand("diagnose", ("--trials", ",".join(newer)))
     undone = {*declined(workspace)}  # effects the user has undone are not suggested again
     late = tuple(name for name in late_open(workspace, diagnosis) if name not in undone)
     claimed = diagnosis.kind in ("effect", "several") and not diagnosis.contested
