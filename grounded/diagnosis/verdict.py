@@ -6,9 +6,17 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.cause_words import clauses, give_or_take, meaning
+from grounded.diagnosis.cause_words import clauses, disagreement, give_or_take, meaning
 from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, furthest, runaway
-from grounded.diagnosis.report import Identifiable, Kind, Ranked, Unconfirmed, Verdict
+from grounded.diagnosis.report import (
+    Agreement,
+    Identifiable,
+    Kind,
+    Ranked,
+    TrialValue,
+    Unconfirmed,
+    Verdict,
+)
 from grounded.diagnosis.ruler_words import explained, floor, improvement, rest, worsened
 from grounded.diagnosis.stopped import AT_BOUNDS, ENDED, wider
 from grounded.instruments.finding import Finding, in_the_log
@@ -36,6 +44,8 @@ def verdict(
     most: int = 0,
     one_motion: bool = False,
     identified: Sequence[Identifiable] = (),
+    per_trial: Sequence[TrialValue] = (),
+    agreement: Sequence[Agreement] = (),
 ) -> Verdict:
     """Return the verdict (effect, several, none or unknown) with its sentences.
 
@@ -51,6 +61,8 @@ def verdict(
         most: the largest number of effects that was looked for; 0 for no limit.
         one_motion: whether all trials repeat one motion.
         identified: how well the trials identify each parameter, and relative to which others.
+        per_trial: each claimed value by trial.
+        agreement: whether the trials agree on each of these values.
     """
     from grounded.effects import like_a_load
 
@@ -75,7 +87,8 @@ def verdict(
         else:
             text = explained(rows)
         return _said("none", text, *once)
-    causes = _causes(claims, ranking, credit, identified)
+    apart = _apart(per_trial, agreement)
+    causes = _causes(claims, ranking, credit, identified, apart)
     told = clauses(
         [one.of for one in credit],
         causes,
@@ -134,6 +147,7 @@ def _causes(
     ranking: Sequence[Ranked],
     credit: Sequence[Credit],
     identified: Sequence[Identifiable],
+    apart: Mapping[str, str],
 ) -> tuple[str, ...]:
     """Return one clause per cause, the largest first."""
     from grounded.diagnosis.validation.claims import has_size
@@ -148,6 +162,7 @@ def _causes(
         if one.of in effects:
             text = meaning(effects[one.of], values[one.of])
             text += UNSURE * (not has_size(effects[one.of], values[one.of], KNOWN))
+            text += f", {apart[one.of]}" if one.of in apart else ""
         else:
             text = f"the model's own parameters are off: {_moved(claims)}"
             text += _others(claims, identified)
@@ -157,6 +172,17 @@ def _causes(
             text += f", but these trials do not determine {listed(vague)}" * bool(vague)
         found.append(text)
     return tuple(found)
+
+
+def _apart(per_trial: Sequence[TrialValue], agreement: Sequence[Agreement]) -> dict[str, str]:
+    """Return a clause for each effect on a value of which the trials disagree."""
+    found: dict[str, str] = {}
+    for one in agreement:
+        own = (one.effect, one.quantity)
+        values = [v for v in per_trial if (v.effect, v.quantity) == own]
+        if not one.agrees and len(values) > 1:
+            found.setdefault(one.effect, disagreement(values, one.estimate.unit))
+    return found
 
 
 def _off(claims: Claims) -> list[str]:
@@ -203,7 +229,7 @@ def _others(claims: Claims, identified: Sequence[Identifiable]) -> str:
     if all(old.values()):
         most = max(abs(known[name].value / value - 1) for name, value in old.items())
         by = f" by {'' if one else 'at most '}{percent(most)}"
-    others = f"{len(old)} other{'' if one else 's'}"
+    others = f"{len(old)} others" if len(old) > NAMED else listed(old)
     return f"; {others}, changed with {'it' if len(off) == 1 else 'them'}{by}, may be right"
 
 

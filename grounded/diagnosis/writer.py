@@ -133,6 +133,8 @@ class Writer:
             self.most,
             one_motion=moved == 1 < data.count,
             identified=identified,
+            per_trial=values,
+            agreement=agreement,
         )
         further = said.look_for > 0
         return Diagnosis(

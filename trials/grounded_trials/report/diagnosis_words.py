@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
-from grounded.diagnosis.cause_words import with_share
+from grounded.diagnosis.cause_words import furthest_apart, with_share
 from grounded.diagnosis.comparison import value_of
 from grounded.diagnosis.error_report import Gap
-from grounded.diagnosis.report import Changed, Correction, Diagnosis, Estimate, TrialValue
+from grounded.diagnosis.report import Changed, Correction, Diagnosis, Estimate
 from grounded.diagnosis.stopped import ENDED
 from grounded.result import listed
 from grounded_trials.wording import changed, count, figure, percent, ranges, with_unit
@@ -93,7 +92,7 @@ def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         if not one.agrees:
             values = [v for v in diagnosis.per_trial if v.effect == one.effect]
             values = [v for v in values if v.quantity == one.quantity]
-            low, high = _furthest_apart(values)
+            low, high = furthest_apart(values)
             ends = (Estimate(v.value, v.std, unit=one.estimate.unit) for v in (low, high))
             lowest, highest = map(_with_spread, ends)
             text = (
@@ -107,20 +106,6 @@ def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 def _difference(one: Changed) -> Estimate:
     by, std = one.second.value - one.first.value, math.hypot(one.first.std, one.second.std)
     return Estimate(by, std, unit=one.first.unit)
-
-
-def _furthest_apart(values: Sequence[TrialValue]) -> tuple[TrialValue, TrialValue]:
-    """Return the two values that differ by most standard deviations, the smaller one first.
-
-    The extremes are often values that a trial hardly determines, and prove nothing.
-    """
-
-    def apart(pair: tuple[TrialValue, TrialValue]) -> float:
-        std = math.hypot(pair[0].std, pair[1].std)
-        return abs(pair[1].value - pair[0].value) / std if std > 0 else 0.0
-
-    low, high = max(itertools.combinations(values, 2), key=apart)
-    return (low, high) if low.value <= high.value else (high, low)
 
 
 def _with_spread(estimate: Estimate) -> str:
