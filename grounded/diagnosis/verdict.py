@@ -240,7 +240,7 @@ def next_trial(
     seen: Sequence[Unconfirmed] = (),
     same: tuple[tuple[str, ...], ...] = (),
     unrepeatable: Mapping[str, str] | None = None,
-    worse: bool = False,
+    worse: str = "",
     adopted: Collection[str] = (),
     further: bool = False,
     ended: bool = False,
@@ -254,7 +254,7 @@ def next_trial(
         seen: effects that only one trial shows.
         same: those of `groups` that are equivalent in this model.
         unrepeatable: trials that cannot or should not be repeated, with the reason.
-        worse: whether predictions get worse with the claimed causes (`Diagnosis.contested`).
+        worse: why adopting the claimed effects is unwise (`ruler_words.objection`), or "".
         adopted: adopted effects, whose values are parameters of the model.
         further: whether more effects should be looked for first (`Verdict.look_for`).
         ended: whether all parameters that moved stopped at their bounds (`at_bounds`).
@@ -284,7 +284,7 @@ def next_trial(
     if not claims.names and not claims.blamed:
         return "None is needed: nothing is tied and nothing needs adopting."
     if worse:
-        return f"Predictions get worse with {_it(claims)}: {REPEAT}."
+        return f"Adopt nothing yet: {worse}. Run another trial and diagnose again."
     if further:
         return "None is needed yet: look for more effects first."
     if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names):
@@ -294,13 +294,6 @@ def next_trial(
     if _own_numbers(claims, adopted):
         return "None is needed to tell causes apart: fit the model's parameters."
     return "None is needed to tell causes apart: adopt the claimed effects."
-
-
-REPEAT = "run another trial and diagnose again before adopting anything"
-
-
-def _it(claims: Claims) -> str:
-    return "them" if len(claims.names or claims.blamed) > 1 else "it"
 
 
 def _own_numbers(claims: Claims, adopted: Collection[str]) -> bool:

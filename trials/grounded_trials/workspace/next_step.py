@@ -186,10 +186,13 @@ def nothing_to_do(found: Diagnosis, best: str) -> str:
         best: the candidate that the search ended with.
     """
     left = ", ".join(one.sentence() for one in found.leftover[:LEFT])
+    if found.leftover and found.leftover[0].sentence() in found.sentence:
+        left = ""  # the verdict says it
     return (
         f"None is needed for the manoeuvre: the search has ended, with {best}. "
         + f"No known effect explains the rest: {left}. " * bool(left)
-        + f"To learn more: {found.next_trial}"
+        + "To learn more: " * (not found.contested)
+        + found.next_trial
     )
 
 
