@@ -142,8 +142,8 @@ def diagnose_in(
         words = nothing_to_do(found, candidate_named(workspace, "best"))
         found = replace(found, next_trial=words)
     elif found.contested and then in (TARGET, PROPOSE):
-        made = "The next candidate will do: it is planned with the model as it is."
-        found = replace(found, next_trial=f"{found.next_trial} {made}")
+        which = "The next candidate will do: it is planned with the model as it is."
+        found = replace(found, next_trial=f"{found.next_trial} {which}")
     return replace(found, then=then)
 
 
