@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import click
 
+from grounded.result import listed
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, parallel
 from grounded_cli.terminal import (
     field,
@@ -69,6 +71,8 @@ def command(params: str | None, latency: bool, apply_: bool, engine: Engine, jso
     for k, line in enumerate(corrected):
         show(field("sensors" if k == 0 else "", line))
     show("\n" * bool(corrected) + _parameters(found))
+    if done.not_fitted:
+        show("\n".join(lines(_not_fitted(done.not_fitted), "  ", "  ")))
     if found.before is not None and found.after is not None:
         show(f"\n{_errors(found, workspace.base_model)}")
         show("\n".join(lines(HELD_OUT, "  ", "  ")))
@@ -81,6 +85,14 @@ def command(params: str | None, latency: bool, apply_: bool, engine: Engine, jso
     else:
         show("\nnothing was written: these values don't reduce the held-out errors by 1 %")
     show(next_line(done.then))
+
+
+def _not_fitted(delays: Sequence[str]) -> str:
+    """Say that adopted delays kept their values, and how to estimate them again."""
+    return (
+        f"not fitted: d of {listed(delays)}; `grounded diagnose` estimates it again, `--latency` "
+        "fits one delay of all inputs in its place"
+    )
 
 
 def _parameters(found: Fit) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.report import Estimate
+from grounded.diagnosis.report import Estimate, TrialValue
 from grounded.model import Model
 from grounded.result import listed, number, percent, with_unit
 
@@ -17,6 +18,8 @@ if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
 AS_STRONG = 0.2  # a gain this close to -1 is a wrong sign and nothing else
 TURNED = ": flip its sign in model.py, or, if only the log has it so, set {log} scale = -1"
 MOST_DIGITS = 6  # significant digits of a value
+DISAGREE = "but the trials disagree"
+KNOWN = 2.0  # standard deviations from zero that a value needs to be worded
 FEW = 3  # up to so many causes get a clause each
 TOLD = 4  # clauses otherwise: one per kind of effect, the smallest causes only counted
 
@@ -37,11 +40,34 @@ GREEK = (
 )
 
 
+NOUNS = (  # names of inputs that can be the subject of a sentence
+    *("acceleration", "aileron", "brake", "current", "drive", "elevator", "force", "fuel", "gas"),
+    *("heater", "heating", "lift", "moment", "motor", "pedal", "power", "pressure", "pump", "push"),
+    *("rudder", "servo", "speed", "steer", "steering", "throttle", "thrust", "torque", "valve"),
+    *("voltage", "winch"),
+)
+
+
 def called(model: Model, name: str) -> str:
     """Name a state or input in a sentence: `the speed v`, `the state delta`, `the throttle`.
 
-    Symbols (short names, Greek letters, names with digits) and plurals (volts) get a noun in front.
+    Symbols (short names, Greek letters, names with digits), plurals (volts) and inputs whose name
+    is no noun (left) get a noun in front.
     """
+    word = _noun(model, name)
+    return f"the {name}" if not word or name == word else f"the {word} {name}"
+
+
+def all_called(model: Model, names: Sequence[str]) -> str:
+    """Name several states or inputs in a sentence: `the inputs left and right`."""
+    words = {_noun(model, name) for name in names}
+    if len(names) < 2 or words not in ({"input"}, {"state"}):
+        return listed(called(model, name) for name in names)
+    return f"the {words.pop()}s {listed(names)}"
+
+
+def _noun(model: Model, name: str) -> str:
+    """Return the noun that a name needs in front of it in a sentence; "" if it needs none."""
     from grounded.effects import places
 
     roles = {
@@ -56,7 +82,7 @@ def called(model: Model, name: str) -> str:
         len(name) <= 3 or re.fullmatch(GREEK, name) or not name.isalpha() or name.endswith("s")
     ):
         word = "input" if name in model.input_names else "state"
-    return f"the {name}" if not word or name == word else f"the {word} {name}"
+    return word or "input" * (name in model.input_names and name.lower() not in NOUNS)
 
 
 def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
@@ -68,7 +94,7 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     words = {name: quantity(e) for name, e in {**constants, **params}.items()}
     words.setdefault("s", "s" if len(targets) == 1 else "")
     driven, _, source = effect.site.target.partition("<-")
-    words["target"] = listed(called(model, n) for n in targets)
+    words["target"] = all_called(model, targets)
     if isinstance(effect.family, ParamFamily):
         words["target"] = effect.site.target
     words |= {"log": "[log]", "driven": called(model, driven), "source": called(model, source)}
@@ -150,6 +176,7 @@ def clauses(
     for i, name in enumerate(names):
         own = effects.get(name)
         alike = own is not None and not re.search(r"[%|>]", own.family.sentence)
+        alike = alike and DISAGREE not in causes[names.index(name)]
         key = (own.family.name, *_told(values[name])) if own is not None and alike else (name,)
         kinds.setdefault(key, []).append(i)
     groups = sorted(kinds.values(), key=lambda group: -sum(shares[i] for i in group))
@@ -169,18 +196,39 @@ def with_share(clause: str, share: float) -> str:
     return f"{clause} ({percent(share)} of the improvement)"
 
 
+def disagreement(values: Sequence[TrialValue], unit: str) -> str:
+    """Return a clause on a value that the trials disagree on, with the two that differ most."""
+    low, high = furthest_apart(values)
+    ends = [with_unit(number(one.value), unit) for one in (low, high)]
+    return f"{DISAGREE}: {low.quantity} = {' to '.join(ends)}"
+
+
+def furthest_apart(values: Sequence[TrialValue]) -> tuple[TrialValue, TrialValue]:
+    """Return the two values that differ by most standard deviations, the smaller one first.
+
+    The extremes are often values that a trial hardly determines, and prove nothing.
+    """
+
+    def apart(pair: tuple[TrialValue, TrialValue]) -> float:
+        std = math.hypot(pair[0].std, pair[1].std)
+        return abs(pair[1].value - pair[0].value) / std if std > 0 else 0.0
+
+    low, high = max(itertools.combinations(values, 2), key=apart)
+    return (low, high) if low.value <= high.value else (high, low)
+
+
 def _beside(effect: Effect, params: Mapping[str, Estimate]) -> str:
     """Return what an effect adds to the clause of another of its family: `the base 0.45 N m`."""
     driven, _, source = effect.site.target.partition("<-")
     targets = [driven] if source else effect.site.targets
-    who = listed(called(effect.site.model, n) for n in targets)
+    who = all_called(effect.site.model, targets)
     told = [params[name] for name in _told(params)] or list(params.values())
     return f"{who} {listed(map(quantity, told))}"
 
 
 def _told(params: Mapping[str, Estimate]) -> list[str]:
-    """Return the quantities that differ from zero by more than their standard deviation."""
-    return [n for n, e in params.items() if e.value != 0 and not abs(e.value) <= e.std]
+    """Return the quantities that differ from zero by more than 2 standard deviations."""
+    return [n for n, e in params.items() if e.value != 0 and not abs(e.value) <= KNOWN * e.std]
 
 
 def quantity(estimate: Estimate) -> str:

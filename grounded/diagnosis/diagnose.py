@@ -11,7 +11,7 @@ measured          table of errors, noise floor, credit of each cause, leftover
 claims            claimed effects with intervals, ties and look-alikes           (lookalike)
 leftover          structure that no effect explains
 correction        a curve that predicts the leftover, if it passes its own test
-agreement         agreement of the trials; changes between two groups of them
+agreement         agreement of the trials; changes between two groups of them (comparison)
 prediction_error  where the gap is, by channel, time and region
 split             explained, unexplained and irreducible parts of the error
 unconfirmed       effects that only few trials show, and where
@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.comparison import with_comparison
 from grounded.diagnosis.hypotheses.attribution import USUAL_EFFECTS, attribute, grown, so_far
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data, prepare
@@ -150,7 +151,7 @@ def diagnose(
     trials, copies = counted_once(trials)
     compare, more = counted_once(compare)
     copies += more
-    exact = bool(copies) and not scattered([*trials, *compare])
+    exact = bool(copies) and not (scattered(trials) or scattered(compare))
     first = sum(trial.known_steps >= 2 for trial in trials)
     looked = sound_trials(subject, [*trials, *compare], options.hidden)
     trials = looked.trials
@@ -210,6 +211,7 @@ def diagnose(
                 tick,
                 task,
                 used,
+                first,
                 exact,
                 uncertain,
             )
@@ -225,13 +227,14 @@ def diagnose(
         decision, found = written.decision, written.diagnosis()
         groups = [k < first for k in range(data.count)]
         apart = compared(search, decision.fit, groups) if compare else None
-        return replace(
+        found = replace(
             found,
             verdict=with_faults(found.verdict, looked.findings),
             preflight=looked.findings,
             changed=apart.changed if apart else None,
             unchanged=apart.unchanged if apart else (),
         )
+        return with_comparison(found, (*options.but, *options.delays))
 
 
 def _again(effect: Effect, known: float, data: Data) -> Effect:

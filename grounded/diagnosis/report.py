@@ -30,7 +30,6 @@ from grounded.result import Document, number
 if TYPE_CHECKING:
     from grounded.figures.figure import Figure
 
-
 Kind = Literal["effect", "several", "none", "unknown"]
 
 
@@ -38,10 +37,10 @@ Kind = Literal["effect", "several", "none", "unknown"]
 class Verdict(Document):
     """The verdict: its kind, the effects that it claims, and sentences that explain them.
 
-    `sentences` has one entry per line, `sentence` joins them. The first is made of `clauses`, one
-    per cause in the order of `Diagnosis.credit`, or per group of `causes`. `parameters` are those
-    that are off. `look_for`: number of effects to look for before any is adopted, if the usual one
-    leaves more than noise, else 0. `limit`: why no cause is named, an entry of `unknowable`.
+    `sentences` has one entry per line, `sentence` joins them. One is made of `clauses`, one per
+    cause in the order of `Diagnosis.credit`, or per group of `causes`; before it is `comparison`,
+    of two groups of trials. `parameters` are off. `look_for`: number of effects to look for before
+    adopting, or 0. `limit`: why no cause is named, an entry of `unknowable`.
     """
 
     kind: str  # one of `Kind`
@@ -53,6 +52,7 @@ class Verdict(Document):
     parameters: tuple[str, ...] = ()
     look_for: int = 0
     limit: str = field(metadata=BRIEF, default="")
+    comparison: str = field(metadata=BRIEF, default="")
 
     @property
     def lines(self) -> tuple[str, ...]:

@@ -82,8 +82,11 @@ def worsened(rows: Sequence[RulerRow]) -> str:
 def outweighed(rows: Sequence[RulerRow]) -> bool:
     """Check whether the states that get worse lose more than the other states gain."""
     ratio, row, _ = _lost_most(rows)
-    if row is None or not ratio > 1 + COUNTS:
-        return False
+    return row is not None and ratio > 1 + COUNTS and _loses(row)
+
+
+def _loses(row: RulerRow) -> bool:
+    """Check whether the errors of a row grow, over all states."""
     told = [n for n, e in row.crude.items() if e > 0 and row.tells(n, "crude", "with_effects")]
     ends = [(row.with_effects[n], row.crude[n], row.noise_floor.get(n, 0.0)) for n in told]
     least = 1e-12
@@ -92,27 +95,51 @@ def outweighed(rows: Sequence[RulerRow]) -> bool:
 
 
 def _lost_most(rows: Sequence[RulerRow]) -> tuple[float, RulerRow | None, str]:
-    """Return (factor, row, channel) of the channel whose error grows most."""
-    losses = [
+    """Return (factor, row, channel) of the channel whose error grows most.
+
+    Whole trials come first if they lose over all states, as they are what a plan is made for.
+    """
+    whole = [] if any(row.drowned for row in rows) else [row for row in rows if row.whole_trial]
+    found = [_losses(some) for some in (whole, rows)]
+    lost, other = (max(some, key=lambda loss: loss[0], default=(0.0, None, "")) for some in found)
+    return lost if lost[0] > 1 + SHOWS and lost[1] is not None and _loses(lost[1]) else other
+
+
+def _losses(rows: Sequence[RulerRow]) -> list[tuple[float, RulerRow, str]]:
+    """Return (factor, row, channel) by which the errors of each channel grow or shrink."""
+    return [
         (row.with_effects[name] / max(error, row.noise_floor.get(name, 0.0)), row, name)
         for row in rows
         if not row.drowned
         for name, error in row.crude.items()
         if error > 0 and math.isfinite(row.with_effects[name]) and row.tells(name, "crude")
     ]
-    return max(losses, key=lambda loss: loss[0], default=(0.0, None, ""))
 
 
 def contested(
     rows: Sequence[RulerRow], agreement: Sequence[Agreement], effects: Sequence[str]
 ) -> bool:
-    """Check whether adopting the claimed effects is unwise.
+    """Check whether adopting the claimed effects is unwise."""
+    return bool(objection(rows, agreement, effects))
+
+
+def objection(
+    rows: Sequence[RulerRow], agreement: Sequence[Agreement], effects: Sequence[str]
+) -> str:
+    """Return a clause on why adopting the claimed effects is unwise; "" if it is not.
 
     It is if predictions lose more than they gain, or get worse somewhere while the trials disagree
     about the effects' values.
     """
-    differ = {one.effect for one in agreement if not one.agrees} & set(effects)
-    return bool(effects) and (outweighed(rows) or bool(differ and worsened(rows)))
+    if not effects:
+        return ""
+    if outweighed(rows):
+        return "predictions get worse with what is claimed"
+    differ = dict.fromkeys(one.effect for one in agreement if not one.agrees)
+    names = [name for name in differ if name in effects]
+    if not names or not worsened(rows):
+        return ""
+    return f"the trials disagree on {listed(names)}, and some predictions get worse"
 
 
 def floor(row: RulerRow | None) -> str:

@@ -6,9 +6,17 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.cause_words import clauses, give_or_take, meaning
+from grounded.diagnosis.cause_words import clauses, disagreement, give_or_take, meaning
 from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, furthest, runaway
-from grounded.diagnosis.report import Identifiable, Kind, Ranked, Unconfirmed, Verdict
+from grounded.diagnosis.report import (
+    Agreement,
+    Identifiable,
+    Kind,
+    Ranked,
+    TrialValue,
+    Unconfirmed,
+    Verdict,
+)
 from grounded.diagnosis.ruler_words import explained, floor, improvement, rest, worsened
 from grounded.diagnosis.stopped import AT_BOUNDS, ENDED, wider
 from grounded.instruments.finding import Finding, in_the_log
@@ -18,6 +26,7 @@ from grounded.result import listed, percent
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.validation.claims import Claims
 
+UNEXPLAINED = "A gap remains that no known effect explains: "
 LOG, LOST = "is a log that no candidate made", "failed"  # why a trial can't be repeated
 MOST_EFFECTS, FURTHER = 6, 2  # most effects blamed at once; how many more the next search allows
 NAMED = 3  # parameters, channels or leftovers named in one sentence
@@ -35,6 +44,8 @@ def verdict(
     most: int = 0,
     one_motion: bool = False,
     identified: Sequence[Identifiable] = (),
+    per_trial: Sequence[TrialValue] = (),
+    agreement: Sequence[Agreement] = (),
 ) -> Verdict:
     """Return the verdict (effect, several, none or unknown) with its sentences.
 
@@ -50,6 +61,8 @@ def verdict(
         most: the largest number of effects that was looked for; 0 for no limit.
         one_motion: whether all trials repeat one motion.
         identified: how well the trials identify each parameter, and relative to which others.
+        per_trial: each claimed value by trial.
+        agreement: whether the trials agree on each of these values.
     """
     from grounded.effects import like_a_load
 
@@ -65,7 +78,7 @@ def verdict(
         return replace(_said("unknown", f"No cause is named: {why}."), limit=why)
     if not claimed:
         if remainder:
-            return _said("unknown", f"A gap remains that no known effect explains: {left}.", *once)
+            return _said("unknown", f"{UNEXPLAINED}{left}.", *once)
         if above := rest(rows):
             text = f"The model explains what these trials show: {above}."
         elif row is not None and row.floor_at_most:
@@ -74,7 +87,8 @@ def verdict(
         else:
             text = explained(rows)
         return _said("none", text, *once)
-    causes = _causes(claims, ranking, credit, identified)
+    apart = _apart(per_trial, agreement)
+    causes = _causes(claims, ranking, credit, identified, apart)
     told = clauses(
         [one.of for one in credit],
         causes,
@@ -92,7 +106,7 @@ def verdict(
         words.append(f"A gap remains: {left}; no more than {most} effects were looked for.")
         more = min(most + FURTHER, MOST_EFFECTS) * any(one.above for one in remainder)
     elif remainder:
-        words.append(f"A gap remains that no known effect explains: {left}.")
+        words.append(f"{UNEXPLAINED}{left}.")
     elif above := rest(rows):
         words.append(sentence([above]))
     if one_motion and (remainder or seen):
@@ -133,6 +147,7 @@ def _causes(
     ranking: Sequence[Ranked],
     credit: Sequence[Credit],
     identified: Sequence[Identifiable],
+    apart: Mapping[str, str],
 ) -> tuple[str, ...]:
     """Return one clause per cause, the largest first."""
     from grounded.diagnosis.validation.claims import has_size
@@ -147,6 +162,7 @@ def _causes(
         if one.of in effects:
             text = meaning(effects[one.of], values[one.of])
             text += UNSURE * (not has_size(effects[one.of], values[one.of], KNOWN))
+            text += f", {apart[one.of]}" if one.of in apart else ""
         else:
             text = f"the model's own parameters are off: {_moved(claims)}"
             text += _others(claims, identified)
@@ -156,6 +172,17 @@ def _causes(
             text += f", but these trials do not determine {listed(vague)}" * bool(vague)
         found.append(text)
     return tuple(found)
+
+
+def _apart(per_trial: Sequence[TrialValue], agreement: Sequence[Agreement]) -> dict[str, str]:
+    """Return a clause for each effect on a value of which the trials disagree."""
+    found: dict[str, str] = {}
+    for one in agreement:
+        own = (one.effect, one.quantity)
+        values = [v for v in per_trial if (v.effect, v.quantity) == own]
+        if not one.agrees and len(values) > 1:
+            found.setdefault(one.effect, disagreement(values, one.estimate.unit))
+    return found
 
 
 def _off(claims: Claims) -> list[str]:
@@ -202,7 +229,7 @@ def _others(claims: Claims, identified: Sequence[Identifiable]) -> str:
     if all(old.values()):
         most = max(abs(known[name].value / value - 1) for name, value in old.items())
         by = f" by {'' if one else 'at most '}{percent(most)}"
-    others = f"{len(old)} other{'' if one else 's'}"
+    others = f"{len(old)} others" if len(old) > NAMED else listed(old)
     return f"; {others}, changed with {'it' if len(off) == 1 else 'them'}{by}, may be right"
 
 
@@ -213,7 +240,7 @@ def next_trial(
     seen: Sequence[Unconfirmed] = (),
     same: tuple[tuple[str, ...], ...] = (),
     unrepeatable: Mapping[str, str] | None = None,
-    worse: bool = False,
+    worse: str = "",
     adopted: Collection[str] = (),
     further: bool = False,
     ended: bool = False,
@@ -227,7 +254,7 @@ def next_trial(
         seen: effects that only one trial shows.
         same: those of `groups` that are equivalent in this model.
         unrepeatable: trials that cannot or should not be repeated, with the reason.
-        worse: whether predictions get worse with the claimed causes (`Diagnosis.contested`).
+        worse: why adopting the claimed effects is unwise (`ruler_words.objection`), or "".
         adopted: adopted effects, whose values are parameters of the model.
         further: whether more effects should be looked for first (`Verdict.look_for`).
         ended: whether all parameters that moved stopped at their bounds (`at_bounds`).
@@ -257,7 +284,7 @@ def next_trial(
     if not claims.names and not claims.blamed:
         return "None is needed: nothing is tied and nothing needs adopting."
     if worse:
-        return f"Predictions get worse with {_it(claims)}: {REPEAT}."
+        return f"Adopt nothing yet: {worse}. Run another trial and diagnose again."
     if further:
         return "None is needed yet: look for more effects first."
     if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names):
@@ -267,13 +294,6 @@ def next_trial(
     if _own_numbers(claims, adopted):
         return "None is needed to tell causes apart: fit the model's parameters."
     return "None is needed to tell causes apart: adopt the claimed effects."
-
-
-REPEAT = "run another trial and diagnose again before adopting anything"
-
-
-def _it(claims: Claims) -> str:
-    return "them" if len(claims.names or claims.blamed) > 1 else "it"
 
 
 def _own_numbers(claims: Claims, adopted: Collection[str]) -> bool:

@@ -23,7 +23,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Diagnosis, Estimate, Identifiable, NoiseLevels
-from grounded.diagnosis.ruler_words import contested, open_noise
+from grounded.diagnosis.ruler_words import objection, open_noise
 from grounded.diagnosis.unconfirmed import another_look, marked, unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import by_trial
 from grounded.diagnosis.validation.claims import Claims
@@ -54,6 +54,7 @@ class Writer:
         tick: Callable[[str], None],
         task: Task | None,
         trials: Sequence[Trial],
+        first: int,
         exact: bool,
         uncertain: Predictor,
     ) -> None:
@@ -63,7 +64,8 @@ class Writer:
         self.search, self.best = decision.search, decision.fit
         self.predictor, self.data = self.search.predictor, self.search.data
         self.shown = list(zip(ruler.shown, ruler.names, strict=True))
-        self.measured = Measured(decision, ruler, trials, exact)
+        self.measured = Measured(decision, ruler, trials, first, exact)
+        self.compares = first < len(trials)  # two groups, of which `compared` says what differs
         self.claims = Claims(decision, self.measured.credit, known, ruler)
         self.left, self.uncertain = self.measured.left, uncertain
 
@@ -116,7 +118,7 @@ class Writer:
         located = bool(named or remainder)  # else the gap is noise: shares of it tell nothing
         ranking = marked(ranking, {one.name for one in self.decision.doubtful} - told)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
-        worse = contested(rows, agreement, named)
+        worse = objection(rows, agreement, named)
         lost = self.unrepeatable()
         moved, parameters = how_many(predictor), self.claims.parameters()
         identified = tuple(_identified(self.uncertain, self.best, parameters))
@@ -132,6 +134,8 @@ class Writer:
             self.most,
             one_motion=moved == 1 < data.count,
             identified=identified,
+            per_trial=values,
+            agreement=() if self.compares else agreement,
         )
         further = said.look_for > 0
         return Diagnosis(

@@ -232,7 +232,8 @@ cornering_drag = RateFamily(
 lever_arm = RateFamily(
     name="lever_arm",
     equation="x' = model - psi' (a sin psi + b cos psi), y' = model + psi' (a cos psi - b sin psi)",
-    sentence="the tracked point lies {a} ahead and {b} to the left of the model's",
+    sentence="the tracked point lies [{a} further {a>ahead|back} & {b} further to the "
+    "{b>left|right}] than the model's",
     targets=places.plane,
     quantities=lambda site: tuple(Quantity(q, site.unit(site.target)) for q in "ab"),
     lookalikes=("side_slip", "drift_body", "sensor_delay", "parameter"),

@@ -1,16 +1,23 @@
 """Whether trials agree in what is claimed, and what changed between two groups of them."""
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from test_diagnosis import cart
 
 from cli import grounded
+from facts import holds
+from grounded.diagnosis.comparison import with_comparison
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.error_report import Credit
+from grounded.diagnosis.report import Changed, Diagnosis, Estimate, Made, Verdict
+from grounded.diagnosis.validation.ruler import repeated
+from grounded.diagnosis.verdict import UNEXPLAINED
 from grounded.effects import Library
-from grounded_trials.report.diagnosis_words import agreement_lines
+from grounded_trials.report.diagnosis_words import agreement_lines, verdict_lines
 
 FEW = (
     *("coulomb_friction", "viscous_friction", "dead_zone"),
@@ -71,3 +78,58 @@ def test_groups_that_overlap_are_refused(workspace_of):
     folder = workspace_of().folder
     done = grounded("-C", folder, "diagnose", "--compare", "t0001,t0002", "t0002")
     assert done.code == 1 and "two groups of different trials" in done.err
+
+
+def compared(changed, unchanged=(), kind="effect", adopted=()):
+    gap = f"{UNEXPLAINED}v is off."
+    lines = ("The speed v is damped.", gap)
+    said = Verdict(kind, ("viscous_friction:v",), " ".join(lines), sentences=lines)
+    said = replace(said, causes=("one", "two"), clauses=("one", "two"))
+    one = Credit("viscous_friction:v", 0.5)
+    made = Made(("t0001", "t0002"), adopted, named=("t0001",), compared=("t0002",))
+    found = Diagnosis(said, changed=changed, unchanged=unchanged, credit=(one, one), made=made)
+    return with_comparison(found, [effect["name"] for effect in adopted])
+
+
+def test_the_verdict_of_a_comparison_begins_with_what_changed():
+    values = Estimate(0.0496, 0.0002, unit="m"), Estimate(0.0459, 0.0002, unit="m")
+    found = compared((Changed("parameter:r", "r", *values, 190.0),))
+    first = found.verdict.lines[0]
+    assert first == found.verdict.comparison and found.sentence.startswith(first)
+    assert holds(first, "r changed", "0.0496 +- 0.0002 m", "0.0459 +- 0.0002 m")
+    causes, others = verdict_lines(found)
+    assert causes == [first, "One", "Two"]
+    assert len(others) == 1 and "no known effect" not in others[0] and "v is off" in others[0]
+    assert "newer trials" in found.next_trial
+    again = Diagnosis.from_json(json.loads(json.dumps(found.to_json())))
+    assert again == found and again.verdict.comparison == first
+
+
+def test_the_verdict_of_a_comparison_says_that_nothing_changed():
+    found = compared(())
+    assert found.verdict.lines[0].startswith("Nothing") and UNEXPLAINED in found.sentence
+    assert not found.next_trial
+    alone = replace(found, changed=None, verdict=Verdict("none", sentence="Nothing."))
+    assert with_comparison(alone, ()) == alone
+
+
+def test_a_compared_value_of_an_adopted_effect_has_its_name_and_unit():
+    lag = {"name": "first_order_lag:left+right", "tau": 0.1}
+    name = "first_order_lag_left_right_tau"
+    values = Estimate(0.1, 0.001, unit="s"), Estimate(0.0996, 0.001, unit="s")
+    one = Changed(f"parameter:{name}", name, *values, 0.1)
+    ((_, _), (title, text)) = agreement_lines(compared((), (one,), adopted=(lag,)))
+    assert title == "unchanged" and name not in text
+    assert holds(text, "tau of first_order_lag:left+right", "0.0014 s")
+    assert name not in compared((one,), adopted=(lag,)).sentence
+
+
+def test_trials_of_two_groups_are_no_repeats():
+    _, trials = cart(trials=1)
+    trials = [replace(trials[0], candidate="c0001")] * 4
+    data = SimpleNamespace(lengths=np.array([trial.steps for trial in trials]))
+    assert repeated(trials, data, 4) == [[0, 1, 2, 3]]
+    assert repeated(trials, data, 2) == [[0, 1], [2, 3]]
+    assert repeated(trials[:2], data, 1) == []
+    same = [replace(trial, candidate="") for trial in trials]
+    assert repeated(same, data, 2) == [[0, 1], [2, 3]]

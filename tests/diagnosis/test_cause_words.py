@@ -1,8 +1,21 @@
 """Many causes in few words: those of one kind together, the smallest counted."""
 
-from grounded.diagnosis.cause_words import clauses, meaning
-from grounded.diagnosis.report import Estimate
+from dataclasses import replace
+
+from facts import holds
+from grounded.diagnosis.cause_words import (
+    DISAGREE,
+    all_called,
+    called,
+    clauses,
+    disagreement,
+    meaning,
+)
+from grounded.diagnosis.report import Agreement, Estimate, TrialValue
+from grounded.diagnosis.verdict import _apart
 from grounded.effects import Library
+from grounded.model import Model
+from grounded.models.car import model as car
 from tests.effects.test_effects_joint import PAIRS, arm
 
 ONE, TWO = (f"joint_friction:{pair}" for pair in PAIRS)
@@ -55,3 +68,47 @@ def test_a_joint_with_dry_friction_is_not_told_beside_one_with_viscous_friction(
     VALUES[TWO] = some
     assert len(found) == 4
     assert found[3].startswith("the input t2 loses 0.1 N m to dry friction (")
+
+
+def test_a_lever_arm_has_directions_and_no_component_that_may_be_zero():
+    arm_of = Library().effect("lever_arm:x+y", car)
+
+    def said(a, b):
+        known = {"a": Estimate(a, 0.002, unit="m"), "b": Estimate(b, 0.002, unit="m")}
+        return meaning(arm_of, known)
+
+    assert holds(said(-0.0128, 0.0001), "0.0128 m further back than")
+    assert "left" not in said(-0.0128, 0.003) and "-" not in said(-0.0128, 0.003)
+    assert holds(said(0.0128, -0.02), "0.0128 m further ahead", "0.02 m further to the right")
+    assert "ahead" not in said(0.0001, 0.02) and "0.02 m further to the left" in said(0.0001, 0.02)
+
+
+def test_an_input_whose_name_is_no_noun_gets_one():
+    wheels = Model(
+        states={"v": "m/s"},
+        inputs={"left": "1", "right": "1"},
+        derivative=lambda s, a, p: {"v": a.left + a.right - s.v},
+    )
+    assert called(wheels, "left") == "the input left"
+    assert all_called(wheels, ("left", "right")) == "the inputs left and right"
+    assert all_called(car, ("steering", "throttle")) == "the steering and the throttle"
+
+
+def test_a_clause_says_on_which_value_the_trials_disagree():
+    values = [
+        TrialValue("t1", BIAS, "b", -0.0149, 0.001),
+        TrialValue("t2", BIAS, "b", -0.0038, 0.0008),
+        TrialValue("t3", BIAS, "b", 0.9, 50.0),  # a trial that hardly determines it
+    ]
+    tests = [Agreement(BIAS, "b", False, 0.0, Estimate(-0.01, unit="rad"))]
+    told = _apart(values, tests)
+    assert list(told) == [BIAS] and told[BIAS] == disagreement(values, "rad")
+    assert holds(told[BIAS], DISAGREE, "b = -0.0149 rad to -0.0038 rad")
+    assert not _apart(values, [replace(tests[0], agrees=True)])
+
+
+def test_a_cause_on_which_trials_disagree_stands_alone():
+    effects = {n: Library().effect(n, arm) for n in (INERTIA, ONE, GAIN, TWO)}
+    causes = [meaning(effects[n], VALUES[n]) for n in effects]
+    causes[1] += f", {DISAGREE}: c = 0.1 to 0.4"
+    assert len(clauses([*effects], causes, [0.4, 0.3, 0.2, 0.1], effects, VALUES)) == 4

@@ -89,9 +89,9 @@ def test_a_repeat_in_another_unit_is_no_noise(known):
 
 def test_repeats_are_found_by_candidate_or_by_their_commands(known):
     predictor, _, trials = known
-    assert repeated(trials, predictor.data) == [[0, 2], [1, 3]]
+    assert repeated(trials, predictor.data, len(trials)) == [[0, 2], [1, 3]]
     named = [replace(t, candidate="c0001" if k in (0, 1) else "") for k, t in enumerate(trials)]
-    assert [0, 1] in [group[:2] for group in repeated(named, predictor.data)]
+    assert [0, 1] in [group[:2] for group in repeated(named, predictor.data, len(trials))]
 
 
 def test_a_trial_that_holds_most_is_left_out_piece_by_piece(known):

@@ -98,7 +98,7 @@ def test_a_value_that_adopt_leaves_alone_is_told_as_not_determined():
         parameters=lambda: {"k": Estimate(1.3, 0.4, None, "N/V")},
     )
     parts = [Identifiable("k", verdict, 1.0, 1.0, {}) for verdict in ("weak", "not identifiable")]
-    told = [_causes(claims, (), [Credit("calibration")], [part])[0] for part in parts]
+    told = [_causes(claims, (), [Credit("calibration")], [part], {})[0] for part in parts]
     assert told[1].startswith(told[0]) and told[1].endswith("do not determine k")
     assert "determine" not in told[0]
 

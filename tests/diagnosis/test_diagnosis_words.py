@@ -15,6 +15,7 @@ from grounded.diagnosis.ruler_words import (
     explained,
     improvement,
     in_doubt,
+    objection,
     open_noise,
     outweighed,
     rest,
@@ -77,10 +78,23 @@ def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt
     assert not contested((short,), (alike,), ("delay:u",))
     assert contested((short,), (unlike,), ("delay:u",))
     claims = _claiming(Library().effect("coulomb_friction:v", cart_task().model))
-    said = {worse: next_trial(claims, "", (), worse=worse) for worse in (False, True)}
-    assert said[False].endswith("adopt the claimed effects.")
-    assert "worse" in said[True] and not said[True].endswith("adopt the claimed effects.")
+    assert next_trial(claims, "", ()).endswith("adopt the claimed effects.")
+    why = objection((short,), (unlike,), ("delay:u",))
+    assert holds(why, "delay:u", "disagree") and "disagree" not in objection(
+        (short, whole), (unlike,), ("delay:u",)
+    )
+    said = next_trial(claims, "", (), worse=why)
+    assert why in said and not said.endswith("adopt the claimed effects.")
     assert "adopt" not in next_trial(claims, "", (), further=True)
+
+
+def test_whole_trials_that_get_worse_are_contested_whatever_one_state_loses_sooner():
+    short = row({"x": 0.2, "v": 0.1}, {"x": 0.05, "v": 0.3})
+    whole = row({"x": 2.0, "v": 0.5}, {"x": 3.0, "v": 0.6}, whole_trial=True, horizon_s=60.0)
+    assert not outweighed((short,))
+    assert outweighed((short, whole)) and "worse for x" in worsened((short, whole))
+    assert contested((short, whole), (), ("delay:u",))
+    assert not outweighed((replace(short, drowned=True), replace(whole, with_effects=whole.crude)))
 
 
 def _claiming(*effects, **more):

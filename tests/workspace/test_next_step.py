@@ -28,7 +28,14 @@ from grounded_trials.workspace.adopting import diagnosed_again
 from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.diagnosing import _in_vain, read_diagnosis
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.next_step import DIAGNOSE, EXPORT, after_diagnosis, since_diagnosis
+from grounded_trials.workspace.next_step import (
+    DIAGNOSE,
+    EXPORT,
+    after_diagnosis,
+    nothing_to_do,
+    since_diagnosis,
+    to_adopt,
+)
 from grounded_trials.workspace.proposing import standing_in
 from recorded import LOGGED, record
 from reported import DIAGNOSIS, cart, copied
@@ -813,3 +820,40 @@ def test_who_goes_on_after_steps_that_lost_is_told_of_a_diagnosis(tmp_path, monk
     assert Workspace(folder).status().then.verb == "adopt"
     notes = Workspace(folder).propose().proposal.notes
     assert not any("2 steps were lost" in note for note in notes), notes
+
+
+def test_what_differs_between_two_robots_is_not_adopted(cart, tmp_path):
+    w = Workspace(copied(cart, tmp_path / "w"))
+    both = ["t0001", "t0002"]
+    value = {"value": 0.1, "std": 0.01}
+    one = {"effect": "parameter:m", "quantity": "m", "first": value, "second": value}
+    made = {"trials": both, "named": ["t0002"], "compared": ["t0001"]}
+    for changed, follows in (([one], True), ([], False)):
+        found = Diagnosis.from_json({**DIAGNOSIS, "changed": changed, "diagnosed": made})
+        then = to_adopt(w, found)
+        assert then is not None
+        assert (then == NextCommand("diagnose", ("--trials", "t0002"))) == follows
+
+
+def test_a_gap_that_the_verdict_states_is_not_repeated_when_the_search_has_ended():
+    left = {"channel": "v", "error": 0.02, "floor": 0.01, "horizon_s": 1.0, "error_unit": "m/s"}
+    found = Diagnosis.from_json({**DIAGNOSIS, "leftover": [left], "next_trial": "Run another."})
+    gap = found.leftover[0].sentence()
+    told = replace(found, verdict=replace(found.verdict, sentence=f"A gap remains: {gap}."))
+    assert gap in nothing_to_do(found, "c0001") and gap not in nothing_to_do(told, "c0001")
+    assert nothing_to_do(told, "c0001").endswith("To learn more: Run another.")
+    errors = ({"v": 0.1}, {}, {"v": 0.3})  # of the crude model, calibrated, as diagnosed
+    worse = RulerRow(1.0, False, {"v": "m/s"}, "trials", *errors)
+    contested = replace(told, prediction_error=(worse,), next_trial="Adopt nothing yet.")
+    assert contested.contested and "To learn more" not in nothing_to_do(contested, "c0001")
+
+
+def test_an_adopted_delay_is_named_as_not_fitted(tmp_path):
+    folder = make(tmp_path / "w").folder
+    grounded("-C", folder, "learn", "--trials", "2")
+    late = {"name": "delay:force", "d": 0.02}
+    for effects, names in (([], []), ([late], ["delay:force"])):
+        set_in_model(folder / "grounded.toml", effects=effects)
+        assert grounded("-C", folder, "fit", "--json").json["not_fitted"] == names
+    assert grounded("-C", folder, "fit", "--latency", "--json").json["not_fitted"] == []
+    assert "not fitted: d of delay:force" in grounded("-C", folder, "fit").out

@@ -85,11 +85,11 @@ def test_the_sentence_of_a_probe_names_its_size_and_the_command_that_makes_it(di
     policy = w.candidate("c0001")[0].policy
     model = w.task.model
     words = [said for said, _ in probes(policy, model, [0])][1:]
-    assert all(" N added to force" in said for said in words)
+    assert all(" N added to the force" in said for said in words)
     plain = replace(model, inputs={"force": "1"})
     low, high = policy.low[0], policy.high[0]
     told = [said for said, _ in probes(policy, plain, [0])][1:]
-    assert all(f"(limits {low:g} to {high:g}) added to force" in said for said in told)
+    assert all(f"(limits {low:g} to {high:g}) added to the force" in said for said in told)
 
 
 def test_a_trial_that_teaches_little_is_not_advised(diagnosed, monkeypatch):

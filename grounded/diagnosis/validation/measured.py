@@ -45,8 +45,14 @@ class Measured:
     """Measurements of a decision; every method is one part of the `Diagnosis`."""
 
     def __init__(
-        self, decision: Decision, ruler: Ruler, trials: Sequence[Trial], exact: bool = False
+        self,
+        decision: Decision,
+        ruler: Ruler,
+        trials: Sequence[Trial],
+        first: int,
+        exact: bool = False,
     ) -> None:
+        self.first = first  # trials of the first group; the others may be of a changed robot
         self.decision, self.ruler, self.trials = decision, ruler, trials
         self.exact = exact  # all repeats were bit-identical: a simulator
         self.search, self.best = decision.search, decision.fit
@@ -88,7 +94,7 @@ class Measured:
         self.unsure = np.zeros((len(self.ruler.steps) + 1, 1))
         if self.exact and not self.is_white:  # white innovations are noise, and the repeat a copy
             return np.zeros((len(self.ruler.steps) + 1, len(self.units))), "repeats"
-        repeats = repeated(self.trials, self.data)
+        repeats = repeated(self.trials, self.data, self.first)
         scatter, source = self.ruler.scatter(self.best, repeats), "repeats"
         if not all(len({self.trials[i].candidate or i for i in group}) == 1 for group in repeats):
             source = "alike"

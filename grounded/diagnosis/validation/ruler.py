@@ -336,12 +336,14 @@ def _jackknife(each: Array) -> Array:
     return np.asarray(np.sqrt((B - 1) / B * ((each - each.mean(axis=0)) ** 2).sum(axis=0)))
 
 
-def repeated(trials: Sequence[Trial], data: Data) -> list[list[int]]:
+def repeated(trials: Sequence[Trial], data: Data, first: int) -> list[list[int]]:
     """Return groups of trials, as indices, with the same candidate or nearly the same commands.
 
     Args:
         trials: the trials of the data, in its order.
         data: the data prepared from them.
+        first: number of trials in the first group of a comparison. Trials of two groups are not
+            repeats of each other, as the robot may have changed between them.
     """
     groups: list[list[int]] = []
     scale = np.maximum(
@@ -349,6 +351,8 @@ def repeated(trials: Sequence[Trial], data: Data) -> list[list[int]]:
     )
     for i, trial in enumerate(trials):
         for group in groups:
+            if (group[0] < first) != (i < first):
+                continue
             one = trials[group[0]]
             if trial.candidate and trial.candidate == one.candidate:
                 group.append(i)

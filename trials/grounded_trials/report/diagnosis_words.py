@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
-from grounded.diagnosis.cause_words import with_share
+from grounded.diagnosis.cause_words import furthest_apart, with_share
+from grounded.diagnosis.comparison import value_of
 from grounded.diagnosis.error_report import Gap
-from grounded.diagnosis.report import Correction, Diagnosis, Estimate, TrialValue
+from grounded.diagnosis.report import Changed, Correction, Diagnosis, Estimate
 from grounded.diagnosis.stopped import ENDED
 from grounded.result import listed
 from grounded_trials.wording import changed, count, figure, percent, ranges, with_unit
@@ -72,18 +72,18 @@ def in_vain(diagnosis: Diagnosis) -> list[str]:
 def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Return what changed between two groups of trials, or where trials disagree."""
     if diagnosis.changed is not None:
+        adopted = diagnosis.made.effects if diagnosis.made is not None else ()
         rows = [
             (
                 "changed",
-                f"{one.effect}: {one.quantity} = {_with_spread(one.first)} in the first trials, "
+                f"{value_of(one, adopted)} = {_with_spread(one.first)} in the first trials, "
                 f"{_with_spread(one.second)} in the second ({figure(one.evidence, 3)} nats)",
             )
             for one in diagnosis.changed
         ]
         rows = rows or [("changed", "nothing that these trials could show")]
         same = [
-            f"{one.effect}: {one.quantity}, by {figure(one.second.value - one.first.value, 2)} "
-            f"+- {figure(math.hypot(one.first.std, one.second.std), 2)}"
+            f"{value_of(one, adopted)}, by {_with_spread(_difference(one))}"
             for one in diagnosis.unchanged
         ]
         return [*rows, ("unchanged", f"within +-: {'; '.join(same)}")] if same else rows
@@ -92,7 +92,7 @@ def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         if not one.agrees:
             values = [v for v in diagnosis.per_trial if v.effect == one.effect]
             values = [v for v in values if v.quantity == one.quantity]
-            low, high = _furthest_apart(values)
+            low, high = furthest_apart(values)
             ends = (Estimate(v.value, v.std, unit=one.estimate.unit) for v in (low, high))
             lowest, highest = map(_with_spread, ends)
             text = (
@@ -103,18 +103,9 @@ def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     return found
 
 
-def _furthest_apart(values: Sequence[TrialValue]) -> tuple[TrialValue, TrialValue]:
-    """Return the two values that differ by most standard deviations, the smaller one first.
-
-    The extremes are often values that a trial hardly determines, and prove nothing.
-    """
-
-    def apart(pair: tuple[TrialValue, TrialValue]) -> float:
-        std = math.hypot(pair[0].std, pair[1].std)
-        return abs(pair[1].value - pair[0].value) / std if std > 0 else 0.0
-
-    low, high = max(itertools.combinations(values, 2), key=apart)
-    return (low, high) if low.value <= high.value else (high, low)
+def _difference(one: Changed) -> Estimate:
+    by, std = one.second.value - one.first.value, math.hypot(one.first.std, one.second.std)
+    return Estimate(by, std, unit=one.first.unit)
 
 
 def _with_spread(estimate: Estimate) -> str:
@@ -192,10 +183,15 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
 
 
 def verdict_lines(diagnosis: Diagnosis) -> tuple[list[str], list[str]]:
-    """Return the causes with their shares if there are several, then the other sentences."""
+    """Return the causes with their shares if there are several, then the other sentences.
+
+    What changed between two groups of trials comes before the causes.
+    """
     causes, told = diagnosis.verdict.causes, list(diagnosis.verdict.lines)
     if len(causes) < 2:
         return [], told
     each = zip(causes, diagnosis.credit, strict=True)
     clauses = diagnosis.verdict.clauses or tuple(with_share(c, one.share) for c, one in each)
-    return [f"{clause[:1].upper()}{clause[1:]}" for clause in clauses], told[1:]
+    first = [text for text in [diagnosis.verdict.comparison] if text]
+    first += [f"{clause[:1].upper()}{clause[1:]}" for clause in clauses]
+    return first, told[1 + bool(diagnosis.verdict.comparison) :]

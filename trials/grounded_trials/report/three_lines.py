@@ -28,7 +28,12 @@ def three_lines(diagnosis: Diagnosis, task: Task) -> list[str]:
     if not diagnosis.verdict.causes:
         return list(diagnosis.verdict.lines)
     better = [gained(diagnosis, task), worsened(diagnosis.prediction_error)]
-    lines = [_wrong(diagnosis), " ".join(filter(None, better)), still_open(diagnosis)]
+    lines = [
+        diagnosis.verdict.comparison,
+        _wrong(diagnosis),
+        " ".join(filter(None, better)),
+        still_open(diagnosis),
+    ]
     return [line for line in lines if line]
 
 

@@ -65,7 +65,14 @@ def diagnose_in(
     from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
     from grounded.effects import Library
     from grounded_trials.workspace.adopting import diagnosed_again
-    from grounded_trials.workspace.next_step import EXPORT, REPORT, after_diagnosis, nothing_to_do
+    from grounded_trials.workspace.next_step import (
+        EXPORT,
+        PROPOSE,
+        REPORT,
+        TARGET,
+        after_diagnosis,
+        nothing_to_do,
+    )
     from grounded_trials.workspace.proposing import candidate_named, to_run
 
     effects = [dict(effect) for effect in workspace.config.model.effects]
@@ -114,6 +121,8 @@ def diagnose_in(
     if words:
         run = f" ({identity}: `{rendered(to_run(workspace, identity, identity))}`)"
         run *= bool(identity)
+        if found.contested and not words.startswith(found.next_trial.rstrip(".")):
+            words = f"{found.next_trial} {words[:1].upper()}{words[1:]}"  # which other trial
         found = replace(found, next_trial=f"{words}{run}", probe=identity)
     undo = _in_vain(workspace, found)
     if undo:
@@ -132,6 +141,9 @@ def diagnose_in(
     if then == EXPORT and found.kind != "none":
         words = nothing_to_do(found, candidate_named(workspace, "best"))
         found = replace(found, next_trial=words)
+    elif found.contested and then in (TARGET, PROPOSE):
+        which = "The next candidate will do: it is planned with the model as it is."
+        found = replace(found, next_trial=f"{found.next_trial} {which}")
     return replace(found, then=then)
 
 
@@ -270,6 +282,8 @@ def _probe(
     none = f"{found.next_trial.rstrip('.')}. No probe is written"
     if found.no_cause:
         return "", f"{none}: these trials can't identify any cause." * write
+    if found.changed and not write:
+        return "", ""  # of one of the two robots, which is to be diagnosed alone
     from grounded.diagnosis.excitation import NOTHING, probe
     from grounded.diagnosis.verdict import sentence
     from grounded.search.safety import objections, spread

@@ -38,6 +38,7 @@ class Fitted(Result):
     applied: bool
     preflight: tuple[Finding, ...]  # findings about the instruments
     then: NextCommand  # the command to type next
+    not_fitted: tuple[str, ...] = ()  # adopted delays, unless the latency is fitted
 
     def summary(self) -> str:
         """Return the fitted values."""
@@ -47,6 +48,7 @@ class Fitted(Result):
         """Return the document of `fit --json`: values, intervals, held-out prediction errors."""
         return self.fit.to_json() | {
             "applied": self.applied,
+            "not_fitted": list(self.not_fitted),
             "preflight": [one.to_json() for one in self.preflight],
         }
 
@@ -69,6 +71,9 @@ def fit_in(
     from grounded_trials.workspace.next_step import after_fit, to_plan
 
     found, seen = fit_trials(workspace, names, latency=latency, engine=engine, progress=progress)
+    delays = [str(e["name"]) for e in workspace.config.model.effects]
+    delays = [name for name in delays if name.startswith("delay:")]
+    kept = () if names or latency else tuple(delays)
     if not (names or latency):
         _keep(workspace, found)
     asked = (*(("--params", ",".join(names)) if names else ()), *["--latency"] * latency)
@@ -77,10 +82,10 @@ def fit_in(
         raise GroundedError(why, then=after_fit(workspace))
     if not apply:
         if not found.helps:
-            return Fitted(found, False, seen, after_fit(workspace))
-        return Fitted(found, False, seen, NextCommand("fit", (*asked, "--apply")))
+            return Fitted(found, False, seen, after_fit(workspace), kept)
+        return Fitted(found, False, seen, NextCommand("fit", (*asked, "--apply")), kept)
     apply_fit(workspace, found)
-    return Fitted(found, True, seen, to_plan(workspace))
+    return Fitted(found, True, seen, to_plan(workspace), kept)
 
 
 def _worse(found: Fit) -> str:

@@ -186,10 +186,13 @@ def nothing_to_do(found: Diagnosis, best: str) -> str:
         best: the candidate that the search ended with.
     """
     left = ", ".join(one.sentence() for one in found.leftover[:LEFT])
+    if found.leftover and found.leftover[0].sentence() in found.sentence:
+        left = ""  # the verdict says it
     return (
         f"None is needed for the manoeuvre: the search has ended, with {best}. "
         + f"No known effect explains the rest: {left}. " * bool(left)
-        + f"To learn more: {found.next_trial}"
+        + "To learn more: " * (not found.contested)
+        + found.next_trial
     )
 
 
@@ -228,6 +231,10 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     from grounded_trials.workspace.adopting import declined
 
     new = diagnosis.open(workspace.config.model.effects, workspace.config.model.params)
+    if diagnosis.changed:  # values of two robots together fit neither
+        made = diagnosis.made or Made()
+        newer = max(made.named, made.compared, key=lambda group: max(group, default=""))
+        return NextCommand("diagnose", ("--trials", ",".join(newer)))
     undone = {*declined(workspace)}  # effects the user has undone are not suggested again
     late = tuple(name for name in late_open(workspace, diagnosis) if name not in undone)
     claimed = diagnosis.kind in ("effect", "several") and not diagnosis.contested
