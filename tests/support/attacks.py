@@ -54,6 +54,10 @@ class Tally:
     tries: int = 0
     broken: dict[str, list[str]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
     note: Counter[str] = field(default_factory=Counter)
+    # [kB] of this process: a forked one begins with the memory of its parent
+    at_start: int = field(
+        default_factory=lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    )
 
     def add(self, kind: str, what: str) -> None:
         self.broken[kind].append(what[-600:])
@@ -90,7 +94,7 @@ def trying(tally: Tally, what: str) -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
-    if resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > 10**6:
+    if resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > tally.at_start + 10**6:
         tally.add("memory", what)
 
 
