@@ -354,7 +354,8 @@ def swing_up(
     for one in chosen:
         hangs = start.get(one.angle, one.hangs)
         columns[one.angle] = np.where(first, hangs, to.get(one.angle, one.stands))
-    return columns | (step_target(to, model, dt, seconds, start) if to else {}) | columns
+    others = {name: value for name, value in to.items() if name not in columns}
+    return columns | (step_target(others, model, dt, seconds, start) if others else {})
 
 
 def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[str, Array]:
