@@ -18,18 +18,19 @@ from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.frozen import Array
 from grounded.instruments.kinematics import integrals
 from grounded.model import Model
+from grounded.task import MAX_HORIZON
 from grounded_trials.logs.inspect_log import inspect_log
 from grounded_trials.logs.inspect_pairs import velocities
 from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import position_names
-from grounded_trials.workspace.task_file import ROW_LIMIT, read_target
+from grounded_trials.workspace.task_file import read_target
 from grounded_trials.workspace.unknown_id import refuse_ids
 
 PATHS = ("line", "circle", "figure-8")
 SHAPES = (*PATHS, "step", "swing-up")
-FEWEST, MOST = 5, ROW_LIMIT - 2  # control steps of a target
+FEWEST = 5  # control steps of a target; at most MAX_HORIZON
 FINE = 2000  # number of points of a path
 AROUND = 720  # angles at which a hinge is tried
 BRIEF, SLIGHT = 1e-4, 1e-3  # [s] of the step there; [rad/s^2] smallest pull of its weight
@@ -102,14 +103,14 @@ def _in_steps(seconds: float, dt: float, steps: float) -> int:
     """Return a target's number of control steps as an integer.
 
     Raises:
-        GroundedError: if there are fewer than FEWEST or more than MOST.
+        GroundedError: if there are fewer than FEWEST or more than MAX_HORIZON.
     """
-    if FEWEST <= steps <= MOST:
+    if FEWEST <= steps <= MAX_HORIZON:
         return int(steps)
     raise GroundedError(
         f"a target of {seconds:.4g} s has {steps:.4g} control steps of [task] dt = {dt:g} s, "
-        f"expected {FEWEST} to {MOST}: check dt in grounded.toml, the time in seconds from one "
-        "command to the next, and how long the manoeuvre lasts"
+        f"expected {FEWEST} to {MAX_HORIZON}: check dt in grounded.toml, the time in seconds from "
+        "one command to the next, and how long the manoeuvre lasts"
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.task import Task
+from grounded.task import MAX_HORIZON, Task
 from grounded.utility import Reward
 from grounded_trials.plain_file import open_file
 from grounded_trials.workspace.config import Config
@@ -118,7 +118,7 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
 
 DRAW = ": draw the manoeuvre, or write one row per control step, with columns t and states"
 SHAPE = NextCommand("target", ("SHAPE",))
-ROW_LIMIT = 200_002
+ROW_LIMIT = MAX_HORIZON + 2  # of target.csv; a longer one is not read to its end
 LEAST = 0.1  # smallest range of a target column used for its weight
 # a column counts as constant if its range is below STILL of its size (of LEAST if that is less), or
 # below HARDLY in its unit
