@@ -16,6 +16,7 @@ what the actuator delivers over the step, so fractions of a step matter:
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -32,11 +33,13 @@ from grounded.effects.family import (
     beyond,
     speed_limit,
 )
+from grounded.frozen import Array
 from grounded.model import Model
 
 LONGEST_DELAY = 0.5  # longest delay of a scan [s]; four steps if these are longer
 NEARBY = (0.05, 0.15, 0.4, 0.8, 1.3, 2.0)  # scanned changes of an adopted delay, in steps
 LONGEST_LAG = 2.0  # longest time constant of a scan [s]; 40 steps if these are longer
+NARROWEST = 0.95  # L of `input_curve` is at most this fraction of U
 ONE_SIDED = 0.05  # fraction of an input's peak below which the weaker side counts as not used
 
 
@@ -71,13 +74,24 @@ def _one_or_alike(model: Model) -> list[str]:
 
 
 def _curve(site: Site) -> tuple[Quantity, ...]:
-    """Return the quantities of `input_curve`; `a` is held if the log has only one side."""
+    """Return the quantities of `input_curve`; `a` is held if the log has only one side.
+
+    L is the smallest command of a log that keeps clear of zero, such as a hover's thrust. So the
+    model's own gain stays what it is amid the commands that were sent.
+    """
     scales, name = site.scales, site.target
     peak = scales.peak(name)
-    weaker = min(scales.high.get(name, 1.0), -scales.low.get(name, -1.0))
+    high, low = scales.high.get(name, 1.0), scales.low.get(name, -1.0)
     whole = Quantity("U", site.unit(name), fixed=True, start=peak)
-    sides = Quantity("a", low=-0.9, high=0.9, fixed=weaker < ONE_SIDED * peak)
-    return (sides, Quantity("b", low=-1.8, high=1.8), whole)
+    least = min(max(low, -high, 0.0), NARROWEST * peak)
+    end = Quantity("L", site.unit(name), fixed=True, start=least)
+    sides = Quantity("a", low=-0.9, high=0.9, fixed=min(high, -low) < ONE_SIDED * peak)
+    return (sides, Quantity("b", low=-1.8, high=1.8), whole, end)
+
+
+def _curved(u: Array, t: Array, c: Mapping[str, Any]) -> Array:
+    size, mid = np.abs(u / c["U"]), (1 + c["L"] / c["U"]) / 2
+    return (1 + c["b"] * (size - mid) / (1 - c["L"] / c["U"])) * u + c["a"] * c["U"] * size
 
 
 def _end_to_end(name: str, value: float) -> float:
@@ -142,17 +156,15 @@ saturation = InputFamily(
 
 input_curve = InputFamily(
     name="input_curve",
-    equation="u_eff = (1 + a sign(u) + b (|u| / U - 1/2)) u",
+    equation="u_eff = (1 + a sign(u) + b (|u| - (L + U) / 2) / (U - L)) u",
     sentence="the gain of {target} is [{a%higher|lower} for positive commands than for negative "
-    "ones & {b%higher|lower} at {U}, its largest command in the log, than near zero]",
+    "ones & {b%higher|lower} at {U}, its largest command in the log, than {least}]",
     ratio=_end_to_end,
     targets=places.inputs,
     quantities=_curve,
     lookalikes=("input_gain", "input_bias", "saturation", "dead_zone"),
     vague=0.5,
-    effect=lambda u, t, c: (
-        (1 + c["b"] * (np.abs(u / c["U"]) - 0.5)) * u + c["a"] * c["U"] * np.abs(u / c["U"])
-    ),
+    effect=_curved,
 )
 
 

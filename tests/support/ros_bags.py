@@ -18,6 +18,13 @@ STORE.register(
         "ackermann_msgs/msg/AckermannDriveStamped",
     )
 )
+STORE.register(
+    get_types_from_msg(
+        "std_msgs/Header header\nuint8 type_mask\ngeometry_msgs/Quaternion orientation\n"
+        "geometry_msgs/Vector3 body_rate\nfloat32 thrust",
+        "mavros_msgs/msg/AttitudeTarget",
+    )
+)
 T = STORE.types
 DT, START = 0.01, 1_760_000_000_000_000_000
 
@@ -121,6 +128,62 @@ def rover_bag(folder):
         v, w = v + DT * (ahead - v) / 0.2, w + DT * (turn - w) / 0.15
         psi += DT * w
         x, y = x + DT * v * np.cos(psi), y + DT * v * np.sin(psi)
+    return bag(folder, topics, messages)
+
+
+def turned(roll, pitch, yaw):
+    """Return the quaternion (x, y, z, w) of Rz(yaw) Ry(pitch) Rx(roll), and that matrix."""
+    angles = np.array([roll, pitch, yaw])
+    (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)
+    rx = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    ry = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    rz = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    (cr, cp, cy), (sr, sp, sy) = np.cos(angles / 2), np.sin(angles / 2)
+    q = (
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )
+    return T["geometry_msgs/msg/Quaternion"](*map(float, q)), rz @ ry @ rx
+
+
+def drone_bag(folder, yaw=1.4, turning=0.0, followed=True):
+    """Write a bag of a drone as mavros does: the velocity of its odometry is in its own axes.
+
+    Not `followed`: its attitude ignores the commands.
+    """
+    topics = {
+        "/mavros/local_position/odom": "nav_msgs/msg/Odometry",
+        "/mavros/setpoint_raw/attitude": "mavros_msgs/msg/AttitudeTarget",
+    }
+    messages, rng = [], np.random.default_rng(0)
+    at, v, angles = np.array([0.0, 0.0, 2.0]), np.zeros(3), np.array([0.0, 0.0, yaw])
+    for k in range(700):
+        t = START + k * 2 * 10**7
+        if k % 25 == 0:
+            tilt, thrust = rng.uniform(-0.3, 0.3, 2), 0.5 + rng.uniform(-0.03, 0.03)
+        sent = np.array([*tilt, yaw + turning * np.sin(0.01 * k)])
+        q, rotation = turned(*angles)
+        own = rotation.T @ v
+        message = odometry(t, 0.0, 0.0, 0.0, 0.0, 0.0)
+        message.pose.pose.position = vector("Point", *map(float, at))
+        message.pose.pose.orientation = q
+        message.twist.twist.linear = vector("Vector3", *map(float, own))
+        messages.append(("/mavros/local_position/odom", t, message))
+        command = T["mavros_msgs/msg/AttitudeTarget"](
+            header=header(t),
+            type_mask=7,
+            orientation=turned(*sent)[0],
+            body_rate=vector("Vector3", 0.0, 0.0, 0.0),
+            thrust=np.float32(thrust),
+        )
+        messages.append(("/mavros/setpoint_raw/attitude", t, command))
+        wish = sent if followed else rng.uniform(-0.3, 0.3, 3)
+        angles = angles + 0.02 * (wish - angles) / 0.15
+        push = rotation @ np.array([0.0, 0.0, 9.81 * thrust / 0.5]) - [0.0, 0.0, 9.81]
+        v = v + 0.02 * (push - 0.2 * v)
+        at = at + 0.02 * v
     return bag(folder, topics, messages)
 
 

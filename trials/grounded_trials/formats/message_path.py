@@ -6,9 +6,9 @@
                                               a slice (both ends included), a filter on its items
     "/odd topic.name".data                    names with dots or blanks in quotes
 
-Functions: @rpy.roll|pitch|yaw of a quaternion, @norm of a vector or list, and of a number: @abs
-@negative @sign @sqrt @sin @cos @tan @asin @acos @atan @exp @log @ceil @floor @round @deg2rad
-@rad2deg @add(c) @sub(c) @mul(c) @div(c). Filters compare with == != < <= > >=; several may follow
+Functions: @rpy.roll|pitch|yaw of a quaternion, @world_velocity.x|y|z of an Odometry message, @norm
+of a vector or list, and of a number: @abs @negative @sign @sqrt @sin @cos @tan @asin @acos @atan
+@exp @log @ceil @floor @round @deg2rad @rad2deg @add(c) @sub(c) @mul(c) @div(c). Filters compare with == != < <= > >=; several may follow
 each other or be joined by &&. This module only parses; `path_walk` applies a path to messages.
 """
 
@@ -26,6 +26,8 @@ _ROUNDING = ("abs", "negative", "sign", "ceil", "floor", "round")
 UNARY = (*_TRIGONOMETRY, *_ROUNDING, "sqrt", "exp", "log", "deg2rad", "rad2deg")
 BINARY = ("add", "sub", "mul", "div")
 ANGLES = ("roll", "pitch", "yaw")
+AXES = ("x", "y", "z")
+WORLD = "world_velocity"  # an Odometry's velocity, turned from the robot's axes into its pose's
 LENGTH_LIMIT = 1000  # characters in a path
 
 _REFUSED = {
@@ -34,7 +36,9 @@ _REFUSED = {
     "timedelta": "times between messages are not a signal",
     "quat": "it gives four numbers; use a field of the orientation",
     "rpy": "name the angle: .@rpy.roll, .@rpy.pitch or .@rpy.yaw",
+    WORLD: "name the axis: .@world_velocity.x, .@world_velocity.y or .@world_velocity.z",
 }
+_PARTS = {"rpy": ANGLES, WORLD: AXES}  # functions that give several numbers, and their names
 
 
 @dataclass(frozen=True)
@@ -202,10 +206,11 @@ class _Parser:
         at = self.pos
         self.pos += 2
         name = self.match(_WORD, "a function's name")
-        if name == "rpy" and self.take("."):
-            part = self.match(_WORD, "roll, pitch or yaw")
-            if part not in ANGLES:
-                self.fail(f"'@rpy' has no '{part}': {nearest(part, ANGLES)}")
+        if name in _PARTS and self.take("."):
+            parts = _PARTS[name]
+            part = self.match(_WORD, f"{', '.join(parts[:-1])} or {parts[-1]}")
+            if part not in parts:
+                self.fail(f"'@{name}' has no '{part}': {nearest(part, parts)}")
             return Function(part)
         if name in _REFUSED:
             self.pos = at
@@ -214,7 +219,7 @@ class _Parser:
             return Function(name, self.argument(name))
         if name != "norm" and name not in UNARY:
             self.pos = at
-            self.fail(f"no function '@{name}': {nearest(name, ['norm', 'rpy', *UNARY, *BINARY])}")
+            self.fail(f"no function '@{name}': {nearest(name, ['norm', *_PARTS, *UNARY, *BINARY])}")
         return Function(name)
 
     def argument(self, name: str) -> float:

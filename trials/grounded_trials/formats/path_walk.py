@@ -18,8 +18,10 @@ import numpy as np
 from grounded.errors import nearest
 from grounded_trials.formats.message_path import (
     ANGLES,
+    AXES,
     BINARY,
     UNARY,
+    WORLD,
     Field,
     Filter,
     Function,
@@ -48,6 +50,8 @@ SECONDS, NANOSECONDS = ("sec", "secs", "seconds"), ("nanosec", "nsec", "nsecs", 
 CALENDAR_S = 9_200_000_000  # 2^63 ns: the years 1678 to 2261
 STAMPS = (("header", "stamp"), ("stamp",), ("timestamp",), ("header", "timestamp"))
 QUATERNION = ("x", "y", "z", "w")
+TURNED = ("pose", "pose", "orientation")  # in nav_msgs/Odometry: how the robot's axes are turned,
+MOVING = ("twist", "twist", "linear")  # and its velocity along them
 
 
 @dataclass(frozen=True)
@@ -125,6 +129,12 @@ def _check_end(type: Type, path: MessagePath) -> None:
         fits = isinstance(type, Struct) and all(_is_number(type, part) for part in QUATERNION)
         if not fits:
             raise BadPath(f"@rpy needs a quaternion (x, y, z, w), found {type}")
+    elif name in AXES:
+        if not _is_odometry(type):
+            raise BadPath(
+                f"@{WORLD} needs a message with {'.'.join(TURNED)} and {'.'.join(MOVING)}, such as "
+                f"an Odometry, found {type}"
+            )
     elif name == "norm":
         fits = isinstance(type, Array) and isinstance(type.item, Number)
         if not fits and not (isinstance(type, Struct) and _numbers_of(type)):
@@ -135,6 +145,19 @@ def _check_end(type: Type, path: MessagePath) -> None:
         raise BadPath(f"it ends at a list, {type}; select an item, as in [0]")
     elif not isinstance(type, Number):
         raise BadPath(f"it ends at a {type}, not at a number")
+
+
+def _is_odometry(type: Type) -> bool:
+    """Check whether a struct has a pose and, in the robot's own axes, a velocity."""
+    for names, parts in ((TURNED, QUATERNION), (MOVING, AXES)):
+        inner: Type = type
+        for name in names:
+            if not isinstance(inner, Struct) or name not in inner.by_name:
+                return False
+            inner = inner.by_name[name].type
+        if not isinstance(inner, Struct) or not all(_is_number(inner, part) for part in parts):
+            return False
+    return True
 
 
 def _is_number(type: Struct, name: str) -> bool:
@@ -271,6 +294,8 @@ def _apply(node: Node, functions: Sequence[Function]) -> tuple[Ints, Floats]:
     first, rest = (functions[0].name, functions[1:]) if functions else ("", ())
     if first in ANGLES:
         rows, values = node.rows, _angle(first, [_part(node, name) for name in QUATERNION])
+    elif first in AXES:
+        rows, values = node.rows, _in_world(node, AXES.index(first))
     elif first == "norm":
         rows, values = node.rows, _norm(node)
     else:
@@ -282,11 +307,11 @@ def _apply(node: Node, functions: Sequence[Function]) -> tuple[Ints, Floats]:
     return rows, values
 
 
-def _part(node: Node, name: str) -> Floats:
+def _part(node: Node, *names: str) -> Floats:
     """Return a number of a struct for each row; NaN where it is absent."""
     values = np.full(len(node.rows), np.nan)
     with _numbered(node) as numbered:
-        inner = numbered.field(name)
+        inner = walk(numbered, tuple(Field(name) for name in names))
         values[inner.rows] = inner.numbers()
     return values
 
@@ -301,6 +326,21 @@ def _angle(name: str, quaternion: list[Floats]) -> Floats:
     if name == "roll":
         return np.arctan2(2 * (w * x + y * z), 1 - 2 * (x**2 + y**2))
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+
+
+def _in_world(node: Node, axis: int) -> Floats:
+    """Return one axis of R v, with R of the pose and v along the robot's axes [m/s]."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        q = [_part(node, *TURNED, name) for name in QUATERNION]
+        norm = np.sqrt(sum(part**2 for part in q))
+        x, y, z, w = (part / norm for part in q)
+    v = [_part(node, *MOVING, name) for name in AXES]
+    row = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )[axis]
+    return row[0] * v[0] + row[1] * v[1] + row[2] * v[2]
 
 
 def _norm(node: Node) -> Floats:
@@ -328,14 +368,17 @@ VISIT_LIMIT = 20_000  # parts of a type that are visited; a malicious one may be
 
 
 def number_paths(type: Type, sample: Any = None) -> list[str]:
-    """List the paths (without the topic) to the numbers of a type, and angles of quaternions.
+    """List the paths (without the topic) to the numbers of a type.
+
+    Angles of quaternions and the velocity of an Odometry in its pose's axes are listed, too.
 
     Args:
         type: of the messages.
         sample: one parsed message, if the type is dynamic (JSON).
     """
     inside = sample if isinstance(type, Dynamic) else type
-    return list(islice(_paths_in(inside, 0, iter(range(VISIT_LIMIT))), FIELD_LIMIT))
+    paths = list(islice(_paths_in(inside, 0, iter(range(VISIT_LIMIT))), FIELD_LIMIT))
+    return paths + [f".@{WORLD}.{axis}" for axis in AXES if _is_odometry(type)]
 
 
 def _paths_in(thing: Any, depth: int, patience: Iterator[int]) -> Iterator[str]:

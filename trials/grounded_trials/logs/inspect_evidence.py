@@ -22,11 +22,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import listed
 from grounded_trials.logs.following import follows
 from grounded_trials.logs.inspect_groups import by_groups
-from grounded_trials.logs.inspect_guess import SIMULATED_S, Guess
+from grounded_trials.logs.inspect_guess import SIMULATED_S, Guess, commands_of
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.inspect_pairs import (
     COMBINATIONS,
@@ -44,7 +45,9 @@ from grounded_trials.logs.joint_names import (
     joint_units,
     of_joint,
 )
-from grounded_trials.logs.stated_units import Stated, factor_between, unit_of
+from grounded_trials.logs.stated_units import Stated, factor_between, unit_of, without_role
+
+LATEST = 0.5  # s: a command is sought up to this long before the angle that follows it
 
 
 def weigh(
@@ -78,6 +81,7 @@ def weigh(
     measured = joint_units(joints)
     guesses = {name: _unit(guess, units[name], measured) for name, guess in guesses.items()}
     guesses |= _by_unit(guesses, model)
+    guesses |= _not_followed(guesses, model, log)
     guesses |= _speed_asked(guesses, model, log)
     turning = [guesses[name] for name in model.state_names if units[name] in ("rad", "deg")]
     stated = Stated.by(log.files)
@@ -174,6 +178,30 @@ def _by_unit(guesses: Mapping[str, Guess], model: Model) -> dict[str, Guess]:
             else replace(guesses[name], others=left)
         )
     return found
+
+
+def _not_followed(guesses: Mapping[str, Guess], model: Model, log: LogReport) -> dict[str, Guess]:
+    """Ask for the command of an angle if the angle does not follow it: a Pose may hold torques."""
+    found = {}
+    taken = {guesses[name].path for name in model.state_names}
+    for name in model.input_names:
+        guess, angle = guesses[name], guesses.get(without_role(name))
+        if angle is None or not angle.path or not guess.is_angle or angle.name == name:
+            continue
+        both = Signals(log, (guess, angle), (), Stated.by(log.files)).grid((angle.path, guess.path))
+        if both is not None and (value := _lagged(both[0], *both[1])) < FOLLOWS:
+            asked = commands_of(log, replace(guess, path="", sure=False, field=None), taken)
+            why = f"{angle.name} does not follow {guess.path} (correlation {value:.2f})"
+            found[name] = replace(asked, reasons=(why, *asked.reasons))
+    return found
+
+
+def _lagged(step: float, angle: Array, command: Array) -> float:
+    """Return the largest correlation of an angle with its command up to LATEST earlier."""
+    most = min(round(LATEST / step), len(angle) - 20)
+    pairs = [(angle[k:], command[: len(command) - k]) for k in range(max(most, 0) + 1)]
+    moved = [(a, c) for a, c in pairs if a.std() > 1e-9 and c.std() > 1e-9]
+    return max((float(np.corrcoef(a, c)[0, 1]) for a, c in moved), default=0.0)
 
 
 def _speed_asked(guesses: Mapping[str, Guess], model: Model, log: LogReport) -> dict[str, Guess]:

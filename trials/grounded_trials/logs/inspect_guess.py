@@ -15,8 +15,15 @@ from types import MappingProxyType
 
 import numpy as np
 
+from grounded_trials.formats.message_path import AXES, WORLD
 from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
-from grounded_trials.logs.stated_units import bare_command, may_be, unit_of, without_unit
+from grounded_trials.logs.stated_units import (
+    bare_command,
+    may_be,
+    unit_of,
+    without_role,
+    without_unit,
+)
 
 FEW = 8  # alternatives listed in [log]
 SURE = 1.5  # lead in score over the next candidate, to be sure
@@ -39,6 +46,7 @@ _MEANINGS: dict[str, tuple[str, ...]] = {
     "pitch_rate": ("angular.y", "angular_velocity.y", "pitch_rate", "pitch_velocity"),
     "phi": ("@rpy.roll", "roll", "phi"),
     "roll": ("@rpy.roll", "roll", "phi"),
+    **{f"v{axis}": (f"@{WORLD}.{axis}", f"linear.{axis}", f"v{axis}") for axis in AXES},
     "v": ("linear.x", "speed", "velocity", "vel", "v"),
     "speed": ("speed", "linear.x", "velocity", "vel", "v"),
     "u": ("linear.x", "u", "surge"),
@@ -125,13 +133,22 @@ def guess_mapping(
     rest = []
     for name in inputs:
         meanings = (*_MEANINGS.get(name, (name,)), *NAMES_BY_UNIT.get(units.get(name, ""), ()))
-        found_for = _candidates(log, name, meanings, is_input=True)
+        found_for = _candidates(log, name, meanings, is_input=True) or _commanded(log, name)
         candidates = [c for c in found_for if c.field.path not in taken]
         guess = _choose(log, name, candidates, {})
-        rest.append(guess if guess.path or guess.others else _commands_of(log, guess, taken))
+        rest.append(guess if guess.path or guess.others else commands_of(log, guess, taken))
     if len(rest) == 1:
         rest = [_only_command(log, rest[0], units.get(rest[0].name, ""))]
     return found, tuple(rest)
+
+
+def _commanded(log: LogReport, name: str) -> list[_Candidate]:
+    """Return the candidates for the command of a state, such as roll_command: its own names."""
+    state = without_role(name)
+    if state == name:
+        return []
+    found = _candidates(log, state, _MEANINGS.get(state, (state,)), is_input=True)
+    return [c for c in found if _COMMAND_TOPIC.search(c.topic.topic.lower())]
 
 
 def _of_unit(log: LogReport, candidates: list[_Candidate], unit: str) -> list[_Candidate]:
@@ -175,7 +192,7 @@ def _only_command(log: LogReport, guess: Guess, unit: str) -> Guess:
     return replace(guess, path=path, clock=clock, others=(), field=field, reasons=why)
 
 
-def _commands_of(log: LogReport, guess: Guess, taken: set[str]) -> Guess:
+def commands_of(log: LogReport, guess: Guess, taken: set[str]) -> Guess:
     """Give an input without a matching name the changing numbers of command topics."""
     commands = [t for t in log.topics if _COMMAND_TOPIC.search(t.topic.lower())]
     moving = [f.path for t in commands for f in t.fields if f.low != f.high]
@@ -233,6 +250,8 @@ def _fit(called: Sequence[str], inside: str, topic: str) -> float:
     """Score how well a name fits: by the end of the path, or by the topic if that is generic."""
     best = 0.0
     for rank, meaning in enumerate(called):
+        if WORLD in inside and WORLD not in meaning:
+            continue  # its last letter is an axis, not a name
         worth = 4.0 - 0.3 * max(rank - 1, 0)
         if inside == meaning or inside.endswith("." + meaning):
             best = max(best, worth + (0.5 if "." in meaning else 0.0))

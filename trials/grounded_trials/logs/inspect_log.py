@@ -18,7 +18,7 @@ from grounded.errors import GroundedError
 from grounded_trials.formats.budget import OverBudget, keep
 from grounded_trials.formats.mcap_records import Channel, Header, Messages, Metadata, Schema
 from grounded_trials.formats.mcap_walk import DamagedFile
-from grounded_trials.formats.message_path import is_topic, parse_path
+from grounded_trials.formats.message_path import WORLD, is_topic, parse_path
 from grounded_trials.formats.messages import (
     BadMessage,
     BadPath,
@@ -322,9 +322,17 @@ class _Topic:
             last_s=float(t.max() - start) * 1e-9 if len(t) else None,
             stamped=stamped or bool(skews is not None and len(skews)),
             skew_s=float(np.median(skews)) * 1e-9 if skews is not None and len(skews) else None,
-            fields=tuple(_field(path, r) for path, r in self.ranges.items() if r.count),
+            fields=tuple(_field(p, r) for p, r in _telling(self.ranges).items() if r.count),
             problem=self.problem,
         )
+
+
+def _telling(ranges: Mapping[str, _Range]) -> dict[str, _Range]:
+    """Leave out velocities in the pose's axes if the robot only moves forwards: v says it all."""
+    ways = [r for p, r in ranges.items() if p.endswith(("linear.y", "linear.z"))]
+    if all(r.low == r.high for r in ways):
+        return {path: r for path, r in ranges.items() if f"@{WORLD}" not in path}
+    return dict(ranges)
 
 
 def _field(path: str, found: _Range) -> FieldReport:

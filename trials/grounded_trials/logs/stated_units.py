@@ -61,7 +61,7 @@ UNITS = (  # units by the end of a path
     (r"@rpy\.\w+$|steering_angle$", "rad"),
     (r"angular_velocity\.[xyz]$|angular\.[xyz]$|steering_angle_velocity$", "rad/s"),
     (r"linear_acceleration\.[xyz]$|accel\.linear\.[xyz]$", "m/s^2"),
-    (r"linear\.[xyz]$|drive\.speed$", "m/s"),
+    (r"linear\.[xyz]$|@world_velocity\.[xyz]$|drive\.speed$", "m/s"),
 )
 ANGLE = re.compile(r"(^|[._/])(angle|angular_position|swing|tilt|pitch|roll|yaw|heading)$")
 LENGTHS = ("m", "m/s")

@@ -15,7 +15,7 @@ from grounded_trials.logs.inspect_guess import Guess
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.stated_units import Stated, factor_between, may_be, unit_of
 
-PARTS = re.compile("covariance|layout")  # parts of messages that are not signals
+PARTS = re.compile(r"covariance|layout|(orientation|rotation)\.[xyzw]$")  # no signals by themselves
 MOST = 20  # largest number of candidates
 
 
@@ -55,7 +55,8 @@ def from_the_rest(
                 return unit_of(path, joints) in ("", unit) and may_be(path, unit, joints)
 
             unsaid = [path for path in left if not stated.unit(path) and named(path)]
-            rest = tuple(p for p in fits[name] or unsaid if p not in alone.values())
+            known = [path for path in unsaid if unit_of(path, joints)]
+            rest = tuple(p for p in fits[name] or known or unsaid if p not in alone.values())
             found.append(replace(guess, others=rest[:MOST]))
         else:
             found.append(guess)

@@ -21,11 +21,11 @@ from grounded_trials.starting.skeletons import (
     CAR,
     CRANE,
     DIFFERENTIAL,
-    DRONE,
     PENDULUM,
     ROVER,
     Skeleton,
     arm,
+    drone,
 )
 
 Joints = Mapping[str, tuple[str, ...]]  # joint names by topic, see `joint_names`
@@ -262,6 +262,19 @@ def _driven_by(command: str, volts: bool) -> Skeleton:
     return replace(BALANCE, inputs={command: "1"}, before=before, params=params)
 
 
+def _drone(log: LogReport) -> Skeleton:
+    """Return the drone's skeleton: its yaw is a constant if the log's hardly changes."""
+    yaws = [(t, f) for t in log.topics for f in t.fields if f.path.endswith("@rpy.yaw")]
+    sent = [t for t, f in yaws if COMMANDED.search(t.topic.lower()) and f.low != f.high]
+    rates = [
+        t for t in log.topics if COMMANDED.search(t.topic.lower()) and _says(t, ("angular.z",))
+    ]
+    own = next((f for t, f in yaws if not COMMANDED.search(t.topic.lower())), None)
+    command = "yaw_command" if sent else "yaw_rate" if rates else ""
+    low, high = (own.low or 0.0, own.high or 0.0) if own else (0.0, 0.0)
+    return drone(low, high, command)
+
+
 def _in_the_plane(topic: TopicReport) -> bool:
     """Return whether a topic is odometry of a robot that moves neither up nor sideways."""
     still = ("position.z", "linear.y", "linear.z")
@@ -314,5 +327,7 @@ def skeleton(
         return _crane(log, units or {})
     if kind == "balance" and (command := _balancing(log)):
         return _driven_by(command, _in_volts(command, moving(log)[command].path, units or {}))
-    fixed = {one.kind: one for one in (CAR, ROVER, DIFFERENTIAL, BALANCE, DRONE, PENDULUM)}
+    if kind == "drone":
+        return _drone(log)
+    fixed = {one.kind: one for one in (CAR, ROVER, DIFFERENTIAL, BALANCE, PENDULUM)}
     return fixed[kind] if kind in fixed else generic(log, inputs, units)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 
 @dataclass(frozen=True)
@@ -145,15 +145,49 @@ DRONE = Skeleton(
         '"x": s.vx',
         '"y": s.vy',
         '"z": s.vz',
-        '"vx": p.g * a.thrust / p.hover * np.sin(s.pitch) - p.drag * s.vx',
-        '"vy": -p.g * a.thrust / p.hover * np.sin(s.roll) - p.drag * s.vy',
-        '"vz": p.g * (a.thrust / p.hover * np.cos(s.roll) * np.cos(s.pitch) - 1) - p.drag * s.vz',
+        '"vx": lift * (ahead * np.cos(yaw) - left * np.sin(yaw)) - p.drag * s.vx',
+        '"vy": lift * (ahead * np.sin(yaw) + left * np.cos(yaw)) - p.drag * s.vy',
+        '"vz": lift * np.cos(s.roll) * np.cos(s.pitch) - p.g - p.drag * s.vz',
         '"roll": (a.roll_command - s.roll) / p.tau',
         '"pitch": (a.pitch_command - s.pitch) / p.tau',
     ),
     (),
     {"position": ("x", "y", "z")},
+    before=(
+        "lift = p.g * a.thrust / p.hover  # acceleration along the drone's own axis",
+        "ahead, left = np.sin(s.pitch) * np.cos(s.roll), -np.sin(s.roll)  # its part in the plane",
+        "yaw = p.yaw",
+    ),
 )
+STEADY = 0.3  # rad: if the yaw changes less than this in a log, it is a constant of the skeleton
+
+
+def drone(low: float, high: float, command: str) -> Skeleton:
+    """Return the drone's skeleton for the yaw of a log.
+
+    Args:
+        low, high: range of the yaw in the log [rad].
+        command: what the log has as its command: `yaw_command` [rad], `yaw_rate` [rad/s] or "".
+    """
+    if high - low < STEADY:
+        given = f'{(low + high) / 2:.3g}, "rad"'
+        return replace(DRONE, params={**DRONE.params, "yaw": given})
+    params, line = DRONE.params, '"yaw": a.yaw_rate'
+    if command == "yaw_command":
+        params = {**params, "tau_yaw": '0.5, "s", 0.02, 5.0'}
+        line = '"yaw": np.arctan2(np.sin(turn), np.cos(turn)) / p.tau_yaw'
+    turn = ("turn = a.yaw_command - s.yaw",) * (command == "yaw_command")
+    return replace(
+        DRONE,
+        states={**DRONE.states, "yaw": "rad"},
+        inputs={**DRONE.inputs, command or "yaw_rate": "rad" if turn else "rad/s"},
+        params=params,
+        lines=(*DRONE.lines, line),
+        angles=("yaw",),
+        before=(*DRONE.before[:-1], "yaw = s.yaw", *turn),
+    )
+
+
 PENDULUM = Skeleton(
     "pendulum",
     "One joint under gravity, theta = 0 hanging down",
