@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-import ros_bags
 
+import ros_bags
 from grounded.errors import GroundedError
 from grounded_trials.logs.signals import SignalSpec, read_signals
 from grounded_trials.starting.begin import begin
