@@ -91,7 +91,8 @@ def _curve(site: Site) -> tuple[Quantity, ...]:
 
 def _curved(u: Array, t: Array, c: Mapping[str, Any]) -> Array:
     size, mid = np.abs(u / c["U"]), (1 + c["L"] / c["U"]) / 2
-    return (1 + c["b"] * (size - mid) / (1 - c["L"] / c["U"])) * u + c["a"] * c["U"] * size
+    gain: Array = 1 + c["b"] * (size - mid) / (1 - c["L"] / c["U"])
+    return gain * u + c["a"] * c["U"] * size
 
 
 def _end_to_end(name: str, value: float) -> float:

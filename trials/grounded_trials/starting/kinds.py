@@ -265,11 +265,10 @@ def _driven_by(command: str, volts: bool) -> Skeleton:
 def _drone(log: LogReport) -> Skeleton:
     """Return the drone's skeleton: its yaw is a constant if the log's hardly changes."""
     yaws = [(t, f) for t in log.topics for f in t.fields if f.path.endswith("@rpy.yaw")]
-    sent = [t for t, f in yaws if COMMANDED.search(t.topic.lower()) and f.low != f.high]
-    rates = [
-        t for t in log.topics if COMMANDED.search(t.topic.lower()) and _says(t, ("angular.z",))
-    ]
-    own = next((f for t, f in yaws if not COMMANDED.search(t.topic.lower())), None)
+    commands = [t for t in log.topics if COMMANDED.search(t.topic.lower())]
+    own = next((f for t, f in yaws if t not in commands), None)
+    sent = any(t in commands and f.low != f.high for t, f in yaws)
+    rates = any(_says(t, ("angular.z",)) for t in commands)
     command = "yaw_command" if sent else "yaw_rate" if rates else ""
     low, high = (own.low or 0.0, own.high or 0.0) if own else (0.0, 0.0)
     return drone(low, high, command)

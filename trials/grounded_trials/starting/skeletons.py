@@ -166,7 +166,8 @@ def drone(low: float, high: float, command: str) -> Skeleton:
     """Return the drone's skeleton for the yaw of a log.
 
     Args:
-        low, high: range of the yaw in the log [rad].
+        low: smallest yaw in the log [rad].
+        high: largest yaw in the log [rad].
         command: what the log has as its command: `yaw_command` [rad], `yaw_rate` [rad/s] or "".
     """
     if high - low < STEADY:
