@@ -35,7 +35,10 @@ TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
 @click.option("--laps", type=float, default=1.0, help="Laps of a circle or figure-8 (1).")
 @click.option("--hold", type=float, default=0.0, help="Time at rest at a path's end [s] (0).")
 @click.option(
-    "--to", multiple=True, metavar="STATE=VALUE", help="Where a line, step or swing-up ends."
+    "--to",
+    multiple=True,
+    metavar="STATE=VALUE",
+    help="Where a line, step or swing-up ends; what a state keeps along a path (a height).",
 )
 @click.option(
     "--seconds", type=float, help="Duration of a step or swing-up (5), or of a line to a STATE."
@@ -60,7 +63,8 @@ def command(
     and keep to the given speeds and accelerations. A line with --to, or of a robot with one axis,
     goes from [task] start to rest, in the states' own units; --seconds, --speed and --accel set
     its pace. A step begins at [task] start. A swing-up brings the first angle that hangs under its
-    weight upright; --to names another angle, or more states. With --hold a path ends at rest and
+    weight upright; --to names another angle, or more states. A path begins at [task] start; what
+    --to names, such as the height of a drone, keeps its value. With --hold a path ends at rest and
     stays there.
 
     The previous target is kept as target.csv.bak. [task] horizon is updated, and so are the weights
@@ -101,7 +105,7 @@ def command(
             "--accel to set how fast a path is driven"
         )
     elif shape in PATHS:
-        columns = path_target(shape, drive, model, dt)
+        columns = path_target(shape, drive, model, dt, ends, start)
     else:
         columns = _recorded(workspace, shape)
     before = _reward(workspace)
@@ -123,7 +127,8 @@ def command(
             )
     show(f"{path}: {shape}, {(rows - 1) * dt:g} s, {rows - 1} steps")
     for name, (low, high) in ranges.items():
-        text = with_unit(f"{number(low)} to {number(high)}", model.states[name])
+        span = f"{number(low)} to {number(high)}" if low < high else f"stays at {number(low)}"
+        text = with_unit(span, model.states[name])
         show(field(name, text, "  "))
     if free:
         show(field("free", _free(free, reward, _rest_of(model, free) * (shape == "line")), "  "))

@@ -9,6 +9,8 @@ jackknife standard error over runs. Two further tests correct weaknesses of this
 - The runs with the largest errors dominate the sums and their scatter, such as that of a pendulum
   that once stopped near the top. So each trial's gain is also computed separately, and all trials
   count equally (`chance`).
+
+In a single log, the runs that it is cut into take the place of trials in both.
 """
 
 from __future__ import annotations
@@ -52,6 +54,7 @@ class Gain:
     pieces: Array = field(default_factory=lambda: np.zeros(0))  # (P,) of each piece, up to 1 s
     trial: Array = field(default_factory=lambda: np.zeros(0, int))  # (P,) trial of each piece
     own: Array = field(default_factory=lambda: np.zeros(0))  # (S,) of each trial separately
+    single: bool = False  # there is one trial only, whose runs count as the trials
 
     @property
     def chance(self) -> float:
@@ -79,7 +82,7 @@ class Gain:
         as its scatter, so it can't be told from chance, but it is not nothing either.
         """
         gains = np.maximum(self.own, 0.0)
-        if len(gains) < FEW or not self.mean > 0:
+        if self.single or len(gains) < FEW or not self.mean > 0:
             return None
         best = int(gains.argmax())
         return best if gains[best] > max(MOST * gains.sum(), CLEAR) else None

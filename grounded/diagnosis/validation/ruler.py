@@ -229,8 +229,9 @@ class Ruler:
             whole.sum(axis=(0, 1)) / counts,
             _jackknife(by / counts),
             self._pieces(before, after),
-            self.data.trial_of[self.run_of],
+            self.run_of if len(self.data.used) == 1 else self.data.trial_of[self.run_of],
             self._by_trial(before, after),
+            len(self.data.used) == 1,
         )
 
     def _matters(self) -> Array:
@@ -246,8 +247,15 @@ class Ruler:
         return np.asarray((n / all_n * np.log((a + usual) / (b + usual))).sum(axis=(0, 2)))
 
     def _by_trial(self, before: Errors, after: Errors) -> Array:
-        """Return the gain of each trial separately, the mean over channels and horizons, (S,)."""
-        trials = [self.data.trial_of == i for i in self.data.used]
+        """Return the gain of each trial separately, the mean over channels and horizons, (S,).
+
+        Of a single trial, return that of each run.
+        """
+        of, used = self.data.trial_of, self.data.used
+        runs_count = np.arange(len(of))
+        trials = (
+            [runs_count == b for b in runs_count] if len(used) == 1 else [of == i for i in used]
+        )
         runs = [self.by_run(e[..., self.shown]) for e in (before.total, after.total, before.count)]
         a, b, n = (np.stack([e[:, own].sum(axis=1) for own in trials]) for e in runs)
         least, seen = n * self._matters() ** 2 + 1e-300, n > 0

@@ -48,20 +48,30 @@ class Drive:
     hold: float = 0.0  # [s] of rest at the end
 
 
-def path_target(shape: str, drive: Drive, model: Model, dt: float) -> dict[str, Array]:
-    """Return the columns of a target that follows a path from rest.
+def path_target(
+    shape: str,
+    drive: Drive,
+    model: Model,
+    dt: float,
+    to: Mapping[str, float] = MappingProxyType({}),
+    start: Mapping[str, float] = MappingProxyType({}),
+) -> dict[str, Array]:
+    """Return the columns of a target that follows a path in the plane from rest.
 
     Args:
         shape: line, circle or figure-8.
         drive: size and speeds of the path.
         model: its roles name the states.
         dt: control interval [s].
+        to: further states, each with the value that it keeps along the path: a drone's height.
+        start: [task] start: where the path begins, and the height unless `to` gives one.
 
     Returns:
         The desired values of each state, (H + 1,).
 
     Raises:
-        GroundedError: if the model has no position, or a number is not positive.
+        GroundedError: if the model has no position, a number is not positive, `to` names a state of
+            the path, or a position of three states has no height.
     """
     position = model.roles.get("position", ())
     if len(position) < 2:
@@ -79,13 +89,40 @@ def path_target(shape: str, drive: Drive, model: Model, dt: float) -> dict[str, 
     middle = 0.5 * (speed[1:] + speed[:-1])
     when = np.concatenate([[0.0], np.cumsum(np.diff(along) / np.maximum(middle, 1e-6))])
     t = _grid(when[-1] + drive.hold, dt)
-    columns = {position[0]: np.interp(t, when, x), position[1]: np.interp(t, when, y)}
+    columns = {
+        name: start.get(name, 0.0) + np.interp(t, when, way)
+        for name, way in zip(position, (x, y), strict=False)
+    }
     rate = np.gradient(heading, along) * speed
     for role, values in {"heading": heading, "speed": speed, "heading_rate": rate}.items():
         played = model.roles.get(role)
         if isinstance(played, str) and played in model.states:
             columns[played] = np.interp(t, when, values)
-    return columns
+    return columns | _kept(shape, model, to, start, columns, len(t))
+
+
+def _kept(
+    shape: str,
+    model: Model,
+    to: Mapping[str, float],
+    start: Mapping[str, float],
+    drawn: Mapping[str, Array],
+    rows: int,
+) -> dict[str, Array]:
+    """Return the columns of states that keep a value along a path."""
+    _check_states(to, model)
+    for name in to:
+        if name in drawn:
+            raise GroundedError(f"the {shape} itself sets '{name}': omit --to {name}")
+    held = dict(to)
+    for height in model.roles["position"][2:]:
+        if height not in {**start, **to}:
+            raise GroundedError(
+                f"the {shape} needs a value of {height}, which would be free otherwise: add "
+                f"--to {height}=1.5, in {model.states[height]}"
+            )
+        held.setdefault(height, start.get(height, 0.0))
+    return {name: np.full(rows, value) for name, value in held.items()}
 
 
 def _check(drive: Drive) -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.errors import NextCommand
+from grounded.instruments.kinematics import integrals
 from grounded.model import is_clock
 from grounded.result import listed, measured, measured_alike, percent
 from grounded.search.scatter import white_noise
@@ -309,6 +310,7 @@ def held_before(workspace: Folder, again: bool = False) -> list[str]:
     # a start taken from the target is off by the bias of a sensor: such a state is free too
     begun = dict(zip(states, base.target[0], strict=False))
     free[:n] = [s not in config.start and (np.isnan(x) or s in biased) for s, x in begun.items()]
+    free[[one.j for one in integrals(base.model) if one.exact]] = False  # at rest, a rate is 0
     chosen = any(name in config.start for name in names)
     priced = bool(base.reward.input_change.any() or base.latency.any())
     stands = None if (chosen and not again) or not priced else resting(task, memory, loose)
@@ -374,6 +376,8 @@ def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> A
         begun = np.clip(first, task.low, task.high)
         one = replace(loose or task, target=still, input_target=None, past=begun)
         x, u = (found[0] for found in trim(one, still, ~free))
+        exact = replace(one, model=task.model, smoothing=0.0, past=u)  # a curved input's kink at 0
+        x, u = (found[0] for found in trim(exact, np.stack([x, still[1]]), ~free))
         moved = np.abs(moved_at_start(replace(task, start=x), u))[~clocks]
         if (moved <= STILL * away).all():
             return np.append(x, u)
@@ -390,7 +394,8 @@ def _out_of_reach(task: Task, free: NDArray[np.bool_], clocks: NDArray[np.bool_]
         f_x, f_u = problem.system.linearise(np.tile(task.start, (4, 1)), u, problem.p, problem.dt)
     others = np.abs(f_x - np.eye(len(free))).max(axis=0)[:, free]
     reach = 2 * np.abs(f_u).max(axis=0) @ (task.high - task.low) + FARTHEST * others.sum(axis=1)
-    return bool((np.abs(moved_at_start(task, task.past)) > reach)[~clocks].any())
+    inside = np.clip(task.past, task.low, task.high)  # a hover's thrust need not reach down to 0
+    return bool((np.abs(moved_at_start(task, inside)) > reach)[~clocks].any())
 
 
 def moved_at_start(task: Task, inputs: Array) -> Array:
