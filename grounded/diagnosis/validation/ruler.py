@@ -77,7 +77,7 @@ class Ruler:
         self.step0 = np.cumsum([0, *data.lengths])[:-1]
         count = -(-data.valid.sum(axis=1).astype(int) // self.steps[-1])
         self.piece0 = np.cumsum([0, *np.maximum(count, 1)])  # first piece of each run, and the end
-        self.run_of = np.repeat(np.arange(len(count)), np.diff(self.piece0))
+        self.run_of: Any = np.repeat(np.arange(len(count)), np.diff(self.piece0))
         self.fine_whole = self.fine  # over whole trials
         self._measured: dict[int, tuple[Fitted, Errors]] = {}
 
