@@ -248,8 +248,10 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
         return DIAGNOSE  # after widening their bounds, as the diagnosis says
     own = {f"parameter:{name}" for name in params}
     if own.issuperset(new):
-        if not fitted_in_vain(workspace):
-            return NextCommand("fit")  # only parameters are off: fit all of them together
+        made = diagnosis.made or Made()
+        some = (*made.named, *made.compared)
+        if not fitted_in_vain(workspace, some):  # only parameters are off: fit all together
+            return NextCommand("fit", ("--trials", ",".join(some)) if some else ())
         if gain(diagnosis.prediction_error, "crude", "with_effects") <= 0:
             return NextCommand("adopt", late) if late else None
     return NextCommand("adopt", (*new, *late))
