@@ -67,8 +67,10 @@ def test_a_missing_log_names_the_closest_or_the_newest_few(tmp_path):
         os.utime(path, (1000 + k, 1000 + k))
     with pytest.raises(GroundedError, match=r"did you mean 'drive\d.mcap'"):
         inspect_log(tmp_path / "drve4.mcap")
+    with pytest.raises(GroundedError, match=r"did you mean 'drive4.mcap'"):
+        inspect_log(tmp_path / "drive4.cvs")
     with pytest.raises(GroundedError) as refused:
-        inspect_log(tmp_path / "zzzz")
+        inspect_log(tmp_path / "zzz.mcap")  # of the same ending as all others
     said = str(refused.value)
     assert "9 logs" in said and "drive8.mcap, drive7.mcap and drive6.mcap" in said
     assert "drive5" not in said
