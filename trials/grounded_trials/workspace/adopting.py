@@ -320,6 +320,14 @@ def _check(
     Raises:
         GroundedError: if not, or if [log] already corrects the delay that it describes.
     """
+    from grounded_trials.workspace.next_step import newer_alone
+
+    if found.changed and not set(names) <= {*found.late_sensors}:
+        raise GroundedError(
+            "the last diagnosis compared two groups of trials between which the robot changed: its "
+            "values fit both together, so they are right for neither",
+            then=newer_alone(found),
+        )
     known = [row.effect for row in found.ranking] + _curves(found) + [*found.late_sensors]
     adopted = [e["name"] for e in workspace.config.model.effects if e["name"] not in before]
     in_log = in_time_now(workspace, found.preflight)

@@ -232,9 +232,7 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
 
     new = diagnosis.open(workspace.config.model.effects, workspace.config.model.params)
     if diagnosis.changed:  # values of two robots together fit neither
-        made = diagnosis.made or Made()
-        newer = max(made.named, made.compared, key=lambda group: max(group, default=""))
-        return NextCommand("diagnose", ("--trials", ",".join(newer)))
+        return newer_alone(diagnosis)
     undone = {*declined(workspace)}  # effects the user has undone are not suggested again
     late = tuple(name for name in late_open(workspace, diagnosis) if name not in undone)
     claimed = diagnosis.kind in ("effect", "several") and not diagnosis.contested
@@ -255,6 +253,13 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
         if gain(diagnosis.prediction_error, "crude", "with_effects") <= 0:
             return NextCommand("adopt", late) if late else None
     return NextCommand("adopt", (*new, *late))
+
+
+def newer_alone(diagnosis: Diagnosis) -> NextCommand:
+    """Return the diagnosis of the newer of the two groups that a diagnosis compared."""
+    made = diagnosis.made or Made()
+    newer = max(made.named, made.compared, key=lambda group: max(group, default=""))
+    return NextCommand("diagnose", ("--trials", ",".join(newer)))
 
 
 def _like_a_load(workspace: Folder, effects: Sequence[str]) -> bool:
