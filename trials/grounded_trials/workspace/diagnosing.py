@@ -332,6 +332,7 @@ def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:
         predicted_states=predicted.states[:, : planner.task.model.n],
         predicted_inputs=predicted.inputs,
         predicted_utility=predicted.utility,
+        units={**planner.task.model.states, **planner.task.model.inputs},
     )
 
 
