@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from grounded_trials import Workspace
 
 SECONDS = 5.0  # default duration of a step or a swing-up
+REACHED = 0.95  # of --speed: a path that stays below it brings a note
 TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
 
 
@@ -114,6 +115,12 @@ def command(
         found = {"target": str(path), "horizon": rows - 1, "columns": ranges, "free": free}
         show_json(found)
         return
+    fastest = _fastest(model, columns, dt) if shape in PATHS and not ends else math.nan
+    if speed is not None and fastest < REACHED * speed:
+        by = f"--accel {drive.accel:g} and --lateral {lateral:g} m/s^2"
+        remark(
+            "note", f"it reaches {fastest:.3g} m/s at most, not --speed {speed:g}: {by} limit it"
+        )
     for name, value in ends.items():
         if model.states.get(name) == "rad" and abs(value) > TURNS * 2 * math.pi:
             remark(
@@ -151,6 +158,14 @@ def command(
             "[reward] state",
         )
     show(f"\n{next_line(NextCommand('propose'))}")
+
+
+def _fastest(model: Model, columns: dict[str, Array], dt: float) -> float:
+    """Return the highest speed along a path in a plane; NaN if the target has none."""
+    place = [columns[name] for name in model.roles.get("position", ()) if name in columns]
+    if len(place) < 2:
+        return math.nan
+    return max(map(math.hypot, *((one[1:] - one[:-1]) / dt for one in place)))
 
 
 def _rest_of(model: Model, free: list[str]) -> str:
@@ -193,14 +208,18 @@ def _values(pairs: tuple[str, ...]) -> dict[str, float]:
     for pair in pairs:
         name, _, value = pair.partition("=")
         try:
-            found[name.strip()] = float(value)
+            end = float(value)
         except ValueError:
-            raise click.UsageError(f"--to {pair}: expected STATE=VALUE, such as x=1.0") from None
+            end = math.nan
+        if not math.isfinite(end):
+            raise click.UsageError(f"--to {pair}: expected STATE=VALUE, such as x=1.0")
+        found[name.strip()] = end
     return found
 
 
 def _recorded(workspace: Workspace, file: str) -> dict[str, Array]:
     """Read a run of a log, or the columns of a CSV of states."""
-    from grounded_trials.starting.shapes import SHAPES, recorded_run
+    from grounded_trials.starting.recorded_run import recorded_run
+    from grounded_trials.starting.shapes import SHAPES
 
     return recorded_run(workspace, file, SHAPES)

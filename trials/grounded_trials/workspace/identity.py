@@ -170,7 +170,8 @@ def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> 
     for name in trials:
         if not workspace.store.matching(name.lower()):
             raise unknown_trial(workspace, name)
-    found = [workspace.store.find(name.lower()) for name in trials]
+    named = dict.fromkeys(name.lower() for name in trials)
+    found = [workspace.store.find(name) for name in named]
     same = []  # no change: discarded again for no other reason, or restored but never discarded
     digests = [stored.digest for stored in workspace.store.list()]
     for one in found:

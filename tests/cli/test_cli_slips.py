@@ -1,0 +1,72 @@
+"""Slips at the track: what somebody types who knows the tool only by its help."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from facts import holds
+from grounded_trials.store.trial_file import read_trial
+from reported import cart, copied
+from workspaces import make
+
+__all__ = ["cart"]
+
+
+@pytest.fixture
+def w(cart: Path, tmp_path: Path) -> Path:
+    return copied(cart, tmp_path / "w")
+
+
+def test_trials_may_be_given_as_a_list_with_commas_and_twice(w):
+    before = len(list((w / "trials").glob("n*.json")))
+    done = grounded("-C", w, "discard", "t0001,t0002", "T0001", "--json")
+    assert done.code == 0 and list(done.json["trials"]) == ["t0001", "t0002"]
+    assert len(list((w / "trials").glob("n*.json"))) == before + 2  # one note each
+    done = grounded("-C", w, "restore", "t0001,t0002", "--json")
+    assert list(done.json["trials"]) == ["t0001", "t0002"] and not done.json["discarded"]
+
+
+def test_a_family_without_its_target_is_completed(w):
+    done = grounded("-C", w, "adopt", "delay")
+    assert done.code == 1 and "did you mean 'delay:force'?" in done.err
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "fast", ""])
+def test_an_end_that_is_no_number_is_refused(w, value):
+    done = grounded("-C", w, "target", "line", "--to", f"x={value}", "--seconds", "2")
+    assert done.code == 2 and holds(done.err, f"--to x={value}", "STATE=VALUE")
+
+
+def test_a_line_of_a_billion_seconds_is_refused_without_a_warning_of_numpy(w):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        done = grounded("-C", w, "target", "line", "--to", "x=1", "--seconds", "1e9")
+    assert done.code == 1 and holds(done.err, "1e+09 s", "200000") and "nan" not in done.err
+
+
+def test_a_stored_trial_its_file_and_its_table_are_targets(w):
+    """`t0001` was no shape, its file needed [log], and its table had a NaN in an input."""
+    table, (own,) = w / "t0001.csv", (w / "trials").glob("t0001-*.mcap")
+    assert grounded("-C", w, "export", "t0001", "--format", "csv", "-o", table).code == 0
+    ran = read_trial(own)[0].states
+    for given in ("T0001", own, table):
+        (w / "target.csv").write_text("")
+        done = grounded("-C", w, "target", given, "--json")
+        assert done.code == 0 and sorted(done.json["columns"]) == ["v", "x"], done.err
+        drawn = np.genfromtxt(w / "target.csv", delimiter=",", names=True)
+        np.testing.assert_allclose(drawn["x"], ran[:, 0], atol=1e-5)
+    done = grounded("-C", w, "target", "c0001")
+    assert done.code == 1 and holds(done.err, "candidate")
+
+
+def test_a_path_that_never_reaches_its_speed_says_so(tmp_path):
+    w = make(tmp_path / "w", "car-circle").folder
+    slow = grounded("-C", w, "target", "circle", "--size", "1", "--speed", "1")
+    fast = grounded("-C", w, "target", "circle", "--size", "1", "--speed", "9", "--json")
+    assert slow.code == fast.code == 0 and "--lateral" not in slow.err
+    assert fast.json["columns"]["v"][1] == pytest.approx(2.0, rel=0.01)  # sqrt(4 m/s^2 * 1 m)
+    said = grounded("-C", w, "target", "circle", "--size", "1", "--speed", "9")
+    assert holds(said.err, "2 m/s", "--speed 9", "--lateral 4", "--accel 1")
