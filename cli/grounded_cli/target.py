@@ -57,12 +57,12 @@ def command(
 ) -> None:
     """Write target.csv: a line, circle, figure-8, step or swing-up, or a recorded run.
 
-    FILE is a log, read through [log], or a CSV with columns `t` and states. Paths start from rest
-    and keep to the given speeds and accelerations. A line with --to, or of a robot with one axis,
-    goes from [task] start to rest, in the states' own units; --seconds, --speed and --accel set
-    its pace. A step begins at [task] start. A swing-up brings the first angle that hangs under its
-    weight upright; --to names another angle, or more states. With --hold a path ends at rest and
-    stays there.
+    FILE is a log, read through [log], a stored trial (t0001), or a CSV with columns `t` and states.
+    Paths start from rest and keep to the given speeds and accelerations. A line with --to, or of a
+    robot with one axis, goes from [task] start to rest, in the states' own units; --seconds,
+    --speed and --accel set its pace. A step begins at [task] start. A swing-up brings the first
+    angle that hangs under its weight upright; --to names another angle, or more states. With --hold
+    a path ends at rest and stays there.
 
     The previous target is kept as target.csv.bak. [task] horizon is updated, and so are the weights
     in [reward] state unless you chose them, and input_change of inputs with [limits] if it is

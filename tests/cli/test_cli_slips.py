@@ -8,6 +8,7 @@ import pytest
 
 from cli import grounded
 from facts import holds
+from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial
 from reported import cart, copied
 from workspaces import make
@@ -60,6 +61,23 @@ def test_a_stored_trial_its_file_and_its_table_are_targets(w):
         np.testing.assert_allclose(drawn["x"], ran[:, 0], atol=1e-5)
     done = grounded("-C", w, "target", "c0001")
     assert done.code == 1 and holds(done.err, "candidate")
+
+
+@pytest.mark.parametrize("first", ["--data", "--json"])
+def test_a_run_is_not_stored_as_data_and_as_a_run(tmp_path, first):
+    """It counted twice: `fit` and `diagnose` took it for two trials."""
+    w = Workspace(make(tmp_path / "w").folder)
+    w.propose()
+    file = w.run().trial_file
+    taken = grounded("-C", w.folder, "ingest", file.parent)
+    assert taken.code == 1 and holds(taken.err, "grounded wrote", file.name)
+    assert grounded("-C", w.folder, "ingest", file, first).code == 0
+    other = "--json" if first == "--data" else "--data"
+    again = grounded("-C", w.folder, "ingest", file, other)
+    assert again.code == 1 and holds(again.err, "as t0001", "discard t0001")
+    w.discard("t0001")
+    assert grounded("-C", w.folder, "ingest", file, other).code == 0
+    assert [one.stored.id for one in Workspace(w.folder).whole_trials()] == ["t0002"]
 
 
 def test_a_path_that_never_reaches_its_speed_says_so(tmp_path):

@@ -90,8 +90,11 @@ def _nearby(path: Path) -> str:
     there = [p for p in path.parent.iterdir() if p.name.endswith(KINDS)]
     logs = sorted((p for p in there if not _NO_LOG.fullmatch(p.name)), key=lambda p: -_written(p))
     if logs:
+        plain = _DIGITS.sub("0", path.stem.lower())
         named = {p.stem.lower(): p.name for p in reversed(logs)}  # endings make all names alike
-        if close := get_close_matches(path.stem.lower(), named, n=1):
+        close = get_close_matches(path.stem.lower(), named, n=1)
+        close += [stem for stem in named if _DIGITS.sub("0", stem) == plain]  # another number
+        if close:
             return f": did you mean '{named[close[0]]}'?"
         if len(logs) <= NEWEST:
             return f"; the folder has {listed(p.name for p in logs)}"

@@ -272,7 +272,8 @@ def copied(workspace: Folder, path: Path, read: Read, wanted: str | None) -> Rea
         return read
     if (one := same_recording(workspace, path, read.data, read.log)) is None:
         return read
-    refuse_as_another(path, (one,), wanted)
+    said = read.trial.candidate if wanted is None and read.log is None else wanted
+    refuse_as_another(path, (one,), said)
     note = f"its rows are those of {one.stored.id}: it is the same recording, or a part of it"
     return Read(one.trial, workspace.store.read(one.stored), notes=(note,), copy=True)
 
