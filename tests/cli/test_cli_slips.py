@@ -8,9 +8,12 @@ import pytest
 
 from cli import grounded
 from facts import holds
+from grounded.errors import NextCommand
 from grounded_trials import Workspace
+from grounded_trials.store.documents import write_document
 from grounded_trials.store.trial_file import read_trial
-from reported import cart, copied
+from grounded_trials.workspace.next_step import usable_ids
+from reported import DIAGNOSIS, cart, copied
 from workspaces import make
 
 __all__ = ["cart"]
@@ -78,6 +81,28 @@ def test_a_run_is_not_stored_as_data_and_as_a_run(tmp_path, first):
     w.discard("t0001")
     assert grounded("-C", w.folder, "ingest", file, other).code == 0
     assert [one.stored.id for one in Workspace(w.folder).whole_trials()] == ["t0002"]
+
+
+def test_too_few_of_many_trials_are_answered_with_a_diagnosis_of_all(w):
+    """`run a second one` was the advice beside stored trials that were not named."""
+    found = Workspace(w).diagnose(["t0001"])
+    more = len(usable_ids(Workspace(w))) - 1
+    assert found.no_cause and found.then == NextCommand("diagnose")
+    assert more > 0 and found.next_trial.startswith(f"{more} stored trial")
+
+
+@pytest.mark.parametrize("changed", [True, False])
+def test_nothing_is_adopted_from_two_robots_compared(w, changed):
+    value = {"value": 0.1, "std": 0.01}
+    one = {"effect": "parameter:m", "quantity": "m", "first": value, "second": value}
+    made = {"trials": ["t0001", "t0002"], "named": ["t0002"], "compared": ["t0001"]}
+    document = {**DIAGNOSIS, "changed": [one] * changed, "diagnosed": made}
+    write_document(w / "reports" / "diagnosis.json", document)
+    before = (w / "grounded.toml").read_text()
+    done = grounded("-C", w, "adopt", "viscous_friction:v")
+    assert done.code == changed and ((w / "grounded.toml").read_text() == before) == changed
+    if changed:
+        assert holds(" ".join(done.err.replace("\\", " ").split()), "diagnose --trials t0002")
 
 
 def test_a_path_that_never_reaches_its_speed_says_so(tmp_path):

@@ -21,7 +21,7 @@ from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand
 from grounded.instruments.finding import in_the_log
 from grounded_trials.store.documents import read_document, write_document
-from grounded_trials.wording import rendered
+from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.identity import ROWS
 from grounded_trials.workspace.intake.where_to_mend import where_to_mend
 from grounded_trials.workspace.unknown_id import named_trials
@@ -66,6 +66,7 @@ def diagnose_in(
     from grounded.effects import Library
     from grounded_trials.workspace.adopting import diagnosed_again
     from grounded_trials.workspace.next_step import (
+        DIAGNOSE,
         EXPORT,
         PROPOSE,
         REPORT,
@@ -135,8 +136,12 @@ def diagnose_in(
             "from."
         )
         found = replace(found, next_trial=f"{first} {found.next_trial}")
+    more = len(diagnosable(workspace)) - len(made.trials)
+    if unasked := found.no_cause and more > 0:
+        words = f"{count(more, 'stored trial')} of this task can be diagnosed as well."
+        found = replace(found, next_trial=words)
     _keep(workspace, found)  # again, now with `next_trial`
-    then = REPORT if undo else after_diagnosis(workspace, found)
+    then = REPORT if undo else DIAGNOSE if unasked else after_diagnosis(workspace, found)
     then = NextCommand("discard", wrong) if wrong else then
     if then == EXPORT and found.kind != "none":
         words = nothing_to_do(found, candidate_named(workspace, "best"))
