@@ -62,25 +62,19 @@ def test_a_stored_trial_its_file_and_its_table_are_targets(w):
         assert done.code == 0 and sorted(done.json["columns"]) == ["v", "x"], done.err
         drawn = np.genfromtxt(w / "target.csv", delimiter=",", names=True)
         np.testing.assert_allclose(drawn["x"], ran[:, 0], atol=1e-5)
-    done = grounded("-C", w, "target", "c0001")
-    assert done.code == 1 and holds(done.err, "candidate")
+    assert grounded("-C", w, "discard", "t0001").code == 0
+    done = grounded("-C", w, "target", "t0001")
+    assert done.code == 1 and holds(done.err, "set aside", "restore t0001")
 
 
-@pytest.mark.parametrize("first", ["--data", "--json"])
-def test_a_run_is_not_stored_as_data_and_as_a_run(tmp_path, first):
-    """It counted twice: `fit` and `diagnose` took it for two trials."""
+def test_a_folder_of_runs_names_the_file_of_the_last_one(tmp_path):
+    """It was `not a trial written by grounded`, and `next:` led to `inspect`."""
     w = Workspace(make(tmp_path / "w").folder)
     w.propose()
     file = w.run().trial_file
-    taken = grounded("-C", w.folder, "ingest", file.parent)
-    assert taken.code == 1 and holds(taken.err, "grounded wrote", file.name)
-    assert grounded("-C", w.folder, "ingest", file, first).code == 0
-    other = "--json" if first == "--data" else "--data"
-    again = grounded("-C", w.folder, "ingest", file, other)
-    assert again.code == 1 and holds(again.err, "as t0001", "discard t0001")
-    w.discard("t0001")
-    assert grounded("-C", w.folder, "ingest", file, other).code == 0
-    assert [one.stored.id for one in Workspace(w.folder).whole_trials()] == ["t0002"]
+    done = grounded("-C", w.folder, "ingest", file.parent)
+    assert done.code == 1 and holds(done.err, "grounded wrote", "ingest", file.name)
+    assert grounded("-C", w.folder, "ingest", file).code == 0
 
 
 def test_too_few_of_many_trials_are_answered_with_a_diagnosis_of_all(w):

@@ -17,7 +17,7 @@ from grounded_trials.store.own_files import TRIAL
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.task_file import read_target
-from grounded_trials.workspace.unknown_id import refuse_ids
+from grounded_trials.workspace.unknown_id import refuse_ids, unknown_trial
 
 
 def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[str, Array]:
@@ -34,6 +34,8 @@ def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[st
     """
     model, path = workspace.base_model, Path(file)
     if not path.exists():
+        if file.lower() in workspace.discarded():
+            raise unknown_trial(workspace, file)
         stored = {one.id: one.path for one in workspace.store.list()}
         path = stored.get(file.lower(), path)
     if not path.exists():

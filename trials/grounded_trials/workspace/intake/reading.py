@@ -272,8 +272,7 @@ def copied(workspace: Folder, path: Path, read: Read, wanted: str | None) -> Rea
         return read
     if (one := same_recording(workspace, path, read.data, read.log)) is None:
         return read
-    said = read.trial.candidate if wanted is None and read.log is None else wanted
-    refuse_as_another(path, (one,), said)
+    refuse_as_another(path, (one,), wanted)
     note = f"its rows are those of {one.stored.id}: it is the same recording, or a part of it"
     return Read(one.trial, workspace.store.read(one.stored), notes=(note,), copy=True)
 

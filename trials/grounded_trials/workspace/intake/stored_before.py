@@ -147,7 +147,7 @@ def same_recording(
 
     Trials are the same recording if all rows are equal at the same times of the log's clock.
     Complete runs of a deterministic simulator whose clock starts at zero are not: they may be equal
-    in logs of equal length. A run and a log of data that are equal are one recording.
+    in logs of equal length.
 
     Args:
         workspace: the workspace.
@@ -184,8 +184,7 @@ def same_recording(
             )
         lasted = one.meta.get(LASTED)
         cut = lasted is not None and log is not None and lasted != log.source[LASTED]
-        other_kind = bool(one.trial.candidate) != bool(trial.candidate)
-        if stamped or cut or other_kind or here.finite_steps < one.measured.finite_steps:
+        if stamped or cut or here.finite_steps < one.measured.finite_steps:
             return one
     return None
 
