@@ -64,7 +64,7 @@ def test_a_stored_trial_its_file_and_its_table_are_targets(w):
         np.testing.assert_allclose(drawn["x"], ran[:, 0], atol=1e-5)
     assert grounded("-C", w, "discard", "t0001").code == 0
     done = grounded("-C", w, "target", "t0001")
-    assert done.code == 1 and holds(done.err, "set aside", "restore t0001")
+    assert done.code == 1 and holds(done.err, "set aside", "restore")
 
 
 def test_a_folder_of_runs_names_the_file_of_the_last_one(tmp_path):
