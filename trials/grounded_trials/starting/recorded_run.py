@@ -44,7 +44,7 @@ def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[st
     if path.is_file() and kind_of(path) == TRIAL:
         trial, _, _ = read_trial(path)
         trial = trial.until(max(trial.finite_steps, 0))
-        times = trial.dt * np.arange(trial.steps + 1)
+        times = trial.dt * np.arange(trial.steps + 1.0)
         return _sampled(workspace, file, times, [*trial.state_names], trial.states)
     mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
     if path.suffix == ".csv" and (mapping is None or not _holds(path, mapping)):

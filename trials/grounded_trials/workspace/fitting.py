@@ -84,7 +84,7 @@ def fit_in(
     kept = () if names or latency else tuple(delays)
     if not (names or latency):
         _keep(workspace, used, found)
-    asked = ("--params", ",".join(names)) if names else ()
+    asked: tuple[str, ...] = ("--params", ",".join(names)) if names else ()
     asked += ("--trials", ",".join(trials)) if trials else ()
     asked += ("--latency",) * latency
     fitted = partial(Fitted, found, preflight=seen, not_fitted=kept, trials=_ids(used))
