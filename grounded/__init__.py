@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from grounded.fit import fit
     from grounded.model import Model, Param
     from grounded.policy import Policy
-    from grounded.search.ask_tell import Search, learn
+    from grounded.search.ask_tell import Search, TrialRefused, learn
     from grounded.search.improve import propose
     from grounded.search.step_size import SearchOptions
     from grounded.task import Task
@@ -56,8 +56,8 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Diagnosis", "Engine", "GroundedError", "Model", "NextCommand", "Param", "Policy", "Reward",
-    "Search", "SearchOptions", "Task", "Trial", "__version__", "diagnose", "fit", "learn",
-    "propose",
+    "Search", "SearchOptions", "Task", "Trial", "TrialRefused", "__version__", "diagnose", "fit",
+    "learn", "propose",
 ]  # fmt: skip
 
 _HOMES = {
@@ -68,7 +68,7 @@ _HOMES = {
     "grounded.fit": ("fit",),
     "grounded.model": ("Model", "Param"),
     "grounded.policy": ("Policy",),
-    "grounded.search.ask_tell": ("Search", "learn"),
+    "grounded.search.ask_tell": ("Search", "TrialRefused", "learn"),
     "grounded.search.improve": ("propose",),
     "grounded.search.step_size": ("SearchOptions",),
     "grounded.task": ("Task",),

@@ -9,6 +9,7 @@ import click
 
 from grounded.result import listed
 from grounded_cli import completion as complete
+from grounded_cli.chosen_trials import chosen_trials
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, parallel
 from grounded_cli.terminal import (
     field,
@@ -33,12 +34,7 @@ CHANNELS, REGIONS = 2, 3  # named in a line, in the details
 
 
 @click.command("diagnose")
-@click.option(
-    "--trials",
-    metavar="T1,T2,...",
-    shell_complete=complete.trials,
-    help="Only these trials (default: all).",
-)
+@chosen_trials
 @click.option(
     "--max-effects",
     type=click.IntRange(1, 6),
@@ -64,7 +60,7 @@ CHANNELS, REGIONS = 2, 3  # named in a line, in the details
 @in_workspace
 @as_json
 def command(
-    trials: str | None,
+    trials: tuple[str, ...],
     max_effects: int | None,
     without: tuple[str, ...],
     compare: tuple[str, str] | None,
@@ -84,20 +80,15 @@ def command(
     from grounded.errors import GroundedError
     from grounded_trials.workspace.diagnosing import unheld_in
 
-    chosen = names_in(trials)
-    if trials is not None and not chosen:
-        raise GroundedError(
-            "--trials names no trial: expected some, like t0001,t0002; omit it to use all"
-        )
     first, second = map(names_in, compare or ("", ""))
-    if compare and (chosen or not (first and second) or {*first} & {*second}):
+    if compare and (trials or not (first and second) or {*first} & {*second}):
         raise GroundedError(
             "--compare takes two groups of different trials, like --compare t0001,t0002 "
             "t0003,t0004, and no --trials"
         )
     if instruments:
-        findings = workspace.preflight(chosen)
-        alone = unheld_in(workspace, chosen)
+        findings = workspace.preflight(trials)
+        alone = unheld_in(workspace, trials)
         if json_:
             odd = [one.to_json() for one in findings]
             return show_json({"preflight": odd, "unheld": list(alone)})
@@ -106,7 +97,7 @@ def command(
     families = [name for text in without for name in names_in(text)]
     with stages() as tell:
         found = workspace.diagnose(
-            chosen or first,
+            trials or first,
             max_effects=max_effects,
             without=families,
             compare=second,

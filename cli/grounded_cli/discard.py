@@ -9,7 +9,7 @@ import click
 from grounded.errors import NextCommand
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
-from grounded_cli.terminal import field, show, show_json
+from grounded_cli.terminal import field, names_in, show, show_json
 
 if TYPE_CHECKING:
     from grounded_trials.workspace.identity import SetAside
@@ -30,7 +30,7 @@ def command(trials: tuple[str, ...], why: str, json_: bool) -> None:
     Nothing is deleted: `grounded restore` undoes it. The search goes on as if the trials had not
     been run.
     """
-    _tell(open_workspace().discard(*trials, why=why), json_)
+    _tell(open_workspace().discard(*names_in(",".join(trials)), why=why), json_)
 
 
 @click.command("restore")
@@ -39,7 +39,7 @@ def command(trials: tuple[str, ...], why: str, json_: bool) -> None:
 @as_json
 def restore(trials: tuple[str, ...], json_: bool) -> None:
     """Use discarded trials again."""
-    _tell(open_workspace().restore(*trials), json_)
+    _tell(open_workspace().restore(*names_in(",".join(trials))), json_)
 
 
 def _tell(done: SetAside, json_: bool) -> None:

@@ -1,4 +1,4 @@
-"""grounded fit: estimate the model's parameters from all trials, with intervals."""
+"""grounded fit: estimate the model's parameters from trials, with intervals."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded.result import listed
+from grounded_cli.chosen_trials import chosen_trials
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, parallel
 from grounded_cli.terminal import (
     field,
@@ -39,13 +40,21 @@ HELD_OUT = (  # `fit.parameters.split_in_time`
 
 
 @click.command("fit")
+@chosen_trials
 @click.option("--params", metavar="A,B,...", help="Fit only these; the others keep their values.")
 @click.option("--latency", is_flag=True, help="Fit one transport delay of all inputs too.")
 @click.option("--apply", "apply_", is_flag=True, help="Write the values to grounded.toml.")
 @parallel
 @in_workspace
 @as_json
-def command(params: str | None, latency: bool, apply_: bool, engine: Engine, json_: bool) -> None:
+def command(
+    trials: tuple[str, ...],
+    params: str | None,
+    latency: bool,
+    apply_: bool,
+    engine: Engine,
+    json_: bool,
+) -> None:
     """Estimate parameters by maximum likelihood of the trials, noise included.
 
     Sensor faults (a delay, filtered speeds, degrees) are corrected first, as in `diagnose`.
@@ -62,7 +71,9 @@ def command(params: str | None, latency: bool, apply_: bool, engine: Engine, jso
             "--params names no parameter: expected names such as a1,L; omit it to fit all"
         )
     with stages() as tell:
-        done = workspace.fit(names, latency=latency, apply=apply_, engine=engine, progress=tell)
+        done = workspace.fit(
+            names, trials=trials, latency=latency, apply=apply_, engine=engine, progress=tell
+        )
     if json_:
         show_json(done.to_json())
         return
@@ -76,7 +87,8 @@ def command(params: str | None, latency: bool, apply_: bool, engine: Engine, jso
     if found.before is not None and found.after is not None:
         show(f"\n{_errors(found, workspace.base_model)}")
         show("\n".join(lines(HELD_OUT, "  ", "  ")))
-    remark("fit", f"{found.sentence}; {count(found.samples, 'sample')}")
+    of = f" of {listed(done.trials)}" * bool(trials)
+    remark("fit", f"{found.sentence}; {count(found.samples, 'sample')}{of}")
     if apply_:
         show("\nwritten to grounded.toml [model] params")
     elif found.helps:

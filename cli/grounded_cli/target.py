@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from grounded_trials import Workspace
 
 SECONDS = 5.0  # default duration of a step or a swing-up
+REACHED = 0.95  # of --speed: a path that stays below it brings a note
 TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
 
 
@@ -59,13 +60,13 @@ def command(
 ) -> None:
     """Write target.csv: a line, circle, figure-8, step or swing-up, or a recorded run.
 
-    FILE is a log, read through [log], or a CSV with columns `t` and states. Paths start from rest
-    and keep to the given speeds and accelerations. A line with --to, or of a robot with one axis,
-    goes from [task] start to rest, in the states' own units; --seconds, --speed and --accel set
-    its pace. A step begins at [task] start. A swing-up brings the first angle that hangs under its
-    weight upright; --to names another angle, or more states. A path begins at [task] start; what
-    --to names, such as the height of a drone, keeps its value. With --hold a path ends at rest and
-    stays there.
+    FILE is a log, read through [log], a stored trial (t0001), or a CSV with columns `t` and states.
+    Paths start from rest and keep to the given speeds and accelerations. A line with --to, or of a
+    robot with one axis, goes from [task] start to rest, in the states' own units; --seconds,
+    --speed and --accel set its pace. A step begins at [task] start. A swing-up brings the first
+    angle that hangs under its weight upright; --to names another angle, or more states. A path
+    begins at [task] start; what --to names, such as the height of a drone, keeps its value. With
+    --hold a path ends at rest and stays there.
 
     The previous target is kept as target.csv.bak. [task] horizon is updated, and so are the weights
     in [reward] state unless you chose them, and input_change of inputs with [limits] if it is
@@ -118,6 +119,12 @@ def command(
         found = {"target": str(path), "horizon": rows - 1, "columns": ranges, "free": free}
         show_json(found)
         return
+    fastest = _fastest(model, columns, dt) if shape in PATHS and not ends else math.nan
+    if speed is not None and fastest < REACHED * speed:
+        by = f"--accel {drive.accel:g} and --lateral {lateral:g} m/s^2"
+        remark(
+            "note", f"it reaches {fastest:.3g} m/s at most, not --speed {speed:g}: {by} limit it"
+        )
     for name, value in ends.items():
         if model.states.get(name) == "rad" and abs(value) > TURNS * 2 * math.pi:
             remark(
@@ -156,6 +163,14 @@ def command(
             "[reward] state",
         )
     show(f"\n{next_line(NextCommand('propose'))}")
+
+
+def _fastest(model: Model, columns: dict[str, Array], dt: float) -> float:
+    """Return the highest speed along a path in a plane; NaN if the target has none."""
+    place = [columns[name] for name in model.roles.get("position", ()) if name in columns]
+    if len(place) < 2:
+        return math.nan
+    return max(map(math.hypot, *((one[1:] - one[:-1]) / dt for one in place)))
 
 
 def _rest_of(model: Model, free: list[str]) -> str:
@@ -198,14 +213,18 @@ def _values(pairs: tuple[str, ...]) -> dict[str, float]:
     for pair in pairs:
         name, _, value = pair.partition("=")
         try:
-            found[name.strip()] = float(value)
+            end = float(value)
         except ValueError:
-            raise click.UsageError(f"--to {pair}: expected STATE=VALUE, such as x=1.0") from None
+            end = math.nan
+        if not math.isfinite(end):
+            raise click.UsageError(f"--to {pair}: expected STATE=VALUE, such as x=1.0")
+        found[name.strip()] = end
     return found
 
 
 def _recorded(workspace: Workspace, file: str) -> dict[str, Array]:
     """Read a run of a log, or the columns of a CSV of states."""
-    from grounded_trials.starting.shapes import SHAPES, recorded_run
+    from grounded_trials.starting.recorded_run import recorded_run
+    from grounded_trials.starting.shapes import SHAPES
 
     return recorded_run(workspace, file, SHAPES)

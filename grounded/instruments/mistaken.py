@@ -42,6 +42,7 @@ MOST = 10  # largest number of states for which all mirror images are tried
 PARTS = {"%": (0.01, "parts of 1"), "deg": (1 / DEGREES, "rad"), "deg/s": (1 / DEGREES, "rad/s")}
 WHOLE = {100.0: "percent", 255.0: "counts of 8 bits", 1000.0: "thousandths"}  # full scale
 OPENED = 0.05  # of full scale: least value of the largest command in a log (at most OVER)
+SWAP_BACK = "Correct the paths in [log] (or the model, if the log is right)"
 ANGULAR, LENGTHS = ("rad", "rad/s"), ("m", "m/s")
 
 
@@ -174,7 +175,7 @@ def mended_by(model: Model, told: Told) -> str:
             "program; or in the model, if the log is right"
         )
     if told.mistake.swap:
-        return "Correct the paths in [log] (or the model, if the log is right)"
+        return SWAP_BACK
     tables = listed(f"[log.input.{model.input_names[j]}]" for j in told.mistake.inputs)
     by = f"{1 / told.mistake.factor:.6g}"
     limits = "as well" if told.mistake.factor > 1 else "if they were taken from the log"

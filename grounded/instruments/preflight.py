@@ -12,6 +12,7 @@ constant      a velocity with a constant bias against its position
 kinematics    velocities against the rates of their positions, headings against courses
 late_position both positions of a plane later than velocities and heading
 mistaken      commands exchanged or in percent, checked after the rest is corrected
+exchanged_states  two states exchanged, by the model's predictions, checked before the rest
 inputs        copies of one another, at or beyond their limits, constant within each trial
 
 Faults that are certain from the sensors alone are corrected in the trials passed on to the

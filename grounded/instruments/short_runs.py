@@ -99,6 +99,14 @@ class Ahead:
         """Whether there are enough samples."""
         return len(self.at) >= LEAST and bool(self.shown)
 
+    @property
+    def moved(self) -> Array:
+        """How far each state moves until the predicted time (n,), rms about the mean."""
+        found = np.ones(self.model.n)
+        off = self.model.difference(self.last, self.first)[:, self.shown]
+        found[self.shown] = off.std(axis=0)
+        return found
+
     def whatever_commands_do(self) -> Ahead:
         """Return a copy that also removes errors linear in the past and present commands."""
         h, half = self.steps, max(1, self.steps // 2)

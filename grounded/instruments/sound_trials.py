@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from grounded.instruments.clocks import judge_clocks
+from grounded.instruments.exchanged_states import judge_exchanged
 from grounded.instruments.finding import Preflight
 from grounded.instruments.mistaken import judge_commands
 from grounded.instruments.plane_units import judge_positions
@@ -31,9 +32,11 @@ def sound_trials(
         GroundedError: for logs that can't be used, with the correction: states that respond before
             their commands are sent, exchanged columns, other units.
     """
-    looked = preflight(subject, trials, hidden)
     model = subject.model if isinstance(subject, Task) else subject
     names = (model.state_names, model.input_names)
+    if all((trial.state_names, trial.input_names) == names for trial in trials):
+        judge_exchanged(model, [t.until(t.known_steps) for t in trials], hidden)
+    looked = preflight(subject, trials, hidden)
     fit = [(trial.state_names, trial.input_names) == names for trial in looked.trials]
     if fit and all(fit):
         judge_positions(model, looked.trials, hidden)

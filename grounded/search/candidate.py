@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -56,6 +56,7 @@ class Candidate(Result):
     slopes: Slopes = ""  # derivatives of the model that it was planned in
     base_as_run: float = float("nan")  # model's utility of the base from where its trials began
     likely_off: float = 0.0  # likely error of predicted_gain, from held-out trials; 0: unknown
+    units: Mapping[str, str] = field(default_factory=dict)  # of states and inputs, for figures
 
     @property
     def predicted_run(self) -> Trial:

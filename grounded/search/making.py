@@ -304,6 +304,7 @@ class Maker:
             predicted_utility=already,
             caution=caution,
             way=way,
+            units={**self.planner.task.model.states, **self.planner.task.model.inputs},
         )
         return self.foretold(made, policy, problem, already)
 

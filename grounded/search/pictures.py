@@ -202,10 +202,13 @@ def candidate_figure(candidate: Candidate) -> Figure:
     policy = candidate.policy
     columns = [*zip(policy.state_names, candidate.predicted_states.T, strict=True)]
     columns += zip(policy.input_names, candidate.predicted_inputs.T, strict=True)
+    shown = {name: unit for name, unit in candidate.units.items() if unit != "1"}
     panels = []
     for name, values in columns:
         times = np.arange(len(values), dtype=np.float64) * policy.dt
         curve = Curve(times, values, "predicted", "predicted")
-        panels.append(Panel(name, "time [s]", "", (curve,), kind="time"))
+        unit = shown.get(name, "")
+        title = f"{name} [{unit}]" if unit else name
+        panels.append(Panel(title, "time [s]", unit, (curve,), kind="time"))
     title = f"{candidate.id}: predicted utility {figure(candidate.predicted_utility)}"
     return Figure("candidate", title, "", tuple(panels), legend(panels[:1]))

@@ -12,6 +12,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from cli import grounded
+from facts import holds
 from grounded.errors import GroundedError
 from grounded_trials.formats.text_tables import column_units, cut_off
 from grounded_trials.logs.inspect_log import inspect_log
@@ -209,6 +210,26 @@ def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path
     for whole in ("t,x\n0,1.5\n20,2.5", "t,x\n0,1.5\n20,2.5\n", "t,x\n0,1.5\n\n\n"):
         path.write_text(whole)
         assert not cut_off(path)
+    rows = [f"{0.1 * k:.2f},{k}.25,{k}.125" for k in range(30)]
+    mangled = {
+        "2.90,29.2": "2.90,29.2",
+        "2.90,29.25\n": "2.90,29.25",  # a row with a line end, but too few cells
+        "2.90,29.25,29.1": "2.90,29.25,29.1",  # half a number
+        "2.90,29.25,-": "2.90,29.25,-",
+        "2.90,29.\0\0\0\0": "2.90,29.",  # a power loss leaves zero bytes
+    }
+    for tail, shown in mangled.items():
+        path.write_text("\n".join(["t,x,v", *rows[:29], tail]))
+        seen = read_signals(path, {"v": SignalSpec("/csv.v")})["v"].values
+        assert seen.tolist() == [k + 0.125 for k in range(29)], tail
+        assert holds(cut_off(path), "line 31", shown), tail
+    path.write_text("\n".join(["t,x,v", *rows]) + "\n" + "\0" * 40)
+    assert len(read_signals(path, {"v": SignalSpec("/csv.v")})["v"].values) == 30
+    assert holds(cut_off(path), "line 32", "zero bytes")
+    path.write_text("\n".join(["t,x,v", *rows[:9], "0.90,9.25", *rows[10:]]) + "\n")
+    with pytest.raises(GroundedError) as broken:  # not at the end: something else went wrong
+        read_signals(path, {"v": SignalSpec("/csv.v")})
+    assert holds(str(broken.value), "line 11", 2, 3)
     path.write_text("elapsed_us,x\n0,1.5\n20,2.5\n")
     assert read_signals(path, {"x": SignalSpec("/csv.x")})["x"].t.tolist() == [0, 20_000]
 
@@ -218,7 +239,6 @@ def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path
     [
         ("1,2\n3,4\n", ("1,2", "'t'")),
         ("a,b\n3,4\n", ("a, b", "'t'")),
-        ("t,b\n0,4\n1\n", ("line 3", "1", "2")),
         ("t,b\n0,4\n1\n2,4", ("line 3", "1", "2")),
         ("t,b\n1e30,4\n", ("'t'", "out of range", "_ms")),
         ("run_time,b\n0,4\n1,4\n2,4\n", ("'run_time' increases", "'t'", "_ms")),

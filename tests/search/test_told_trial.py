@@ -9,7 +9,6 @@ import pytest
 import grounded as gr
 from facts import holding, holds
 from grounded.plant import Plant
-from grounded.search.ask_tell import TrialRefused
 from small_tasks import drive, other, rover_task
 
 TASK = rover_task()
@@ -43,7 +42,7 @@ WRONG = [
 @pytest.mark.parametrize(("change", "facts"), WRONG)
 def test_a_trial_that_is_not_its_candidate_s_run(change, facts):
     """`learn` refuses it and says how to override that; `tell` takes it and warns."""
-    with pytest.raises(TrialRefused, match=holding(*facts, "check=False")) as refused:
+    with pytest.raises(gr.TrialRefused, match=holding(*facts, "check=False")) as refused:
         gr.learn(TASK, lambda c: change(run(c)), ONE)
     assert refused.value.search.trials == ()
     assert "ingest" not in str(refused.value) and "[log" not in str(refused.value)
@@ -59,7 +58,7 @@ def test_a_later_trial_is_checked_too_and_the_earlier_ones_are_kept():
         trial = run(candidate)
         return trial if candidate.id == "c0001" else scaled(trial, 1, -1)
 
-    with pytest.raises(TrialRefused, match=holding("c0002", "turn")) as refused:
+    with pytest.raises(gr.TrialRefused, match=holding("c0002", "turn")) as refused:
         gr.learn(TASK, turned, gr.SearchOptions(max_trials=3))
     search = refused.value.search
     assert len(search.trials) == 1 and search.ask().id == "c0002"

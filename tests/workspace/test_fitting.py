@@ -1,5 +1,6 @@
 """`fit` in a workspace: the sensors first, nothing written that predicts worse, no round trips."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +54,13 @@ def misled(tmp_path: Path) -> Workspace:
     return logs(tmp_path / "w", [1.4, 1.4, 1.4, 1.0] * 2)
 
 
-def claimed(w: Workspace, value: float = 1.2, crude: float = 0.3, after: float = 0.1) -> None:
+def claimed(
+    w: Workspace,
+    value: float = 1.2,
+    crude: float = 0.3,
+    after: float = 0.1,
+    named: Sequence[str] = (),
+) -> None:
     """A diagnosis of today's trials and model that says what the mass should be."""
     mass = {"value": value - 1.0, "std": 0.01, "interval": [value - 1.02, value - 0.98]}
     row = {"effect": "parameter:mass", "params": {"d": mass}, "claimed": True, "evidence": 40.0}
@@ -65,6 +72,7 @@ def claimed(w: Workspace, value: float = 1.2, crude: float = 0.3, after: float =
         "with_effects": {"x": after},
     }
     made = {"trials": usable_ids(w), "adopted": [], "params": {}, "nominal": {"mass": 1.0}}
+    made["named"] = list(named)
     changes = {
         "verdict": {"kind": "effect", "effects": ["parameter:mass"], "sentence": "One."},
         "ranking": [row],
@@ -102,6 +110,37 @@ def test_values_that_predict_worse_are_never_written(misled):
     done = grounded("-C", misled.folder, "fit", "--params", "mass", "--apply")
     assert done.code == 1 and "Traceback" not in done.err
     assert misled.config.file.read_text() == before
+
+
+def test_trials_of_before_a_change_of_the_robot_can_be_left_out(tmp_path):
+    w = logs(tmp_path / "w", [1.0] * 4 + [1.4] * 4)
+    newer = ("t0005", "t0006", "t0007", "t0008")
+    mixed, found = w.fit(), w.fit(trials=newer)
+    assert mixed.trials == tuple(usable_ids(w)) and found.trials == newer
+    assert mixed.fit.params["mass"].value < 1.35
+    assert found.fit.params["mass"].value == pytest.approx(1.4, rel=0.02)
+    assert found.to_json()["trials"] == list(newer)
+    said = grounded("-C", w.folder, "fit", "--trials", ",".join(newer))
+    assert holds(" ".join(said.err.split()), "t0005, t0006, t0007 and t0008")
+    assert found.then == NextCommand("fit", ("--trials", ",".join(newer), "--apply"))
+    w.fit(trials=newer, apply=True)
+    assert w.base_model.params["mass"].value == pytest.approx(1.4, rel=0.02)
+    with pytest.raises(GroundedError) as unknown:
+        w.fit(trials=["T0005", "t0009"])
+    assert holds(str(unknown.value), "t0009", "t0001", "t0008")
+    empty = grounded("-C", w.folder, "fit", "--trials", ",")
+    assert empty.code == 1 and holds(empty.err, "--trials", "names no trial")
+
+
+def test_the_fit_after_a_diagnosis_of_some_trials_is_of_the_same_trials(misled):
+    some = ["t0001", "t0002", "t0003", "t0004"]
+    claimed(misled, named=some)
+    asked = NextCommand("fit", ("--trials", ",".join(some)))
+    assert misled.status().then == asked
+    misled.fit()  # of other trials
+    assert misled.status().then == asked
+    assert not misled.fit(trials=some).fit.helps
+    assert misled.status().then == NextCommand("adopt", ("parameter:mass",))
 
 
 def test_a_fit_in_vain_is_not_asked_for_again(misled):

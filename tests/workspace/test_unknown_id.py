@@ -31,7 +31,7 @@ WRONG = [  # command, what its message names
     (["export", "foo"], ["no candidate 'foo'", "c0001 to c0002"]),
     (["ingest", "t0001"], ["stored trial", "expected the file of a log"]),
     (["inspect", "t0001"], ["stored trial", "trials/t0001-"]),
-    (["target", "t0001"], ["stored trial", "trials/t0001-"]),
+    (["target", "c0001"], ["is a candidate"]),
     (["next", "c0001"], ["candidate", "expected the file of a log"]),
 ]
 

@@ -136,8 +136,7 @@ class Workspace(Folder):
 
         Args:
             path: a trial file of grounded's, a log of another format, or the folder of a bag.
-            candidate: the candidate that was run, or `best`; None: the one that the trial names,
-                else the outstanding one.
+            candidate: the candidate that was run, or `best`; None: the log's, else the outstanding.
             data: the log ran no candidate and serves fitting and diagnosis only.
         """
         from grounded_trials.workspace.intake.ingest import ingest_log
@@ -200,15 +199,17 @@ class Workspace(Folder):
         self,
         params: Sequence[str] | None = None,
         *,
+        trials: Sequence[str] = (),
         latency: bool = False,
         apply: bool = False,
         engine: Engine | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> Fitted:
-        """Estimate the model's parameters from all trials, after correcting sensor errors.
+        """Estimate the model's parameters from trials, after correcting sensor errors.
 
         Args:
             params: names of the parameters to fit; None: all.
+            trials: short names such as t0007; empty: all usable trials.
             latency: also fit one transport delay, common to all inputs.
             apply: write the values to grounded.toml.
             engine: workers for the trials' likelihoods; their number does not change the result.
@@ -219,8 +220,8 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.fitting import fit_in
 
-        asked = partial(fit_in, self._afresh(), params, latency=latency, apply=apply)
-        done = asked(engine=engine, progress=progress)
+        asked = partial(fit_in, self._afresh(), params, trials=trials, latency=latency)
+        done = asked(apply=apply, engine=engine, progress=progress)
         self.forget()
         return done
 
@@ -364,8 +365,7 @@ class Workspace(Folder):
         """Check all stored files for changes, damage, deletion and replacement.
 
         Trials and notes are checked against their hashes and for completeness; candidates against
-        their checksums, the records of what was handed out, and their predictions; the last
-        diagnosis and the optimum against their checksums.
+        their checksums, what was handed out, and their predictions; the rest by checksums.
         """
         from grounded_trials.workspace.verifying import verify_in
 

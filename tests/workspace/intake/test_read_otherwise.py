@@ -7,7 +7,7 @@ from cli import grounded
 from facts import holds
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
-from recorded import record, waiting
+from recorded import LOGGED, record, waiting
 
 
 @pytest.fixture
@@ -55,6 +55,35 @@ def test_two_states_in_each_other_s_column_are_named(w, tmp_path):
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5)
     said = str(refused(w, edited(run, exchanged)))
     assert holds(said, "c0002", "[log.state.x]", "[log.state.v]", "each other's column")
+
+
+def test_columns_that_no_command_depends_on_are_not_called_exchanged(tmp_path):
+    """An open-loop run of another candidate: `x and v seem to be in each other's column`."""
+    w = waiting(tmp_path, LOGGED.replace("[task]\n", "[task]\nfeedback = false\n"))
+    ran = w.candidate("c0002")[0].policy
+    w.ingest(record(w, tmp_path / "a.csv", ran, 0.0))
+    waits = w.propose().candidate
+    assert waits.policy.gain is None
+    off = np.std(waits.policy.feedforward - ran.feedforward)
+    assert 1e-3 < off < 0.1 * np.abs(ran.feedforward).max()
+    found = w.ingest(record(w, tmp_path / "b.csv", ran, 0.0, seed=1), candidate=waits.id)
+    said = " ".join(found.warnings)
+    assert holds(said, "c0002", f"what {waits.id} sends") and "column" not in said
+
+
+def test_a_log_that_somebody_named_a_run_of_a_candidate_says_that_it_counts(w, tmp_path):
+    def driven(table):
+        t, rng = table[:, 0] - table[0, 0], np.random.default_rng(0)
+        table[:, 1], table[:, 2] = np.sin(2 * t), 2 * np.cos(2 * t)
+        table[:, 3] = np.repeat(rng.uniform(-2, 2, len(t)), 25)[: len(t)]
+
+    run = edited(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0), driven)
+    found = w.ingest(run, candidate="c0002")
+    assert found.candidate == "c0002" and found.warnings
+    (note,) = [one for one in found.notes if "counts" in one]
+    assert holds(note, "c0002", "--candidate", f"discard {found.trial}")
+    own = record(w, tmp_path / "b.csv", w.candidate("c0002")[0].policy, 0.0, seed=3)
+    assert not any("counts" in one for one in w.ingest(own, candidate="c0002").notes)
 
 
 def test_a_speed_that_stays_at_zero_is_the_reason_that_is_given(w, tmp_path):

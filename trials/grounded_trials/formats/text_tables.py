@@ -12,9 +12,11 @@ import codecs
 import csv
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from itertools import islice
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -27,6 +29,7 @@ from grounded_trials.formats.tables import column_name, is_time, table_records, 
 
 PREAMBLE = 100  # largest number of lines above the column names
 LOOK = 65536  # characters read of a line
+BEFORE = 20  # rows before the last one that show how many digits its last cell should have
 DATES = ("date", "datetime", "date_time", "datum", "datum_zeit", "fecha")
 DAY = re.compile(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})")  # as in Germany
 CLOCK = re.compile(r"^(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d*)?)$")
@@ -53,15 +56,15 @@ def csv_records(path: Path) -> Iterator[Record]:
         first = [stream.readline(LOOK) for _ in range(PREAMBLE + 2)]
         head = _head(first, path)
         width, times = len(head.names), _times_among(head, first, path)
-        _pass_over(stream, head)
+        cut = _cut_in(stream, head)
         try:
             with warnings.catch_warnings():  # a table without rows is reported below
                 warnings.simplefilter("ignore")
-                values = np.loadtxt(stream, delimiter=head.mark, ndmin=2, usecols=range(width))
+                rows = _rows(stream, head, cut)
+                values = np.loadtxt(rows, delimiter=head.mark, ndmin=2, usecols=range(width))
             stamps = None
         except ValueError:
-            _pass_over(stream, head)
-            values, stamps = _with_texts(stream, head, times, path)
+            values, stamps = _with_texts(_rows(stream, head, cut), head, times, path)
     if not values.size:
         raise GroundedError(f"{path} has no rows below line {head.line} with the column names")
     columns: dict[str, Any] = {name: values[:, i] for i, name in enumerate(head.names) if name}
@@ -84,21 +87,62 @@ def column_units(path: Path) -> dict[str, str]:
 
 
 def cut_off(path: Path) -> str:
-    """Return a warning if the last row of a text table is cut off and left out; "" otherwise."""
+    """Return a warning if the last row of a text table is incomplete and left out, else ""."""
     if path.suffix.lower() not in (".csv", ".tsv", ".txt"):
         return ""
     with _opened(path) as stream:
-        head, last = _head([stream.readline(LOOK) for _ in range(PREAMBLE + 2)], path), ""
-        _pass_over(stream, head)
-        for line in stream:
-            last = line
-    short = last.strip() and len(_cells(last, head.mark)) < len(head.names)
-    if not short or not _is_cut([last]):
+        head = _head([stream.readline(LOOK) for _ in range(PREAMBLE + 2)], path)
+        cut = _cut_in(stream, head)
+    if cut is None:
         return ""
+    if not cut.text:
+        return (
+            f"from line {cut.line} on it holds only zero bytes, as after a power loss: what was "
+            "recorded after that is lost"
+        )
     return (
-        f"its last row, {last.strip()[:80]!r}, was cut off and is left out: the file ends in the "
-        "middle of it, and everything after that is lost"
+        f"its last row, line {cut.line} ({cut.text[:80]!r}), is incomplete and is left out: "
+        "everything after that is lost"
     )
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """The last row of a table whose writer was interrupted."""
+
+    line: int  # line number, from 1
+    text: str  # what is left of the row; "" if there are only zero bytes
+
+
+def _cut_in(stream: TextIO, head: _Head) -> _Cut | None:
+    """Find a last row with too few cells, or, without a line end, with half a number."""
+    _pass_over(stream, head)
+    last = deque[tuple[int, str]](maxlen=BEFORE + 1)
+    last.extend((n, line) for n, line in enumerate(stream, head.rows + 1) if line.strip())
+    if not last:
+        return None
+    (number, line), before = last[-1], [_cells(line, head.mark) for _, line in last][:-1]
+    text = line.strip(" \t\r\n\0")
+    cells = _cells(text if "\0" in line else line.rstrip("\r\n"), head.mark)
+    whole = line.endswith("\n") or not all(len(row) == len(cells) for row in before)
+    if len(cells) < len(head.names) or not (whole or _ends(cells[-1], [row[-1] for row in before])):
+        return _Cut(number, text)
+    return None
+
+
+def _ends(cell: str, before: Sequence[str]) -> bool:
+    """Check whether the last cell of a file is as complete as those above it."""
+    if any(np.isnan(_number(one)) for one in before):
+        return True  # texts or empty cells
+    digits = {len(one.partition(".")[2]) for one in before}
+    fixed = len(digits) == 1 and len(before) >= BEFORE
+    return not np.isnan(_number(cell)) and not (fixed and len(cell.partition(".")[2]) < min(digits))
+
+
+def _rows(stream: TextIO, head: _Head, cut: _Cut | None) -> Iterable[str]:
+    """Return the lines of the rows, without one that is cut off."""
+    _pass_over(stream, head)
+    return stream if cut is None else islice(stream, cut.line - head.rows - 1)
 
 
 def _opened(path: Path) -> TextIO:
@@ -192,22 +236,16 @@ def _rises(cells: Sequence[Sequence[str]]) -> bool:
     return len(found) > 2 and bool(np.all(np.diff(found) > 0))
 
 
-def _with_texts(stream: TextIO, head: _Head, times: str, path: Path) -> tuple[Floats, Any]:
-    """Read rows with texts or empty cells as NaN, and times [ns] if these are texts, else None.
-
-    A last row that is cut off is left out.
-    """
+def _with_texts(lines: Iterable[str], head: _Head, times: str, path: Path) -> tuple[Floats, Any]:
+    """Read rows with texts or empty cells as NaN, and times [ns] if these are texts, else None."""
     rows: list[list[float]] = []
     width, at = len(head.names), head.names.index(times)
     date = next((i for i, n in enumerate(head.names) if n.lower() in DATES and i != at), None)
     texts: list[tuple[int, str, str]] = []
-    lines = list(stream)
     for number, row in enumerate(csv.reader(lines, delimiter=head.mark), start=head.rows + 1):
         if not any(cell.strip() for cell in row):
             continue
         if len(row) != width:
-            if number > len(lines) + head.rows - 1 and len(row) < width and _is_cut(lines):
-                break  # the writer was interrupted
             raise GroundedError(
                 f"{path}, line {number} has {len(row)} cells, but line {head.line} names {width}"
             )
@@ -219,10 +257,6 @@ def _with_texts(stream: TextIO, head: _Head, times: str, path: Path) -> tuple[Fl
     if np.isfinite(values[:, at]).any() or not rows:
         return values, None  # times are numbers; missing ones are reported later
     return values, _stamps(texts, times, path)
-
-
-def _is_cut(lines: Sequence[str]) -> bool:
-    return not lines[-1].endswith("\n")
 
 
 def _stamps(texts: Sequence[tuple[int, str, str]], name: str, path: Path) -> Any:

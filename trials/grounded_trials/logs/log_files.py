@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError
 from grounded.result import listed
 from grounded_trials.formats.budget import budget
 from grounded_trials.formats.mcap_records import Messages, Metadata, Record
@@ -83,15 +83,21 @@ def _bag(folder: Path) -> list[Path]:
 
 def _nearby(path: Path) -> str:
     """Return advice on a file that does not exist, to append to the message."""
+    from difflib import get_close_matches
+
     if not path.parent.is_dir():
         return f", nor does its folder {path.parent}: give a path relative to the current folder"
     there = [p for p in path.parent.iterdir() if p.name.endswith(KINDS)]
     logs = sorted((p for p in there if not _NO_LOG.fullmatch(p.name)), key=lambda p: -_written(p))
     if logs:
-        close = nearest(path.name, [p.name for p in logs])
-        if len(logs) <= NEWEST or close.startswith("did you mean"):
-            said = close.startswith("did you mean")
-            return f": {close}" if said else f"; the folder has {listed(p.name for p in logs)}"
+        plain = _DIGITS.sub("0", path.stem.lower())
+        named = {p.stem.lower(): p.name for p in reversed(logs)}  # endings make all names alike
+        close = get_close_matches(path.stem.lower(), named, n=1)
+        close += [stem for stem in named if _DIGITS.sub("0", stem) == plain]  # another number
+        if close:
+            return f": did you mean '{named[close[0]]}'?"
+        if len(logs) <= NEWEST:
+            return f"; the folder has {listed(p.name for p in logs)}"
         newest = listed([p.name for p in logs[:NEWEST]])
         return f": the newest of the {len(logs)} logs in its folder are {newest}"
     return ": give the path of a log or of a bag's folder, relative to the current folder"

@@ -36,6 +36,7 @@ from grounded_trials.starting.interval import interval_of
 from grounded_trials.starting.kinds import KINDS, Joints, called_input, kind_in, moving, skeleton
 from grounded_trials.starting.own_model import OwnModel, own_model
 from grounded_trials.store.store import write_atomically
+from grounded_trials.wording import count
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.model_file import load_module, model_in
@@ -176,6 +177,12 @@ def _begin(
         raise GroundedError(
             f"{log} holds no numbers, {words}: init needs a log with the robot's states and "
             "commands as numbers"
+        )
+    numbers = [field for topic in report.topics for field in topic.fields if field.low is not None]
+    if all(field.low == field.high for field in numbers):
+        raise GroundedError(
+            f"nothing changes in {log}: each of its {count(len(numbers), 'number')} is the same in "
+            "every row. Was the robot switched off? init needs a log in which it moves"
         )
     report, notes = _one_run(report)
     joints = joint_names(report)

@@ -1,4 +1,4 @@
-"""Draws targets: paths with limited speed and acceleration, steps, swing-ups, recorded runs.
+"""Draws targets: paths with limited speed and acceleration, steps, swing-ups.
 
 A path is parametrised by its length. The speed starts at zero, rises with `accel`, and is limited
 by `speed` and, in curves, by sqrt(lateral / curvature). Every state with one of the roles position,
@@ -7,26 +7,19 @@ heading, speed and heading_rate gets a column.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 
-from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
 from grounded.instruments.kinematics import integrals
 from grounded.model import Model
 from grounded.task import MAX_HORIZON
-from grounded_trials.logs.inspect_log import inspect_log
 from grounded_trials.logs.inspect_pairs import velocities
-from grounded_trials.logs.log_files import log_files
-from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
-from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import position_names
-from grounded_trials.workspace.task_file import read_target
-from grounded_trials.workspace.unknown_id import refuse_ids
 
 PATHS = ("line", "circle", "figure-8")
 SHAPES = (*PATHS, "step", "swing-up")
@@ -132,11 +125,11 @@ def _check(drive: Drive) -> None:
 
 
 def _grid(seconds: float, dt: float) -> Array:
-    steps = _in_steps(seconds, dt, float(np.ceil(seconds / dt - 1e-6)))
+    steps = in_steps(seconds, dt, float(np.ceil(seconds / dt - 1e-6)))
     return dt * np.arange(steps + 1.0)
 
 
-def _in_steps(seconds: float, dt: float, steps: float) -> int:
+def in_steps(seconds: float, dt: float, steps: float) -> int:
     """Return a target's number of control steps as an integer.
 
     Raises:
@@ -190,6 +183,7 @@ def line_target(
         raise GroundedError(f"the line ends where it starts, at {_told(to)}: change --to")
     if seconds is not None:
         drive = _in_time(drive, length, seconds, kept)
+        _grid(seconds + drive.hold, dt)
     along = np.linspace(0, length, FINE)
     limit = np.full(FINE, drive.speed)
     limit[-1] = 0.0
@@ -292,7 +286,7 @@ def step_target(
     """
     if not to:
         raise GroundedError("name a state and its value, such as --to x=1.0")
-    rows = _in_steps(seconds, dt, np.round(seconds / dt)) + 1
+    rows = in_steps(seconds, dt, np.round(seconds / dt)) + 1
     _check_states(to, model)
     first = np.arange(rows) < 1
     return {name: np.where(first, start.get(name, 0.0), value) for name, value in to.items()}
@@ -387,50 +381,10 @@ def swing_up(
             f"no angle of model '{model.name}' hangs under its weight, so none can swing up; name "
             "the angle and its value, such as --to q=3.1416"
         )
-    first = np.arange(_in_steps(seconds, dt, np.round(seconds / dt)) + 1) < 1
+    first = np.arange(in_steps(seconds, dt, np.round(seconds / dt)) + 1) < 1
     columns = {}
     for one in chosen:
         hangs = start.get(one.angle, one.hangs)
         columns[one.angle] = np.where(first, hangs, to.get(one.angle, one.stands))
     others = {name: value for name, value in to.items() if name not in columns}
     return columns | (step_target(others, model, dt, seconds, start) if others else {})
-
-
-def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[str, Array]:
-    """Return the states of a recorded run as a target: a log read through [log], or a CSV.
-
-    Args:
-        workspace: provides the model and [log].
-        file: a log in any format, or a CSV with columns `t` and states.
-        shapes: names of the shapes, suggested if the file does not exist.
-
-    Raises:
-        GroundedError: if there is no such file, or it can't be sampled.
-    """
-    model, dt = workspace.base_model, workspace.config.task.dt
-    refuse_ids(workspace, file, "target")
-    if not Path(file).exists():
-        raise GroundedError(f"'{file}' is neither a file nor a shape: {nearest(file, shapes)}")
-    mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
-    if Path(file).suffix == ".csv" and (mapping is None or not _holds(Path(file), mapping)):
-        names, values = read_target(Path(file))
-        known = [name for name in names[1:] if name in model.states]
-        if not known:
-            raise GroundedError(f"{file} has no column named after a state: {', '.join(names)}")
-        lasts = values[-1, 0] - values[0, 0]
-        t = dt * np.arange(_in_steps(lasts, dt, np.floor((lasts + 1e-9) / dt)) + 1)
-        at = values[:, 0] - values[0, 0]
-        return {name: np.interp(t, at, values[:, names.index(name)]) for name in known}
-    if mapping is None:
-        raise GroundedError(
-            f"grounded.toml has no [log] table, which reading {file} needs: `inspect` prints one",
-            NextCommand("inspect", (file,)),
-        )
-    found = read_log(log_files(file), mapping, dt, angles=model.angles)
-    return dict(zip(mapping.states, found.states.T, strict=True))
-
-
-def _holds(table: Path, mapping: LogMapping) -> bool:
-    """Return whether a table has all states and inputs of [log]: then it is a log, no target."""
-    known = {f.path for t in inspect_log(table).topics for f in t.fields}
-    return all(s.path in known for s in (*mapping.states.values(), *mapping.inputs.values()))

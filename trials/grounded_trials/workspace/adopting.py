@@ -320,15 +320,23 @@ def _check(
     Raises:
         GroundedError: if not, or if [log] already corrects the delay that it describes.
     """
+    from grounded_trials.workspace.next_step import newer_alone
+
+    if found.changed and not set(names) <= {*found.late_sensors}:
+        raise GroundedError(
+            "the last diagnosis compared two groups of trials between which the robot changed: no "
+            "value of both is right for either",
+            newer_alone(found),
+        )
     known = [row.effect for row in found.ranking] + _curves(found) + [*found.late_sensors]
     adopted = [e["name"] for e in workspace.config.model.effects if e["name"] not in before]
     in_log = in_time_now(workspace, found.preflight)
     for name in names:
         if name not in known:
             _check_alike(name, found)
-            raise GroundedError(
-                f"'{name}' is not among the effects of the last diagnosis: {nearest(name, known)}"
-            )
+            family = [one for one in known if one.startswith(f"{name}:")]
+            there = f"did you mean '{family[0]}'?" if family else nearest(name, known)
+            raise GroundedError(f"'{name}' is not among the effects of the last diagnosis: {there}")
         if name in in_log:
             _, _, state = name.partition(":")
             raise GroundedError(

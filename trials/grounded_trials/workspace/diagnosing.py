@@ -18,13 +18,13 @@ import numpy as np
 
 from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked
-from grounded.errors import GroundedError, NextCommand, list_of
+from grounded.errors import GroundedError, NextCommand
 from grounded.instruments.finding import in_the_log
 from grounded_trials.store.documents import read_document, write_document
-from grounded_trials.wording import rendered
+from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.identity import ROWS
 from grounded_trials.workspace.intake.where_to_mend import where_to_mend
-from grounded_trials.workspace.unknown_id import unusable_trial
+from grounded_trials.workspace.unknown_id import named_trials
 
 if TYPE_CHECKING:
     from grounded.effects import Library
@@ -66,6 +66,7 @@ def diagnose_in(
     from grounded.effects import Library
     from grounded_trials.workspace.adopting import diagnosed_again
     from grounded_trials.workspace.next_step import (
+        DIAGNOSE,
         EXPORT,
         PROPOSE,
         REPORT,
@@ -135,8 +136,12 @@ def diagnose_in(
             "from."
         )
         found = replace(found, next_trial=f"{first} {found.next_trial}")
+    more = len(diagnosable(workspace)) - len(made.trials)
+    if unasked := found.no_cause and more > 0:
+        words = f"{count(more, 'stored trial')} of this task can be diagnosed as well."
+        found = replace(found, next_trial=words)
     _keep(workspace, found)  # again, now with `next_trial`
-    then = REPORT if undo else after_diagnosis(workspace, found)
+    then = REPORT if undo else DIAGNOSE if unasked else after_diagnosis(workspace, found)
     then = NextCommand("discard", wrong) if wrong else then
     if then == EXPORT and found.kind != "none":
         words = nothing_to_do(found, candidate_named(workspace, "best"))
@@ -242,19 +247,8 @@ def _with_limit(found: Diagnosis) -> Diagnosis:
 
 def _chosen(workspace: Folder, names: Sequence[str]) -> list[Trial]:
     """Return the trials to diagnose; states filled in by a smoother are no evidence: NaN again."""
-    if isinstance(names, str):
-        raise GroundedError(f"trials must be a list of names, such as ['{names}'], got '{names}'")
-    names = list_of(names, str, "trials")
     used = diagnosable(workspace)
-    if not used:
-        raise GroundedError(
-            "there is no trial to learn from: ingest runs of candidates, or other logs with --data"
-        )
-    known = [trial.id for trial in used]
-    names = [name.lower() for name in names]
-    for name in names:
-        if name not in known:
-            raise unusable_trial(workspace, name, known)
+    names = named_trials(workspace, names, [trial.id for trial in used])
     guessed = {t.stored.id: t.meta.get("estimated", "") for t in workspace.trials()}
     return [
         _measured(trial, [name for name in guessed[trial.id].split(",") if name])
@@ -343,6 +337,7 @@ def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:
         predicted_states=predicted.states[:, : planner.task.model.n],
         predicted_inputs=predicted.inputs,
         predicted_utility=predicted.utility,
+        units={**planner.task.model.states, **planner.task.model.inputs},
     )
 
 

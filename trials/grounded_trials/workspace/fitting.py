@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.workspace.adopting import settled
 from grounded_trials.workspace.config import set_in_model, set_latency
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.unknown_id import named_trials
 
 if TYPE_CHECKING:
     from grounded.engine import Engine
@@ -39,6 +41,7 @@ class Fitted(Result):
     preflight: tuple[Finding, ...]  # findings about the instruments
     then: NextCommand  # the command to type next
     not_fitted: tuple[str, ...] = ()  # adopted delays, unless the latency is fitted
+    trials: tuple[str, ...] = ()  # the trials that were fitted
 
     def summary(self) -> str:
         """Return the fitted values."""
@@ -48,6 +51,7 @@ class Fitted(Result):
         """Return the document of `fit --json`: values, intervals, held-out prediction errors."""
         return self.fit.to_json() | {
             "applied": self.applied,
+            "trials": list(self.trials),
             "not_fitted": list(self.not_fitted),
             "preflight": [one.to_json() for one in self.preflight],
         }
@@ -57,6 +61,7 @@ def fit_in(
     workspace: Folder,
     names: Sequence[str] | None,
     *,
+    trials: Sequence[str] = (),
     latency: bool = False,
     apply: bool = False,
     engine: Engine | None = None,
@@ -70,22 +75,28 @@ def fit_in(
     """
     from grounded_trials.workspace.next_step import after_fit, to_plan
 
-    found, seen = fit_trials(workspace, names, latency=latency, engine=engine, progress=progress)
+    used = usable_trials(workspace, trials)
+    found, seen = fit_trials(
+        workspace, used, names, latency=latency, engine=engine, progress=progress
+    )
     delays = [str(e["name"]) for e in workspace.config.model.effects]
     delays = [name for name in delays if name.startswith("delay:")]
     kept = () if names or latency else tuple(delays)
     if not (names or latency):
-        _keep(workspace, found)
-    asked = (*(("--params", ",".join(names)) if names else ()), *["--latency"] * latency)
+        _keep(workspace, used, found)
+    asked: tuple[str, ...] = ("--params", ",".join(names)) if names else ()
+    asked += ("--trials", ",".join(trials)) if trials else ()
+    asked += ("--latency",) * latency
+    fitted = partial(Fitted, found, preflight=seen, not_fitted=kept, trials=_ids(used))
     if apply and found.worse:
         why = f"nothing was written: {_worse(found)}"
         raise GroundedError(why, then=after_fit(workspace))
     if not apply:
         if not found.helps:
-            return Fitted(found, False, seen, after_fit(workspace), kept)
-        return Fitted(found, False, seen, NextCommand("fit", (*asked, "--apply")), kept)
+            return fitted(applied=False, then=after_fit(workspace))
+        return fitted(applied=False, then=NextCommand("fit", (*asked, "--apply")))
     apply_fit(workspace, found)
-    return Fitted(found, True, seen, to_plan(workspace), kept)
+    return fitted(applied=True, then=to_plan(workspace))
 
 
 def _worse(found: Fit) -> str:
@@ -108,50 +119,61 @@ def _worse(found: Fit) -> str:
     )
 
 
-def _keep(workspace: Folder, found: Fit) -> None:
+def _keep(workspace: Folder, used: Sequence[Trial], found: Fit) -> None:
     workspace.reports.mkdir(exist_ok=True)
-    write_document(workspace.reports / KEPT, _made_from(workspace) | {"helps": found.helps})
+    write_document(workspace.reports / KEPT, _made_from(workspace, used) | {"helps": found.helps})
 
 
-def _made_from(workspace: Folder) -> dict[str, Any]:
-    """Return the trials and the model that a fit would use now."""
-    trials = [trial.id for trial in usable_trials(workspace)]
-    return {"trials": trials, "model": workspace.planner.fingerprint}
+def _made_from(workspace: Folder, used: Sequence[Trial]) -> dict[str, Any]:
+    """Return the trials and the model of a fit."""
+    return {"trials": list(_ids(used)), "model": workspace.planner.fingerprint}
 
 
-def fitted_in_vain(workspace: Folder) -> bool:
-    """Return whether the current model was already fitted to the same trials without a gain."""
+def _ids(trials: Sequence[Trial]) -> tuple[str, ...]:
+    return tuple(trial.id for trial in trials)
+
+
+def fitted_in_vain(workspace: Folder, trials: Sequence[str] = ()) -> bool:
+    """Return whether the current model was already fitted to the same trials without a gain.
+
+    Args:
+        workspace: the workspace.
+        trials: short names; empty: all usable trials.
+    """
     try:
         kept = read_document(workspace.reports / KEPT)
+        used = usable_trials(workspace, trials)
     except (OSError, ValueError, RecursionError, GroundedError):  # then fit again
         return False
-    return kept.get("helps") is False and _made_from(workspace).items() <= kept.items()
+    return kept.get("helps") is False and _made_from(workspace, used).items() <= kept.items()
 
 
-def usable_trials(workspace: Folder) -> list[Trial]:
-    """Return the stored trials of this model, each up to its first non-finite sample.
+def usable_trials(workspace: Folder, names: Sequence[str] = ()) -> list[Trial]:
+    """Return stored trials of this model, each up to its first non-finite sample.
+
+    Args:
+        workspace: the workspace.
+        names: short names of the trials to return; empty: all that have at least 3 such steps.
 
     Raises:
-        GroundedError: if none has at least 3 steps.
+        GroundedError: if there is none, or one of those named can't be used.
     """
     trials = ((trial, trial.finite_steps) for trial in workspace.task_trials())
     found = [trial.until(T) for trial, T in trials if T >= 3]
-    if not found:
-        raise GroundedError(
-            "there is no trial to learn from: ingest runs of candidates, or other logs with --data"
-        )
-    return found
+    chosen = named_trials(workspace, names, _ids(found))
+    return [trial for trial in found if not chosen or trial.id in chosen]
 
 
 def fit_trials(
     workspace: Folder,
+    used: Sequence[Trial],
     names: Sequence[str] | None,
     *,
     latency: bool = False,
     engine: Engine | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[Fit, tuple[Finding, ...]]:
-    """Fit the parameters of the workspace's model, including adopted effects, to its trials.
+    """Fit the parameters of the workspace's model, including adopted effects, to trials of it.
 
     Findings about the instruments are corrected first, as in `diagnose`. The memory of an effect (a
     lag's output) is not measured: the filter estimates it, with an initial value from the commands.
@@ -168,7 +190,6 @@ def fit_trials(
     guessed = {n for t in workspace.trials() for n in t.meta.get("estimated", "").split(",")}
     model, n = planner.plan.model, planner.task.model.n
     shown = [i for i, name in enumerate(model.state_names[:n]) if name not in guessed]
-    used = usable_trials(workspace)
     hidden = [name for i, name in enumerate(model.state_names) if i not in shown]
     looked = sound_trials(planner.plan, [planner.lift(trial) for trial in used], hidden)
     records = []

@@ -383,7 +383,7 @@ def outside_limits(task: Task, policy: Policy) -> Iterator[str]:
     """
     for j, (name, unit) in enumerate(task.model.inputs.items()):
         low, high = task.low[j], task.high[j]
-        today = f"[limits] {name} = [{low:g}, {high:g}] {unit}"
+        today = with_unit(f"[limits] {name} = [{low:g}, {high:g}]", unit)
         if policy.low[j] < low or policy.high[j] > high:
             own = f"[{policy.low[j]:g}, {policy.high[j]:g}]"
             yield f"its own limits of {name} are {own}, wider than {today}"

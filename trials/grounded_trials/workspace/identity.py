@@ -9,6 +9,7 @@ trials of the second count as data and get a name with the hash of what they ran
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -169,7 +170,8 @@ def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> 
     for name in trials:
         if not workspace.store.matching(name.lower()):
             raise unknown_trial(workspace, name)
-    found = [workspace.store.find(name.lower()) for name in trials]
+    named = dict.fromkeys(name.lower() for name in trials)
+    found = [workspace.store.find(name) for name in named]
     same = []  # no change: discarded again for no other reason, or restored but never discarded
     digests = [stored.digest for stored in workspace.store.list()]
     for one in found:
@@ -282,6 +284,7 @@ def _proven(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
             f"{name} holds the candidate '{about['id'][:40]}', but a file must have the name of "
             "its candidate. Rename it, or delete it if the candidate's own file exists"
         )
+    about["units"] = json.loads(meta["states"]) | json.loads(meta["inputs"])
     return Candidate(policy=policy, predicted_states=states, predicted_inputs=inputs, **about), meta
 
 

@@ -232,9 +232,7 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
 
     new = diagnosis.open(workspace.config.model.effects, workspace.config.model.params)
     if diagnosis.changed:  # values of two robots together fit neither
-        made = diagnosis.made or Made()
-        newer = max(made.named, made.compared, key=lambda group: max(group, default=""))
-        return NextCommand("diagnose", ("--trials", ",".join(newer)))
+        return newer_alone(diagnosis)
     undone = {*declined(workspace)}  # effects the user has undone are not suggested again
     late = tuple(name for name in late_open(workspace, diagnosis) if name not in undone)
     claimed = diagnosis.kind in ("effect", "several") and not diagnosis.contested
@@ -248,11 +246,20 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
         return DIAGNOSE  # after widening their bounds, as the diagnosis says
     own = {f"parameter:{name}" for name in params}
     if own.issuperset(new):
-        if not fitted_in_vain(workspace):
-            return NextCommand("fit")  # only parameters are off: fit all of them together
+        made = diagnosis.made or Made()
+        some = (*made.named, *made.compared)
+        if not fitted_in_vain(workspace, some):  # only parameters are off: fit all together
+            return NextCommand("fit", ("--trials", ",".join(some)) if some else ())
         if gain(diagnosis.prediction_error, "crude", "with_effects") <= 0:
             return NextCommand("adopt", late) if late else None
     return NextCommand("adopt", (*new, *late))
+
+
+def newer_alone(diagnosis: Diagnosis) -> NextCommand:
+    """Return the diagnosis of the newer of the two groups that a diagnosis compared."""
+    made = diagnosis.made or Made()
+    newer = max(made.named, made.compared, key=lambda group: max(group, default=""))
+    return NextCommand("diagnose", ("--trials", ",".join(newer)))
 
 
 def _like_a_load(workspace: Folder, effects: Sequence[str]) -> bool:

@@ -130,8 +130,12 @@ CHANGE = 0.01  # weight on the changes of an input with range -1 to 1
 CHANGES = 4 * CHANGE
 
 
-def read_target(path: Path) -> tuple[list[str], Array]:
+def read_target(path: Path, free: Collection[str] = ()) -> tuple[list[str], Array]:
     """Read the names of the columns (`t` first) and their values, (rows, columns).
+
+    Args:
+        path: the CSV file.
+        free: names of columns that may hold NaN: of inputs, beside the states of a run.
 
     Raises:
         GroundedError: naming the line and the column of a value that is not a number.
@@ -154,7 +158,7 @@ def read_target(path: Path) -> tuple[list[str], Array]:
                 if len(values) != len(names) or not math.isfinite(sum(values)):
                     if not any(cell.strip() for cell in row):
                         continue
-                    values = _numbers(path, line, names, row)
+                    values = _numbers(path, line, names, row, free)
                 rows.append(values)
     except FileNotFoundError:
         raise GroundedError(f"{path} does not exist, but [task] target names it") from None
@@ -176,7 +180,9 @@ def _check_header(path: Path, names: list[str]) -> None:
         raise GroundedError(f"{path.name}: there are two columns named '{twice[0]}'")
 
 
-def _numbers(path: Path, line: int, names: list[str], row: list[str]) -> list[float]:
+def _numbers(
+    path: Path, line: int, names: list[str], row: list[str], free: Collection[str]
+) -> list[float]:
     if len(row) != len(names):
         raise GroundedError(
             f"{path.name} line {line}: {len(row)} values for {len(names)} columns "
@@ -190,7 +196,7 @@ def _numbers(path: Path, line: int, names: list[str], row: list[str]) -> list[fl
             raise GroundedError(
                 f"{path.name} line {line}: '{cell}' in column '{name}' is not a number"
             ) from None
-        if not math.isfinite(value):
+        if not math.isfinite(value) and name not in free:
             raise GroundedError(
                 f"{path.name} line {line}: {cell.strip()} in column '{name}'; every tracked value "
                 "must be finite; omit the column if the state is free"

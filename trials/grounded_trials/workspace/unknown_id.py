@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import GroundedError, NextCommand, list_of
 from grounded_trials.wording import ranges
 
 if TYPE_CHECKING:
@@ -69,6 +69,30 @@ def unusable_trial(workspace: Folder, name: str, usable: Sequence[str]) -> Groun
         f"{given} can't be used: it is too short, or has other states, inputs or dt than this "
         f"task; trials to use: {ranges(usable)}"
     )
+
+
+def named_trials(workspace: Folder, names: Sequence[str], usable: Sequence[str]) -> tuple[str, ...]:
+    """Return the trials that fit and diagnose are to use, in lower case; empty: all usable ones.
+
+    Args:
+        workspace: the workspace.
+        names: the names that were given.
+        usable: the trials that can be used.
+
+    Raises:
+        GroundedError: if nothing can be used, or a name is no usable trial.
+    """
+    if isinstance(names, str):
+        raise GroundedError(f"trials must be a list of names, such as ['{names}'], got '{names}'")
+    given = list_of(names, str, "trials")
+    if not usable:
+        raise GroundedError(
+            "there is no trial to learn from: ingest runs of candidates, or other logs with --data"
+        )
+    for name in given:
+        if name.lower() not in usable:
+            raise unusable_trial(workspace, name, usable)
+    return tuple(name.lower() for name in given)
 
 
 def refuse_ids(workspace: Folder, log: str | Path, verb: str) -> None:

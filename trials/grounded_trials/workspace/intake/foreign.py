@@ -19,12 +19,13 @@ from grounded.result import listed
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.logs.inspect_log import inspect_log
-from grounded_trials.logs.log_files import log_files, log_records
+from grounded_trials.logs.log_files import kind_of, log_files, log_records
 from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signals
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.samples import MIXED_S
 from grounded_trials.logs.signals import Series, read_signals
 from grounded_trials.store.store import hash_file
+from grounded_trials.wording import count
 from grounded_trials.workspace.adopted import but_late_sensors, planner_of
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
@@ -232,6 +233,13 @@ def mapping_of(workspace: Folder, path: Path) -> LogMapping:
         return mapping
     if (path / FILE).is_file():
         raise GroundedError(f"{path} is a workspace: name the log in it, or the log's folder")
+    own = [file for file in files if kind_of(file)] if path.is_dir() else []
+    if own:
+        raise GroundedError(
+            f"{path} is a folder with {count(len(own), 'file')} that grounded wrote: ingest the "
+            "file of a run",
+            NextCommand("ingest", (str(max(own, key=lambda file: file.stat().st_mtime)),)),
+        )
     for file in files:
         next(iter(log_records(file)), None)
     raise GroundedError(

@@ -204,22 +204,22 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         read = replace(read, warnings=(*read.warnings, loosely(found.loose_s, ran)))
     why, other = seen.why, seen.other
     fell, stored = look.fell, read.log.stored if read.log else ()
-    if before := [one.trial.steps for one in stored if one.trial.candidate == ran]:
-        # the log was accepted when it was stored first
-        return cut_short(read, fell.steps, "") if fell and fell.steps in before else read
-    units, by = other_units(workspace.task, whole, own, seen.ran)
+    task, policy = workspace.task, own.policy
+    if accepted := [one.trial.steps for one in stored if one.trial.candidate == ran]:
+        return cut_short(read, fell.steps, "") if fell and fell.steps in accepted else read
+    units, by = other_units(task, whole, own, seen.ran)
     units = () if other else units
     if not why and not units:
         told = _like(read, ran, seen.ran)
         if fell:
             read = cut_short(read, fell.steps, fell.told)
         return replace(read, warnings=(*read.warnings, *told))
-    slow = pace_of(log, workspace.task, own.policy) if log else None
+    slow = pace_of(log, task, policy) if log and not other else None
     if slow:  # a recording at another rate may look like one in another unit
         units = ()
     elif log and not units and not other:
-        units, by = unit_of(log, workspace.task, own.policy)
-    if fell and not (units or slow or misled(log, workspace.task, own.policy)):
+        units, by = unit_of(log, task, policy)
+    if fell and not (units or slow or misled(log, task, policy)):
         return cut_short(read, fell.steps, fell.told)
     pace = slow and (
         f"a second of its stamps is {slow:g} s of the run (a recording played at another rate?): "
@@ -227,7 +227,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     )
     if candidate is not None:
         seem = f"with {listed(units)} times {by:.6g} it is its run: another unit, or sign?"
-        doubts = [seem if units else pace or misled(log, workspace.task, own.policy) or why]
+        doubts = [seem if units else pace or misled(None if other else log, task, policy) or why]
         if log and not (found and found.opens_alike):
             doubts.append(
                 f"no start of {ran} was found in it: the run is assumed to begin with the first "
@@ -257,7 +257,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     named = [*(misread(read.log) if read.log else ())]
     named += [one.told(known, own=read.own) for one in odd]
     if not named and not other:
-        named += filter(None, [misled(log, workspace.task, own.policy)])
+        named += filter(None, [misled(log, task, policy)])
     if named:
         raise GroundedError(f"{path} can't be read as a run of {ran}: {'; '.join(named)}")
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"

@@ -65,6 +65,8 @@ def log_faults(workspace: Folder, trial: Trial) -> tuple[Fault, ...]:
         trial: the trial, with gaps bridged.
     """
     model, known = workspace.base_model, trial.until(trial.known_steps)
+    if exchanged := _by_model(model, known):
+        return exchanged  # other faults may only be a consequence
     found = [*_exchanged(model, known), *dead_sensors(model, trial), *_thousands(model, known)]
     found += [*way_faults(model, known), *positions_faults(model, known)]
     said = {fault.said for fault in found}
@@ -81,6 +83,18 @@ def _exchanged(model: Model, known: Trial) -> Iterator[Fault]:
 
     if pair := swapped_columns(model, known, relations=integrals(model)):
         yield Fault(exchanged(pair), "Exchange their paths in [log]")
+
+
+def _by_model(model: Model, known: Trial) -> tuple[Fault, ...]:
+    """Return a fault for two exchanged states that only the model reveals."""
+    from grounded.instruments.exchanged_states import exchanged_states
+    from grounded.instruments.mistaken import SWAP_BACK, described
+    from grounded.instruments.swapped import swapped_columns
+
+    if swapped_columns(model, known):
+        return ()
+    told = exchanged_states(model, known, range(model.n))
+    return () if told is None else (Fault(described(model, told), SWAP_BACK),)
 
 
 def dead_sensors(model: Model, trial: Trial) -> list[Fault]:

@@ -29,6 +29,7 @@ from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.intake.run_start import TRIED, Recording, recording
 
 PAIRS = 28  # largest number of pairs of states, and of inputs, that are tried exchanged
+WORSE = 2.0  # factor by which a log must follow a policy worse than with two columns exchanged
 PACES = (2.0, 0.5)  # rates of a recording that are tried
 NAMED = (  # factor of a column and its meaning
     (np.pi / 180, " (in degrees)"),
@@ -115,14 +116,19 @@ def exchanged_in(log: Recording, task: Task, policy: Policy) -> tuple[str, str] 
         task: the task with the control step.
         policy: the policy.
     """
+    if (as_it_is := log.trial_from(log.first)) is None:
+        return None
+    apart = follows(policy, as_it_is.until(policy.horizon), 0)
     inputs = list(combinations(task.model.input_names, 2))[:PAIRS]
     states = [name for name in task.model.state_names if name in log.logged]
+    if policy.gain is None or not policy.gain.any():
+        states = []  # none has an effect on the commands
     for a, b in (*inputs, *list(combinations(states, 2))[:PAIRS]):
         one, other = log.logged[a], log.logged[b]
         back = {a: replace(other, spec=one.spec), b: replace(one, spec=other.spec)}
         run = _run_in(recording({**log.logged, **back}, task, log.complete), policy)
         fit = run and follows(policy, run.until(policy.horizon), 0)
-        if fit and fit.error < NEARLY:
+        if fit and fit.error < NEARLY and not (apart and apart.error < WORSE * fit.error):
             return a, b
     return None
 

@@ -65,7 +65,7 @@ def warnings_about(
             "as ended there"
         )
     if not trial.candidate:
-        return (*found, *_beyond(task, whole, scaled))
+        return (*found, *_still(whole), *_beyond(task, whole, scaled))
     if whole.steps < task.horizon and not fell:
         ends = f"after {whole.steps} of {task.horizon} steps ({whole.steps * trial.dt:.2f} s)"
         found.append(
@@ -84,6 +84,7 @@ def warnings_about(
     found += _start(task, whole, _starts_before(workspace, trial.id))
     found += _inputs(task, whole)
     candidate, _ = workspace.candidate(trial.candidate)
+    found += _still(whole) if np.ptp(candidate.predicted_states, axis=0).any() else []
     found += [] if fell else _unsafe(task, whole, candidate)
     ran = follows(candidate.policy, whole, max(LATEST, latest(task)))
     if ran is not None and ran.alike and ran.late and ran.moved < UNLIKE:
@@ -262,6 +263,17 @@ def _inputs(task: Task, trial: Trial) -> list[str]:
         "clipping"
         for i, name in enumerate(trial.input_names)
         if excess[i] > 1e-6
+    ]
+
+
+def _still(trial: Trial) -> list[str]:
+    """Return a warning if no known state changes during a trial."""
+    known = trial.states[:, np.isfinite(trial.states).any(axis=0)]
+    if len(known) < 2 or np.any(np.nanmax(known, axis=0) > np.nanmin(known, axis=0)):
+        return []
+    return [
+        "no state changes in it: was the robot switched on, and are these the columns of its "
+        f"sensors? fit and diagnose learn nothing from it; `discard {trial.id}` sets it aside"
     ]
 
 
