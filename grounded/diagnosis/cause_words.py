@@ -70,8 +70,10 @@ def _noun(model: Model, name: str) -> str:
     """Return the noun that a name needs in front of it in a sentence; "" if it needs none."""
     from grounded.effects import places
 
+    # one of two velocities, `vx` beside `vy`, is not the speed
+    own = places.role(model, "speed") or len([u for u in model.states.values() if u == "m/s"]) == 1
     roles = {
-        "speed": (places.speed(model),),
+        "speed": (places.speed(model),) if own else (),
         "heading": places.role(model, "heading"),
         "heading rate": places.role(model, "heading_rate"),
         "position": places.position(model),
