@@ -93,10 +93,11 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
 
     model, targets = effect.site.model, effect.site.targets
     constants = {q.name: Estimate(q.start, 0.0, None, q.unit) for q in effect.quantities if q.fixed}
-    words = {name: quantity(e) for name, e in {**constants, **params}.items()}
+    known = {**constants, **params}
+    words = {name: quantity(e) for name, e in known.items()}
     words.setdefault("s", "s" if len(targets) == 1 else "")
-    some = "L" in constants and constants["L"].value
-    words["least"] = f"at {words['L']}, its smallest" if some else "near zero"
+    clear = "L" in known and known["L"].value > 0
+    words["least"] = f"at {words['L']}, its smallest" if clear else "near zero"
     driven, _, source = effect.site.target.partition("<-")
     words["target"] = all_called(model, targets)
     if isinstance(effect.family, ParamFamily):

@@ -5,7 +5,7 @@ A mechanism without a position in the plane is drawn from the side, with the pat
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +24,7 @@ LOGS = 4  # largest number of logs drawn if there is no run
 LOG_ROLES = ("best", "model", "accepted", "limit")
 SEEN = 5.0  # smallest factor at which enlarged deviations are drawn
 MOSTLY = 0.5  # a path with a larger share beyond FAR is left out
+FLAT = 0.1  # smallest height of a view from the side, as a fraction of its width
 FAR = 0.4  # limit of enlarged deviations, as a fraction of the desired path's size
 
 
@@ -35,6 +36,7 @@ class View:
     place: Callable[[Array], Array]
     equal: bool
     body: Body | None = None
+    side: bool = False  # a height over a distance, in one unit, each with its own scale
 
     @property
     def title(self) -> str:
@@ -55,8 +57,12 @@ def _views(findings: Findings, scene: Scene) -> list[View]:
 def _plane(scene: Scene, axis: int) -> View:
     """Return the view of an axis over the first one."""
     x, y = (labelled(scene.names[i], scene.units[i]) for i in (0, axis))
-    equal = axis == 1 and scene.spatial and scene.units[0] == scene.units[1]
-    return View((x, y), lambda states: states[:, [scene.axes[0], scene.axes[axis]]], equal)
+    one = scene.spatial and scene.units[0] == scene.units[axis]
+
+    def place(states: Array) -> Array:
+        return states[:, [scene.axes[0], scene.axes[axis]]]
+
+    return View((x, y), place, one and axis == 1, side=one and axis > 1)
 
 
 def path_figure(findings: Findings) -> Figure | None:
@@ -155,7 +161,20 @@ def _seen_in(findings: Findings, view: View) -> Panel:
     ]
     curves = tuple(_path(view, states, dt, *words) for states, *words in drawn)
     dots = tuple(d for _, _, r in runs for d in _crash_mark(r, view, dt))
-    return Panel(view.title, *view.names, curves, dots, equal=view.equal, kind="path")
+    y_range = _level(curves) if view.side else None
+    return Panel(
+        view.title, *view.names, curves, dots, equal=view.equal, y_range=y_range, kind="path"
+    )
+
+
+def _level(curves: Sequence[Curve]) -> tuple[float, float] | None:
+    """Return a range in which a level flight looks level; None if the heights differ by more."""
+    x, y = (np.concatenate([getattr(c, axis) for c in curves]) for axis in ("x", "y"))
+    x, y = x[np.isfinite(x)], y[np.isfinite(y)]
+    if not len(y) or not np.ptp(y) < FLAT * np.ptp(x):
+        return None
+    middle, half = 0.5 * float(y.min() + y.max()), 0.5 * FLAT * float(np.ptp(x))
+    return middle - half, middle + half
 
 
 def _crash_mark(run: Run, view: View, dt: float) -> list[Dot]:
