@@ -7,6 +7,7 @@ page's script replaces by colours for light or dark mode. Building the values do
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -29,6 +30,7 @@ from grounded.figures.figure import (
 )
 from grounded.frozen import Array
 
+LONG = 26  # most letters in a line of a bar's label
 MOST = 1600  # most points of a curve
 CONTEXT = 300  # most points of a curve that is only context
 STEPS = 65535  # steps in the range of a packed number
@@ -199,10 +201,22 @@ def _bars(panel: Bars, axis: str) -> dict[str, Any]:
     }  # fmt: skip
     across = {"range": [*panel.ends], "visible": False, "fixedrange": True}
     up = {
-        "tickvals": list(range(len(bars))), "ticktext": [bar.label for bar in bars],
+        "tickvals": list(range(len(bars))), "ticktext": [in_lines(bar.label) for bar in bars],
         "automargin": True, "fixedrange": True, "showgrid": False, "zeroline": False,
     }  # fmt: skip
     return {"data": [trace], "layout": {f"xaxis{axis}": across, f"yaxis{axis}": up}}
+
+
+def in_lines(label: str) -> str:
+    """Break a label that is too long for a small panel, after a blank, a colon or a plus."""
+    if len(label) <= LONG:
+        return label
+    lines = [""]
+    for part in re.findall(r"[^ :+]+[ :+]?", label):
+        if lines[-1] and len(lines[-1] + part.rstrip()) > LONG:
+            lines.append("")
+        lines[-1] += part
+    return "<br>".join(line.rstrip() for line in lines)
 
 
 def coloured(value: Any, dark: bool = False) -> Any:

@@ -123,3 +123,15 @@ def test_a_level_flight_looks_level_in_the_view_from_the_side(tmp_path):
     low, high = _level([Curve(x, 2 + noise, "best", "", 1.0)])
     assert high - low == pytest.approx(0.4, rel=0.05) and low < 2 < high
     assert _level([Curve(x, x, "best", "", 1.0)]) is None
+
+
+def test_long_names_are_broken_where_they_are_joined():
+    """In a small panel they were cut, and so were the values behind the bars."""
+    from grounded.figures.interactive import LONG, in_lines
+
+    whole = "without delay:roll_command+pitch_command+thrust"
+    lines = in_lines(whole).split("<br>")
+    assert max(map(len, lines)) <= LONG and "".join(lines).replace(" ", "") == whole.replace(
+        " ", ""
+    )
+    assert in_lines("without calibration") == "without calibration"
