@@ -235,7 +235,8 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             )
         return replace(read, warnings=(*read.warnings, *doubts), doubted=True)
     if units:
-        raise GroundedError(f"{path} ran {ran}, {units_told(units, by, read.log is not None)}")
+        told = units_told(task.model, units, by, read.log is not None)
+        raise GroundedError(f"{path} ran {ran}, {told}")
     if pace:
         raise GroundedError(f"{path} ran {ran}, but {pace}")
     if read.bare:
