@@ -11,8 +11,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from grounded.diagnosis.cause_words import wider
 from grounded.diagnosis.report import Diagnosis, Estimate, Made
-from grounded.diagnosis.stopped import wider
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.result import Result, listed, percent
 from grounded_trials.store.documents import read_document, write_document

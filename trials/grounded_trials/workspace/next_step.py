@@ -30,7 +30,6 @@ REPORT = NextCommand("report", ("--html",))
 TARGET = NextCommand("target", ("SHAPE",))
 WRITTEN = 1e-3  # tolerance for target.csv, relative to its range, due to the digits in the file
 SHORT = 0.1  # fraction of a control step: shorter filters and delays make no difference
-LEFT = 2  # number of states reported of the unexplained rest
 SAME = 1e-6  # relative tolerance for values that were written with eight digits
 
 
@@ -181,16 +180,14 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
 def nothing_to_do(found: Diagnosis, best: str) -> str:
     """Return a text for a search that has ended although part of the gap is unexplained.
 
+    The verdict itself says which part that is.
+
     Args:
         found: the diagnosis of the current model and trials, without claims left to adopt.
         best: the candidate that the search ended with.
     """
-    left = ", ".join(one.sentence() for one in found.leftover[:LEFT])
-    if found.leftover and found.leftover[0].sentence() in found.sentence:
-        left = ""  # the verdict says it
     return (
         f"None is needed for the manoeuvre: the search has ended, with {best}. "
-        + f"No known effect explains the rest: {left}. " * bool(left)
         + "To learn more: " * (not found.contested)
         + found.next_trial
     )
