@@ -94,13 +94,22 @@ class UnusableTrials(GroundedError):
 
     Args:
         message: the whole message.
+        clauses: only what is wrong with them.
+        mend: what to do before their logs are ingested again.
         in_program: only what is wrong with them, for a program that has no [log].
         then: the command that discards them.
     """
 
-    def __init__(self, message: str, in_program: str, then: NextCommand | None = None) -> None:
+    def __init__(
+        self,
+        message: str,
+        clauses: str,
+        mend: str,
+        in_program: str,
+        then: NextCommand | None = None,
+    ) -> None:
         super().__init__(message, then)
-        self.in_program = in_program
+        self.clauses, self.mend, self.in_program = clauses, mend, in_program
 
 
 def unusable(
@@ -121,6 +130,8 @@ def unusable(
     return UnusableTrials(
         f"{where} {clauses}. {mend}; then discard {'this trial' if one else 'these trials'} and "
         "ingest the log again",
+        clauses,
+        mend,
         in_program or clauses,
         then=NextCommand("discard", tuple(names)) if trials[0].id else None,
     )

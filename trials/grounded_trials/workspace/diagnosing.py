@@ -122,8 +122,6 @@ def diagnose_in(
     if words:
         run = f" ({identity}: `{rendered(to_run(workspace, identity, identity))}`)"
         run *= bool(identity)
-        if found.contested and not words.startswith(found.next_trial.rstrip(".")):
-            words = f"{found.next_trial} {words[:1].upper()}{words[1:]}"  # which other trial
         found = replace(found, next_trial=f"{words}{run}", probe=identity)
     undo = _in_vain(workspace, found)
     if undo:
@@ -279,7 +277,6 @@ def _probe(
     if found.changed and not write:
         return "", ""  # of one of the two robots, which is to be diagnosed alone
     from grounded.diagnosis.excitation import NOTHING, probe
-    from grounded.diagnosis.verdict import sentence
     from grounded.search.safety import objections, spread
     from grounded_trials.workspace.handover import outside_limits
     from grounded_trials.workspace.proposing import standing_in
@@ -303,18 +300,20 @@ def _probe(
         if made is None:
             break
         worth = not made.little or (write and (not ties or made.expected >= NOTHING))
+        said = made.sentence
+        if found.contested or not (worth or ties):  # it is the trial that is asked for, if one
+            said = f"{found.next_trial} {said[:1].upper()}{said[1:]}"
         if not worth:
-            said = made.sentence if ties else f"{found.next_trial} {sentence([made.sentence])}"
-            return "", f"{said.rstrip('.')}. No probe is written." if write else said
+            return "", f"{said.rstrip('.')}.{' No probe is written.' * write}"
         if not offer:
-            return "", f"{made.sentence} (`{rendered(PROBE)}` makes the candidate)"
+            return "", f"{said} (`{rendered(PROBE)}` makes the candidate)"
         candidate = _candidate_of(workspace, planner.narrowed(made.policy), best.candidate.id)
         reasons = (*outside_limits(task, candidate.policy), *objections(task, candidate, strays))
         if not reasons:
             while (saved := workspace.save_candidate(candidate, kind="probe")) is None:
                 workspace.forget_trials()  # another process took the name
                 candidate = replace(candidate, id=workspace.next_id())
-            return saved.id, made.sentence
+            return saved.id, said
         why = "; ".join(reasons).replace(candidate.id, "the best")
     return "", f"{found.next_trial.rstrip('.')}; no candidate for it is offered: {why}" * offer
 

@@ -21,6 +21,7 @@ from grounded_trials.workspace.diagnosing import diagnosable, read_diagnosis
 from grounded_trials.workspace.fitting import fitted_in_vain
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.where_to_mend import in_time_now
+from grounded_trials.workspace.off_target import logged_target
 from grounded_trials.workspace.proposing import standing_in, status_of, to_run
 
 PROPOSE = NextCommand("propose")
@@ -28,7 +29,6 @@ DIAGNOSE = NextCommand("diagnose")
 EXPORT = NextCommand("export", ("best", "--runner"))
 REPORT = NextCommand("report", ("--html",))
 TARGET = NextCommand("target", ("SHAPE",))
-WRITTEN = 1e-3  # tolerance for target.csv, relative to its range, due to the digits in the file
 SHORT = 0.1  # fraction of a control step: shorter filters and delays make no difference
 SAME = 1e-6  # relative tolerance for values that were written with eight digits
 
@@ -133,26 +133,6 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
         return next_command(workspace, now, found, usable_ids(workspace))
     goes_on = now.phase in ("propose", "await-trial") and not now.doubt
     return PROPOSE if goes_on else status_of(workspace, now).then
-
-
-def logged_target(workspace: Folder) -> str:
-    """Return the trial whose states target.csv still repeats, as `init --from` wrote it; or "".
-
-    Only trials that ran no candidate count; the target must equal their states row by row.
-    """
-    if not workspace.config.task.target:
-        return ""
-    task = workspace.task
-    asked = np.isfinite(task.target).any(axis=0)
-    for stored in workspace.whole_trials():
-        trial, rows = stored.trial, len(task.target)
-        if trial.candidate or trial.steps + 1 < rows or trial.dt != task.dt:
-            continue
-        off = np.abs(trial.states[:rows, asked] - task.target[:, asked])
-        moved = np.ptp(task.target[:, asked], axis=0).max(initial=0.0)
-        if moved > 0 and off.size and np.nanmax(off) < WRITTEN * moved:
-            return trial.id or stored.stored.id
-    return ""
 
 
 def _none_stood(now: Standing) -> bool:
