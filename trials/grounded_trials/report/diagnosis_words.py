@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 
 from grounded.diagnosis.cause_words import ENDED, furthest_apart, value_of, with_share
-from grounded.diagnosis.error_report import Gap
-from grounded.diagnosis.report import Changed, Correction, Diagnosis, Estimate
+from grounded.diagnosis.error_report import Correction, Gap
+from grounded.diagnosis.report import Changed, Diagnosis, Estimate
 from grounded.result import listed
 from grounded_trials.wording import changed, count, figure, percent, ranges, with_unit
 

@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from grounded.errors import GroundedError
 from grounded.model import Model
@@ -134,11 +134,12 @@ class Folder:
         """The notes of the workspace."""
         return self._read_notes(None)
 
-    def forget(self) -> None:
-        """Forget everything that was read, so that it is read again when needed."""
+    def forget(self) -> Self:
+        """Forget everything that was read, since files may have changed; return the folder."""
         self.read_target.cache_clear()
         for name in [n for n, kept in vars(Folder).items() if isinstance(kept, cached_property)]:
             vars(self).pop(name, None)
+        return self
 
     def forget_trials(self) -> None:
         """Forget the trials that were read, so that they are read again when needed."""
