@@ -21,6 +21,7 @@ from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand
 from grounded.instruments.finding import in_the_log
 from grounded_trials.store.documents import read_document, write_document
+from grounded_trials.store.store import made_folder
 from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.identity import ROWS
 from grounded_trials.workspace.intake.where_to_mend import where_to_mend
@@ -213,8 +214,7 @@ def unheld_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[str, ...]:
 
 
 def _keep(workspace: Folder, found: Diagnosis) -> None:
-    workspace.reports.mkdir(exist_ok=True)
-    write_document(workspace.reports / FILE, found.to_json())
+    write_document(made_folder(workspace.reports) / FILE, found.to_json())
 
 
 def read_diagnosis(folder: Path) -> Diagnosis | None:

@@ -25,7 +25,7 @@ from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.plain_file import open_file
 from grounded_trials.store.documents import Notes
-from grounded_trials.store.store import Damaged, Store, Stored, write_atomically
+from grounded_trials.store.store import Damaged, Store, Stored, made_folder, write_atomically
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.config import Config, read_config
 from grounded_trials.workspace.identity import (
@@ -269,7 +269,7 @@ class Folder:
             candidate = replace(candidate, id=self.next_id(handed=True))
             data = encoded(candidate, self.task, kind)
         path = self.candidate_path(candidate.id)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        made_folder(path.parent)
         with self.store.locked():
             if path.exists() or seen not in (None, self.names()):
                 return None
