@@ -32,7 +32,7 @@ from grounded_trials.workspace.task_file import limited_changes, seen_in
 if TYPE_CHECKING:
     from grounded.frozen import Array
     from grounded.search.candidate import Candidate
-    from grounded.search.proposal import Proposal
+    from grounded.search.standing import Proposal
 
 MOSTLY = 0.9  # share of the cost due to inputs above which a note says so
 HELD = 0.8  # share of the steps at a limit above which an input counts as limited

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
     from grounded.figures.figure import Figure
     from grounded.search.candidate import Candidate
-    from grounded.search.proposal import Proposal
-    from grounded.search.standing import Standing
+    from grounded.search.standing import Proposal, Standing
     from grounded_trials.workspace.identity import StoredTrial
     from grounded_trials.workspace.next_step import Since
 
