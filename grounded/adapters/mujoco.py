@@ -42,6 +42,7 @@ from grounded.adapters.mujoco_names import (
     Setting,
     controls_of,
     joint_name,
+    limits_of,
     setting_of,
     states_of,
 )
@@ -49,7 +50,7 @@ from grounded.adapters.stepper import Stepper, library, model_of
 from grounded.adapters.tangent import Coordinates
 from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
-from grounded.model import Model, Param
+from grounded.model import Model
 
 SHIFT = 1e-6  # relative step of the forward differences, as in mjd_transitionFD
 CHUNK = 4096  # samples stepped in one call
@@ -105,7 +106,7 @@ def model(
     controls = controls_of(compiled, inputs, states)
     named = params if isinstance(params, Mapping) else dict.fromkeys(params, None)
     settings = [setting_of(mj, compiled, spec) for spec in named]
-    values = {s.name: _param(s, given) for s, given in zip(settings, named.values(), strict=True)}
+    values = {s.name: s.param(given) for s, given in zip(settings, named.values(), strict=True)}
     several = threads or min(os.cpu_count() or 1, MOST_THREADS)
     stepper = MujocoStepper(compiled, coordinates, list(states), controls, settings, several)
     angles = [
@@ -123,21 +124,6 @@ def model(
     )
 
 
-def _param(setting: Setting, given: float | tuple[float, ...] | None) -> Param:
-    """Return the Param: a number gives a constant, a tuple bounds, None a lower bound of zero."""
-    if given is None:
-        return Param(setting.nominal, setting.unit, 0.0)
-    if isinstance(given, int | float):
-        return Param(float(given), setting.unit)
-    if len(given) not in (2, 3):
-        raise GroundedError(
-            f"parameter '{setting.name}': expected a value, (low, high) or (value, low, high), "
-            f"found {given!r}"
-        )
-    value, low, high = (setting.nominal, *given) if len(given) == 2 else given
-    return Param(value, setting.unit, low, high)
-
-
 def limits(xml: str | Path, inputs: str | Sequence[str] = "auto") -> dict[str, tuple[float, float]]:
     """Return the limits of the inputs for [limits]: ctrlrange, or a joint's actuatorfrcrange.
 
@@ -149,20 +135,7 @@ def limits(xml: str | Path, inputs: str | Sequence[str] = "auto") -> dict[str, t
         (low, high) by name of every input that has limits.
     """
     compiled = load(xml)
-    return _limits(compiled, controls_of(compiled, inputs, states_of(compiled)))
-
-
-def _limits(compiled: Any, controls: Controls) -> dict[str, tuple[float, float]]:
-    limited, spans, at = (
-        compiled.actuator_ctrllimited,
-        compiled.actuator_ctrlrange,
-        controls.columns,
-    )
-    if controls.torques:
-        limited, spans = compiled.jnt_actfrclimited, compiled.jnt_actfrcrange
-        at = tuple(int(compiled.dof_jntid[column]) for column in at)
-    own = {name: spans[i] for name, i in zip(controls.names, at, strict=True) if limited[i]}
-    return {name: (float(low), float(high)) for name, (low, high) in own.items()}
+    return limits_of(compiled, controls_of(compiled, inputs, states_of(compiled)))
 
 
 class MujocoStepper(Stepper):
@@ -218,7 +191,7 @@ class MujocoStepper(Stepper):
     @property
     def limits(self) -> dict[str, tuple[float, float]]:
         """See `limits`."""
-        return _limits(self._model, self.controls)
+        return limits_of(self._model, self.controls)
 
     @property
     def body(self) -> MujocoBody:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import GroundedError, nearest
+from grounded.model import Param
 
 FREE, BALL, SLIDE, HINGE = 0, 1, 2, 3  # mjtJoint
 
@@ -99,6 +100,20 @@ def controls_of(compiled: Any, inputs: str | Sequence[str], states: Mapping[str,
     )
 
 
+def limits_of(compiled: Any, controls: Controls) -> dict[str, tuple[float, float]]:
+    """Return (low, high) by name of every input that has limits, see `mujoco.limits`."""
+    limited, spans, at = (
+        compiled.actuator_ctrllimited,
+        compiled.actuator_ctrlrange,
+        controls.columns,
+    )
+    if controls.torques:
+        limited, spans = compiled.jnt_actfrclimited, compiled.jnt_actfrcrange
+        at = tuple(int(compiled.dof_jntid[column]) for column in at)
+    own = {name: spans[i] for name, i in zip(controls.names, at, strict=True) if limited[i]}
+    return {name: (float(low), float(high)) for name, (low, high) in own.items()}
+
+
 def joint_name(compiled: Any, j: int) -> str:
     """Return the joint's name; for an unnamed only joint of a body, the body's name."""
     name, body = compiled.joint(j).name, int(compiled.jnt_bodyid[j])
@@ -180,6 +195,20 @@ class Setting:
         """Set the parameter in an MjModel; call `mj_setConst` afterwards."""
         for array, index, factor in self.places:
             getattr(compiled, array)[index] = factor * value
+
+    def param(self, given: float | tuple[float, ...] | None) -> Param:
+        """Return the Param: a number gives a constant, a tuple bounds, None a lower bound of 0."""
+        if given is None:
+            return Param(self.nominal, self.unit, 0.0)
+        if isinstance(given, int | float):
+            return Param(float(given), self.unit)
+        if len(given) not in (2, 3):
+            raise GroundedError(
+                f"parameter '{self.name}': expected a value, (low, high) or (value, low, high), "
+                f"found {given!r}"
+            )
+        value, low, high = (self.nominal, *given) if len(given) == 2 else given
+        return Param(value, self.unit, low, high)
 
 
 def setting_of(mj: Any, compiled: Any, spec: str) -> Setting:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.report import Estimate, TrialValue
+from grounded.diagnosis.report import Changed, Estimate, TrialValue
 from grounded.model import Model
 from grounded.result import listed, number, percent, with_unit
 
@@ -220,6 +220,62 @@ def furthest_apart(values: Sequence[TrialValue]) -> tuple[TrialValue, TrialValue
 
     low, high = max(itertools.combinations(values, 2), key=apart)
     return (low, high) if low.value <= high.value else (high, low)
+
+
+def comparison(changed: Iterable[Changed], adopted: Iterable[str]) -> str:
+    """Return a sentence on what changed between two groups of trials, or that nothing did.
+
+    Args:
+        changed: the values that differ.
+        adopted: names of adopted effects, whose values are parameters of the model.
+    """
+    adopted = tuple(adopted)
+    told = [
+        f"{value_of(one, adopted)} changed from {give_or_take(one.first)} to "
+        f"{give_or_take(one.second)}"
+        for one in changed
+    ]
+    if not told:
+        return "Nothing that these trials show changed between the two groups beyond the noise."
+    return f"Between the two groups, {listed(told)}."
+
+
+def value_of(one: Changed, adopted: Iterable[str]) -> str:
+    """Name a compared value: `r`, `c of dead_zone:u`, also if an adopted effect has it."""
+    from grounded.effects import param_name
+
+    if not one.effect.startswith("parameter:"):
+        return f"{one.quantity} of {one.effect}"
+    for effect in adopted:
+        start = param_name(effect, "")
+        if one.quantity.startswith(start):
+            return f"{one.quantity.removeprefix(start)} of {effect}"
+    return one.quantity
+
+
+ENDED = {  # what is said of a parameter that stopped, by `Estimate.stopped`
+    "": (),
+    "bound": ("at its bound, the data ask for more",),
+    "prior": ("at the limit of its std, the data ask for more",),
+}
+
+
+def wider(known: Mapping[str, Estimate]) -> str:
+    """Return advice on the parameters that their prior stopped; "" if there are none.
+
+    Args:
+        known: the calibrated values, by parameter.
+    """
+    names = [name for name, estimate in known.items() if estimate.stopped == "prior"]
+    if not names:
+        return ""
+    one = len(names) == 1
+    its, each = ("its", "it is") if one else ("their", "they are")
+    return (
+        f"{listed(names)} moved as far as {its} std allows, and the data ask for more: if {each} "
+        f"known less well than that, widen {its} std in the model file, or give bounds instead, "
+        "and diagnose again; otherwise adopt the claimed effects."
+    )
 
 
 def _beside(effect: Effect, params: Mapping[str, Estimate]) -> str:

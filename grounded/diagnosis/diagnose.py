@@ -11,7 +11,7 @@ measured          table of errors, noise floor, credit of each cause, leftover
 claims            claimed effects with intervals, ties and look-alikes           (lookalike)
 leftover          structure that no effect explains
 correction        a curve that predicts the leftover, if it passes its own test
-agreement         agreement of the trials; changes between two groups of them (comparison)
+agreement         agreement of the trials; changes between two groups of them
 prediction_error  where the gap is, by channel, time and region
 split             explained, unexplained and irreducible parts of the error
 unconfirmed       effects that only few trials show, and where
@@ -27,7 +27,6 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.comparison import with_comparison
 from grounded.diagnosis.hypotheses.attribution import USUAL_EFFECTS, attribute, grown, so_far
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data, prepare
@@ -205,7 +204,7 @@ def diagnose(
                 decision,
                 ruler,
                 known,
-                options.but,
+                (*options.but, *options.delays),
                 options.horizon,
                 most,
                 tick,
@@ -224,17 +223,11 @@ def diagnose(
             most += 1
             tick("more effects")
             best = grown(search, best, most)
-        decision, found = written.decision, written.diagnosis()
         groups = [k < first for k in range(data.count)]
-        apart = compared(search, decision.fit, groups) if compare else None
-        found = replace(
-            found,
-            verdict=with_faults(found.verdict, looked.findings),
-            preflight=looked.findings,
-            changed=apart.changed if apart else None,
-            unchanged=apart.unchanged if apart else (),
-        )
-        return with_comparison(found, (*options.but, *options.delays))
+        apart = compared(search, written.decision.fit, groups) if compare else None
+        found = written.diagnosis(apart)
+        said = with_faults(found.verdict, looked.findings)
+        return replace(found, verdict=said, preflight=looked.findings)
 
 
 def _again(effect: Effect, known: float, data: Data) -> Effect:

@@ -1,4 +1,4 @@
-"""Errors in a diagnosis: where the gap is, prediction errors by horizon, and the leftover."""
+"""Errors in a diagnosis: where and at which horizon, the leftover, a curve that predicts it."""
 
 from __future__ import annotations
 
@@ -299,6 +299,34 @@ class Remainder(Document):
             )
         [off, noise] = beside_noise(errors, self.floor, unit, at_most=self.floor_at_most)
         return f"{name} is still off by {off} {ahead}{noise}{where}"
+
+
+@dataclass(frozen=True, eq=False)
+class Curve(Document):
+    """The shape of a leftover: a rate `value` with its `std` at points `at` of one variable."""
+
+    effect: str  # its name for `adopt`
+    over: str
+    at: tuple[float, ...] = ()
+    value: tuple[float, ...] = ()
+    std: tuple[float, ...] = ()
+    quantities: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Correction(Document):
+    """A curve that predicts what no effect explains. It does not count as a cause.
+
+    `held_out_gain` is the share of the squared error that it removes on held-out trials;
+    `adoptable`: whether that exceeds its scatter from trial to trial.
+    """
+
+    channel: str
+    over: tuple[str, ...] = ()
+    held_out_gain: float = math.nan
+    adoptable: bool = False
+    unit: str = ""
+    curves: tuple[Curve, ...] = ()
 
 
 def doubt_of(unsure: float) -> float:

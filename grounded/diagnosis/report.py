@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from grounded.diagnosis.error_report import (
     BRIEF,
+    Correction,
     Credit,
     Gap,
     Region,
@@ -204,34 +205,6 @@ class Changed(Document):
     second: Estimate = field(default_factory=lambda: Estimate(math.nan))
     evidence: float = math.nan
     chance: float = math.nan  # p-value of the difference
-
-
-@dataclass(frozen=True, eq=False)
-class Curve(Document):
-    """The shape of a leftover: a rate `value` with its `std` at points `at` of one variable."""
-
-    effect: str  # its name for `adopt`
-    over: str
-    at: tuple[float, ...] = ()
-    value: tuple[float, ...] = ()
-    std: tuple[float, ...] = ()
-    quantities: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class Correction(Document):
-    """A curve that predicts what no effect explains. It does not count as a cause.
-
-    `held_out_gain` is the share of the squared error that it removes on held-out trials;
-    `adoptable`: whether that exceeds its scatter from trial to trial.
-    """
-
-    channel: str
-    over: tuple[str, ...] = ()
-    held_out_gain: float = math.nan
-    adoptable: bool = False
-    unit: str = ""
-    curves: tuple[Curve, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

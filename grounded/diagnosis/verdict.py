@@ -6,10 +6,19 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.cause_words import clauses, disagreement, give_or_take, meaning
+from grounded.diagnosis.cause_words import (
+    ENDED,
+    clauses,
+    comparison,
+    disagreement,
+    give_or_take,
+    meaning,
+    wider,
+)
 from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, furthest, runaway
 from grounded.diagnosis.report import (
     Agreement,
+    Changed,
     Identifiable,
     Kind,
     Ranked,
@@ -18,7 +27,6 @@ from grounded.diagnosis.report import (
     Verdict,
 )
 from grounded.diagnosis.ruler_words import explained, floor, improvement, rest, worsened
-from grounded.diagnosis.stopped import AT_BOUNDS, ENDED, wider
 from grounded.instruments.finding import Finding, in_the_log
 from grounded.model import all_at_bounds
 from grounded.result import listed, percent
@@ -27,6 +35,16 @@ if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.validation.claims import Claims
 
 UNEXPLAINED = "A gap remains that no known effect explains: "
+BOTH = "A gap remains if both groups get the same values: "  # groups of trials that differ
+CHANGED = (  # advice on the next trial if two groups differ
+    "None is needed yet: the robot changed between the two groups, so adopt no value of both. "
+    "Diagnose the newer trials alone, or discard the older ones."
+)
+AT_BOUNDS = (  # the same if every parameter that moved is at its bound
+    "None helps yet: parameters stopped at their bounds and the data ask for more. Widen the "
+    "bounds in the model file if the true value may lie beyond; otherwise a parameter that the "
+    "model holds constant may be off, so give it bounds. Then diagnose again."
+)
 LOG, LOST = "is a log that no candidate made", "failed"  # why a trial can't be repeated
 MOST_EFFECTS, FURTHER = 6, 2  # most effects blamed at once; how many more the next search allows
 NAMED = 3  # parameters, channels or leftovers named in one sentence
@@ -46,6 +64,8 @@ def verdict(
     identified: Sequence[Identifiable] = (),
     per_trial: Sequence[TrialValue] = (),
     agreement: Sequence[Agreement] = (),
+    changed: Sequence[Changed] | None = None,
+    adopted: Collection[str] = (),
 ) -> Verdict:
     """Return the verdict (effect, several, none or unknown) with its sentences.
 
@@ -63,6 +83,8 @@ def verdict(
         identified: how well the trials identify each parameter, and relative to which others.
         per_trial: each claimed value by trial.
         agreement: whether the trials agree on each of these values.
+        changed: the values that differ between two groups of trials; None for one group.
+        adopted: adopted effects, whose values are parameters of the model.
     """
     from grounded.effects import like_a_load
 
@@ -71,6 +93,8 @@ def verdict(
     left = remainder[0].sentence() if remainder else ""
     others = len(remainder) - 1
     left += f"; {others} more state{'s' * (others > 1)}" if others > 0 else ""
+    unexplained = f"{BOTH if changed else UNEXPLAINED}{left}."
+    first = "" if changed is None else comparison(changed, adopted)
     claimed = [row for row in ranking if row.claimed]
     row = furthest(rows)
     if claims.known.no_cause:
@@ -78,15 +102,15 @@ def verdict(
         return replace(_said("unknown", f"No cause is named: {why}."), limit=why)
     if not claimed:
         if remainder:
-            return _said("unknown", f"{UNEXPLAINED}{left}.", *once)
+            return _said("unknown", unexplained, *once, first=first)
         if above := rest(rows):
             text = f"The model explains what these trials show: {above}."
         elif row is not None and row.floor_at_most:
             what = "No known effect explains the rest, which may be noise that is not white"
-            return _said("unknown", f"{what}{floor(row)}.", *once)
+            return _said("unknown", f"{what}{floor(row)}.", *once, first=first)
         else:
             text = explained(rows)
-        return _said("none", text, *once)
+        return _said("none", text, *once, first=first)
     apart = _apart(per_trial, agreement)
     causes = _causes(claims, ranking, credit, identified, apart)
     told = clauses(
@@ -106,7 +130,7 @@ def verdict(
         words.append(f"A gap remains: {left}; no more than {most} effects were looked for.")
         more = min(most + FURTHER, MOST_EFFECTS) * any(one.above for one in remainder)
     elif remainder:
-        words.append(f"{UNEXPLAINED}{left}.")
+        words.append(unexplained)
     elif above := rest(rows):
         words.append(sentence([above]))
     if one_motion and (remainder or seen):
@@ -115,7 +139,11 @@ def verdict(
     kind: Kind = "effect" if len(claimed) == 1 else "several"
     effects, off = tuple(r.effect for r in claimed), tuple(_off(claims))
     said = replace(
-        _said(kind, *words), effects=effects, causes=causes, clauses=told, parameters=off
+        _said(kind, *words, first=first),
+        effects=effects,
+        causes=causes,
+        clauses=told,
+        parameters=off,
     )
     return replace(said, look_for=more if more > most else 0)
 
@@ -137,9 +165,9 @@ LOAD = (
 ONE_MOTION = "All trials repeat one motion, so these values may not hold for another one."
 
 
-def _said(kind: Kind, *words: str) -> Verdict:
-    said = tuple(text for text in words if text)
-    return Verdict(kind, sentence=" ".join(said), sentences=said)
+def _said(kind: Kind, *words: str, first: str = "") -> Verdict:
+    said = tuple(text for text in (first, *words) if text)
+    return Verdict(kind, sentence=" ".join(said), sentences=said, comparison=first)
 
 
 def _causes(

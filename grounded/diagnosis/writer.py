@@ -25,7 +25,7 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Diagnosis, Estimate, Identifiable, NoiseLevels
 from grounded.diagnosis.ruler_words import objection, open_noise
 from grounded.diagnosis.unconfirmed import another_look, marked, unconfirmed, unrepeatable
-from grounded.diagnosis.validation.agreement import by_trial
+from grounded.diagnosis.validation.agreement import Compared, by_trial
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import SLIGHT, SURE, Decision
 from grounded.diagnosis.validation.held_out import shrinkage, utility_prediction
@@ -34,7 +34,7 @@ from grounded.diagnosis.validation.measured import Measured, root_mean_square
 from grounded.diagnosis.validation.motions import how_many
 from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.diagnosis.verdict import at_bounds, next_trial, verdict
+from grounded.diagnosis.verdict import CHANGED, at_bounds, next_trial, verdict
 from grounded.effects import acting_order, wrapping_order
 from grounded.task import Task
 from grounded.trial import Trial
@@ -65,7 +65,6 @@ class Writer:
         self.predictor, self.data = self.search.predictor, self.search.data
         self.shown = list(zip(ruler.shown, ruler.names, strict=True))
         self.measured = Measured(decision, ruler, trials, first, exact)
-        self.compares = first < len(trials)  # two groups, of which `compared` says what differs
         self.claims = Claims(decision, self.measured.credit, known, ruler)
         self.left, self.uncertain = self.measured.left, uncertain
 
@@ -88,8 +87,8 @@ class Writer:
         more = ruler.gain(other.decision.fit, fit).mean
         return more > SLIGHT * ruler.since_outset(fit)
 
-    def diagnosis(self) -> Diagnosis:
-        """All of it."""
+    def diagnosis(self, apart: Compared | None = None) -> Diagnosis:
+        """All of it; `apart` is what differs between two groups of trials, if there are two."""
         data, predictor = self.data, self.predictor
         self.tick("gap")
         where = horizon(predictor, self.best, self.ahead)
@@ -135,9 +134,12 @@ class Writer:
             one_motion=moved == 1 < data.count,
             identified=identified,
             per_trial=values,
-            agreement=() if self.compares else agreement,
+            agreement=() if apart else agreement,
+            changed=apart.changed if apart else None,
+            adopted=self.adopted,
         )
         further = said.look_for > 0
+        differ = bool(apart and apart.changed) and not self.known.no_cause
         return Diagnosis(
             verdict=said,
             where=Where(
@@ -169,7 +171,9 @@ class Writer:
             leftover=remainder,
             unconfirmed=seen,
             correction=correction(predictor, self.best, self.left, where),
-            next_trial=next_trial(
+            next_trial=CHANGED
+            if differ
+            else next_trial(
                 self.claims,
                 look,
                 groups,
@@ -189,6 +193,8 @@ class Writer:
             credit=credit,
             per_trial=values,
             agreement=agreement,
+            changed=apart.changed if apart else None,
+            unchanged=apart.unchanged if apart else (),
             trials=data.count,
             motions=moved,
             steps=data.steps,

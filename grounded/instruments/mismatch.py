@@ -227,15 +227,24 @@ def stop_at(model: Model, trials: Sequence[Trial], found: Sequence[Mismatch]) ->
     stops = [one for one in found if not one.change.corrected]
     if not stops:
         return
-    clauses = []
+    choices = []
     for mismatch in stops:
         first, others = mismatch.change, mismatch.others
         others = tuple(c for c in others if not any(_within(c, o) for o in (first, *others)))
-        texts = [_said(model, c) for c in (first, *others)]
-        clauses.append(", or else ".join(texts))
+        choices.append((first, *others))
     scales = "the paths and scales in [log] (multiply the scale; a missing one is 1)"
-    said = f"positions don't move as velocities and angles imply: {'; '.join(clauses)}"
-    raise unusable(trials, stops[0].trials, said, f"Correct the log, or {scales}")
+    in_log, in_program = (
+        "; ".join(", or else ".join(_said(model, c, log=log) for c in some) for some in choices)
+        for log in (True, False)
+    )
+    odd = "positions don't move as velocities and angles imply: "
+    raise unusable(
+        trials,
+        stops[0].trials,
+        odd + in_log,
+        f"Correct the log, or {scales}",
+        odd + in_program,
+    )
 
 
 def _within(a: Change, b: Change) -> bool:
@@ -274,13 +283,13 @@ def stop_at_folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -
             )
 
 
-def _said(model: Model, change: Change) -> str:
+def _said(model: Model, change: Change, *, log: bool) -> str:
     names = [model.state_names[i] for i in change.states]
     if change.swap:
         return exchanged(listed(names))
     if change.factor == -1.0:
         return f"{listed(names)}: the sign looks wrong, set scale = -1"
-    return ", ".join(described(model, i, change.factor) for i in change.states)
+    return ", ".join(described(model, i, change.factor, log=log) for i in change.states)
 
 
 def unexplained(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> Iterator[Finding]:

@@ -68,9 +68,12 @@ def judge_units(
     found = list(_found(ratios))
     if not found:
         return
-    clauses = [_clause(model, trials, ratios, one, found, shown) for one in found]
+    in_log, in_program = (
+        "; ".join(_clause(model, trials, ratios, one, found, shown, log=log) for one in found)
+        for log in (True, False)
+    )
     odd = sorted({k for one in found for k in one.trials})
-    raise unusable(trials, odd, "; ".join(clauses), MEND)
+    raise unusable(trials, odd, in_log, MEND, in_program)
 
 
 def units_apart(model: Model, trial: Trial, shown: Sequence[int]) -> list[str]:
@@ -92,16 +95,25 @@ class UnusableTrials(GroundedError):
     Args:
         message: the whole message.
         clauses: only what is wrong with them.
+        mend: what to do before their logs are ingested again.
+        in_program: only what is wrong with them, for a program that has no [log].
         then: the command that discards them.
     """
 
-    def __init__(self, message: str, clauses: str, then: NextCommand | None = None) -> None:
+    def __init__(
+        self,
+        message: str,
+        clauses: str,
+        mend: str,
+        in_program: str,
+        then: NextCommand | None = None,
+    ) -> None:
         super().__init__(message, then)
-        self.clauses = clauses
+        self.clauses, self.mend, self.in_program = clauses, mend, in_program
 
 
 def unusable(
-    trials: Sequence[Trial], odd: Sequence[int], clauses: str, mend: str
+    trials: Sequence[Trial], odd: Sequence[int], clauses: str, mend: str, in_program: str = ""
 ) -> UnusableTrials:
     """Return the error that some trials must be corrected and ingested again, with its command.
 
@@ -110,6 +122,7 @@ def unusable(
         odd: indices of those affected.
         clauses: what is wrong with them.
         mend: what to do before the log is ingested again.
+        in_program: the clauses for a program, if they name keys of [log].
     """
     names = [trials[k].id or f"number {k + 1}" for k in odd]
     one, every = len(odd) == 1, len(odd) == len(trials) > 1
@@ -118,6 +131,8 @@ def unusable(
         f"{where} {clauses}. {mend}; then discard {'this trial' if one else 'these trials'} and "
         "ingest the log again",
         clauses,
+        mend,
+        in_program or clauses,
         then=NextCommand("discard", tuple(names)) if trials[0].id else None,
     )
 
@@ -141,6 +156,8 @@ def _clause(
     one: _Off,
     found: Sequence[_Off],
     shown: Sequence[int],
+    *,
+    log: bool = True,
 ) -> str:
     """Return one clause: the ratio, the likeliest fault, and other possible ones."""
     names = model.state_names
@@ -148,10 +165,10 @@ def _clause(
     first, second = _ranked(model, trials, one, found, shown)
     text = (
         f"{names[one.relation.i]} moves {ratio:.4g} times as fast as {names[one.relation.j]} says: "
-        f"{described(model, first.states[0], first.factor)}"
+        f"{described(model, first.states[0], first.factor, log=log)}"
     )
     if not (one.sound or _clear(model, trials[one.trials[0]], one, shown, first, second)):
-        text += f", or else {described(model, second.states[0], second.factor)}"
+        text += f", or else {described(model, second.states[0], second.factor, log=log)}"
         if slow_or_fast(model, ratios[one.trials[0]]) is not None:
             text += ", or the time stamps are in milliseconds" if one.factor < 1 else ""
             text += ", or the time stamps were taken for milliseconds" if one.factor > 1 else ""
@@ -224,14 +241,23 @@ def _unexplained(model: Model, trial: Trial, j: int, shown: Sequence[int]) -> fl
     return missed(model, trial, [j], shown) / change if change > 0 else np.inf
 
 
-def described(model: Model, i: int, factor: float) -> str:
-    """Return a clause on a state that looks `factor` times too large, with the scale to set."""
+def described(model: Model, i: int, factor: float, *, log: bool = True) -> str:
+    """Return a clause on a state that looks `factor` times too large, with the correction.
+
+    Args:
+        model: with the state's name and unit.
+        i: index of the state.
+        factor: by which it looks too large.
+        log: whether to name the key of [log] that corrects it, not only the factor.
+    """
     name = model.state_names[i]
     size = max(factor, 1 / factor)
     base, _, per = model.states[name].partition("/")
     prefix = PREFIXES.get(factor, "") if base in SINGLE else ""
     unit = f" (in {prefix}{base}{'/' * bool(per)}{per})" if prefix else ""
     text = f"{size:g} times too {'large' if factor > 1 else 'small'}{unit}"
+    if not log:
+        return f"{name} looks {text} (multiply it by {1 / factor:g})"
     return f"{name} looks {text}, corrected by [log.state.{name}] scale = {1 / factor:g}"
 
 

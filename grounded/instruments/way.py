@@ -292,13 +292,13 @@ def stop_at_units(plane: Plane, trials: Sequence[Trial]) -> None:
     verb = "looks" if len(states) == 1 else "look"
     said = (
         f"{plane.names(states)} {verb} {factor:.4g} times too large (in {unit}): divided by that, "
-        f"positions move as speeds and {plane.names((plane.relation.k,))} imply: {some}"
+        f"positions move as speeds and {plane.names((plane.relation.k,))} imply"
     )
     mend = (
         "Put these scales into [log] (multiply the scale there; a missing one is 1) and into the "
         "robot's program"
     )
-    raise unusable(trials, _concerned(told, (states, unit)), said, mend)
+    raise unusable(trials, _concerned(told, (states, unit)), f"{said}: {some}", mend, said)
 
 
 def _unit(plane: Plane, trial: Trial) -> tuple[tuple[int, ...], str] | None:

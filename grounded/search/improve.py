@@ -35,8 +35,7 @@ from grounded.search.candidate import Candidate, Tried
 from grounded.search.making import About, Maker
 from grounded.search.original import keeping_promises
 from grounded.search.planner import Planner
-from grounded.search.proposal import Proposal
-from grounded.search.standing import Ending, Phase, Standing, standing
+from grounded.search.standing import Ending, Phase, Proposal, Standing, standing
 from grounded.search.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
 from grounded.trial import Trial

@@ -16,9 +16,8 @@ from grounded.search.directions import base_columns, direction
 from grounded.search.limit_cycle import between_limits, limit_cycle
 from grounded.search.margin import steadied
 from grounded.search.planner import Planner, predicted
-from grounded.search.proposal import Proposal
 from grounded.search.safety import objections, spread
-from grounded.search.standing import Standing, wild
+from grounded.search.standing import Proposal, Standing, wild
 from grounded.search.step_size import KEPT, SearchOptions, Step, losers_of
 from grounded.solve import ddp
 from grounded.solve.measured import measured_gains

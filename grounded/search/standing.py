@@ -11,7 +11,8 @@ order of their proposal, and their trials determine:
 Two trials of a candidate that agree to the last bit show that the system is deterministic, unless
 other repeats differ: from then on nothing is run twice.
 
-The same candidates and trials give the same state, at any time and in any process.
+The same candidates and trials give the same state, at any time and in any process. A `Proposal` is
+a state with what to run next.
 """
 
 from __future__ import annotations
@@ -127,6 +128,38 @@ class Standing(Result):
 
         found = search_figure(self)
         return () if found is None else (found,)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Proposal(Result):
+    """What to run next, or why there is nothing: `candidate` is None if the search has ended."""
+
+    standing: Standing
+    candidate: Candidate | None
+    is_new: bool  # whether the candidate was made by this call
+    notes: tuple[str, ...] = ()
+    refused: Candidate | None = None  # a candidate that was refused for the reasons in `notes`
+
+    def summary(self) -> str:
+        """Return the summary of the candidate, or of the standing if there is none."""
+        return self.candidate.summary() if self.candidate else self.standing.summary()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of `grounded propose --json`; the command fills in `file`."""
+        now, made = self.standing, self.candidate
+        known = document(
+            candidate=made and made.id,
+            file=None,
+            iteration=made.iteration if made else now.iteration,
+            alpha=made and made.alpha,
+            damping=made.damping if made and made.base else None,
+            predicted_utility=made and made.predicted_utility,
+            phase="await-trial" if made else now.phase,
+            sentence=now.sentence,
+            notes=self.notes,
+        )
+        best = document(best_utility=now.incumbent and now.incumbent.utility, new=self.is_new)
+        return known | best if made else known
 
 
 def _row(tried: Tried, verdict: str) -> tuple[str, ...]:

@@ -10,12 +10,11 @@ from test_diagnosis import cart
 
 from cli import grounded
 from facts import holds
-from grounded.diagnosis.comparison import with_comparison
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.error_report import Credit
-from grounded.diagnosis.report import Changed, Diagnosis, Estimate, Made, Verdict
+from grounded.diagnosis.error_report import Credit, Remainder
+from grounded.diagnosis.report import Changed, Diagnosis, Estimate, Made
 from grounded.diagnosis.validation.ruler import repeated
-from grounded.diagnosis.verdict import UNEXPLAINED
+from grounded.diagnosis.verdict import BOTH, CHANGED, UNEXPLAINED, verdict
 from grounded.effects import Library
 from grounded_trials.report.diagnosis_words import agreement_lines, verdict_lines
 
@@ -62,6 +61,8 @@ def test_what_changed_between_two_groups(first, second, effect, values):
     found = diagnose(model, before, OPTIONS, compare=after)
     assert found.trials == 6 and found.changed is not None
     assert [one.effect for one in found.changed] == ([effect] if effect else [])
+    assert found.verdict.lines[0] == found.verdict.comparison != ""
+    assert (found.next_trial == CHANGED) == bool(effect)
     for one in found.changed:
         assert (one.first.value, one.second.value) == pytest.approx(values, abs=0.06)
         assert one.evidence > 20 and one.chance < 1e-6
@@ -80,15 +81,15 @@ def test_groups_that_overlap_are_refused(workspace_of):
     assert done.code == 1 and "two groups of different trials" in done.err
 
 
-def compared(changed, unchanged=(), kind="effect", adopted=()):
-    gap = f"{UNEXPLAINED}v is off."
-    lines = ("The speed v is damped.", gap)
-    said = Verdict(kind, ("viscous_friction:v",), " ".join(lines), sentences=lines)
+def compared(changed, unchanged=(), adopted=(), no_cause=False):
+    claims = SimpleNamespace(known=SimpleNamespace(no_cause=no_cause, sentences=("few",)))
+    left = (Remainder("v", 0.1, "m/s", 9.0, None),)
+    names = [effect["name"] for effect in adopted]
+    said = verdict(claims, (), (), left, (), (), changed=changed, adopted=names)
     said = replace(said, causes=("one", "two"), clauses=("one", "two"))
     one = Credit("viscous_friction:v", 0.5)
     made = Made(("t0001", "t0002"), adopted, named=("t0001",), compared=("t0002",))
-    found = Diagnosis(said, changed=changed, unchanged=unchanged, credit=(one, one), made=made)
-    return with_comparison(found, [effect["name"] for effect in adopted])
+    return Diagnosis(said, changed=changed, unchanged=unchanged, credit=(one, one), made=made)
 
 
 def test_the_verdict_of_a_comparison_begins_with_what_changed():
@@ -99,8 +100,8 @@ def test_the_verdict_of_a_comparison_begins_with_what_changed():
     assert holds(first, "r changed", "0.0496 +- 0.0002 m", "0.0459 +- 0.0002 m")
     causes, others = verdict_lines(found)
     assert causes == [first, "One", "Two"]
-    assert len(others) == 1 and "no known effect" not in others[0] and "v is off" in others[0]
-    assert "newer trials" in found.next_trial
+    assert others == [] and found.verdict.lines[1].startswith(BOTH)
+    assert "v is off" in found.verdict.lines[1]
     again = Diagnosis.from_json(json.loads(json.dumps(found.to_json())))
     assert again == found and again.verdict.comparison == first
 
@@ -108,9 +109,9 @@ def test_the_verdict_of_a_comparison_begins_with_what_changed():
 def test_the_verdict_of_a_comparison_says_that_nothing_changed():
     found = compared(())
     assert found.verdict.lines[0].startswith("Nothing") and UNEXPLAINED in found.sentence
-    assert not found.next_trial
-    alone = replace(found, changed=None, verdict=Verdict("none", sentence="Nothing."))
-    assert with_comparison(alone, ()) == alone
+    alone = compared(None)
+    assert alone.verdict.comparison == "" and alone.verdict.lines[0].startswith(UNEXPLAINED)
+    assert compared((), no_cause=True).verdict.comparison == ""
 
 
 def test_a_compared_value_of_an_adopted_effect_has_its_name_and_unit():

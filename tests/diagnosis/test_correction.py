@@ -8,7 +8,8 @@ from test_diagnosis import cart
 
 from grounded import GroundedError
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.report import Correction, Curve, Diagnosis, Verdict
+from grounded.diagnosis.error_report import Correction, Curve
+from grounded.diagnosis.report import Diagnosis, Verdict
 from grounded.effects import Library, wrap
 from grounded_trials import Workspace
 from grounded_trials.store.documents import write_document

@@ -7,7 +7,7 @@ import pytest
 
 from grounded import Model, Param
 from grounded.diagnosis.hypotheses import scan
-from grounded.diagnosis.hypotheses.scan import between, elsewhere
+from grounded.diagnosis.hypotheses.grid_points import between, elsewhere
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis

@@ -7,7 +7,7 @@ from cli import grounded
 from grounded_trials import Workspace
 from grounded_trials.logs.joint_names import joint_units, slides
 from grounded_trials.starting.begin import begin
-from grounded_trials.workspace.next_step import logged_target
+from grounded_trials.workspace.off_target import logged_target
 from ros_bags import crane_bag
 
 CRANE = """import numpy as np

@@ -114,3 +114,29 @@ def test_a_reward_without_a_weight_gives_nothing_to_plan():
     idle = replace(TASK, reward=replace(reward, **none, input_change=0 * reward.input_change))
     with pytest.raises(gr.GroundedError, match=holding("weight", "0")):
         gr.Search(idle).ask()
+
+
+def test_a_velocity_in_another_unit_is_corrected_by_a_factor_and_no_key():
+    """An open-loop policy's commands show no unit, so the columns are compared."""
+    model = gr.Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"force": "N"},
+        derivative=lambda s, a, p: {"x": s.v, "v": a.force - s.v},
+    )
+    target = np.column_stack([np.linspace(0, 1, 41), np.full(41, np.nan)])
+    task = gr.Task(
+        model=model,
+        dt=0.05,
+        target=target,
+        reward=gr.Reward(state=[1.0, 0], terminal=[1.0, 0], input=[0.01], input_change=[0.01]),
+        start=np.zeros(2),
+        past=np.zeros(1),
+        low=np.array([-5.0]),
+        high=np.array([5.0]),
+        feedback=False,
+    )
+    search = gr.Search(task)
+    trial = drive(task, Plant(model), search.ask())
+    with pytest.warns(UserWarning, match=holding("v", "1000", "mm", "multiply", "0.001")) as told:
+        search.tell(replace(trial, states=trial.states * np.array([1.0, 1e3])))
+    assert "[log" not in str(told[0].message)

@@ -13,7 +13,7 @@ import pytest
 from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials.store import store
-from grounded_trials.store.store import Store, write_atomically
+from grounded_trials.store.store import Store, made_folder, write_atomically
 
 
 def test_the_same_content_is_kept_once(tmp_path: Path) -> None:
@@ -37,6 +37,15 @@ def test_a_file_is_taken_from_its_path(tmp_path: Path) -> None:
     assert added.path.stat().st_mode & 0o222 == 0
     with pytest.raises(GroundedError, match="nowhere"):
         Store(tmp_path / "s").add(tmp_path / "nowhere")
+
+
+def test_a_folder_that_cannot_be_made_is_an_error_that_names_it(tmp_path: Path) -> None:
+    assert made_folder(made_folder(tmp_path / "a/b")).is_dir()
+    (tmp_path / "reports").touch()
+    with pytest.raises(GroundedError, match=holding(tmp_path / "reports", "File exists")):
+        made_folder(tmp_path / "reports")
+    with pytest.raises(GroundedError, match="Not a directory"):
+        made_folder(tmp_path / "reports/a")
 
 
 def test_order_survives_a_move_and_a_merge(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials.starting.examples import toml_of
 from grounded_trials.store.documents import read_document
-from grounded_trials.store.store import DIGITS, Store, write_atomically
+from grounded_trials.store.store import DIGITS, Store, made_folder, write_atomically
 from grounded_trials.store.trial_file import trial_bytes
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.diagnosing import FILE as DIAGNOSIS
@@ -65,12 +65,7 @@ def write_cases(
     if labels.resolve().is_relative_to(folder.resolve()):
         raise GroundedError(f"the labels ({labels}) must lie outside {folder}, to keep it blind")
     for place in (folder, labels):
-        try:
-            place.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise GroundedError(
-                f"{place} can't be created: {error.strerror}; name another folder"
-            ) from None
+        made_folder(place)
     entries: dict[str, Any] = {}
     for number, case in enumerate(cases, start=1):
         trials = _write_case(case, folder / case.name)
@@ -96,7 +91,7 @@ def _write_case(case: Case, folder: Path) -> list[str]:
             f"{folder} holds trials of another challenge: repeat the command that made it, or name "
             "another folder"
         )
-    folder.mkdir(parents=True, exist_ok=True)
+    made_folder(folder)
     task, names = task_of(case), case.model.state_names
     columns = {name: case.target[:, i] for i, name in enumerate(names)}
     write_target(folder / "target.csv", case.dt, columns)

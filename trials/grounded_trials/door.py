@@ -106,7 +106,7 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.proposing import propose_in
 
-        return propose_in(self._afresh())
+        return propose_in(self.forget())
 
     def run(
         self,
@@ -127,7 +127,7 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.running import run_candidate
 
-        return run_candidate(self._afresh(), candidate, anyway=anyway, warn=warn)
+        return run_candidate(self.forget(), candidate, anyway=anyway, warn=warn)
 
     def ingest(
         self, path: str | Path, *, candidate: str | None = None, data: bool = False
@@ -141,7 +141,7 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.intake.ingest import ingest_log
 
-        return ingest_log(self._afresh(), path_of(path), candidate, data=data, ahead=True)
+        return ingest_log(self.forget(), path_of(path), candidate, data=data, ahead=True)
 
     def next(
         self, log: str | Path, *, candidate: str | None = None, runner: bool = True
@@ -155,7 +155,7 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.looping import next_in
 
-        return next_in(self._afresh(), path_of(log), candidate, runner=runner)
+        return next_in(self.forget(), path_of(log), candidate, runner=runner)
 
     def target(self, columns: Mapping[str, Array]) -> Path:
         """Write target.csv and set the horizon in grounded.toml; the old target is kept as .bak.
@@ -166,7 +166,7 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.new_target import replace_target
 
-        here = self._afresh()
+        here = self.forget()
         path = replace_target(here.config, columns, here.base_model)
         self.forget()
         return path
@@ -187,13 +187,13 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.looping import learn_in
 
-        return learn_in(self._afresh(), trials, progress, each)
+        return learn_in(self.forget(), trials, progress, each)
 
     def status(self) -> Status:
         """Return the state of the search; writes nothing."""
         from grounded_trials.workspace.proposing import standing_in, status_of
 
-        return status_of(self._afresh(), standing_in(self, ahead=True))
+        return status_of(self.forget(), standing_in(self, ahead=True))
 
     def fit(
         self,
@@ -220,7 +220,7 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.fitting import fit_in
 
-        asked = partial(fit_in, self._afresh(), params, trials=trials, latency=latency)
+        asked = partial(fit_in, self.forget(), params, trials=trials, latency=latency)
         done = asked(apply=apply, engine=engine, progress=progress)
         self.forget()
         return done
@@ -255,7 +255,7 @@ class Workspace(Folder):
         from grounded_trials.workspace.diagnosing import diagnose_in
 
         return diagnose_in(
-            self._afresh(),
+            self.forget(),
             trials=trials,
             max_effects=max_effects,
             without=without,
@@ -270,7 +270,7 @@ class Workspace(Folder):
         """Check the sensors of some or all trials for delays and scale errors, from their data."""
         from grounded_trials.workspace.diagnosing import instruments_in
 
-        return instruments_in(self._afresh(), trials)
+        return instruments_in(self.forget(), trials)
 
     def adopt(self, *effects: str, parameters: bool = True) -> Adopted:
         """Add effects of the last diagnosis to the model in grounded.toml.
@@ -281,7 +281,7 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.adopting import adopt_effects
 
-        done = adopt_effects(self._afresh(), effects, parameters=parameters)
+        done = adopt_effects(self.forget(), effects, parameters=parameters)
         self.forget()
         return done
 
@@ -289,7 +289,7 @@ class Workspace(Folder):
         """Undo the last `adopt`: restore the effects and params of grounded.toml."""
         from grounded_trials.workspace.adopting import undo_adoption
 
-        done = undo_adoption(self._afresh())
+        done = undo_adoption(self.forget())
         self.forget()
         return done
 
@@ -308,7 +308,7 @@ class Workspace(Folder):
         """
         from grounded_trials.report.reporting import report_in
 
-        return report_in(self._afresh(), html=html, png=png, rrd=rrd)
+        return report_in(self.forget(), html=html, png=png, rrd=rrd)
 
     def watch(
         self, *, every: float = 1.0, trouble: Callable[[GroundedError], None] = lambda error: None
@@ -354,7 +354,7 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.exporting import export_candidate
 
-        file, here, candidate = Path(path) if path else None, self._afresh(), candidate.lower()
+        file, here, candidate = Path(path) if path else None, self.forget(), candidate.lower()
         if form == "bag" or candidate.startswith("t"):
             from grounded_trials.report.ros_bag import export_run
 
@@ -369,7 +369,7 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.verifying import verify_in
 
-        return verify_in(self._afresh())
+        return verify_in(self.forget())
 
     def discard(self, *trials: str, why: str = "") -> SetAside:
         """Exclude trials from search, fit, diagnosis and report; nothing is deleted.
@@ -380,21 +380,16 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.identity import set_aside
 
-        return set_aside(self._afresh(), "discard", trials, why)
+        return set_aside(self.forget(), "discard", trials, why)
 
     def restore(self, *trials: str) -> SetAside:
         """Undo `discard` for some trials."""
         from grounded_trials.workspace.identity import set_aside
 
-        return set_aside(self._afresh(), "restore", trials, "")
+        return set_aside(self.forget(), "restore", trials, "")
 
     def inspect(self, log: str | Path) -> Inspected:
         """List the signals of a log, and guess a [log] table for this workspace's model."""
         from grounded_trials.workspace.inspecting import inspect_in
 
-        return inspect_in(self._afresh(), path_of(log))
-
-    def _afresh(self) -> Self:
-        """Drop cached contents and return self: files may have changed since the last call."""
-        self.forget()
-        return self
+        return inspect_in(self.forget(), path_of(log))

@@ -3,7 +3,7 @@
 The modules:
 
     attribution   START HERE: the whole search, from the first scan to the last effect added
-    scan          linear estimate of what every candidate effect would gain
+    scan          linear estimate of what every candidate effect would gain, at `grid_points`
     explored      the hypotheses fitted so far, and their evidence
     search        the fits to try next
     joint_model   friction and inertia of all joints of an arm at once

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.error_report import Correction, Curve
 from grounded.diagnosis.hypotheses.leftover import CLAIM, Leftover, filter_of, held_out_columns
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.report import Correction, Curve
 from grounded.diagnosis.validation.prediction_error import Horizon, errors
 from grounded.effects import Library
 from grounded.effects.correction import KNOTS, bells

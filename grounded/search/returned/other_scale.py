@@ -29,10 +29,19 @@ from grounded.search.returned.who_drove import (
 from grounded.task import Task
 from grounded.trial import Trial
 
-THOUSAND, PERCENT = (1e-3, 1e3), (1e-2, 1e2)
+THOUSAND, PERCENT, CENTI = (1e-3, 1e3), (1e-2, 1e2), 1e-2
 ANGULAR = (("rad", "rad/s"), ("rad",), ("rad/s",))  # groups of units that may be in degrees
 IN_DEGREES = ("deg", "deg/s")  # units that may be in radians
 LENGTHS = (("m", "m/s"), ("m",), ("m/s",))  # units of what one wheel measures
+UNITS = (  # units of the model, factor from the log's unit, and the log's unit
+    (ANGULAR[0], np.pi / 180, "degrees"),
+    (IN_DEGREES, 180 / np.pi, "radians"),
+    (LENGTHS[0], THOUSAND[0], "mm"),
+    (LENGTHS[0], CENTI, "cm"),
+    (LENGTHS[0], THOUSAND[1], "km"),
+    (("1",), PERCENT[0], "percent"),
+    (("1",), PERCENT[1], "fractions of 1, not percent"),
+)
 NEARLY = 0.1  # largest difference of commands with another unit, relative to an input's size
 EXACT, CLOSE = 0.01, 0.05  # the same for a unit that is certain, and for any factor
 # largest share of the original difference left by a unit, and by any factor (many are tried)
@@ -216,3 +225,17 @@ def units_tried(model: Model) -> Iterator[tuple[Sequence[str], float]]:
     yield from ((names, f) for f in (*THOUSAND, -1.0) for names in together)
     lengths = [[n for n, u in model.states.items() if u in units] for units in LENGTHS]
     yield from ((names, f) for f in THOUSAND for names in lengths if len(names) > 1)
+    yield from ((names, CENTI) for names in lengths if names)
+
+
+def unit_named(model: Model, names: Sequence[str], by: float) -> str:
+    """Return the unit of signals in a log that a factor converts to the model's; "" if unknown."""
+    own = {**model.states, **model.inputs}
+    return next(
+        (
+            unit
+            for units, factor, unit in UNITS
+            if np.isclose(by, factor, rtol=1e-6) and all(own[name] in units for name in names)
+        ),
+        "",
+    )

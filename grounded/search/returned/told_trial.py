@@ -5,27 +5,24 @@ The same checks as `grounded ingest` makes, worded for a program: there is no lo
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.instruments.fed_back import unit_fed_back
 from grounded.instruments.finding import in_the_log
 from grounded.instruments.other_units import UnusableTrials
 from grounded.instruments.sound_trials import sound_trials
 from grounded.model import Model
 from grounded.result import listed, with_unit
 from grounded.search.candidate import Candidate
-from grounded.search.returned.other_scale import other_units
+from grounded.search.returned.other_scale import other_units, unit_named
 from grounded.search.returned.who_drove import suspicion
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 
 BEYOND = 0.1  # mean excess of an input over its limits, in ranges, that is reported as such
-LOG_KEY = re.compile(r", corrected by \[log\.\w+\.[^]]+\] scale = ([^\s,;]+)")
 
 
 def odd_trial(task: Task, candidates: Sequence[Candidate], trial: Trial, *, first: bool) -> str:
@@ -41,10 +38,21 @@ def odd_trial(task: Task, candidates: Sequence[Candidate], trial: Trial, *, firs
     own = next(one for one in candidates if one.id == trial.candidate)
     if whole.finite_steps < 1 and (unknown := _unknown(trial)):
         return f"{listed(unknown)} {'is' if len(unknown) == 1 else 'are'} NaN from the start"
-    if unit := unit_fed_back(task.model, whole, own.policy):
-        return unit
+    seen = suspicion(task, whole, own, candidates)
+    names, by = ((), 1.0) if seen.other else other_units(task, whole, own, seen.ran)
+    if unit := unit_named(task.model, names, by):  # the columns may agree with each other
+        ours = {**task.model.states, **task.model.inputs}
+        units = " and ".join(dict.fromkeys(ours[name] for name in names))
+        return (
+            f"{listed(names)} {'is' if len(names) == 1 else 'are'} in {unit}, not in {units}: "
+            f"times {by:.4g}, its commands are those of {own.id}"
+        )
     columns = _odd_columns(task.model, whole) if first else ""
-    return columns or _not_its_run(task, candidates, whole, own)
+    if columns or not seen.why:
+        return columns
+    if names:
+        return f"only with {listed(names)} times {by:.4g} are its commands those of {own.id}"
+    return _beyond_limits(task, whole, own) or seen.why
 
 
 def crashed(task: Task, trial: Trial) -> str:
@@ -73,20 +81,14 @@ def _odd_columns(model: Model, trial: Trial) -> str:
     try:
         looked = sound_trials(model, [replace(trial, id="")])
     except UnusableTrials as error:
-        return LOG_KEY.sub(r" (multiply it by \1)", error.clauses)
+        return error.in_program
     except GroundedError as error:
         return str(error).rstrip(".")
     return "; ".join(f"{one.signal} {one.finding}" for one in in_the_log(looked.findings))
 
 
-def _not_its_run(task: Task, candidates: Sequence[Candidate], trial: Trial, own: Candidate) -> str:
-    """Return why the commands are not those of the candidate on the trial's states, or ""."""
-    seen = suspicion(task, trial, own, candidates)
-    if not seen.why:
-        return ""
-    names, by = other_units(task, trial, own, seen.ran)
-    if names:
-        return f"only with {listed(names)} times {by:.4g} are its commands those of {own.id}"
+def _beyond_limits(task: Task, trial: Trial, own: Candidate) -> str:
+    """Return which input is far outside its limits, which a policy's never is; or ""."""
     inputs = trial.inputs[: task.horizon]
     for name, sent, low, high in zip(trial.input_names, inputs.T, task.low, task.high, strict=True):
         beyond = np.abs(sent - np.clip(sent, low, high)).mean()
@@ -96,4 +98,4 @@ def _not_its_run(task: Task, candidates: Sequence[Candidate], trial: Trial, own:
                 f"{name} is {sent.min() + 0:.4g} to {most}, outside its "
                 f"limits, {low:g} to {high:g}: it is not what {own.id} sends"
             )
-    return seen.why
+    return ""

@@ -9,10 +9,11 @@ from facts import holds
 from grounded import Model
 from grounded.errors import GroundedError
 from grounded.result import listed
-from grounded.search.returned.other_scale import other_units, units_tried
+from grounded.search.returned.other_scale import other_units, unit_named, units_tried
 from grounded.search.returned.who_drove import follows, latest
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
+from grounded_trials.workspace.intake.read_otherwise import units_told
 from recorded import LOGGED, record, waiting
 from workspaces import MODEL, make
 
@@ -107,6 +108,20 @@ def test_an_encoder_of_one_joint_the_other_way_round_is_tried(tmp_path):
     assert {(("ta", "tb"), 1e-3), (("ta", "tb"), 1e3)} <= tried
 
 
+def test_centimetres_are_tried_and_are_no_percent():
+    cart = Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"throttle": "1"},
+        derivative=lambda s, a, p: {"x": s.v, "v": a.throttle - s.v},
+    )
+    tried = {(tuple(names), factor) for names, factor in units_tried(cart)}
+    assert {(("x", "v"), 1e-2), (("x",), 1e-2)} <= tried
+    assert unit_named(cart, ("x", "v"), 1e-2) == "cm"
+    assert unit_named(cart, ("throttle",), 1e-2) == "percent"
+    assert unit_named(cart, ("x", "throttle"), 1e-2) == ""
+    assert holds(units_told(cart, ("x", "v"), 1e-2, mapped=True), "100 times", "cm", "0.01")
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_other_driving_is_no_factor(driven, seed):
     w, trial, _ = driven
@@ -147,4 +162,4 @@ def test_a_rate_that_is_logged_in_radians_for_a_model_in_degrees_is_told(tmp_pat
     np.savetxt(log, rows, "%.6f", ",", header="t,x,v,force", comments="")
     with pytest.raises(GroundedError) as refused:
         w.ingest(log)
-    assert holds(str(refused.value), "ran c0001", "force", "57.2958", "radians for degrees")
+    assert holds(str(refused.value), "ran c0001", "force", "57.2958", "in radians")

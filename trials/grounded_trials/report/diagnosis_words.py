@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from grounded.diagnosis.cause_words import furthest_apart, with_share
-from grounded.diagnosis.comparison import value_of
-from grounded.diagnosis.error_report import Gap
-from grounded.diagnosis.report import Changed, Correction, Diagnosis, Estimate
-from grounded.diagnosis.stopped import ENDED
+from grounded.diagnosis.cause_words import ENDED, furthest_apart, value_of, with_share
+from grounded.diagnosis.error_report import Correction, Gap
+from grounded.diagnosis.report import Changed, Diagnosis, Estimate
 from grounded.result import listed
 from grounded_trials.wording import changed, count, figure, percent, ranges, with_unit
 

@@ -17,7 +17,7 @@ from grounded.result import Result
 from grounded_trials.report.findings import Findings, Run, off_prediction, off_target, rms
 from grounded_trials.report.gathering import gather
 from grounded_trials.store.documents import write_document
-from grounded_trials.store.store import write_atomically
+from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.folder import Folder
 
@@ -123,7 +123,7 @@ def save_recording(workspace: Folder, findings: Findings | None = None) -> Path:
     """Write reports/recording.rrd for the Rerun viewer; return its path."""
     from grounded_trials.report.recording.recording import write_recording
 
-    path = _place(workspace) / RECORDING
+    path = made_folder(workspace.reports) / RECORDING
     write_recording(findings or gather(workspace), path)
     return path
 
@@ -132,7 +132,7 @@ def save_layouts(workspace: Folder, findings: Findings) -> tuple[Path, Path]:
     """Write the layouts for Foxglove and PlotJuggler to reports/; return their paths."""
     from grounded_trials.report.layouts import write_layouts
 
-    return write_layouts(_place(workspace), findings.task.model)
+    return write_layouts(made_folder(workspace.reports), findings.task.model)
 
 
 def save_page(workspace: Folder, findings: Findings, watched: int = 0) -> Path:
@@ -143,7 +143,7 @@ def save_page(workspace: Folder, findings: Findings, watched: int = 0) -> Path:
     """
     from grounded_trials.report.page.page import page
 
-    path = _place(workspace) / PAGE
+    path = made_folder(workspace.reports) / PAGE
     write_atomically(path, page(findings, watched).encode())
     if watched:
         stamp = f'<svg xmlns="http://www.w3.org/2000/svg" width="{watched}" height="1"/>'
@@ -188,7 +188,7 @@ def save_pictures(workspace: Folder, findings: Findings) -> list[Path]:
 
     paths = []
     for figure in all_figures(findings):
-        path = _place(workspace) / f"{figure.name}.png"
+        path = made_folder(workspace.reports) / f"{figure.name}.png"
         write_atomically(path, png(figure))
         paths.append(path)
     return paths
@@ -197,12 +197,4 @@ def save_pictures(workspace: Folder, findings: Findings) -> list[Path]:
 def save_optimum(workspace: Folder, utility: float | None) -> None:
     """Write the optimum of the real system, known in a study, for the report; None: do nothing."""
     if utility is not None:
-        write_document(_place(workspace) / OPTIMUM, {"utility": utility})
-
-
-def _place(workspace: Folder) -> Path:
-    try:
-        workspace.reports.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise GroundedError(f"{workspace.reports} can't be created: {error.strerror}") from None
-    return workspace.reports
+        write_document(made_folder(workspace.reports) / OPTIMUM, {"utility": utility})

@@ -29,7 +29,7 @@ from grounded.model import Model
 from grounded_trials.formats.bags import standard_types
 from grounded_trials.logs.inspect_pairs import velocities
 from grounded_trials.report.scene import Scene, scene_of
-from grounded_trials.store.store import write_atomically
+from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.workspace.exporting import Exported, format_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.proposing import candidate_named
@@ -50,7 +50,7 @@ def _write_bag(
         raise GroundedError(f"{path} exists already: name another folder, or remove it first")
     storage = StoragePlugin.MCAP if "mcap" in path.name else StoragePlugin.SQLITE3
     store = standard_types()
-    with tempfile.TemporaryDirectory(prefix=".bag-", dir=_parent(path)) as room:
+    with tempfile.TemporaryDirectory(prefix=".bag-", dir=made_folder(path.parent)) as room:
         made = Path(room) / path.name
         with Writer(made, version=9, storage_plugin=storage) as writer:
             topics: dict[str, Any] = {}
@@ -59,14 +59,6 @@ def _write_bag(
                     topics[topic] = writer.add_connection(topic, kind, typestore=store)
                 writer.write(topics[topic], time, store.serialize_cdr(message, kind))
         shutil.move(made, path)
-
-
-def _parent(path: Path) -> Path:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise GroundedError(f"{path.parent} can't be created: {error.strerror}") from None
-    return path.parent
 
 
 class _Run:

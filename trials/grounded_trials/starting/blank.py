@@ -21,8 +21,8 @@ from grounded.utility import Reward
 from grounded_trials.starting.examples import fresh_folder, toml_of
 from grounded_trials.starting.own_model import own_model
 from grounded_trials.store.store import write_atomically
+from grounded_trials.workspace.at_rest import resting
 from grounded_trials.workspace.config import FILE
-from grounded_trials.workspace.first_plan import resting
 from grounded_trials.workspace.task_file import change_weight, write_target
 
 DT, HORIZON = 0.05, 100  # [s], steps

@@ -14,7 +14,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, nearest
 from grounded.task import Task
-from grounded_trials.store.store import write_atomically
+from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.toml_table import key
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.task_file import target_text
@@ -179,11 +179,8 @@ def fresh_folder(folder: Path, files: Iterable[str]) -> Iterator[None]:
     refuse_existing(folder, files)
     new = not folder.exists()
     try:
-        try:
-            for made in (folder, folder / "trials", folder / "candidates"):
-                made.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise GroundedError(f"{folder} can't be created: {error.strerror}") from None
+        for made in (folder, folder / "trials", folder / "candidates"):
+            made_folder(made)
         yield
     except BaseException:
         for path in [folder] if new else [folder / name for name in files]:

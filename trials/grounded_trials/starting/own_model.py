@@ -16,7 +16,7 @@ from grounded.adapters.beside import beside, recorded
 from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.result import listed
-from grounded_trials.store.store import write_atomically
+from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.workspace.model_file import load_module, model_in
 
 SIMULATED = (".xml", ".urdf", ".mjcf")  # suffixes of files that MuJoCo loads
@@ -55,7 +55,7 @@ class OwnModel:
             GroundedError: if it does not load from that folder.
         """
         for name in self.missing(folder):
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            made_folder((folder / name).parent)
             data = self.source if name == FILE else self.others[name].read_bytes()
             write_atomically(folder / name, data)
         try:

@@ -25,7 +25,7 @@ from typing import Any
 
 from grounded.errors import GroundedError
 from grounded_trials.plain_file import open_file
-from grounded_trials.store.store import Damaged, Store, Stored, write_atomically
+from grounded_trials.store.store import Damaged, Store, Stored, made_folder, write_atomically
 
 Known = Callable[[str, Path, Callable[[], dict[str, Any]]], dict[str, Any]]
 _SEALED = re.compile(rb'\{\n "sha256": "([0-9a-f]{64})",(\n.*)', re.DOTALL)
@@ -85,11 +85,7 @@ class StudyStore(MutableMapping[str, dict[str, Any]]):
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise GroundedError(f"{folder} can't be created: {error.strerror}") from None
+        self.folder = made_folder(folder)
 
     def _path(self, key: str) -> Path:
         return self.folder / f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.json"

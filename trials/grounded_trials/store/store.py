@@ -271,6 +271,19 @@ class Store:
         )
 
 
+def made_folder(folder: Path) -> Path:
+    """Create a folder, with those above it, if it does not exist yet; return it.
+
+    Raises:
+        GroundedError: if it can't be created.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise GroundedError(f"{folder} can't be created: {error.strerror}") from None
+    return folder
+
+
 def write_atomically(path: Path, data: bytes) -> None:
     """Write a file atomically: temporary name, sync, rename, sync of the folder.
 

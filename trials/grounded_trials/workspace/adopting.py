@@ -11,8 +11,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from grounded.diagnosis.cause_words import wider
 from grounded.diagnosis.report import Diagnosis, Estimate, Made
-from grounded.diagnosis.stopped import wider
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.result import Result, listed, percent
 from grounded_trials.store.documents import read_document, write_document
@@ -93,7 +93,8 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     that it does not claim was fitted instead of those, without parameters.
     """
     from grounded_trials.workspace.adopted import in_order
-    from grounded_trials.workspace.next_step import logged_target, to_plan
+    from grounded_trials.workspace.next_step import to_plan
+    from grounded_trials.workspace.off_target import logged_target
 
     found = read_diagnosis(workspace.reports)
     if found is None:
@@ -117,13 +118,12 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     write_document(workspace.reports / KEPT, {"adoptions": [*earlier, step], "undone": []})
     fitted = {*names, *before, *(found.effects if claimed else ()), *found.late_sensors}
     beside = (str(effect["name"]) for effect in adopted)
-    logged = logged_target(workspace) if not workspace.candidate_ids() else ""
     return Adopted(
         tuple(adopted),
         own,
         claimed,
         then=to_plan(workspace),
-        logged=logged,
+        logged=logged_target(workspace) if not workspace.candidate_ids() else "",
         beside=tuple(n for n in beside if n not in fitted),
         left=left_behind(found) if parameters and physics and claimed else {},
         stopped=wider(found.parameters) if parameters and physics and claimed else "",

@@ -21,6 +21,7 @@ from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand
 from grounded.instruments.finding import in_the_log
 from grounded_trials.store.documents import read_document, write_document
+from grounded_trials.store.store import made_folder
 from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.identity import ROWS
 from grounded_trials.workspace.intake.where_to_mend import where_to_mend
@@ -122,8 +123,6 @@ def diagnose_in(
     if words:
         run = f" ({identity}: `{rendered(to_run(workspace, identity, identity))}`)"
         run *= bool(identity)
-        if found.contested and not words.startswith(found.next_trial.rstrip(".")):
-            words = f"{found.next_trial} {words[:1].upper()}{words[1:]}"  # which other trial
         found = replace(found, next_trial=f"{words}{run}", probe=identity)
     undo = _in_vain(workspace, found)
     if undo:
@@ -215,8 +214,7 @@ def unheld_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[str, ...]:
 
 
 def _keep(workspace: Folder, found: Diagnosis) -> None:
-    workspace.reports.mkdir(exist_ok=True)
-    write_document(workspace.reports / FILE, found.to_json())
+    write_document(made_folder(workspace.reports) / FILE, found.to_json())
 
 
 def read_diagnosis(folder: Path) -> Diagnosis | None:
@@ -279,7 +277,6 @@ def _probe(
     if found.changed and not write:
         return "", ""  # of one of the two robots, which is to be diagnosed alone
     from grounded.diagnosis.excitation import NOTHING, probe
-    from grounded.diagnosis.verdict import sentence
     from grounded.search.safety import objections, spread
     from grounded_trials.workspace.handover import outside_limits
     from grounded_trials.workspace.proposing import standing_in
@@ -303,18 +300,20 @@ def _probe(
         if made is None:
             break
         worth = not made.little or (write and (not ties or made.expected >= NOTHING))
+        said = made.sentence
+        if found.contested or not (worth or ties):  # it is the trial that is asked for, if one
+            said = f"{found.next_trial} {said[:1].upper()}{said[1:]}"
         if not worth:
-            said = made.sentence if ties else f"{found.next_trial} {sentence([made.sentence])}"
-            return "", f"{said.rstrip('.')}. No probe is written." if write else said
+            return "", f"{said.rstrip('.')}.{' No probe is written.' * write}"
         if not offer:
-            return "", f"{made.sentence} (`{rendered(PROBE)}` makes the candidate)"
+            return "", f"{said} (`{rendered(PROBE)}` makes the candidate)"
         candidate = _candidate_of(workspace, planner.narrowed(made.policy), best.candidate.id)
         reasons = (*outside_limits(task, candidate.policy), *objections(task, candidate, strays))
         if not reasons:
             while (saved := workspace.save_candidate(candidate, kind="probe")) is None:
                 workspace.forget_trials()  # another process took the name
                 candidate = replace(candidate, id=workspace.next_id())
-            return saved.id, made.sentence
+            return saved.id, said
         why = "; ".join(reasons).replace(candidate.id, "the best")
     return "", f"{found.next_trial.rstrip('.')}; no candidate for it is offered: {why}" * offer
 

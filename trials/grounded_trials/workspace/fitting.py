@@ -18,6 +18,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, measured_alike
 from grounded.trial import Trial
 from grounded_trials.store.documents import read_document, write_document
+from grounded_trials.store.store import made_folder
 from grounded_trials.workspace.adopting import settled
 from grounded_trials.workspace.config import set_in_model, set_latency
 from grounded_trials.workspace.folder import Folder
@@ -120,8 +121,8 @@ def _worse(found: Fit) -> str:
 
 
 def _keep(workspace: Folder, used: Sequence[Trial], found: Fit) -> None:
-    workspace.reports.mkdir(exist_ok=True)
-    write_document(workspace.reports / KEPT, _made_from(workspace, used) | {"helps": found.helps})
+    made = _made_from(workspace, used) | {"helps": found.helps}
+    write_document(made_folder(workspace.reports) / KEPT, made)
 
 
 def _made_from(workspace: Folder, used: Sequence[Trial]) -> dict[str, Any]:

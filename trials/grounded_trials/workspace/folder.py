@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from grounded.errors import GroundedError
 from grounded.model import Model
@@ -25,7 +25,7 @@ from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.plain_file import open_file
 from grounded_trials.store.documents import Notes
-from grounded_trials.store.store import Damaged, Store, Stored, write_atomically
+from grounded_trials.store.store import Damaged, Store, Stored, made_folder, write_atomically
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.config import Config, read_config
 from grounded_trials.workspace.identity import (
@@ -134,11 +134,12 @@ class Folder:
         """The notes of the workspace."""
         return self._read_notes(None)
 
-    def forget(self) -> None:
-        """Forget everything that was read, so that it is read again when needed."""
+    def forget(self) -> Self:
+        """Forget everything that was read, since files may have changed; return the folder."""
         self.read_target.cache_clear()
         for name in [n for n, kept in vars(Folder).items() if isinstance(kept, cached_property)]:
             vars(self).pop(name, None)
+        return self
 
     def forget_trials(self) -> None:
         """Forget the trials that were read, so that they are read again when needed."""
@@ -268,7 +269,7 @@ class Folder:
             candidate = replace(candidate, id=self.next_id(handed=True))
             data = encoded(candidate, self.task, kind)
         path = self.candidate_path(candidate.id)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        made_folder(path.parent)
         with self.store.locked():
             if path.exists() or seen not in (None, self.names()):
                 return None

@@ -21,6 +21,7 @@ from grounded_trials.workspace.diagnosing import diagnosable, read_diagnosis
 from grounded_trials.workspace.fitting import fitted_in_vain
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.where_to_mend import in_time_now
+from grounded_trials.workspace.off_target import logged_target
 from grounded_trials.workspace.proposing import standing_in, status_of, to_run
 
 PROPOSE = NextCommand("propose")
@@ -28,9 +29,7 @@ DIAGNOSE = NextCommand("diagnose")
 EXPORT = NextCommand("export", ("best", "--runner"))
 REPORT = NextCommand("report", ("--html",))
 TARGET = NextCommand("target", ("SHAPE",))
-WRITTEN = 1e-3  # tolerance for target.csv, relative to its range, due to the digits in the file
 SHORT = 0.1  # fraction of a control step: shorter filters and delays make no difference
-LEFT = 2  # number of states reported of the unexplained rest
 SAME = 1e-6  # relative tolerance for values that were written with eight digits
 
 
@@ -136,26 +135,6 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
     return PROPOSE if goes_on else status_of(workspace, now).then
 
 
-def logged_target(workspace: Folder) -> str:
-    """Return the trial whose states target.csv still repeats, as `init --from` wrote it; or "".
-
-    Only trials that ran no candidate count; the target must equal their states row by row.
-    """
-    if not workspace.config.task.target:
-        return ""
-    task = workspace.task
-    asked = np.isfinite(task.target).any(axis=0)
-    for stored in workspace.whole_trials():
-        trial, rows = stored.trial, len(task.target)
-        if trial.candidate or trial.steps + 1 < rows or trial.dt != task.dt:
-            continue
-        off = np.abs(trial.states[:rows, asked] - task.target[:, asked])
-        moved = np.ptp(task.target[:, asked], axis=0).max(initial=0.0)
-        if moved > 0 and off.size and np.nanmax(off) < WRITTEN * moved:
-            return trial.id or stored.stored.id
-    return ""
-
-
 def _none_stood(now: Standing) -> bool:
     """Return whether every policy that was run crashed."""
     return bool(now.history) and now.incumbent is None
@@ -181,16 +160,14 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
 def nothing_to_do(found: Diagnosis, best: str) -> str:
     """Return a text for a search that has ended although part of the gap is unexplained.
 
+    The verdict itself says which part that is.
+
     Args:
         found: the diagnosis of the current model and trials, without claims left to adopt.
         best: the candidate that the search ended with.
     """
-    left = ", ".join(one.sentence() for one in found.leftover[:LEFT])
-    if found.leftover and found.leftover[0].sentence() in found.sentence:
-        left = ""  # the verdict says it
     return (
         f"None is needed for the manoeuvre: the search has ended, with {best}. "
-        + f"No known effect explains the rest: {left}. " * bool(left)
         + "To learn more: " * (not found.contested)
         + found.next_trial
     )

@@ -18,9 +18,11 @@ from grounded.result import Document, measured_alike
 from grounded.search.scatter import beyond_noise
 from grounded.task import Task
 from grounded.trial import Trial
+from grounded_trials.workspace.folder import Folder
 
 FEW = 2  # groups of states reported: positions and angles before their rates, then by cost
 MOST = 0.5  # a group with more than this share of the tracking cost is reported in any case
+WRITTEN = 1e-3  # tolerance for target.csv, relative to its range, due to the digits in the file
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
 
 
@@ -163,3 +165,23 @@ def began_elsewhere(task: Task, trials: Sequence[Trial]) -> tuple[str, ...]:
     off = np.array([task.model.difference(t.states[0], task.start) for t in trials])
     names = np.array(task.model.state_names)
     return tuple(names[beyond_noise(trials, off, task.start)].tolist())
+
+
+def logged_target(workspace: Folder) -> str:
+    """Return the trial whose states target.csv still repeats, as `init --from` wrote it; or "".
+
+    Only trials that ran no candidate count; the target must equal their states row by row.
+    """
+    if not workspace.config.task.target:
+        return ""
+    task = workspace.task
+    asked = np.isfinite(task.target).any(axis=0)
+    for stored in workspace.whole_trials():
+        trial, rows = stored.trial, len(task.target)
+        if trial.candidate or trial.steps + 1 < rows or trial.dt != task.dt:
+            continue
+        off = np.abs(trial.states[:rows, asked] - task.target[:, asked])
+        moved = np.ptp(task.target[:, asked], axis=0).max(initial=0.0)
+        if moved > 0 and off.size and np.nanmax(off) < WRITTEN * moved:
+            return trial.id or stored.stored.id
+    return ""

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
     from grounded.figures.figure import Figure
     from grounded.search.candidate import Candidate
-    from grounded.search.proposal import Proposal
-    from grounded.search.standing import Standing
+    from grounded.search.standing import Proposal, Standing
     from grounded_trials.workspace.identity import StoredTrial
     from grounded_trials.workspace.next_step import Since
 
@@ -112,7 +111,8 @@ def propose_in(workspace: Folder) -> Proposed:
         notes = [f"{note}; run {candidate.id} instead" for note in notes]
     held: list[str] = []
     if not proposal.standing.trials and (candidate is None or proposal.is_new):
-        from grounded_trials.workspace.first_plan import held_before, left_open
+        from grounded_trials.workspace.at_rest import held_before
+        from grounded_trials.workspace.first_plan import left_open
 
         held = held_before(workspace, _other_model(workspace, before))
         notes += left_open(workspace, proposal, held)

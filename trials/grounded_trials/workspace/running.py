@@ -25,6 +25,7 @@ from grounded.search.candidate import Candidate
 from grounded.search.step_size import SearchOptions
 from grounded.trial import Trial
 from grounded.trusted import check_own
+from grounded_trials.store.store import made_folder
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
@@ -113,8 +114,7 @@ def simulated_plant(workspace: Folder) -> Plant:
 
 
 def _next_run(folder: Path, identity: str) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    taken = [p.stem.rsplit("-", 1)[-1] for p in folder.glob(f"{identity}-*.mcap")]
+    taken = [p.stem.rsplit("-", 1)[-1] for p in made_folder(folder).glob(f"{identity}-*.mcap")]
     number = max((int(t) for t in taken if t.isdigit()), default=0) + 1
     return folder / f"{identity}-{number}.mcap"
 

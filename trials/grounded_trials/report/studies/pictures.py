@@ -42,7 +42,7 @@ from grounded_trials.report.studies.bars import (
     footnote9_figure,
     nondeterminism_figure,
 )
-from grounded_trials.store.store import write_atomically
+from grounded_trials.store.store import made_folder, write_atomically
 
 FIRST, LAST, DESIRED = "the model’s controller", "after learning", "desired"
 PAPER_FIGURE = {"turn": 4, "circle": 5, "figure8": 5}
@@ -260,8 +260,5 @@ def draw_study(name: str, result: Any, path: Path) -> None:
     """
     if name not in PICTURES:
         raise GroundedError(f"there is no picture of '{name}', only of {', '.join(PICTURES)}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise GroundedError(f"{path.parent} can't be created: {error.strerror}") from None
+    made_folder(path.parent)
     write_atomically(path, png(PICTURES[name](result)))

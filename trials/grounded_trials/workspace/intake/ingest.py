@@ -12,7 +12,6 @@ import math
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.result import listed
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.returned.other_scale import other_units
-from grounded.search.returned.who_drove import OTHERS, Following, suspicion
+from grounded.search.returned.who_drove import OTHERS, Following
 from grounded.search.safety import COASTS
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
@@ -30,20 +29,16 @@ from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
-from grounded_trials.workspace.intake.acted_on import rival_in, sender_of
 from grounded_trials.workspace.intake.earlier_task import OfEarlierTask, of_earlier_task
-from grounded_trials.workspace.intake.fell import fall_in, who_fell
-from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.intake.log_faults import dead_sensors, log_faults, mistaken_in
-from grounded_trials.workspace.intake.missed_steps import not_sent
+from grounded_trials.workspace.intake.look import Look
 from grounded_trials.workspace.intake.odd_run import odd_run
 from grounded_trials.workspace.intake.read_otherwise import misled, pace_of, unit_of, units_told
 from grounded_trials.workspace.intake.reading import (
     NoneWaits,
     Read,
     copied,
-    cut_log,
     cut_short,
     is_stored,
     misread,
@@ -52,9 +47,6 @@ from grounded_trials.workspace.intake.reading import (
 )
 from grounded_trials.workspace.intake.run_start import (
     LOOSE,
-    Recording,
-    Start,
-    elsewhere,
     loosely,
 )
 from grounded_trials.workspace.intake.stored_before import (
@@ -195,7 +187,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     logs = [read.log]
     if read.log and (late := read.log.as_seen):  # its program may have acted on these samples
         logs.append(late)
-    looks = [_Look(read, one, own, candidates, workspace.task) for one in logs]
+    looks = [Look(read, one, own, candidates, workspace.task) for one in logs]
     look = min(looks, key=lambda one: one.doubt)
     if look.read.log and look.read.cut:  # states may be unknown when the run begins
         look.read.log.refuse_late(look.read.cut)
@@ -235,7 +227,8 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             )
         return replace(read, warnings=(*read.warnings, *doubts), doubted=True)
     if units:
-        raise GroundedError(f"{path} ran {ran}, {units_told(units, by, read.log is not None)}")
+        other_unit = units_told(task.model, units, by, read.log is not None)
+        raise GroundedError(f"{path} ran {ran}, {other_unit}")
     if pace:
         raise GroundedError(f"{path} ran {ran}, but {pace}")
     if read.bare:
@@ -308,89 +301,6 @@ def _like(read: Read, ran: str, found: Following | None) -> tuple[str, ...]:
         f"it ran: if that was the {ran} of another workspace, `discard` it. To be sure, write "
         "trials with TrialWriter(..., policy=Path(candidate).read_bytes())",
     )
-
-
-class _Look:
-    """The search for a candidate's run in a log: where it begins, and whether it is its run.
-
-    Args:
-        read: the trial that would be stored.
-        log: the log in which its commands are judged; None if `read` was written by grounded.
-        own: the candidate.
-        candidates: candidates that may have been run instead.
-        task: the task of all candidates.
-    """
-
-    def __init__(
-        self,
-        read: Read,
-        log: ForeignLog | None,
-        own: Candidate,
-        candidates: list[Candidate],
-        task: Task,
-    ) -> None:
-        ran, judged = read.trial.candidate, partial(suspicion, task, own=own, others=candidates)
-        apart = None if log is read.log else log  # set if judged on other samples than stored
-        self.read, self.found = read, None
-        self.whole = interpolate_gaps(apart.cut(ran)[0] if apart else read.trial).trial
-        seen = judged(self.whole)
-        if read.bare and (alone := judged(self.whole, others=())).why:
-            seen = alone  # it may be of another workspace: resembling one of these is coincidence
-        self.log = log.recording if log else None
-        if log and read.log and self.log:
-            start_of = cache(partial(_start_of, self.log))
-            self.found = found = start_of(own)
-            if found and elsewhere(self.log, found, own.policy, seen.why):
-                begins = found.seconds + (_sooner(apart, read.log) if apart else 0)
-                note = f"the log begins {begins:.3f} s before {ran} does: that part is left out"
-                there = cut_log(read.log, ran, begins)
-                warnings, notes = list(there.warnings), list(read.notes)
-                if found.missed:
-                    warnings.insert(0, not_sent(task, ran, found.missed))
-                else:
-                    notes.append(note)
-                self.read = replace(there, warnings=tuple(warnings), notes=tuple(notes))
-                cut = apart.cut(ran, found.seconds)[0] if apart else self.read.trial
-                self.whole = interpolate_gaps(cut).trial
-                seen = judged(self.whole)
-            sender = sender_of(self.log, own, candidates, start_of)
-            if sender.sure:
-                seen = replace(seen, why="", other="")
-            elif sender.other:
-                seen = replace(seen, why=sender.why, other=sender.other)
-            elif (rival := rival_in(self.log, own, candidates, start_of)) is not None:
-                best = judged(rival)  # cut where the other candidate fits best
-                told = best if best.other else seen if seen.why else replace(seen, why=best.why)
-                seen = replace(told, ran=seen.ran)
-        elif log and read.cut and log.spanned and (seen.why or seen.other) and log.anywhere:
-            begins = 1e-9 * (read.cut.start_ns - log.anywhere.whole.origin_ns)
-            given = Start(begins, 0.0, alike=True, opens_alike=True)
-            if sender_of(log.anywhere, own, [], lambda _: given).sure:
-                seen = replace(seen, why="", other="")
-        asked = read.log and not seen.other
-        self.fell = fall_in(task, own, self.read.trial, seen.ran) if asked else None
-        if self.fell and self.log:
-            first, steps = self.found.seconds if self.found else self.log.first, self.fell.steps
-            if name := who_fell(self.log, own, candidates, start_of, first + steps * task.dt):
-                self.fell, seen = None, replace(seen, other=name)
-        self.suspicion = seen
-
-    @property
-    def doubt(self) -> tuple[bool, float]:
-        """Whether it is another's run, and how far the commands are from the candidate's."""
-        ran = self.suspicion.ran
-        return bool(self.suspicion.why), math.inf if ran is None else ran.error
-
-
-def _start_of(log: Recording, candidate: Candidate) -> Start | None:
-    """Return where a candidate's run seems to begin in a log."""
-    return log.start_of(candidate.policy)
-
-
-def _sooner(log: ForeignLog, stored: ForeignLog) -> float:
-    """Return by how much the first sample of the stored log is earlier [s]."""
-    assert log.recording is not None and stored.recording is not None
-    return (log.recording.whole.origin_ns - stored.recording.whole.origin_ns) * 1e-9
 
 
 def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:

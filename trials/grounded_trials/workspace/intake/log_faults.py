@@ -121,6 +121,7 @@ def _thousands(model: Model, known: Trial) -> list[Fault]:
 
 def way_faults(model: Model, known: Trial) -> list[Fault]:
     """Return faults of heading and speeds found from the path: other axes, a compass, knots."""
+    from grounded.instruments.other_units import UnusableTrials
     from grounded.instruments.rows import kinematic_rows, tied
     from grounded.instruments.way import judge_way
 
@@ -128,8 +129,8 @@ def way_faults(model: Model, known: Trial) -> list[Fault]:
     try:
         with np.errstate(all="ignore"):
             odd = list(judge_way(model, [replace(known, id="")], rows))
-    except GroundedError as error:
-        return [Fault(str(error).replace("in trial number 1 ", ""))]
+    except UnusableTrials as error:
+        return [Fault(error.clauses, error.mend)]
     return [
         Fault(f"{one.signal} {one.finding}", f"Set {one.log} in [log.state.{one.signal}]")
         for one in odd

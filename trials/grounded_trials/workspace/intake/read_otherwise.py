@@ -11,6 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
+from grounded.model import Model
 from grounded.policy import Policy
 from grounded.result import listed
 from grounded.search.returned.other_scale import (
@@ -18,6 +19,7 @@ from grounded.search.returned.other_scale import (
     THOUSAND,
     any_factor,
     any_offset,
+    unit_named,
     units_tried,
 )
 from grounded.search.returned.who_drove import follows
@@ -31,13 +33,6 @@ from grounded_trials.workspace.intake.run_start import TRIED, Recording, recordi
 PAIRS = 28  # largest number of pairs of states, and of inputs, that are tried exchanged
 WORSE = 2.0  # factor by which a log must follow a policy worse than with two columns exchanged
 PACES = (2.0, 0.5)  # rates of a recording that are tried
-NAMED = (  # factor of a column and its meaning
-    (np.pi / 180, " (in degrees)"),
-    (180 / np.pi, " (radians for degrees)"),
-    (1e-2, " (in percent)"),
-    (1e2, " (not in percent)"),
-    *((factor, "") for factor in THOUSAND),
-)
 
 
 def pace_of(log: Recording, task: Task, policy: Policy) -> float | None:
@@ -164,10 +159,11 @@ def _paced(series: Series, pace: float) -> Series:
     return replace(series, t=t, log_times=log)
 
 
-def units_told(names: Sequence[str], by: float, mapped: bool) -> str:
+def units_told(model: Model, names: Sequence[str], by: float, mapped: bool) -> str:
     """Describe a wrong unit or sign in a log and how to correct it.
 
     Args:
+        model: with the units of the signals.
         names: the signals.
         by: the factor that corrects them.
         mapped: whether the log is read through a [log] table.
@@ -180,10 +176,10 @@ def units_told(names: Sequence[str], by: float, mapped: bool) -> str:
         return f"with {which} of the other sign: {mend if mapped else alone}"
     size = f"{max(abs(by), 1 / abs(by)):.4g} times too {'large' if abs(by) < 1 else 'small'}"
     size += " and of the other sign" * (by < 0)
-    told = next((text for factor, text in NAMED if np.isclose(by, factor, rtol=1e-6)), None)
+    unit = unit_named(model, names, by)
     mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (a missing scale is 1)"
-    if told is None:
+    if not unit and by not in THOUSAND:
         mend += "; if the log is right, the robot's program measures it wrong"
     if not mapped:
         mend = f"write {which} times {by:.6g} and run it again, or ingest it with --data"
-    return f"with {which} {size}{told or ''}: {mend}"
+    return f"with {which} {size}{f' (in {unit})' if unit else ''}: {mend}"

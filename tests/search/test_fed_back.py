@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import grounded as gr
-from grounded.instruments.fed_back import unit_fed_back
 from grounded.onboard import Runner
+from grounded.search.returned.other_scale import other_units, unit_named
+from grounded.search.returned.who_drove import follows, latest
 
 MODEL = gr.Model(
     states={"x": "m", "v": "m/s"},
@@ -29,6 +30,12 @@ TASK = gr.Task(
 )
 
 
+def found(task, candidate, trial):
+    """The signals and the factor with which a trial is the candidate's run."""
+    plain = follows(candidate.policy, trial, latest(task))
+    return other_units(task, trial, candidate, plain)
+
+
 def robot(candidate, units=1.0, noise=0.0, late=0):
     """A run of a heavier cart with friction that feeds back metres and logs other units."""
     runner, states, inputs = Runner(candidate.policy), [np.zeros(2)], []
@@ -46,8 +53,10 @@ def robot(candidate, units=1.0, noise=0.0, late=0):
 @pytest.mark.parametrize(("units", "named"), [(1e3, "mm"), (100.0, "cm"), (1e-3, "km")])
 def test_lengths_in_another_unit_are_found_though_all_columns_agree(units, named):
     candidate = gr.Search(TASK).ask()
-    told = unit_fed_back(MODEL, robot(candidate, units), candidate.policy)
-    assert told.startswith(f"x and v are in {named}, not in m and m/s")
+    names, by = found(TASK, candidate, robot(candidate, units))
+    assert names == ("x", "v")
+    assert by == pytest.approx(1 / units)
+    assert unit_named(MODEL, names, by) == named
     with pytest.raises(gr.GroundedError, match=f"are in {named}"):
         gr.learn(TASK, lambda c: robot(c, units))
     assert gr.learn(
@@ -58,12 +67,13 @@ def test_lengths_in_another_unit_are_found_though_all_columns_agree(units, named
 @pytest.mark.parametrize(("noise", "late"), [(0.0, 0), (0.01, 0), (0.0, 2), (0.05, 1)])
 def test_noise_and_late_samples_are_no_other_unit(noise, late):
     candidate = gr.Search(TASK).ask()
-    assert unit_fed_back(MODEL, robot(candidate, 1.0, noise, late), candidate.policy) == ""
+    assert found(TASK, candidate, robot(candidate, 1.0, noise, late)) == ((), 1.0)
 
 
 def test_an_open_loop_run_shows_no_unit():
-    candidate = gr.Search(replace(TASK, feedback=False)).ask()
-    assert unit_fed_back(MODEL, robot(candidate, 1e3), candidate.policy) == ""
+    task = replace(TASK, feedback=False)
+    candidate = gr.Search(task).ask()
+    assert found(task, candidate, robot(candidate, 1e3)) == ((), 1.0)
 
 
 def test_tell_warns_of_the_first_trial_only_and_keeps_it():

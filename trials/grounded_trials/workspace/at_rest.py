@@ -1,0 +1,145 @@
+"""Find the input that holds the robot at rest at its start, if the task begins with another one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from grounded.instruments.kinematics import integrals
+from grounded.model import is_clock
+from grounded.task import Task
+from grounded_trials.wording import with_unit
+from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.folder import Folder
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from grounded.frozen import Array
+
+FARTHEST = 1e4  # largest distance, in its unit, of a free state from where it starts
+UNGIVEN = 3  # largest number of states without a start value that are solved for
+STILL = 1e-3  # the robot is at rest if it moves less than this share of the motion as configured
+NOTHING = 1e-6  # fraction of an input's range (of 1 unit without limits) treated as zero
+MOVED = 0.01  # fraction of the same by which a given input must differ to be reported
+BEGUN = (0.0, 1.0, -1.0)  # offsets tried: a thrust that is squared has zero slope at 0
+
+
+def held_before(workspace: Folder, again: bool = False) -> list[str]:
+    """Return a note if the robot is not at rest at its start, but would be under another input.
+
+    Values of states that the user did not give (a fan's speed, say) may be changed too. There is no
+    note if the user gave the inputs, or if they make no difference: without weights on changes and
+    without latency the first command does not depend on the input held before.
+
+    Args:
+        workspace: the workspace of the first plan.
+        again: whether another model was used for an earlier plan: inputs that the user gave are
+            checked too, since they may have held that one.
+    """
+    base, planner, config = workspace.task, workspace.planner, workspace.config.task
+    task, loose = planner.plan, planner.loose
+    assert base.latency is not None
+    names, states, n = task.model.input_names, task.model.state_names, base.model.n
+    memory = np.arange(task.model.n) >= n  # the memory states of adopted effects: they settle
+    free = memory.copy()
+    biased = {str(e["name"]).removeprefix("sensor_bias:") for e in workspace.config.model.effects}
+    # a start taken from the target is off by the bias of a sensor: such a state is free too
+    begun = dict(zip(states, base.target[0], strict=False))
+    free[:n] = [s not in config.start and (np.isnan(x) or s in biased) for s, x in begun.items()]
+    free[[one.j for one in integrals(base.model) if one.exact]] = False  # at rest, a rate is 0
+    chosen = any(name in config.start for name in names)
+    priced = bool(base.reward.input_change.any() or base.latency.any())
+    stands = None if (chosen and not again) or not priced else resting(task, memory, loose)
+    if stands is None and 0 < free[:n].sum() <= UNGIVEN:
+        stands = resting(task, free, loose)
+    if stands is None:
+        return []
+    units = {**base.model.states, **task.model.inputs}
+    given = np.concatenate([task.start[:n], task.past])
+    stands = np.concatenate([stands[:n], stands[len(states) :]])
+    span = np.append(np.ones(n), task.high - task.low)
+    span = np.where(np.isfinite(span), span, np.maximum(1.0, np.abs(given)))
+    stands[np.abs(stands) < NOTHING * span] = 0.0
+    if chosen and not (np.abs(stands - given) > MOVED * span).any():
+        return []
+    rate = moved_at_start(task, task.past) / task.dt
+    k = int(np.argmax(np.abs(rate[:n])))
+    other = {
+        name: to
+        for name, at, to in zip(units, given, stands, strict=True)
+        if name in names or abs(to - at) > STILL * (1 + abs(to))
+    }
+    before = dict(zip(units, given, strict=True))
+    held = ", ".join(with_unit(f"{name} = {before[name]:.4g}", units[name]) for name in other)
+    whole = {name: f"{value:.10g}" for name, value in config.start.items() if name in units}
+    whole |= {name: f"{to:.4g}" for name, to in other.items()}
+    told = ", ".join(f"{name} = {whole[name]}" for name in units if name in whole)
+    return [
+        f"the plan assumes {held} before the start, under which {states[k]} changes at once, by "
+        f"{with_unit(f'{rate[k]:.3g}', units[states[k]])} per second; after its end the runner "
+        "holds that input again. If the robot is at rest before the run, put what holds it into "
+        f"[task] of {FILE} and propose again (if not, just propose again): start = {{ {told} }}"
+    ]
+
+
+def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> Array | None:
+    """Find states and inputs inside the limits under which the robot rests at its start.
+
+    The clock states of effects that grow with time are ignored: they always move.
+
+    Args:
+        task: the task with the start.
+        free: (n,), states that may differ from the start.
+        loose: the task with softened dry friction, used for the search: with sticking friction the
+            robot would rest under almost any input.
+
+    Returns:
+        States and inputs (n + m,); None if the robot rests under the input held before already, or
+        if no input holds it because the start is in motion.
+    """
+    from grounded.search.first_guess import trim
+
+    clocks = free & [is_clock(name) for name in task.model.state_names]
+    free = free & ~clocks
+    away = np.abs(moved_at_start(task, task.past))[~clocks].max()
+    if not away > 1e-9 or _out_of_reach(task, free, clocks):
+        return None
+    still = np.tile(task.start, (2, 1))
+    still[1, clocks] += task.dt
+    middle, inside = task.past.copy(), np.isfinite(task.high - task.low)
+    middle[inside] = 0.5 * (task.low[inside] + task.high[inside])
+    for first in [*(task.past + move for move in BEGUN), middle]:
+        begun = np.clip(first, task.low, task.high)
+        one = replace(loose or task, target=still, input_target=None, past=begun)
+        x, u = (found[0] for found in trim(one, still, ~free))
+        exact = replace(one, model=task.model, smoothing=0.0, past=u)  # a curved input's kink at 0
+        x, u = (found[0] for found in trim(exact, np.stack([x, still[1]]), ~free))
+        moved = np.abs(moved_at_start(replace(task, start=x), u))[~clocks]
+        if (moved <= STILL * away).all():
+            return np.append(x, u)
+    return None
+
+
+def _out_of_reach(task: Task, free: NDArray[np.bool_], clocks: NDArray[np.bool_]) -> bool:
+    """Return whether no input inside the limits can stop the motion at the start, linearised."""
+    if not np.isfinite(task.high - task.low).all():
+        return False
+    problem = task.problem(exact=True)
+    u = np.array([task.past, task.low, 0.5 * (task.low + task.high), task.high])
+    with np.errstate(all="ignore"):
+        f_x, f_u = problem.system.linearise(np.tile(task.start, (4, 1)), u, problem.p, problem.dt)
+    others = np.abs(f_x - np.eye(len(free))).max(axis=0)[:, free]
+    reach = 2 * np.abs(f_u).max(axis=0) @ (task.high - task.low) + FARTHEST * others.sum(axis=1)
+    inside = np.clip(task.past, task.low, task.high)  # a hover's thrust need not reach down to 0
+    return bool((np.abs(moved_at_start(task, inside)) > reach)[~clocks].any())
+
+
+def moved_at_start(task: Task, inputs: Array) -> Array:
+    """Return by how much the state changes in the first step under an input, (n,)."""
+    problem = task.problem(exact=True)
+    with np.errstate(all="ignore"):
+        after = problem.system.step(task.start[None], inputs[None], problem.p, problem.dt)[0]
+    return task.model.difference(after, task.start)
