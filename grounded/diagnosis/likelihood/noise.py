@@ -126,7 +126,7 @@ class NoiseModel:
 
     def allowing(self, structure: Structure, dt: float) -> NoiseModel:
         """Return where a fit of the same noise with another structure starts."""
-        if structure.tau is None:
+        if structure.tau is None or self.structure.tau is not None:
             return replace(self, structure=structure)
         # a tenth of the low-frequency power: summed over time, c has about 2 tau / dt times its C
         share = math.log(0.1 * dt / (2 * structure.tau))
