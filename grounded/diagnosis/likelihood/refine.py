@@ -41,6 +41,7 @@ from grounded.diagnosis.likelihood.noise import (
     cleaned,
     climbed,
     likelihood_slopes,
+    start_slopes,
     working,
 )
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -302,6 +303,9 @@ def _climbed(
         info = average(columns[:, i * B : (i + 1) * B])[:K, :K]
         in_log = adjoint if delays is None else delays.restored(adjoint)
         slope = likelihood_slopes(work.noise, in_log, data.dt)
+        if delays is None:
+            own = np.arange(i * B, (i + 1) * B)
+            slope = slope + start_slopes(work.noise, g.of_runs(own), white[:, own], data.dt)
         noise = climbed(work.noise, slope, info, int(data.valid.sum()))
         pairs = zip(slope, noise.logs, work.noise.logs, strict=False)
         found.append((noise, 0.5 * sum(float(s @ (a - b)) for s, a, b in pairs)))
