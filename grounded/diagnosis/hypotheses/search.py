@@ -81,13 +81,7 @@ class HypothesisSearch(FittedHypotheses):
     ) -> list[Fitted]:
         """Refine hypotheses and keep the fits; of rivals, the worse half stops early."""
         worth = self.score if rivals else None
-        fits = refine(
-            self.predictor,
-            starts,
-            iterations=iterations,
-            tick=lambda: self.tick("refine"),
-            worth=worth,
-        )
+        fits = refine(self.predictor, starts, iterations=iterations, tick=self._ticks, worth=worth)
         self.keep(fits)
         return fits
 
@@ -99,9 +93,10 @@ class HypothesisSearch(FittedHypotheses):
 
     def settled(self, fits: Sequence[Fitted]) -> None:
         """Converge fits that decide, see `polished`."""
-        self.keep(
-            polished(self.predictor, fits, iterations=TO_THE_TOP, tick=lambda: self.tick("refine"))
-        )
+        self.keep(polished(self.predictor, fits, iterations=TO_THE_TOP, tick=self._ticks))
+
+    def _ticks(self) -> None:
+        self.tick("refine")
 
     # -- without effects ------------------------------------------------------------------------
 

@@ -234,6 +234,9 @@ def identifiable(
     the priors. The verdict depends on the posterior standard deviation relative to the prior's. If
     a calibrated value states a larger standard deviation, that one is used.
 
+    Parameters that are not identifiable one by one may be so together: the calibrated values differ
+    from nominal in one direction, and if that direction is identifiable, so is what is adopted.
+
     Args:
         predictor: evaluates hypotheses, with all uncertain parameters free.
         fit: the hypothesis beside which they are identified, and its noise.
@@ -244,6 +247,7 @@ def identifiable(
     model, found = predictor.data.model, []
     names = [model.param_names[i] for i in calibrated(predictor.data)]
     priors = np.array([model.params[name].spread for name in names])
+    jointly = _jointly(cov, names, priors, model, known)
     held_ = [i for i, name in enumerate(names) if known and name not in known]
     for i, name in enumerate(names):
         std = known[name].std if name in known else 0.0
@@ -255,8 +259,32 @@ def identifiable(
                 if slope**2 * cov[j, j] > PART * cov[i, i]:
                     size = model.params[names[j]].value / known[name].value
                     given[names[j]] = float(slope * priors[i] / priors[j] * size)
-        found.append(Identifiable(name, _verdict(share), float(priors[i]), share, given))
+        alone = _verdict(share)
+        joint = jointly and alone == "not identifiable" and name in known
+        found.append(Identifiable(name, alone, float(priors[i]), share, given, joint))
     return found
+
+
+def _jointly(
+    cov: Array,
+    names: Sequence[str],
+    priors: Array,
+    model: Model,
+    known: Mapping[str, Estimate],
+) -> bool:
+    """Check whether the data identify the direction in which the parameters were moved.
+
+    Args:
+        cov: posterior covariance (K, K) in units of the priors.
+        names: the uncertain parameters (K).
+        priors: their prior standard deviations (K,).
+        model: holds their nominal values.
+        known: the calibrated values.
+    """
+    off = [known[n].value - model.params[n].value if n in known else 0.0 for n in names]
+    along = np.array(off) / priors
+    size = float(along @ along)
+    return size > 0 and _verdict(float(np.sqrt(along @ cov @ along / size))) != "not identifiable"
 
 
 def held(predictor: Predictor, fit: Fitted) -> Model:
