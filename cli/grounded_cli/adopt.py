@@ -88,6 +88,7 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
         show("written to [model] params, calibrated beside the effects:")
     for name, value in done.params.items():
         text = with_unit(f"{number(before[name].value)} -> {number(value)}", before[name].unit)
+        text += " (not determined alone, only with the others)" * (name in done.jointly)
         show(field(name, text, "  "))
     for one in done.left.values():
         kept, beside = (with_unit(number(value), one.unit) for value in (one.kept, one.value))

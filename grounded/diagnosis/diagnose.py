@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.hypotheses.attribution import USUAL_EFFECTS, attribute, grown, so_far
-from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data, prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -165,7 +165,7 @@ def diagnose(
     uncertain = Predictor(data)
     with np.errstate(all="ignore"):
         search = HypothesisSearch(data, ())
-        null = search.refined([search.fresh(Hypothesis())], FIRST_LOOK)
+        null = search.refined([search.fresh(Hypothesis())], TO_THE_TOP)
         if null:
             data = replace(data, model=held(uncertain, null[0]))
             model = without_others(Predictor(data), null[0].track, options.but, options.library)
@@ -182,7 +182,12 @@ def diagnose(
     joints = knowable(data, [e for e in joints if e.name not in settled])
     with running(engine):
         search, best = attribute(
-            data, candidates, max_effects=options.max_effects, tick=tick, joints=joints
+            data,
+            candidates,
+            max_effects=options.max_effects,
+            tick=tick,
+            joints=joints,
+            alone=null,
         )
     many = len(best.hypothesis.effects)  # may exceed the usual number if it has all joints
     most = options.max_effects or (many + 1 if many > USUAL_EFFECTS else USUAL_EFFECTS)
@@ -238,4 +243,3 @@ def _again(effect: Effect, known: float, data: Data) -> Effect:
 
 MOST_NAMES = 50  # 36 states and 12 inputs already give 1,649 effects, each of which is filtered
 USUAL = 160  # typical number of progress ticks: stages, and blocks of hypotheses refined
-FIRST_LOOK = 6  # iterations of the fit whose noise decides which parameters are identifiable

@@ -247,6 +247,29 @@ def runaway(rows: Sequence[RulerRow]) -> str:
 
 
 @dataclass(frozen=True, eq=False)
+class Identifiable(Document):
+    """How well the trials identify one uncertain parameter, with all others free.
+
+    left: remaining fraction of its prior standard deviation `prior`, 0 to 1. jointly: not alone,
+    but as calibrated, all together. given: {parameter: slope} for parameters that were held though
+    the trials don't identify them: how many per cent this one is off per per cent of error of the
+    other (1: only the ratio is known). Its `+-` assumes them exact.
+    """
+
+    parameter: str
+    verdict: str  # identifiable, weak, not identifiable
+    prior: float = math.nan
+    left: float = math.nan
+    given: Mapping[str, float] = field(metadata=BRIEF, default_factory=dict)
+    jointly: bool = field(metadata=BRIEF, default=False)
+
+    @property
+    def lost(self) -> bool:
+        """Whether its calibrated value is not known, not even together with the others."""
+        return self.verdict == "not identifiable" and not self.jointly
+
+
+@dataclass(frozen=True, eq=False)
 class Credit(Document):
     """Credit of an effect, or of "calibration": the loss of prediction accuracy without it.
 

@@ -16,6 +16,7 @@ from grounded.diagnosis.error_report import (
     Correction,
     Credit,
     Gap,
+    Identifiable,
     Region,
     Remainder,
     RulerRow,
@@ -138,23 +139,6 @@ class Unconfirmed(Document):
             f"trial {self.trial}, {f'{start} to {end}' if start != end else f'at {end}'} s{where}"
         )
         return f"unconfirmed, seen in {few} of {all_} trials: {self.meaning} ({when})"
-
-
-@dataclass(frozen=True, eq=False)
-class Identifiable(Document):
-    """How well the trials identify one uncertain parameter, with all others free.
-
-    left: remaining fraction of its prior standard deviation `prior`, 0 to 1. given: {parameter:
-    slope} for parameters that were held though the trials don't identify them; the slope is by how
-    many per cent this one is off for each per cent of error of the other (1: only the ratio is
-    known). Its `+-` assumes that they are exact.
-    """
-
-    parameter: str
-    verdict: str  # identifiable, weak, not identifiable
-    prior: float = math.nan
-    left: float = math.nan
-    given: Mapping[str, float] = field(metadata=BRIEF, default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,8 +324,13 @@ class Diagnosis(Document):
     @property
     def known_parameters(self) -> dict[str, Estimate]:
         """The calibrated parameters that the trials identify, which may be adopted."""
-        lost = {i.parameter for i in self.identifiable if i.verdict == "not identifiable"}
+        lost = {one.parameter for one in self.identifiable if one.lost}
         return {name: e for name, e in self.parameters.items() if name not in lost}
+
+    @property
+    def jointly(self) -> set[str]:
+        """The calibrated parameters that the trials identify only together with the others."""
+        return {one.parameter for one in self.identifiable if one.jointly}
 
     def open(
         self, adopted: Iterable[Mapping[str, Any]], params: Mapping[str, float] | None = None

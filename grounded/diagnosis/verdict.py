@@ -183,7 +183,8 @@ def _causes(
 
     effects = {e.name: e for e in claims.best.hypothesis.effects}
     given = {one.parameter: tuple(one.given) for one in identified}
-    lost = {one.parameter for one in identified if one.verdict == "not identifiable"}
+    lost = {one.parameter for one in identified if one.lost}
+    joint = {one.parameter for one in identified if one.jointly}
     values = {row.effect: row.params for row in ranking}
     found = []
     for one in credit:
@@ -198,6 +199,8 @@ def _causes(
             text += f", given {listed(held)} as in the model" * bool(held)
             vague = [n for n in _off(claims)[:NAMED] if n in lost]
             text += f", but these trials do not determine {listed(vague)}" * bool(vague)
+            joined = [n for n in _off(claims)[:NAMED] if n in joint]
+            text += f" ({listed(joined)} only together with the others)" * bool(joined)
         found.append(text)
     return tuple(found)
 
@@ -248,7 +251,7 @@ def _others(claims: Claims, identified: Sequence[Identifiable]) -> str:
     They were calibrated together with those that are off, whose values are only valid with them.
     """
     params, known, off = claims.data.model.params, claims.parameters(), _off(claims)
-    lost = {one.parameter for one in identified if one.verdict == "not identifiable"}
+    lost = {one.parameter for one in identified if one.lost}
     old = {name: params[name].value for name in known if name not in (*off, *lost)}
     if not old:
         return ""

@@ -121,6 +121,8 @@ class Writer:
         lost = self.unrepeatable()
         moved, parameters = how_many(predictor), self.claims.parameters()
         identified = tuple(_identified(self.uncertain, self.best, parameters))
+        if not self.ruler.held_out:  # what predicts no other trial is adopted only if it is known
+            identified = tuple(replace(one, jointly=False) for one in identified)
         said = verdict(
             self.claims,
             ranking,

@@ -93,6 +93,14 @@ class Gains:
         P = None if self.P is None else some(self.P)
         return Gains(system, some(self.k), some(self.weight), P, late)
 
+    def of_steps(self, count: int) -> Gains:
+        """The same of the first steps."""
+        assert self.delayed is None
+        rows = self.system._asdict() | {"seen": self.system.seen[: count + 1]}
+        rows |= {name: a[:count] for name, a in rows.items() if name in "AQHG" and a is not None}
+        rows["R"] = self.system.R[: count + 1]
+        return Gains(LinearSystem(**rows), self.k[:count], self.weight[:count])
+
     @cached_property
     def measured(self) -> Array:
         """H, zero rows where a channel was not seen, (L, B, n, N)."""

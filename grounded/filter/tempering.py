@@ -3,10 +3,12 @@
 Evidence adds up the nats of all samples as if each were news. Where the model is wrong, whitened
 innovations are correlated: N samples then say as much as
 
-    N_eff = N / (1 + 2 (rho_1 + rho_2 + ...))          while rho_k stands out of its scatter
+    N_eff = N / (1 + 2 (w_1 rho_1 + w_2 rho_2 + ...))
 
-independent ones, and where they are larger than claimed, each nat is one of a noise that is
-`misfit` times too small. Differences of evidence are multiplied by the one factor
+independent ones, where the weights w_k fall from 1 to 0 at the first lags at which rho_k no longer
+stands out of its scatter (a sum cut off at one threshold would jump with the last bit). And where
+innovations are larger than claimed, each nat is one of a noise that is `misfit` times too small.
+Differences of evidence are multiplied by the one factor
 
     N_eff / N / max(1, misfit)
 
@@ -24,6 +26,7 @@ import numpy as np
 from grounded.frozen import Array
 
 LAGS = 50
+CHANCE, CLEAR = 2.0, 3.0  # standard errors of a correlation from which it counts in part, and whole
 
 
 @dataclass(frozen=True)
@@ -44,13 +47,14 @@ def tempering(eps: Array, seen: Array) -> Tempering:
     counts, news = seen.sum(axis=(0, 1)).tolist(), 0.0
     for i, count in enumerate(counts):
         e, there = eps[..., i] * seen[..., i], seen[..., i]
-        power, worth = float(np.sum(e**2)) / max(count, 1.0), 1.0
+        power, worth, weight = float(np.sum(e**2)) / max(count, 1.0), 1.0, 1.0
         for k in range(1, min(LAGS, len(e) // 4) + 1):
             pairs = float(np.sum(there[k:] * there[:-k]))
             rho = float(np.sum(e[k:] * e[:-k])) / max(pairs * power, 1e-300)
-            if pairs == 0 or rho < 2 / pairs**0.5:
+            weight = min(weight, (rho * pairs**0.5 - CHANCE) / (CLEAR - CHANCE))
+            if weight <= 0:
                 break
-            worth += 2 * rho
+            worth += 2 * weight * rho
         news += count / worth
     total = max(sum(counts), 1.0)
     return Tempering(news / total if news else 1.0, float(np.sum((eps * seen) ** 2)) / total)

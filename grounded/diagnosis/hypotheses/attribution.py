@@ -10,6 +10,7 @@ better. Confirmation on held-out trials follows later (`validation`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from grounded.diagnosis.hypotheses.search import (
     LARGE,
     LARGE_GAIN,
     SHORTLIST,
+    SPREADS,
     TO_THE_TOP,
     HypothesisSearch,
     sweep,
@@ -39,6 +41,9 @@ TUNED = 2  # best sets whose constants are optimised
 FORETOLD = (2.0, 0.05)  # scatters and gain by which a rival must predict better to be extended too
 AT_FIRST = 8  # iterations of the first fit of a further effect
 HALVES = 2  # single effects that are also extended though other hypotheses are likelier
+NEAR = 5.0  # nats behind the likeliest of a size within which fits have to converge
+AGAIN = 12  # iterations of fits of the model alone from each other's values
+ROUNDS = 2  # most rounds of that, since others may become the likeliest
 RESTARTED = 3  # large effects that are also fitted from a start of their own
 
 
@@ -49,6 +54,7 @@ def attribute(
     max_effects: int | None = None,
     tick: Callable[[str], None] | None = None,
     joints: Sequence[Effect] = (),
+    alone: Sequence[Fitted] = (),
 ) -> tuple[HypothesisSearch, Fitted]:
     """Search for the effects that cause the gap.
 
@@ -60,6 +66,7 @@ def attribute(
         tick: called with the current activity, for a progress display.
         joints: plain dry frictions of joints, tried in place of richer ones even if they are not
             candidates.
+        alone: a fit of the model alone with exact parameters, if there is one already.
 
     Returns:
         The search and its best fit.
@@ -69,7 +76,7 @@ def attribute(
         np.errstate(all="ignore"),  # a hypothesis that diverges scores minus infinity
         interruptible(lambda: so_far(search, most)),
     ):
-        search, best = _searched(search, any_number=max_effects is None)
+        search, best = _searched(search, alone, any_number=max_effects is None)
         return search, grown(search, best, max(most, len(best.hypothesis.effects)))
 
 
@@ -101,9 +108,11 @@ def so_far(search: HypothesisSearch, most: int, decided: Sequence[str] | None = 
     )
 
 
-def _searched(search: HypothesisSearch, *, any_number: bool) -> tuple[HypothesisSearch, Fitted]:
+def _searched(
+    search: HypothesisSearch, alone: Sequence[Fitted], *, any_number: bool
+) -> tuple[HypothesisSearch, Fitted]:
     """Return the search and its best single effect; with outliers, those under their weights."""
-    search.nulls()
+    search.nulls(alone)
     best = _explore(search, any_number=any_number)
     if outliers(best):
         search = search.with_weights(clean(search.predictor, best))
@@ -259,4 +268,48 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
             search.extended(search.without(best, name), 6)
         best = search.of_size(size + 1)[0]
         size += 1
+    settle(search, most)
     return search.chosen(most)
+
+
+def settle(search: HypothesisSearch, most: int) -> None:
+    """Continue the fits that decide until they converge: the likeliest of each size.
+
+    A fit that stops early is some point of its climb, and which one depends on the last bit of a
+    computation. Without effects, noise and parameters explain the gap in several ways, each a
+    maximum of its own: every likely fit is tried from the best of these.
+    """
+    _neighbours(search)
+    for _ in range(ROUNDS):
+        near: list[Fitted] = []
+        for size in range(most + 1):
+            fits = [f for f in search.fits.values() if len(f.hypothesis.names) == size]
+            top = max(map(search.score, fits), default=0.0) - NEAR
+            near += [f for f in fits if not f.fine and search.score(f) > top]
+        if not near:
+            return
+        search.settled(near)
+
+
+def _neighbours(search: HypothesisSearch) -> None:
+    """Fit the model alone under other noise and other priors, each from the likeliest such fit.
+
+    First the likeliest is fitted from the noise and parameters of several effects, as `fair` does
+    from those of one.
+    """
+    found = max(search.fits.values(), key=search.score)
+    if len(found.hypothesis.effects) > 1:
+        bare = replace(found.hypothesis, effects=(), values=())
+        search.refined([(bare, found.noise, found.track)], AGAIN)
+    for _ in range(ROUNDS):
+        best = search.best_null()
+        h, own = best.hypothesis, best.noise.structure
+        near = [(replace(h, spread=w), best.noise, best.track) for w in SPREADS if h.spread > 0]
+        search.refined([start for start in near if start[0].spread != h.spread], AGAIN)
+        for structure in map(Structure, search.taus):
+            if structure != own:
+                noise = best.noise.allowing(structure, search.data.dt)
+                search.refined([(h, noise, best.track)], AGAIN)
+        if search.best_null() is best:
+            return
+        search.finished([search.best_null()], TO_THE_TOP)

@@ -28,6 +28,7 @@ from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, rates_of
 from grounded.diagnosis.likelihood.noise import Structure
+from grounded.diagnosis.likelihood.polish import APART
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Effect, InputFamily, MediumFamily, ParamFamily, RateFamily
 from grounded.effects.wrap import SURE
@@ -95,8 +96,17 @@ class FittedHypotheses:
         for fit in fits:
             h = fit.hypothesis
             key = (fit.noise.structure, h.spread, tuple(sorted(h.names)))
-            if key not in self.fits or self.score(fit) > self.score(self.fits[key]):
+            known = self.fits.get(key)
+            if known is None or self.score(fit) > self.score(known) - APART * (
+                fit.fine and not known.fine
+            ):
                 self.fits[key] = fit
+
+    def latest(self, fit: Fitted) -> Fitted:
+        """Return the best fit of the same hypothesis under the same noise structure."""
+        h = fit.hypothesis
+        found = self.fits.get((fit.noise.structure, h.spread, tuple(sorted(h.names))), fit)
+        return found if found.fine or self.score(found) > self.score(fit) else fit
 
     def best_null(self) -> Fitted:
         """Return the likeliest fit without effects."""

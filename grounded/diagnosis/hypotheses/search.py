@@ -19,6 +19,7 @@ from grounded.diagnosis.likelihood.delays import delayed
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure, noise_guess
+from grounded.diagnosis.likelihood.polish import polished
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.likelihood.simulated import simulated
@@ -79,13 +80,8 @@ class HypothesisSearch(FittedHypotheses):
         rivals: bool = False,
     ) -> list[Fitted]:
         """Refine hypotheses and keep the fits; of rivals, the worse half stops early."""
-        fits = refine(
-            self.predictor,
-            starts,
-            iterations=iterations,
-            tick=lambda: self.tick("refine"),
-            worth=self.score if rivals else None,
-        )
+        worth = self.score if rivals else None
+        fits = refine(self.predictor, starts, iterations=iterations, tick=self._ticks, worth=worth)
         self.keep(fits)
         return fits
 
@@ -95,11 +91,18 @@ class HypothesisSearch(FittedHypotheses):
             of_one = [f for f in fits if f.noise.structure == structure]
             self.refined(of_one, iterations, rivals=rivals)
 
+    def settled(self, fits: Sequence[Fitted]) -> None:
+        """Converge fits that decide, see `polished`."""
+        self.keep(polished(self.predictor, fits, iterations=TO_THE_TOP, tick=self._ticks))
+
+    def _ticks(self) -> None:
+        self.tick("refine")
+
     # -- without effects ------------------------------------------------------------------------
 
-    def nulls(self) -> Fitted:
+    def nulls(self, alone: Sequence[Fitted] = ()) -> Fitted:
         """Fit the model alone under every noise structure and with calibrated parameters."""
-        found = self.refined([self.fresh(Hypothesis())], iterations=20)
+        found = self.refined(alone or [self.fresh(Hypothesis())], TO_THE_TOP)
         if not found:
             raise undefined(self.predictor)
         (plain,) = found
@@ -232,8 +235,6 @@ class HypothesisSearch(FittedHypotheses):
             noise = replace(weights, structure=Structure())
             other.refined([(Hypothesis(), noise, clean_fit.track)], 12)
         return other
-
-    # -- one effect more --------------------------------------------------------------------------
 
     def shortlist(self, fit: Fitted, count: int) -> list[Look]:
         """Return the candidates that would gain most beside a fit, less their price."""

@@ -13,4 +13,5 @@ itself is `grounded.filter`):
     step          the next step of the fit: Gauss-Newton and scoring
     refine        maximum likelihood of many hypotheses at once
     fitted        the result of a fit
+    polish        convergence of the fits that decide
 """

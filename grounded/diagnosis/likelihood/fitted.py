@@ -27,6 +27,7 @@ class Fitted:
     noise: NoiseModel
     track: Array  # (L + 1, B, n) about which it is linearised
     loglik: float  # log-likelihood of the data
+    peak: float  # loglik and the log prior of the shifts: what a fit climbs
     evidence: float  # log p(y | h), the shifts integrated out
     gram: Array
     score: Array
@@ -35,6 +36,7 @@ class Fitted:
     white: Array
     states: Array  # (L + 1, B, n) filtered states, which predictions start from
     settled: bool = False  # converged: a fit that starts here ends here
+    fine: bool = False  # converged as far as it goes, see `polish`
 
     @property
     def covariance(self) -> Array:

@@ -38,6 +38,7 @@ from grounded.frozen import Array
 
 DOF = 4.0
 UNSEEN = 1e-2  # initial disturbance of a state that is never measured, as a fraction of its scale
+REMEMBERED = 40  # steps after which a start is taken to be forgotten
 NOTHING = 1e-4  # fraction of a channel's one-step variance below which a variance counts as zero
 
 
@@ -126,7 +127,7 @@ class NoiseModel:
 
     def allowing(self, structure: Structure, dt: float) -> NoiseModel:
         """Return where a fit of the same noise with another structure starts."""
-        if structure.tau is None:
+        if structure.tau is None or self.structure.tau is not None:
             return replace(self, structure=structure)
         # a tenth of the low-frequency power: summed over time, c has about 2 tau / dt times its C
         share = math.log(0.1 * dt / (2 * structure.tau))
@@ -185,6 +186,38 @@ def likelihood_slopes(noise: NoiseModel, adjoint: Adjoint, dt: float) -> Array:
         eta = np.exp(noise.log_c) * (1 - phi**2)
         parts.append((eta, adjoint.r[..., n:], adjoint.N[..., n:]))
     return np.stack([0.5 * (v * (s**2 - c)).sum(axis=(0, 1)) for v, s, c in parts])
+
+
+def start_slopes(noise: NoiseModel, g: kalman.Gains, white: Array, dt: float) -> Array:
+    """Return the part of `likelihood_slopes` that the starts of the runs add, (2 or 3, n).
+
+    A start has the variance of its measurement, and that of the coloured part, so both show in it,
+    once a run. Without this part, fits of many short runs would stop beside the maximum.
+
+    Args:
+        noise: the current noise.
+        g: gains of the runs (L, B, ...), none of them delayed.
+        white: whitened innovations (L, B, n).
+        dt: time step [s].
+    """
+    L, B, n = white.shape
+    L = min(L, REMEMBERED)
+    G, phi = g.system.G, noise.structure.phi(dt)
+    K = n if phi is None else 2 * n
+    d, r = (np.zeros((T, B, n, kalman.whole(K, n))) for T in (L, L + 1))
+    r[0, ..., :n] = np.eye(n)
+    if phi is not None:
+        fades = (phi ** np.arange(L))[:, None, None, None]
+        d[..., n:K] = fades * (np.eye(n) if G is None else G[:L])
+    moves = kalman.innovations(g.of_steps(L), d, r)[0]
+    score = np.einsum("lbnc,lbn->bc", moves, white[:L])
+    known = np.einsum("lbnc,lbnc->bc", moves, moves)
+    there = g.system.seen[0] > 0
+    found = np.zeros((2 if phi is None else 3, n))
+    found[1] = np.exp(noise.log_r) * ((score**2 - known)[:, :n] * there).sum(axis=0)
+    if phi is not None:
+        found[2] = np.exp(noise.log_c) * (score**2 - known)[:, n : 2 * n].sum(axis=0)
+    return 0.5 * found
 
 
 def climbed(noise: NoiseModel, slope: Array, info: Array, count: int) -> NoiseModel:

@@ -3,12 +3,13 @@
 Each iteration of a fit predicts along the hypothesis' own track, whitens the residual with the
 Kalman filter, takes one Gauss-Newton step in the effects' values and the parameters' shifts and one
 scoring step in the noise, and makes the filtered track the new track. It repeats until the
-likelihood no longer rises. Each step starts from the best point so far; a step that does not raise
-the likelihood is shortened (`Work`). A track filtered with a wrong model hides the model's error,
-so every hypothesis has a track of its own.
+posterior no longer rises: the likelihood times the prior of the shifts, whose slope the steps
+follow. Each step starts from the best point so far; a step that does not raise the posterior is
+shortened (`Work`). A track filtered with a wrong model hides the model's error, so every hypothesis
+has a track of its own.
 
-The shifts of the model's parameters have a normal prior and are integrated out (Laplace), with G
-their Fisher information:
+The shifts of the model's parameters have a normal prior and are integrated out at this maximum
+(Laplace), with G their Fisher information:
 
     log p(y | h) = loglik - shift' P shift / 2 - log det(1 + P^-1 G) / 2,   P = (spread scale)^-2
 
@@ -40,6 +41,7 @@ from grounded.diagnosis.likelihood.noise import (
     cleaned,
     climbed,
     likelihood_slopes,
+    start_slopes,
     working,
 )
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -58,6 +60,7 @@ CLOSE = 10.0  # nats behind the best within which all rivals continue
 LITTLE = 0.1  # nats that a shortened step must promise to be tried
 NOTHING = 0.01  # nats: after a rise below LEAST, a step that promises less is not tried
 LEAST = 1.0  # nats: smaller rises may end a fit
+STILL = 0.03  # nats: smaller rises do end it
 
 
 @dataclass(eq=False)
@@ -74,6 +77,7 @@ class Work:
     given_up: bool = False  # too far behind its rivals
     moving: bool = True  # the track moves with the step; at kinks of the model this may not help
     along: Predictor | None = None  # predictor of its own track, during the fit
+    share: float = 1.0  # of the thresholds LITTLE, NOTHING and STILL, below which it ends
 
     def shorten(self, data: Data) -> None:
         """Retry the step with the track held, then shorter ones; stop if they are too short."""
@@ -81,7 +85,7 @@ class Work:
             self.moving = False
         else:
             self.part *= 0.4
-        if self.step is None or self.part < SHORTEST or self.hope < LITTLE:
+        if self.step is None or self.part < SHORTEST or self.hope < LITTLE * self.share:
             self.still = True
         else:
             self.go(data)
@@ -111,6 +115,7 @@ def refine(
     tick: Callable[[], None] | None = None,
     fixed_noise: bool = False,
     worth: Callable[[Fitted], float] | None = None,
+    share: float = 1.0,
 ) -> list[Fitted]:
     """Fit hypotheses that share a noise structure.
 
@@ -121,14 +126,15 @@ def refine(
         tick: called whenever a block of fits is done.
         fixed_noise: keep the noise as it is.
         worth: value of a rival; after a few iterations the worse half stops. None: all continue.
+        share: fraction of the thresholds (in nats) at which a fit ends.
 
     Returns:
         The fits, in the order of `starts` (without those that could not be filtered at all).
     """
     works = [
-        Work(s.hypothesis, s.noise, s.track, s if s.settled else None, still=s.settled)
+        Work(s.hypothesis, s.noise, s.track, s if s.settled else None, still=s.settled, share=share)
         if isinstance(s, Fitted)
-        else Work(*s)
+        else Work(*s, share=share)
         for s in starts
     ]
     if not works:
@@ -267,7 +273,8 @@ def _iterate(
     for i, work, step in zip(rises, up, steps, strict=True):
         assert work.best is not None
         work.step = proposed(data, work.best, filtered[:, own[i]], *step)
-        work.still = work.still or (rises[i] < LEAST and work.step.promise < NOTHING)
+        little = rises[i] < LEAST and work.step.promise < NOTHING * work.share
+        work.still = work.still or little
         work.go(data)
 
 
@@ -296,6 +303,9 @@ def _climbed(
         info = average(columns[:, i * B : (i + 1) * B])[:K, :K]
         in_log = adjoint if delays is None else delays.restored(adjoint)
         slope = likelihood_slopes(work.noise, in_log, data.dt)
+        if delays is None:
+            own = np.arange(i * B, (i + 1) * B)
+            slope = slope + start_slopes(work.noise, g.of_runs(own), white[:, own], data.dt)
         noise = climbed(work.noise, slope, info, int(data.valid.sum()))
         pairs = zip(slope, noise.logs, work.noise.logs, strict=False)
         found.append((noise, 0.5 * sum(float(s @ (a - b)) for s, a, b in pairs)))
@@ -329,10 +339,10 @@ def clean(predictor: Predictor, fit: Fitted, rounds: int = 8) -> Fitted:
 
 def _rises(work: Work, fit: Fitted) -> float:
     """Return the rise over the best point so far, 0.0 for none; keep the point if it rose."""
-    rise = np.inf if work.best is None else fit.evidence - work.best.evidence
+    rise = np.inf if work.best is None else fit.peak - work.best.peak
     if not (rise > 0 and np.isfinite(fit.evidence) and np.isfinite(fit.gram).all()):
         return 0.0
-    work.still = not rise > 0.03
+    work.still = not rise > STILL * work.share
     work.moving = work.moving or rise > 1.0
     work.part = min(1.0, 2 * work.part)
     work.best = fit
@@ -356,19 +366,21 @@ def _scored(
     run_logdet = logdet.sum(axis=0)
     count = data.seen[1:].sum()
     loglik = -0.5 * float(rss.sum() + run_logdet.sum() + count * np.log(2 * np.pi)) + before
-    evidence, k = loglik, len(h.theta)
+    peak = evidence = loglik
+    k = len(h.theta)
     if k < C:
         precision = shift_precision(h, C - k)
         which = calibrated(data)
         shift = 0.0 if h.shift is None else h.shift[which] / param_scale(data.model)[which]
         G = gram.sum(axis=0)[k:, k:] / np.sqrt(np.outer(precision, precision))
-        evidence -= 0.5 * float(np.sum(precision * np.square(shift)))
-        evidence -= 0.5 * float(np.linalg.slogdet(np.eye(C - k) + G)[1])
+        peak -= 0.5 * float(np.sum(precision * np.square(shift)))
+        evidence = peak - 0.5 * float(np.linalg.slogdet(np.eye(C - k) + G)[1])
     return Fitted(
         hypothesis=h,
         noise=work.noise,
         track=work.track,
         loglik=loglik,
+        peak=peak,
         evidence=evidence,
         gram=gram,
         score=score,

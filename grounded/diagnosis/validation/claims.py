@@ -69,9 +69,9 @@ def loss(H: Array, b: Array, free: list[int]) -> float:
 def moved_parameters(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> tuple[Blame, ...]:
     """Return the parameters of a calibrated fit that must differ from nominal, by importance.
 
-    Evidence selects as few as possible, so that the others gain less than ENOUGH. Of these, a
-    parameter is left out if predictions at its nominal value, the others fitted again, are as good
-    up to a negligible difference.
+    Evidence selects as few as possible, so that the others gain less than ENOUGH. Of these, one
+    after another is left out, the least needed first, if predictions with it at nominal, the others
+    fitted again, are as good. So of two that can do each other's work, one stays.
     """
     data, h = search.data, fit.hypothesis
     if h.spread == 0 or h.shift is None:
@@ -91,17 +91,23 @@ def moved_parameters(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> tup
     nats = {i: loss(H, b, [j for j in free if j != i]) - now for i in free}
     if ruler.held_out:
         least = SLIGHT * ruler.since_outset(fit)
-        gains = {i: ruler.gain(unmoved(data, fit, k + i, b[i]), fit).mean for i in free}
-        most = max(free, key=lambda i: gains[i])
-        free = [i for i in free if gains[i] >= least or i == most]
+        gains = {i: ruler.gain(unmoved(data, fit, k + i), fit).mean for i in free}
+        rest = fit
+        for i in sorted(free, key=lambda i: gains[i])[:-1]:
+            less = unmoved(data, rest, k + i)  # beside those left out already, which may hide it
+            if gains[i] < least and ruler.gain(less, fit).mean < least:
+                free, rest = [j for j in free if j != i], less
     # the parabola can't gain more than the fit itself
     whole = max(search.score(fit) - search.score(search.exact_null()), 0.0)
     worth = {i: min(search.tempering.factor * nats[i], whole) for i in free}
     return tuple(Blame(int(which[i]), worth[i]) for i in sorted(free, key=lambda i: -nats[i]))
 
 
-def unmoved(data: Data, fit: Fitted, column: int, shift: float) -> Fitted:
+def unmoved(data: Data, fit: Fitted, column: int) -> Fitted:
     """Return the fit with one parameter at nominal, the others fitted again by a Newton step."""
+    h, index = fit.hypothesis, calibrated(data)[column - len(fit.hypothesis.theta)]
+    assert h.shift is not None
+    shift = h.shift[index] / param_scale(data.model)[index]
     H = fit.gram.sum(axis=0) + np.diag(fit.prior)
     rest = np.delete(np.arange(len(H)), column)
     delta = np.zeros(len(H))

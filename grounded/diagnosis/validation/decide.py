@@ -112,6 +112,8 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
         fit, without, _ = _pruned(search, search.best_null(), ruler, white)
     if not causes(fit) or not _pays(search, ruler, crude, fit, white):
         search, fit, without = whole, crude, {}
+    search.settled([fit, *without.values(), search.best_null()])
+    fit, without = search.latest(fit), {name: search.latest(f) for name, f in without.items()}
     open_ = sorted((d for d in doubtful if d.name not in causes(fit)), key=lambda d: -d.nats)
     return Decision(search, whole, fit, crude, without, tuple(open_))
 

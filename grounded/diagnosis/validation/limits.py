@@ -43,6 +43,7 @@ WEAK, UNKNOWN = 0.2, 0.6  # remaining fraction of a parameter's prior standard d
 DEPENDS = 2.0  # a value depends on held parameters if freeing them widens it by this factor,
 PART = 0.2  # namely on those that contribute at least this part of its variance
 FRICTIONS = ("viscous_friction", "coulomb_friction", "quadratic_drag", "stiction")
+ROUNDING = 1e-9  # of a channel's largest value: smaller differences are rounding, not noise
 QUIETER = 100.0  # factor by which effects may still reduce the noise variance
 
 
@@ -121,22 +122,36 @@ def joints_without_input(model: Model, claimed: Collection[str]) -> list[str]:
 
 
 def counted_once(trials: Sequence[Trial]) -> tuple[list[Trial], list[str]]:
-    """Drop trials that are bit-identical to an earlier one; return the rest and a sentence each.
+    """Drop trials that equal an earlier one up to rounding; return the rest and a sentence each.
 
     A copy has the same noise. If it were counted twice, it would confirm what a single run shows.
     """
-    known: dict[tuple[bytes, bytes], tuple[int, Trial]] = {}
+    known: dict[tuple[int, ...], list[tuple[int, Trial]]] = {}
     found, said = [], []
     for k, trial in enumerate(trials):
-        key = trial.states.tobytes(), trial.inputs.tobytes()
-        if (one := known.setdefault(key, (k, trial)))[0] == k:
+        alike = known.setdefault(trial.states.shape, [])
+        other = next(((i, t) for i, t in alike if _is_copy(trial, t)), None)
+        if other is None:
+            alike.append((k, trial))
             found.append(trial)
             continue
-        name, other = (t.id or f"trial {i + 1}" for i, t in ((k, trial), one))
-        said.append(
-            f"{name} is bit-identical to {other} (a copy, or no noise at all): it counts once"
-        )
+        name, first = (t.id or f"trial {i + 1}" for i, t in ((k, trial), other))
+        exact = trial.repeats(other[1])
+        same = f"is bit-identical to {first}" if exact else f"equals {first} up to rounding"
+        said.append(f"{name} {same} (a copy, or no noise at all): it counts once")
     return found, said
+
+
+def _is_copy(trial: Trial, other: Trial) -> bool:
+    """Check whether two trials of one length have the same states and inputs up to rounding."""
+    for a, b in ((trial.states, other.states), (trial.inputs, other.inputs)):
+        size = np.max(np.abs(b), axis=0, where=np.isfinite(b), initial=0.0)
+        if not np.allclose(a[-1], b[-1], rtol=0.0, atol=ROUNDING * size.max(), equal_nan=True):
+            return False  # cheap, and true of almost all pairs
+        off = np.abs(a - b) <= ROUNDING * size
+        if not np.all(off | (np.isnan(a) & np.isnan(b))):
+            return False
+    return True
 
 
 def constant_inputs(data: Data) -> list[str]:
@@ -219,6 +234,9 @@ def identifiable(
     the priors. The verdict depends on the posterior standard deviation relative to the prior's. If
     a calibrated value states a larger standard deviation, that one is used.
 
+    Parameters that are not identifiable one by one may be so together: the calibrated values differ
+    from nominal in one direction, and if that direction is identifiable, so is what is adopted.
+
     Args:
         predictor: evaluates hypotheses, with all uncertain parameters free.
         fit: the hypothesis beside which they are identified, and its noise.
@@ -229,6 +247,7 @@ def identifiable(
     model, found = predictor.data.model, []
     names = [model.param_names[i] for i in calibrated(predictor.data)]
     priors = np.array([model.params[name].spread for name in names])
+    jointly = _jointly(cov, names, priors, model, known)
     held_ = [i for i, name in enumerate(names) if known and name not in known]
     for i, name in enumerate(names):
         std = known[name].std if name in known else 0.0
@@ -240,8 +259,32 @@ def identifiable(
                 if slope**2 * cov[j, j] > PART * cov[i, i]:
                     size = model.params[names[j]].value / known[name].value
                     given[names[j]] = float(slope * priors[i] / priors[j] * size)
-        found.append(Identifiable(name, _verdict(share), float(priors[i]), share, given))
+        alone = _verdict(share)
+        joint = jointly and alone == "not identifiable" and name in known
+        found.append(Identifiable(name, alone, float(priors[i]), share, given, joint))
     return found
+
+
+def _jointly(
+    cov: Array,
+    names: Sequence[str],
+    priors: Array,
+    model: Model,
+    known: Mapping[str, Estimate],
+) -> bool:
+    """Check whether the data identify the direction in which the parameters were moved.
+
+    Args:
+        cov: posterior covariance (K, K) in units of the priors.
+        names: the uncertain parameters (K).
+        priors: their prior standard deviations (K,).
+        model: holds their nominal values.
+        known: the calibrated values.
+    """
+    off = [known[n].value - model.params[n].value if n in known else 0.0 for n in names]
+    along = np.array(off) / priors
+    size = float(along @ along)
+    return size > 0 and _verdict(float(np.sqrt(along @ cov @ along / size))) != "not identifiable"
 
 
 def held(predictor: Predictor, fit: Fitted) -> Model:

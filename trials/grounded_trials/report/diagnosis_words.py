@@ -128,13 +128,14 @@ def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> st
         return ""
     made = diagnosis.made
     moved, then = [], {**before, **(made.nominal if made is not None else {})}
-    known = diagnosis.known_parameters
+    known, joint = diagnosis.known_parameters, diagnosis.jointly
     for name, e in diagnosis.parameters.items():
         old = then.get(name, math.nan)
         if abs(e.value - old) > 1e-6 * max(abs(e.value), abs(old)):
             change = abs(e.value - old) / abs(old) if old else math.inf
             more = "".join(f" ({text})" for text in ENDED[e.stopped])
             more += " (not identified, not adopted)" * (name not in known)
+            more += " (not determined alone, only with the others)" * (name in joint)
             moved.append((-change, changed(name, old, e.value, e.unit) + more))
     named = ", ".join(text for _, text in sorted(moved))
     return f"calibrated with the effects: {named}" * bool(moved)

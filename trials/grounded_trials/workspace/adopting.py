@@ -48,6 +48,7 @@ class Adopted(Result):
     beside: tuple[str, ...] = ()  # adopted from the same diagnosis, but fitted instead of these
     left: Mapping[str, Left] = field(default_factory=dict)  # by parameter name
     logged: str = ""  # the trial that target.csv still repeats, if it ran no candidate
+    jointly: tuple[str, ...] = ()  # of `params`: determined only together with the others
     stopped: str = ""  # what to do about parameters that reached their bounds
 
     def summary(self) -> str:
@@ -62,6 +63,7 @@ class Adopted(Result):
             "params": dict(self.params),
             "claimed": self.claimed,
             "beside": list(self.beside),
+            "jointly": list(self.jointly),
             "left": {name: one.value for name, one in self.left.items()},
         }
 
@@ -126,6 +128,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
         logged=logged_target(workspace) if not workspace.candidate_ids() else "",
         beside=tuple(n for n in beside if n not in fitted),
         left=left_behind(found) if parameters and physics and claimed else {},
+        jointly=tuple(name for name in own if name in calibrated and name in found.jointly),
         stopped=wider(found.parameters) if parameters and physics and claimed else "",
     )
 

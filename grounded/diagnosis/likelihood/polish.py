@@ -1,0 +1,54 @@
+"""Fits that decide, converged until where they started from no longer matters.
+
+`refine` keeps a step only if the posterior rises, also the part of it that moves the track. Points
+beside the track's fixed point (the track that the filter returns unchanged) can be a few tenths of
+a nat higher. A fit that meets one stops there, and which one it meets depends on the last bit of a
+computation. So the track is first moved to what the filter makes of it, wherever that leads, and
+the fit goes on from there, with finer thresholds: along a ridge of the posterior each step promises
+little, and a nat may remain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.likelihood.refine import refine
+
+SHARE = 0.02  # of the thresholds of `refine`
+ROUNDS = 3  # most times that the track is moved
+SAME = 0.02  # nats by which the evidence may change in the last of these rounds
+APART = 2.0  # nats that a point beside the fixed point may be higher; more is a kink of the model
+
+
+def polished(
+    predictor: Predictor,
+    fits: Sequence[Fitted],
+    *,
+    iterations: int,
+    tick: Callable[[], None] | None = None,
+) -> list[Fitted]:
+    """Return converged fits of one noise structure, in order.
+
+    Args:
+        predictor: evaluates hypotheses on the data.
+        fits: results of `refine`.
+        iterations: most iterations of a round.
+        tick: called whenever a block of fits is done.
+    """
+    found = list(fits)
+    open_ = [i for i, fit in enumerate(found) if not fit.fine]
+    for _ in range(ROUNDS):
+        left = []
+        for i in open_:
+            fit = found[i]
+            start = (fit.hypothesis, fit.noise, fit.states)
+            again = refine(predictor, [start], iterations=iterations, tick=tick, share=SHARE)
+            if again and again[0].evidence > fit.evidence - APART:
+                found[i] = again[0]
+                if abs(again[0].evidence - fit.evidence) > SAME:
+                    left.append(i)
+        open_ = left
+    return [replace(fit, settled=True, fine=True) for fit in found]
