@@ -74,17 +74,22 @@ def nearest(name: str, valid: Iterable[str]) -> str:
         name: the name that was given.
         valid: the names that are accepted.
     """
-    from difflib import get_close_matches
-
     names = list(valid)
-    lower = {known.lower(): known for known in reversed(names[:COMPARED])}
-    close = get_close_matches(name.lower(), lower, n=1, cutoff=0.6)
-    if close:
-        return f"did you mean '{lower[close[0]]}'?"
+    if close := alike(name, names):
+        return f"did you mean '{close}'?"
     if not names:
         return "none is defined"
     more = f" and {len(names) - MOST} more" if len(names) > MOST else ""
     return "valid names: " + ", ".join(names[:MOST]) + more
+
+
+def alike(name: str, valid: Iterable[str]) -> str:
+    """Return the valid name closest to `name`; "" if none is close."""
+    from difflib import get_close_matches
+
+    lower = {known.lower(): known for known in reversed([*valid][:COMPARED])}
+    close = get_close_matches(name.lower(), lower, n=1, cutoff=0.6)
+    return lower[close[0]] if close else ""
 
 
 def needs(module: str, extra: str) -> Any:

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from grounded.compile import System, system_of
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError, alike, nearest
 from grounded.frozen import Array, readonly, wrapped
 
 Function = Callable[..., Mapping[str, Any]]
@@ -272,9 +272,8 @@ class Model:
                 "along an axis, two in a plane (horizontal first), or three"
             )
         for role, targets in self.roles.items():
-            meant = "" if role in ROLES else nearest(role, ROLES)
-            if meant.startswith("did you"):  # other roles may be for user-defined effects
-                raise GroundedError(f"unknown role '{role}': {meant}")
+            if role not in ROLES and alike(role, ROLES):  # others may be for user-defined effects
+                raise GroundedError(f"unknown role '{role}': {nearest(role, ROLES)}")
             for name in (targets,) if isinstance(targets, str) else targets:
                 if name not in self.states and name not in self.inputs:
                     raise GroundedError(

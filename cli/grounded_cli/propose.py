@@ -163,8 +163,8 @@ def _what(candidate: Candidate, standing: Standing, task: Task) -> str:
         )
     if candidate.base:
         step = Step(candidate.damping, candidate.alpha)
-        by = ", with derivatives corrected by the trials" * ("corrected" in candidate.slopes)
-        if candidate.slopes.startswith("original"):
+        by = ", with derivatives corrected by the trials" * candidate.of_corrected
+        if candidate.of_original:
             by += ", by the model without the adopted effects, which broke their promises"
         return f"iteration {candidate.iteration}: {step} from {candidate.base}{by}, {seconds}"
     crashes = round(candidate.caution)  # crashes of earlier first policies

@@ -184,11 +184,6 @@ class MujocoStepper(Stepper):
         self._prepare()
 
     @property
-    def timestep(self) -> float:
-        """The simulation's step [s]; a control step is a whole multiple of it."""
-        return self._own
-
-    @property
     def limits(self) -> dict[str, tuple[float, float]]:
         """See `limits`."""
         return limits_of(self._model, self.controls)
@@ -264,7 +259,7 @@ class MujocoStepper(Stepper):
 
         A control step estimated from time stamps is slightly off; the steps are adjusted to it.
         """
-        h = self.timestep
+        h = self._own  # a control step is a whole multiple of it
         steps = round(dt / h)
         off = abs(steps * h - dt)
         if steps < 1 or off > NEAR * dt:

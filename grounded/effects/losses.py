@@ -227,7 +227,7 @@ def _kernel(losses: Losses, names: tuple[tuple[str, ...], ...], known: bool) -> 
     system = system_of(
         step, kind="step", states=states, inputs=inputs, params=(), derivatives=False
     )
-    return system if system.how.startswith("compiled") else None
+    return system if system.how in ("compiled", "compiled steps") else None
 
 
 def dry(w: Any, free: Any, gain: Any, c: Any, b: Any, width: Any, parts: int = PARTS) -> Any:

@@ -121,6 +121,16 @@ class Candidate(Result):
             f"trials the model's likely error there is {off}{stop}"
         )
 
+    @property
+    def of_original(self) -> bool:
+        """Whether it was planned without the adopted effects."""
+        return self.slopes in ("original", "original, corrected")
+
+    @property
+    def of_corrected(self) -> bool:
+        """Whether it was planned with derivatives corrected by trials."""
+        return self.slopes in ("corrected", "original, corrected")
+
     def summary(self) -> str:
         """Return the id, the step and the predicted utility."""
         predicted = f"predicted utility {self.predicted_utility:.4g}"

@@ -104,8 +104,7 @@ class About:
         """Count the steps with corrected derivatives that lost by more than their likely error."""
         best, model = self.incumbent, self.make.fingerprint
         lost = losers_of(self.make.now.history, best.candidate.id, model)
-        kind = "original, corrected" if self.original else "corrected"
-        corrected = {candidate.id for candidate in lost if candidate.slopes == kind}
+        corrected = {c.id for c in lost if c.of_corrected and c.of_original == self.original}
         return sum(
             tried.utility - best.utility < tried.candidate.expected_gain
             for tried in self.make.now.history

@@ -64,7 +64,7 @@ def promises(history: Sequence[Tried], model: str) -> tuple[Promises, Promises]:
         if made.base not in utility or made.id not in utility or not promised > 0:
             continue
         gained = max(-promised, min(utility[made.id] - utility[made.base], promised))
-        if made.model == model and not made.slopes.startswith("original"):
+        if made.model == model and not made.of_original:
             adopted = Promises(adopted.promised + promised, adopted.real + gained)
         else:
             original = Promises(original.promised + promised, original.real + gained)

@@ -138,7 +138,10 @@ def test_slopes_that_kept_their_promise_are_not_corrected():
     first, second = found.search.standing.history
     brought = second.utility - first.utility
     assert second.accepted and brought == pytest.approx(second.candidate.predicted_gain, rel=0.1)
-    assert found.search.ask().slopes == ""
+    kept = found.search.ask()
+    assert kept.slopes == "" and not (kept.of_corrected or kept.of_original)
+    both = replace(kept, slopes="original, corrected")
+    assert both.of_corrected and both.of_original
     wrong = searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 2)
     assert wrong.search.ask().slopes == "corrected"
 

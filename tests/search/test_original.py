@@ -40,7 +40,7 @@ def test_a_wrong_effect_that_broke_its_promises_makes_no_further_steps(name):
     found, candidates = searched(task, plant, [(target, {"g": -1.6})])
     assert found[1] < found[0]  # the step of the wrong model lost
     assert len({c.model for c in candidates}) == 2
-    assert all(c.slopes.startswith("original") for c in candidates[2:])
+    assert all(c.of_original for c in candidates[2:])
     assert max(found) >= 1.002 * max(without)
 
 
@@ -49,12 +49,12 @@ def test_an_effect_that_keeps_its_promises_makes_all_steps():
     true = planner_with(task, [("rate_gain:v", {"g": 0.5})]).plan.model
     _, candidates = searched(task, Plant(true), [("rate_gain:v", {"g": 0.45})])
     assert len(candidates) > 1
-    assert not any(c.slopes.startswith("original") for c in candidates)
+    assert not any(c.of_original for c in candidates)
 
 
-def step(name, base, model, promised, utility, slopes="", accepted=True):
+def step(name, base, model, promised, utility, of_original=False, accepted=True):
     fields = {"id": name, "base": base, "model": model, "predicted_gain": promised}
-    made = SimpleNamespace(**fields, slopes=slopes)
+    made = SimpleNamespace(**fields, of_original=of_original)
     return SimpleNamespace(candidate=made, utility=utility, accepted=accepted)
 
 
@@ -64,7 +64,7 @@ def test_promises_are_counted_for_each_model():
         step("c2", "c1", "crude", 4.0, -7.0),
         step("c3", "c2", "better", 2.0, -100.0, accepted=False),  # loses at most what it promised
         step("c4", "c2", "better", 1.0, -4.0),  # gains at most what it promised
-        step("c5", "c4", "better", 2.0, -3.0, "original, corrected"),
+        step("c5", "c4", "better", 2.0, -3.0, of_original=True),
         step("c6", "c5", "better", 2.0, -1.0, accepted=None),  # awaits its trial
     )
     adopted, original = promises(history, "better")

@@ -35,7 +35,7 @@ MOST = 3  # most look-alikes named per effect
 
 
 def lookalikes(
-    predictor: Predictor, fit: Fitted, candidates: Sequence[Effect], nearly: float = NEARLY
+    predictor: Predictor, fit: Fitted, candidates: Sequence[Effect]
 ) -> tuple[Likeness, ...]:
     """Return the look-alikes that reproduce nearly all of a claimed effect's signal, best first.
 
@@ -43,14 +43,13 @@ def lookalikes(
         predictor: evaluates hypotheses on the data.
         fit: the fit with the claimed effects.
         candidates: effects that may be look-alikes.
-        nearly: share of the signal from which an effect is named.
     """
     found: list[Likeness] = []
     for effect in fit.hypothesis.effects:
         own = [c for c in candidates if related(effect, c) and c.name not in fit.hypothesis.names]
         if fit.hypothesis.spread > 0:
             own = [c for c in own if not isinstance(c.family, ParamFamily)]
-        found += _likely(predictor, fit, effect, own, nearly)
+        found += _likely(predictor, fit, effect, own)
     return tuple(found)
 
 
@@ -59,7 +58,6 @@ def of_parameters(
     null: Fitted,
     off: Sequence[int],
     candidates: Sequence[Effect],
-    nearly: float = NEARLY,
 ) -> tuple[Likeness, ...]:
     """Return the effects that act like the error of a calibrated parameter, best first.
 
@@ -71,7 +69,6 @@ def of_parameters(
         null: the calibrated fit without effects.
         off: indices of the parameters.
         candidates: effects that may be look-alikes.
-        nearly: share of the signal from which an effect is named.
     """
     assert null.hypothesis.shift is not None
     model, found = predictor.data.model, list[Likeness]()
@@ -86,7 +83,7 @@ def of_parameters(
         there = Predictor(replace(predictor.data, model=model.with_values(moved)))
         h = Hypothesis().plus(effect, {"d": float(null.hypothesis.shift[index])})
         own = [c for c in candidates if related(effect, c) and not c.name.startswith("parameter:")]
-        found += _likely(there, replace(null, hypothesis=h), effect, own, nearly)
+        found += _likely(there, replace(null, hypothesis=h), effect, own)
     return tuple(found)
 
 
@@ -120,12 +117,12 @@ def related(one: Effect, other: Effect) -> bool:
 
 
 def _likely(
-    predictor: Predictor, fit: Fitted, effect: Effect, own: Sequence[Effect], nearly: float
+    predictor: Predictor, fit: Fitted, effect: Effect, own: Sequence[Effect]
 ) -> list[Likeness]:
-    """Return the candidates that reproduce more than `nearly` of an effect's signal, best first."""
+    """Return the candidates that reproduce more than NEARLY of an effect's signal, best first."""
     shares = _shares(predictor, fit, effect, own) if own else []
     likely = [Likeness(effect.name, c.name, s) for c, s in zip(own, shares, strict=True)]
-    near = sorted((one for one in likely if one.share > nearly), key=lambda one: -one.share)
+    near = sorted((one for one in likely if one.share > NEARLY), key=lambda one: -one.share)
     return near[:MOST]
 
 

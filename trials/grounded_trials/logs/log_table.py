@@ -122,7 +122,6 @@ def read_log(
     dt: float,
     *,
     states: Sequence[str] | None = None,
-    inputs: Sequence[str] | None = None,
     angles: Sequence[str] = (),
     steps: int | None = None,
 ) -> Gridded:
@@ -133,7 +132,6 @@ def read_log(
         mapping: the signal of each state and input.
         dt: control interval [s].
         states: the mapped states to read, in array order; all of them by default.
-        inputs: the same for the inputs.
         angles: states to unwrap.
         steps: at most this many steps.
 
@@ -141,7 +139,7 @@ def read_log(
         GroundedError: see `signals.read_signals` and `resample.to_grid`.
     """
     states = list(mapping.states) if states is None else states
-    inputs = list(mapping.inputs) if inputs is None else inputs
+    inputs = list(mapping.inputs)
     series = mapped_signals(paths, mapping, states, inputs)
     return to_grid(series, dt, states, inputs, mapping.span, angles=angles, steps=steps)
 
