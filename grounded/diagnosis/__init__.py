@@ -6,7 +6,7 @@ Read `diagnose` first; its docstring lists the stages. `report` holds the result
     hypotheses/    search for the effects: hypotheses are made, fitted and compared
     validation/    held-out prediction errors in units, and the decision what is claimed
     excitation     the next trial, which would separate tied effects, from `patterns`
-    verdict        the result in words
+    verdict        the result in words; `next_trial` says what to run next
     tables         the result in rows, for terminal, page and notebook
     pictures       the result in figures
 """

@@ -15,7 +15,7 @@ agreement         agreement of the trials; changes between two groups of them
 prediction_error  where the gap is, by channel, time and region
 split             explained, unexplained and irreducible parts of the error
 unconfirmed       effects that only few trials show, and where
-verdict           the result in sentences; `writer` assembles the `report`
+verdict           the result in sentences (next_trial); `writer` assembles the `report`
 excitation        the next trial, to separate two explanations that tie
 """
 

@@ -19,12 +19,12 @@ import numpy as np
 
 from grounded.diagnosis.cause_words import meaning
 from grounded.diagnosis.hypotheses.explored import CLAIM
+from grounded.diagnosis.next_trial import LOG, LOST
 from grounded.diagnosis.report import Ranked, Unconfirmed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Doubtful
 from grounded.diagnosis.validation.prediction_error import by_region
 from grounded.diagnosis.validation.visits import acting, few_trials
-from grounded.diagnosis.verdict import LOG, LOST
 from grounded.frozen import Array
 from grounded.task import Task
 from grounded.trial import Trial

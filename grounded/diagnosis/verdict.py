@@ -1,4 +1,4 @@
-"""The verdict of a diagnosis in words, and what to run next."""
+"""The verdict of a diagnosis in words."""
 
 from __future__ import annotations
 
@@ -15,11 +15,17 @@ from grounded.diagnosis.cause_words import (
     meaning,
     wider,
 )
-from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, furthest, runaway
+from grounded.diagnosis.error_report import (
+    Credit,
+    Identifiable,
+    Remainder,
+    RulerRow,
+    furthest,
+    runaway,
+)
 from grounded.diagnosis.report import (
     Agreement,
     Changed,
-    Identifiable,
     Kind,
     Ranked,
     TrialValue,
@@ -28,7 +34,6 @@ from grounded.diagnosis.report import (
 )
 from grounded.diagnosis.ruler_words import explained, floor, improvement, rest, worsened
 from grounded.instruments.finding import Finding, in_the_log
-from grounded.model import all_at_bounds
 from grounded.result import listed, percent
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
@@ -36,16 +41,6 @@ if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
 
 UNEXPLAINED = "A gap remains that no known effect explains: "
 BOTH = "A gap remains if both groups get the same values: "  # groups of trials that differ
-CHANGED = (  # advice on the next trial if two groups differ
-    "None is needed yet: the robot changed between the two groups, so adopt no value of both. "
-    "Diagnose the newer trials alone, or discard the older ones."
-)
-AT_BOUNDS = (  # the same if every parameter that moved is at its bound
-    "None helps yet: parameters stopped at their bounds and the data ask for more. Widen the "
-    "bounds in the model file if the true value may lie beyond; otherwise a parameter that the "
-    "model holds constant may be off, so give it bounds. Then diagnose again."
-)
-LOG, LOST = "is a log that no candidate made", "failed"  # why a trial can't be repeated
 MOST_EFFECTS, FURTHER = 6, 2  # most effects blamed at once; how many more the next search allows
 NAMED = 3  # parameters, channels or leftovers named in one sentence
 
@@ -137,7 +132,7 @@ def verdict(
         words.append(ONE_MOTION)
     words += once
     kind: Kind = "effect" if len(claimed) == 1 else "several"
-    effects, off = tuple(r.effect for r in claimed), tuple(_off(claims))
+    effects, off = tuple(r.effect for r in claimed), tuple(parameters_off(claims))
     said = replace(
         _said(kind, *words, first=first),
         effects=effects,
@@ -195,11 +190,12 @@ def _causes(
         else:
             text = f"the model's own parameters are off: {_moved(claims)}"
             text += _others(claims, identified)
-            held = dict.fromkeys(other for n in _off(claims)[:NAMED] for other in given.get(n, ()))
+            named = parameters_off(claims)[:NAMED]
+            held = dict.fromkeys(other for n in named for other in given.get(n, ()))
             text += f", given {listed(held)} as in the model" * bool(held)
-            vague = [n for n in _off(claims)[:NAMED] if n in lost]
+            vague = [n for n in named if n in lost]
             text += f", but these trials do not determine {listed(vague)}" * bool(vague)
-            joined = [n for n in _off(claims)[:NAMED] if n in joint]
+            joined = [n for n in named if n in joint]
             text += f" ({listed(joined)} only together with the others)" * bool(joined)
         found.append(text)
     return tuple(found)
@@ -216,21 +212,15 @@ def _apart(per_trial: Sequence[TrialValue], agreement: Sequence[Agreement]) -> d
     return found
 
 
-def _off(claims: Claims) -> list[str]:
+def parameters_off(claims: Claims) -> list[str]:
     """Return the parameters that are off, the most important first."""
     return [claims.data.model.param_names[one.index] for one in claims.moved]
-
-
-def at_bounds(claims: Claims) -> bool:
-    """Check whether parameters are off and all of them stopped at a bound."""
-    known = claims.parameters()
-    return all_at_bounds(claims.data.model.params, {n: known[n].value for n in _off(claims)})
 
 
 def _moved(claims: Claims) -> str:
     """Return `L should be 0.1662 +- 0.0011 m (+11 %)` for the parameters that are off."""
     params, known = claims.data.model.params, claims.parameters()
-    named, texts = _off(claims), []
+    named, texts = parameters_off(claims), []
     for name in named[:NAMED]:
         old = params[name].value
         change = 100 * (known[name].value - old) / abs(old) if old else 0.0
@@ -250,7 +240,7 @@ def _others(claims: Claims, identified: Sequence[Identifiable]) -> str:
 
     They were calibrated together with those that are off, whose values are only valid with them.
     """
-    params, known, off = claims.data.model.params, claims.parameters(), _off(claims)
+    params, known, off = claims.data.model.params, claims.parameters(), parameters_off(claims)
     lost = {one.parameter for one in identified if one.lost}
     old = {name: params[name].value for name in known if name not in (*off, *lost)}
     if not old:
@@ -262,106 +252,6 @@ def _others(claims: Claims, identified: Sequence[Identifiable]) -> str:
         by = f" by {'' if one else 'at most '}{percent(most)}"
     others = f"{len(old)} others" if len(old) > NAMED else listed(old)
     return f"; {others}, changed with {'it' if len(off) == 1 else 'them'}{by}, may be right"
-
-
-def next_trial(
-    claims: Claims,
-    look: str,
-    groups: tuple[tuple[str, ...], ...],
-    seen: Sequence[Unconfirmed] = (),
-    same: tuple[tuple[str, ...], ...] = (),
-    unrepeatable: Mapping[str, str] | None = None,
-    worse: str = "",
-    adopted: Collection[str] = (),
-    further: bool = False,
-    ended: bool = False,
-) -> str:
-    """Return a sentence on the next trial; `excitation.probe` designs the trial itself.
-
-    Args:
-        claims: the causes that are claimed.
-        look: what to run because of a gap without a cause; "" if there is none.
-        groups: effects that the data cannot tell apart.
-        seen: effects that only one trial shows.
-        same: those of `groups` that are equivalent in this model.
-        unrepeatable: trials that cannot or should not be repeated, with the reason.
-        worse: why adopting the claimed effects is unwise (`ruler_words.objection`), or "".
-        adopted: adopted effects, whose values are parameters of the model.
-        further: whether more effects should be looked for first (`Verdict.look_for`).
-        ended: whether all parameters that moved stopped at their bounds (`at_bounds`).
-    """
-    from grounded.effects import like_a_load, places
-
-    if claims.known.no_cause:
-        return "Run two or more trials in which every input changes."
-    if groups and groups[0] in same:
-        return f"None helps: {told_apart(groups[0], same)}, so adopt either."
-    if groups:
-        made = f"A trial designed for it may tell {tied(groups[0])}."
-        turns = bool(places.plane(claims.data.model))
-        return " ".join([made, *distinguishing(groups[0], turns=turns)])
-    if seen:
-        one = seen[0]
-        if one.repeats:
-            return f"Run a different motion: all trials that show {one.effect} move alike."
-        why = (unrepeatable or {}).get(one.trial)
-        if why is None:
-            return f"Repeat trial {one.trial}: few others show {one.effect}."
-        there = "" if one.region is None else f" that goes where {one.region.told}"
-        better = f"run a gentler one{there}" if why == LOST else f"record another one{there}"
-        return f"Trial {one.trial} shows {one.effect} best, but it {why}: {better}."
-    if not claims.names and look:
-        return look
-    if not claims.names and not claims.blamed:
-        return "None is needed: nothing is tied and nothing needs adopting."
-    if worse:
-        return f"Adopt nothing yet: {worse}. Run another trial and diagnose again."
-    if further:
-        return "None is needed yet: look for more effects first."
-    if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names):
-        return "None is needed yet: give the model a parameter for a load and diagnose again."
-    if ended:
-        return AT_BOUNDS
-    if _own_numbers(claims, adopted):
-        return "None is needed to tell causes apart: fit the model's parameters."
-    return "None is needed to tell causes apart: adopt the claimed effects."
-
-
-def _own_numbers(claims: Claims, adopted: Collection[str]) -> bool:
-    """Check whether only parameters of the original model are blamed, none of adopted effects."""
-    from grounded.effects import ParamFamily, param_name
-
-    effects, theirs = claims.best.hypothesis.effects, tuple(param_name(n, "") for n in adopted)
-    names = [e.site.target if isinstance(e.family, ParamFamily) else "" for e in effects]
-    off = names if claims.names else _off(claims)
-    return all(off) and not any(theirs and name.startswith(theirs) for name in off)
-
-
-HINTS = {
-    "dead_zone": "sweep it slowly through zero and hold small commands",
-    "stall": "sweep it slowly through zero and hold small commands",
-    "stiction": "start and stop often, from small commands",
-    "coulomb_friction": "coast down from different speeds",
-    "viscous_friction": "hold several speeds, slow and fast",
-    "quadratic_drag": "hold several speeds, slow and fast",
-    "delay": "step the input sharply, by different amounts",
-    "first_order_lag": "step the input sharply, by different amounts",
-    "rate_limit": "step the input by small and large amounts",
-    "slew_limit": "step the input by small and large amounts",
-    "input_bias": "use small and large commands, of both signs where it takes them",
-    "input_gain": "use small and large commands",
-    "input_fade": "repeat the same manoeuvre early and late in one trial",
-    "understeer": "drive the same curve slowly and fast",
-    "rate_gain": "drive the same curve slowly and fast",
-    "sensor_bias": "start from different headings and reverse direction",
-    "patch": "cross the same places at other speeds and directions",
-    "slope": "drive the same way in several headings",
-}
-
-STRAIGHT = {  # where nothing has a heading or drives a curve
-    "sensor_bias": "hold still before and after the run, and move both ways",
-    "rate_gain": "make the same motion slowly and fast",
-}
 
 
 def sentence(clauses: Iterable[str]) -> str:
@@ -380,21 +270,3 @@ def told_apart(group: Sequence[str], same: Sequence[Sequence[str]]) -> str:
 def tied(group: Sequence[str]) -> str:
     """Return `A from B or C`."""
     return f"{group[0]} from {' or '.join(group[1:])}"
-
-
-def distinguishing(group: Sequence[str], *, turns: bool = True) -> list[str]:
-    """Return sentences on how to excite the robot so that a trial tells a group apart.
-
-    Args:
-        group: names of effects.
-        turns: whether the model has a heading.
-    """
-    found = []
-    for name in group:
-        family, _, target = name.partition(":")
-        hint = STRAIGHT.get(family) if not turns else None
-        hint = hint or HINTS.get(family)
-        text = f"{hint[0].upper()}{hint[1:]} ({target})." if hint else ""
-        if text and text not in found:
-            found.append(text)
-    return found or ["Excite every input over its whole range."]

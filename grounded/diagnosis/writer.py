@@ -12,6 +12,7 @@ from grounded.diagnosis.error_report import (
     Change,
     ChannelShare,
     Gap,
+    Identifiable,
     RulerRow,
     UtilityPrediction,
     Where,
@@ -22,7 +23,8 @@ from grounded.diagnosis.hypotheses.correction import correction
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.report import Diagnosis, Estimate, Identifiable, NoiseLevels
+from grounded.diagnosis.next_trial import CHANGED, at_bounds, next_trial
+from grounded.diagnosis.report import Diagnosis, Estimate, NoiseLevels
 from grounded.diagnosis.ruler_words import objection, open_noise
 from grounded.diagnosis.unconfirmed import another_look, marked, unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import Compared, by_trial
@@ -34,7 +36,7 @@ from grounded.diagnosis.validation.measured import Measured, root_mean_square
 from grounded.diagnosis.validation.motions import how_many
 from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.diagnosis.verdict import CHANGED, at_bounds, next_trial, verdict
+from grounded.diagnosis.verdict import verdict
 from grounded.effects import acting_order, wrapping_order
 from grounded.task import Task
 from grounded.trial import Trial

@@ -12,9 +12,10 @@ from cli import grounded
 from facts import holds
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import Credit, Remainder
+from grounded.diagnosis.next_trial import CHANGED
 from grounded.diagnosis.report import Changed, Diagnosis, Estimate, Made
 from grounded.diagnosis.validation.ruler import repeated
-from grounded.diagnosis.verdict import BOTH, CHANGED, UNEXPLAINED, verdict
+from grounded.diagnosis.verdict import BOTH, UNEXPLAINED, verdict
 from grounded.effects import Library
 from grounded_trials.report.diagnosis_words import agreement_lines, verdict_lines
 

@@ -9,6 +9,7 @@ import numpy as np
 from facts import holds
 from grounded import Trial
 from grounded.diagnosis.error_report import Credit, Region, Remainder, RulerRow, furthest, runaway
+from grounded.diagnosis.next_trial import LOG, LOST, next_trial
 from grounded.diagnosis.report import Agreement, Estimate, Ranked, Unconfirmed
 from grounded.diagnosis.ruler_words import (
     contested,
@@ -24,7 +25,7 @@ from grounded.diagnosis.ruler_words import (
 )
 from grounded.diagnosis.tables import error_table
 from grounded.diagnosis.unconfirmed import another_look, unrepeatable
-from grounded.diagnosis.verdict import LOG, LOST, next_trial, verdict
+from grounded.diagnosis.verdict import verdict
 from grounded.effects import Library
 from grounded.models import car, pendulum
 from small_tasks import cart_task

@@ -11,13 +11,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from grounded.diagnosis.error_report import Identifiable
 from grounded.diagnosis.hypotheses.leftover import filter_of
 from grounded.diagnosis.likelihood.data import PIECES, Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.linearise import base_columns
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.diagnosis.report import Estimate, Identifiable
+from grounded.diagnosis.report import Estimate
 from grounded.effects import (
     Effect,
     InputFamily,

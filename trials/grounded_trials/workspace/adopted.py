@@ -66,6 +66,21 @@ def installed_effects() -> Library:
     return Library().with_families(found)
 
 
+def settled(
+    params: Mapping[str, float], effects: Sequence[Mapping[str, Any]]
+) -> tuple[dict[str, float], list[dict[str, Any]]]:
+    """Split parameters into the model's own, and those of effects, which are set in the effects."""
+    from grounded.effects import param_name
+
+    own, changed = dict(params), []
+    for effect in effects:
+        names = {q: param_name(str(effect["name"]), q) for q in effect}
+        changed.append(
+            dict(effect) | {q: own.pop(name) for q, name in names.items() if name in own}
+        )
+    return own, changed
+
+
 def in_order(
     old: Sequence[Mapping[str, Any]], new: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:

@@ -234,6 +234,8 @@ def joined(
         nominal: the value to which the change of each parameter among `names` is added.
         calibrated: the parameters that are adopted with the effects.
     """
+    from grounded_trials.workspace.adopted import settled
+
     before = {} if found.made is None else found.made.effects
     adopted, new = [dict(effect) for effect in effects], list[Effect]()
     params = {key: _rounded(estimate.value) for key, estimate in calibrated.items()}
@@ -298,21 +300,6 @@ def nominal_values(found: Diagnosis, workspace: Folder, names: Iterable[str]) ->
             )
         nominal[name] = made.nominal[name] if name in made.nominal else float(base[name].value)
     return nominal
-
-
-def settled(
-    params: Mapping[str, float], effects: Sequence[Mapping[str, Any]]
-) -> tuple[dict[str, float], list[Effect]]:
-    """Split parameters into the model's own, and those of effects, which are set in the effects."""
-    from grounded.effects import param_name
-
-    own, changed = dict(params), []
-    for effect in effects:
-        names = {q: param_name(str(effect["name"]), q) for q in effect}
-        changed.append(
-            dict(effect) | {q: own.pop(name) for q, name in names.items() if name in own}
-        )
-    return own, changed
 
 
 def _check(

@@ -19,7 +19,6 @@ from grounded.result import Result, measured_alike
 from grounded.trial import Trial
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.store.store import made_folder
-from grounded_trials.workspace.adopting import settled
 from grounded_trials.workspace.config import set_in_model, set_latency
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.unknown_id import named_trials
@@ -225,6 +224,8 @@ def apply_fit(workspace: Folder, found: Fit) -> None:
     Parameters that are not identified keep their values. A fitted latency is the total one: it
     replaces adopted delays.
     """
+    from grounded_trials.workspace.adopted import settled
+
     base, table = workspace.base_model, workspace.config.model
     values = {
         name: float(f"{e.value:.8g}")

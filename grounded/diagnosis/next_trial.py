@@ -1,0 +1,150 @@
+"""What to run next: the trial that would tell more, or why none is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from grounded.diagnosis.report import Unconfirmed
+from grounded.diagnosis.verdict import parameters_off, tied, told_apart
+from grounded.model import all_at_bounds
+
+if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
+    from grounded.diagnosis.validation.claims import Claims
+
+LOG, LOST = "is a log that no candidate made", "failed"  # why a trial can't be repeated
+CHANGED = (  # advice on the next trial if two groups differ
+    "None is needed yet: the robot changed between the two groups, so adopt no value of both. "
+    "Diagnose the newer trials alone, or discard the older ones."
+)
+AT_BOUNDS = (  # the same if every parameter that moved is at its bound
+    "None helps yet: parameters stopped at their bounds and the data ask for more. Widen the "
+    "bounds in the model file if the true value may lie beyond; otherwise a parameter that the "
+    "model holds constant may be off, so give it bounds. Then diagnose again."
+)
+
+
+def next_trial(
+    claims: Claims,
+    look: str,
+    groups: tuple[tuple[str, ...], ...],
+    seen: Sequence[Unconfirmed] = (),
+    same: tuple[tuple[str, ...], ...] = (),
+    unrepeatable: Mapping[str, str] | None = None,
+    worse: str = "",
+    adopted: Collection[str] = (),
+    further: bool = False,
+    ended: bool = False,
+) -> str:
+    """Return a sentence on the next trial; `excitation.probe` designs the trial itself.
+
+    Args:
+        claims: the causes that are claimed.
+        look: what to run because of a gap without a cause; "" if there is none.
+        groups: effects that the data cannot tell apart.
+        seen: effects that only one trial shows.
+        same: those of `groups` that are equivalent in this model.
+        unrepeatable: trials that cannot or should not be repeated, with the reason.
+        worse: why adopting the claimed effects is unwise (`ruler_words.objection`), or "".
+        adopted: adopted effects, whose values are parameters of the model.
+        further: whether more effects should be looked for first (`Verdict.look_for`).
+        ended: whether all parameters that moved stopped at their bounds (`at_bounds`).
+    """
+    from grounded.effects import like_a_load, places
+
+    if claims.known.no_cause:
+        return "Run two or more trials in which every input changes."
+    if groups and groups[0] in same:
+        return f"None helps: {told_apart(groups[0], same)}, so adopt either."
+    if groups:
+        made = f"A trial designed for it may tell {tied(groups[0])}."
+        turns = bool(places.plane(claims.data.model))
+        return " ".join([made, *distinguishing(groups[0], turns=turns)])
+    if seen:
+        one = seen[0]
+        if one.repeats:
+            return f"Run a different motion: all trials that show {one.effect} move alike."
+        why = (unrepeatable or {}).get(one.trial)
+        if why is None:
+            return f"Repeat trial {one.trial}: few others show {one.effect}."
+        there = "" if one.region is None else f" that goes where {one.region.told}"
+        better = f"run a gentler one{there}" if why == LOST else f"record another one{there}"
+        return f"Trial {one.trial} shows {one.effect} best, but it {why}: {better}."
+    if not claims.names and look:
+        return look
+    if not claims.names and not claims.blamed:
+        return "None is needed: nothing is tied and nothing needs adopting."
+    if worse:
+        return f"Adopt nothing yet: {worse}. Run another trial and diagnose again."
+    if further:
+        return "None is needed yet: look for more effects first."
+    if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names):
+        return "None is needed yet: give the model a parameter for a load and diagnose again."
+    if ended:
+        return AT_BOUNDS
+    if _own_numbers(claims, adopted):
+        return "None is needed to tell causes apart: fit the model's parameters."
+    return "None is needed to tell causes apart: adopt the claimed effects."
+
+
+def at_bounds(claims: Claims) -> bool:
+    """Check whether parameters are off and all of them stopped at a bound."""
+    known = claims.parameters()
+    return all_at_bounds(
+        claims.data.model.params, {n: known[n].value for n in parameters_off(claims)}
+    )
+
+
+def _own_numbers(claims: Claims, adopted: Collection[str]) -> bool:
+    """Check whether only parameters of the original model are blamed, none of adopted effects."""
+    from grounded.effects import ParamFamily, param_name
+
+    effects, theirs = claims.best.hypothesis.effects, tuple(param_name(n, "") for n in adopted)
+    names = [e.site.target if isinstance(e.family, ParamFamily) else "" for e in effects]
+    off = names if claims.names else parameters_off(claims)
+    return all(off) and not any(theirs and name.startswith(theirs) for name in off)
+
+
+HINTS = {
+    "dead_zone": "sweep it slowly through zero and hold small commands",
+    "stall": "sweep it slowly through zero and hold small commands",
+    "stiction": "start and stop often, from small commands",
+    "coulomb_friction": "coast down from different speeds",
+    "viscous_friction": "hold several speeds, slow and fast",
+    "quadratic_drag": "hold several speeds, slow and fast",
+    "delay": "step the input sharply, by different amounts",
+    "first_order_lag": "step the input sharply, by different amounts",
+    "rate_limit": "step the input by small and large amounts",
+    "slew_limit": "step the input by small and large amounts",
+    "input_bias": "use small and large commands, of both signs where it takes them",
+    "input_gain": "use small and large commands",
+    "input_fade": "repeat the same manoeuvre early and late in one trial",
+    "understeer": "drive the same curve slowly and fast",
+    "rate_gain": "drive the same curve slowly and fast",
+    "sensor_bias": "start from different headings and reverse direction",
+    "patch": "cross the same places at other speeds and directions",
+    "slope": "drive the same way in several headings",
+}
+
+STRAIGHT = {  # where nothing has a heading or drives a curve
+    "sensor_bias": "hold still before and after the run, and move both ways",
+    "rate_gain": "make the same motion slowly and fast",
+}
+
+
+def distinguishing(group: Sequence[str], *, turns: bool = True) -> list[str]:
+    """Return sentences on how to excite the robot so that a trial tells a group apart.
+
+    Args:
+        group: names of effects.
+        turns: whether the model has a heading.
+    """
+    found = []
+    for name in group:
+        family, _, target = name.partition(":")
+        hint = STRAIGHT.get(family) if not turns else None
+        hint = hint or HINTS.get(family)
+        text = f"{hint[0].upper()}{hint[1:]} ({target})." if hint else ""
+        if text and text not in found:
+            found.append(text)
+    return found or ["Excite every input over its whole range."]
