@@ -9,7 +9,7 @@ import click
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, remark, sentence, show, show_json
-from grounded_trials.wording import with_unit
+from grounded_trials.wording import ALONE, with_unit
 
 if TYPE_CHECKING:
     from grounded_trials import Workspace
@@ -88,7 +88,7 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
         show("written to [model] params, calibrated beside the effects:")
     for name, value in done.params.items():
         text = with_unit(f"{number(before[name].value)} -> {number(value)}", before[name].unit)
-        text += " (not determined alone, only with the others)" * (name in done.jointly)
+        text += ALONE * (name in done.jointly)
         show(field(name, text, "  "))
     for one in done.left.values():
         kept, beside = (with_unit(number(value), one.unit) for value in (one.kept, one.value))

@@ -196,7 +196,8 @@ def _causes(
             vague = [n for n in named if n in lost]
             text += f", but these trials do not determine {listed(vague)}" * bool(vague)
             joined = [n for n in named if n in joint]
-            text += f" ({listed(joined)} only together with the others)" * bool(joined)
+            are = "is" if len(joined) == 1 else "are"
+            text += f" ({listed(joined)} {are} known only with the others)" * bool(joined)
         found.append(text)
     return tuple(found)
 

@@ -1,5 +1,7 @@
 """The climb of one hypothesis: steps inside bounds, and what hangs on them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,14 @@ from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import gains_of, linearise
-from grounded.diagnosis.likelihood.noise import noise_guess
+from grounded.diagnosis.likelihood.noise import (
+    Structure,
+    likelihood_slopes,
+    noise_guess,
+    started,
+)
 from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.likelihood.step import bounded
 from grounded.effects import Library
 from grounded.experiments.pendulum import FRICTION, HEAVIER, pendulum_task
@@ -167,3 +175,32 @@ def test_what_fills_up_a_shorter_run_grows_without_bound_nowhere():
     adjoint = smoother(g, white[..., 0])
     for found in (g.k, white, filtered, *vars(adjoint).values()):
         assert found is None or (np.isfinite(found).all() and np.abs(found).max() < 1e150)
+
+
+@pytest.mark.parametrize("tau", [None, 0.1])
+def test_the_slopes_of_the_noise_are_those_of_the_likelihood(tau):
+    """Those of the starts of the runs were missing: fits of many short runs stopped beside the top,
+    in one of several places, by the last bit."""
+    rng, trials = np.random.default_rng(2), []
+    for _ in range(12):
+        x = np.cumsum(0.1 * rng.standard_normal((13, 1)), axis=0)
+        y = x + 0.1 * rng.standard_normal((13, 1))
+        trials.append(Trial(y, np.zeros((12, 1)), 0.05, ("x",), ("u",)))
+    drift = Model(
+        states={"x": "m"}, inputs={"u": "m/s"}, params={}, derivative=lambda s, a, p: {"x": a.u}
+    )
+    data = prepare(drift, trials)
+    predictor, h, track = Predictor(data), Hypothesis(), data.y.copy()
+    start = HypothesisSearch(data, ()).fresh(h)[1].allowing(Structure(tau), data.dt)
+
+    def likelihood(noise):
+        return refine(predictor, [(h, noise, track)], iterations=1)[0].loglik
+
+    F, d, r = linearise(predictor, h, track)
+    g = gains_of(predictor, h, start, track, F)
+    white = innovations(g, d, r)[0][..., 0]
+    starts = started(g, white, start.structure.phi(data.dt))
+    slope = likelihood_slopes(start, smoother(g, white), data.dt, starts)
+    for row, name in zip(slope, ("log_q", "log_r", "log_c"), strict=False):
+        up, down = (replace(start, **{name: getattr(start, name) + e}) for e in (1e-4, -1e-4))
+        assert row[0] == pytest.approx((likelihood(up) - likelihood(down)) / 2e-4, rel=1e-3)

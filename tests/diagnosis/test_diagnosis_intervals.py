@@ -1,9 +1,17 @@
 """Standard deviations from the information: right where it is regular, honest where it is not."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from grounded.diagnosis.likelihood.intervals import _fisher
+from grounded import Model, Param, Trial
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.intervals import _fisher, standard_deviations
+from grounded.diagnosis.validation.claims import moved_parameters
+from grounded.diagnosis.validation.limits import counted_once
+from grounded.diagnosis.validation.ruler import folds
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -28,3 +36,71 @@ def test_what_the_data_do_not_determine_is_not_certain():
 def test_an_unknown_that_nothing_depends_on_is_unknown():
     found = _fisher(np.diag([4.0, 0.0]))
     assert found[0] == pytest.approx(0.5) and found[1] > 1e100
+
+
+def test_correlated_innovations_hold_less_information():
+    """The interval of a value was as narrow as if every sample were news."""
+    rng = np.random.default_rng(4)
+    trials = [
+        Trial(
+            np.cumsum(rng.standard_normal((41, 1)), axis=0), np.ones((40, 1)), 0.1, ("x",), ("u",)
+        )
+        for _ in range(2)
+    ]
+    drift = Model(
+        states={"x": "m"},
+        inputs={"u": "1"},
+        params={"k": Param(1.0, std=1.0)},
+        derivative=lambda s, a, p: {"x": p.k * a.u},
+    )
+    search = HypothesisSearch(prepare(drift, trials), ())
+    search.nulls()
+    fit = next(f for (_, spread, _), f in search.fits.items() if spread > 0)
+    of = search.predictor, fit, folds(search.data)
+    (whole, _), (less, _) = (standard_deviations(*of, worth) for worth in (1.0, 1e-6))
+    assert less[0] == pytest.approx(fit.hypothesis.spread, rel=0.01) and less[0] > whole[0]
+
+
+def test_of_two_parameters_that_hide_each_other_one_stays():
+    """Each could be spared beside the other, so both were left out."""
+    rng, trials = np.random.default_rng(1), []
+    for _ in range(3):
+        u, v = np.repeat(rng.uniform(-3, 3, 10), 8)[:, None], np.zeros(81)
+        for k in range(80):
+            v[k + 1] = v[k] + 0.05 * (1.3 * u[k, 0] - 0.8 * v[k] - 0.7 * v[k] ** 3)
+        noisy = (v + 1e-3 * rng.standard_normal(81))[:, None]
+        trials.append(Trial(noisy, u, 0.05, ("v",), ("u",), start_inputs=np.zeros(1)))
+    boat = Model(
+        states={"v": "m/s"},
+        inputs={"u": "N"},
+        params={"a": Param(0.5, std=0.3), "b": Param(0.5, std=0.3), "gain": Param(1.0, std=0.3)},
+        derivative=lambda s, a, p: {"v": p.gain * a.u - p.a * s.v - p.b * s.v**3},
+        integrator="euler",
+    )
+    search = HypothesisSearch(prepare(boat, trials), ())
+    fit = search.nulls()
+    without = SimpleNamespace(held_out=False)
+    assert {b.index for b in moved_parameters(search, fit, without)} == {0, 1, 2}
+
+    def gain(less, whole):
+        a, b, needed = np.abs(less.hypothesis.shift) > 1e-9
+        return SimpleNamespace(mean=0.0 if needed and (a or b) else 1.0)
+
+    ruler = SimpleNamespace(held_out=True, since_outset=lambda fit: 1.0, gain=gain)
+    left = {b.index for b in moved_parameters(search, fit, ruler)}
+    assert 2 in left and len(left) == 2
+
+
+def test_a_trial_that_differs_by_rounding_counts_once():
+    rng = np.random.default_rng(1)
+    x, u = np.cumsum(rng.standard_normal((31, 1)), axis=0), rng.standard_normal((30, 1))
+    x[7] = np.nan
+    names = {"state_names": ("x",), "input_names": ("u",)}
+
+    def counted(factor):
+        return counted_once([Trial(x, u, 0.1, **names), Trial(x * factor, u, 0.1, **names)])
+
+    for factor, words in ((1.0, "bit-identical"), (1 + 1e-13, "up to rounding")):
+        kept, said = counted(factor)
+        assert len(kept) == 1 and words in said[0]
+    assert len(counted(1 + 1e-6)[0]) == 2

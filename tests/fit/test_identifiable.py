@@ -5,7 +5,10 @@ import pytest
 
 from facts import holding
 from grounded import Model, Param, Trial
-from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.report import Estimate
+from grounded.diagnosis.validation.limits import _jointly
+from grounded.effects import Library
 from grounded.errors import GroundedError
 from grounded.fit import fit
 
@@ -61,3 +64,48 @@ def test_of_a_combination_the_surest_parameter_stays():
     verdicts = {one.parameter: one.verdict for one in diagnosis.identifiable}
     assert verdicts["mass"] == "not identifiable"
     assert "mass" not in diagnosis.known_parameters
+
+
+def drags(noise=0.02, T=80):
+    """Make trials at speeds near 1, where two drags of 0.6 show nearly as one."""
+    rng, found = np.random.default_rng(5), []
+    for _ in range(4):
+        u, v = np.repeat(rng.uniform(1.1, 1.3, T // 8), 8)[:, None], np.ones(T + 1)
+        for k in range(T):
+            x = v[k]
+            for _ in range(10):
+                x += 0.005 * (u[k, 0] - 0.6 * x - 0.6 * x * x)
+            v[k + 1] = x
+        noisy = (v + noise * rng.standard_normal(T + 1))[:, None]
+        found.append(Trial(noisy, u, 0.05, ("v",), ("u",), start_inputs=np.zeros(1)))
+    return found
+
+
+def test_parameters_that_are_known_only_together_are_written_together():
+    """Neither was written, though their calibration made the whole gain."""
+    model = Model(
+        states={"v": "m/s"},
+        inputs={"u": "N"},
+        params={"a": Param(0.5, std=0.1), "b": Param(0.5, std=0.1)},
+        derivative=lambda s, a, p: {"v": a.u - p.a * s.v - p.b * s.v**2},
+    )
+    diagnosis = diagnose(
+        model, drags(), DiagnosisOptions(library=Library((Library().family("offset"),)))
+    )
+    assert [c.of for c in diagnosis.credit] == ["calibration"]
+    assert {i.verdict for i in diagnosis.identifiable} == {"not identifiable"}
+    assert diagnosis.jointly == {"a", "b"} == set(diagnosis.known_parameters)
+    total = sum(e.value for e in diagnosis.known_parameters.values())
+    assert total == pytest.approx(1.2, abs=0.01)
+    written = diagnosis.to_json()["identifiable"]
+    assert all(one["jointly"] for one in written)
+    assert "known only with the others" in diagnosis.sentence
+
+
+def test_a_direction_that_only_the_prior_sets_is_not_known():
+    model = motor(mass=Param(2.0, std=1.0), gain=Param(3.0, std=1.0))
+    cov = np.array([[0.5, -0.49], [-0.49, 0.5]])  # the sum is known, the difference is not
+    of = (cov, ["mass", "gain"], np.ones(2), model)
+    assert _jointly(*of, {"mass": Estimate(2.4, 0.7), "gain": Estimate(3.4, 0.7)})
+    assert not _jointly(*of, {"mass": Estimate(2.4, 0.7), "gain": Estimate(2.6, 0.7)})
+    assert not _jointly(*of, {})

@@ -75,6 +75,18 @@ def test_a_parameter_that_stays_behind_is_told_and_no_gain_is_claimed(cart, tmp_
     assert not adopted["gained"] and "instead of 25 cm" not in words(folder, "status")
 
 
+def test_a_parameter_known_only_with_the_others_is_adopted_and_marked(cart, tmp_path):
+    joint = {"parameter": "mass", "verdict": "not identifiable", "jointly": True}
+    folder = written(copied(cart, tmp_path / "w"), identifiable=[joint])
+    done = grounded("-C", folder, "adopt", "viscous_friction:v")
+    assert done.code == 0 and "not determined alone" in done.out and "stays at" not in done.err
+    assert grounded("-C", folder, "adopt", "--undo").code == 0
+    again = grounded("-C", folder, "adopt", "viscous_friction:v", "--json").json
+    assert again["params"]["mass"] == 1.4 and again["jointly"] == ["mass"] and not again["left"]
+    adopted = grounded("-C", folder, "report", "--json").json["adopted"]
+    assert any("not determined alone" in clause for clause in adopted["clauses"])
+
+
 def test_a_number_of_an_adopted_effect_that_stays_behind_is_told_by_its_effect(cart, tmp_path):
     """A KeyError, with grounded.toml written: it was looked for among the model's parameters."""
     adopted = {"name": "quadratic_drag:v", "k": 0.2}

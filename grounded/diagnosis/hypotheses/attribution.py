@@ -41,7 +41,7 @@ TUNED = 2  # best sets whose constants are optimised
 FORETOLD = (2.0, 0.05)  # scatters and gain by which a rival must predict better to be extended too
 AT_FIRST = 8  # iterations of the first fit of a further effect
 HALVES = 2  # single effects that are also extended though other hypotheses are likelier
-NEAR = 5.0  # nats behind the likeliest of a size within which fits have to converge
+NEAR = 3.0  # nats behind the likeliest of a size within which fits have to converge
 AGAIN = 12  # iterations of fits of the model alone from each other's values
 ROUNDS = 2  # most rounds of that, since others may become the likeliest
 RESTARTED = 3  # large effects that are also fitted from a start of their own
@@ -281,11 +281,12 @@ def settle(search: HypothesisSearch, most: int) -> None:
     """
     _neighbours(search)
     for _ in range(ROUNDS):
-        near: list[Fitted] = []
+        near, claimed = list[Fitted](), len(search.chosen(most).hypothesis.names)
         for size in range(most + 1):
             fits = [f for f in search.fits.values() if len(f.hypothesis.names) == size]
-            top = max(map(search.score, fits), default=0.0) - NEAR
-            near += [f for f in fits if not f.fine and search.score(f) > top]
+            top = max(map(search.score, fits), default=0.0)
+            least = top - NEAR if size in (0, claimed) else top  # of others, the likeliest
+            near += [f for f in fits if not f.fine and search.score(f) >= least]
         if not near:
             return
         search.settled(near)

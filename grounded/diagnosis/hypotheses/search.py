@@ -295,11 +295,11 @@ class HypothesisSearch(FittedHypotheses):
 
     def under(self, structure: Structure, spread: float) -> HypothesisSearch | None:
         """Return the fits under one noise structure and prior width; None without a null."""
-        other = self._empty()
-        exact = (structure, 0.0, ())
-        kept = {k: f for k, f in self.fits.items() if k[:2] == (structure, spread) or k == exact}
-        other.fits, other._prices = kept, self._prices
-        return other if exact in kept else None
+        other, exact = self._empty(), (structure, 0.0, ())
+        other._prices = self._prices
+        kept = [f for k, f in self.fits.items() if k[:2] == (structure, spread) or k == exact]
+        other.keep(kept)  # which also sets the tempering, by the likeliest of them
+        return other if exact in other.fits else None
 
 
 def undefined(predictor: Predictor) -> GroundedError:

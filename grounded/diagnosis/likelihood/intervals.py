@@ -1,6 +1,7 @@
 """Standard deviations of the values of a fit: the largest of three estimates.
 
-1. The inverse Fisher information, which assumes that model and noise are right.
+1. The inverse Fisher information, which assumes that the model is right. Where innovations are
+   correlated, it is that of as many samples as are independent.
 2. The jackknife over trials, each left out once (Efron & Tibshirani 1993, ch. 11).
 3. A jackknife over stretches of time, each left out of all trials at once. Trials of one manoeuvre
    share the errors of the model and agree on a biased value, which the second does not show. With
@@ -30,17 +31,21 @@ CHANCE = 0.01  # p-value of differing scores below which the model is taken to b
 LEAST = 0.2  # smallest fraction of the information taken to be left without a stretch
 
 
-def standard_deviations(predictor: Predictor, fit: Fitted, trial_of: Array) -> tuple[Array, Array]:
+def standard_deviations(
+    predictor: Predictor, fit: Fitted, trial_of: Array, worth: float = 1.0
+) -> tuple[Array, Array]:
     """Return each unknown's standard deviation and half-width of its 95 % interval, (C,) each.
 
     Args:
         predictor: evaluates hypotheses on the data of the fit.
         fit: the fit at its most likely values.
         trial_of: the group that each run is left out with, usually its trial (B,).
+        worth: what a nat is worth, below 1 if innovations are correlated: the same samples then
+            hold less information (`grounded.filter.tempering`).
     """
     if fit.gram.shape[-1] == 0:
         return np.zeros(0), np.zeros(0)
-    std = _fisher(fit.gram.sum(axis=0) + np.diag(fit.prior))
+    std = _fisher(worth * fit.gram.sum(axis=0) + np.diag(fit.prior))
     half = 1.96 * std
     shifts, _ = leave_one_out(fit, trial_of)
     for some in (shifts, *_by_stretch(predictor, fit)):

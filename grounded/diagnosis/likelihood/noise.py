@@ -176,8 +176,13 @@ def noise_guess(residual: Array, seen: Array, scale: Array) -> NoiseModel:
     )
 
 
-def likelihood_slopes(noise: NoiseModel, adjoint: Adjoint, dt: float) -> Array:
-    """Return d loglik / d log variance, (2 or 3, n): of w, v and, if any, the coloured part."""
+def likelihood_slopes(
+    noise: NoiseModel, adjoint: Adjoint, dt: float, starts: Array | None = None
+) -> Array:
+    """Return d loglik / d log variance, (2 or 3, n): of w, v and, if any, the coloured part.
+
+    `starts` are those of `started`, of the same runs.
+    """
     n = len(noise.log_q)
     q, r = np.exp(noise.log_q) / noise.weight_w, np.exp(noise.log_r) / noise.weight_v
     parts = [(q, adjoint.r[..., :n], adjoint.N[..., :n]), (r, adjoint.u, adjoint.D)]
@@ -185,39 +190,41 @@ def likelihood_slopes(noise: NoiseModel, adjoint: Adjoint, dt: float) -> Array:
     if phi is not None:
         eta = np.exp(noise.log_c) * (1 - phi**2)
         parts.append((eta, adjoint.r[..., n:], adjoint.N[..., n:]))
-    return np.stack([0.5 * (v * (s**2 - c)).sum(axis=(0, 1)) for v, s, c in parts])
+    found = np.stack([0.5 * (v * (s**2 - c)).sum(axis=(0, 1)) for v, s, c in parts])
+    if starts is not None:
+        for row, log, own in zip(
+            found[1:], noise.logs[1:], (starts[:, :n], starts[:, n:]), strict=False
+        ):
+            row += 0.5 * np.exp(log) * own.sum(axis=0)
+    return found
 
 
-def start_slopes(noise: NoiseModel, g: kalman.Gains, white: Array, dt: float) -> Array:
-    """Return the part of `likelihood_slopes` that the starts of the runs add, (2 or 3, n).
+def started(g: kalman.Gains, white: Array, phi: float | None) -> Array:
+    """Return twice the slope of loglik by the variance of each run's start, (B, n or 2 n).
 
     A start has the variance of its measurement, and that of the coloured part, so both show in it,
-    once a run. Without this part, fits of many short runs would stop beside the maximum.
+    once a run. Without this part (`likelihood_slopes`), fits of many short runs would stop beside
+    the maximum.
 
     Args:
-        noise: the current noise.
         g: gains of the runs (L, B, ...), none of them delayed.
         white: whitened innovations (L, B, n).
-        dt: time step [s].
+        phi: correlation of the coloured part over one step, if there is one.
     """
     L, B, n = white.shape
-    L = min(L, REMEMBERED)
-    G, phi = g.system.G, noise.structure.phi(dt)
+    L, G = min(L, REMEMBERED), g.system.G
     K = n if phi is None else 2 * n
     d, r = (np.zeros((T, B, n, kalman.whole(K, n))) for T in (L, L + 1))
     r[0, ..., :n] = np.eye(n)
     if phi is not None:
         fades = (phi ** np.arange(L))[:, None, None, None]
         d[..., n:K] = fades * (np.eye(n) if G is None else G[:L])
-    moves = kalman.innovations(g.of_steps(L), d, r)[0]
-    score = np.einsum("lbnc,lbn->bc", moves, white[:L])
-    known = np.einsum("lbnc,lbnc->bc", moves, moves)
-    there = g.system.seen[0] > 0
-    found = np.zeros((2 if phi is None else 3, n))
-    found[1] = np.exp(noise.log_r) * ((score**2 - known)[:, :n] * there).sum(axis=0)
-    if phi is not None:
-        found[2] = np.exp(noise.log_c) * (score**2 - known)[:, n : 2 * n].sum(axis=0)
-    return 0.5 * found
+    moves = kalman.innovations(g.of_steps(L), d, r)[0][..., :K].swapaxes(0, 1)
+    moves = moves.reshape(B, L * n, K)
+    score = (white[:L].swapaxes(0, 1).reshape(B, 1, L * n) @ moves)[:, 0]
+    found = score**2 - np.square(moves).sum(axis=1)
+    found[:, :n] *= g.system.seen[0] > 0
+    return np.asarray(found)
 
 
 def climbed(noise: NoiseModel, slope: Array, info: Array, count: int) -> NoiseModel:

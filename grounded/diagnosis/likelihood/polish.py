@@ -17,9 +17,9 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 
-SHARE = 0.02  # of the thresholds of `refine`
-ROUNDS = 3  # most times that the track is moved
-SAME = 0.02  # nats by which the evidence may change in the last of these rounds
+SHARE = 0.05  # of the thresholds of `refine`
+ROUNDS = 2  # most times that the track is moved
+SAME = 0.05  # nats by which the evidence may change in the last of these rounds
 APART = 2.0  # nats that a point beside the fixed point may be higher; more is a kink of the model
 
 
@@ -30,7 +30,7 @@ def polished(
     iterations: int,
     tick: Callable[[], None] | None = None,
 ) -> list[Fitted]:
-    """Return converged fits of one noise structure, in order.
+    """Return converged fits, in order.
 
     Args:
         predictor: evaluates hypotheses on the data.
@@ -42,13 +42,14 @@ def polished(
     open_ = [i for i, fit in enumerate(found) if not fit.fine]
     for _ in range(ROUNDS):
         left = []
-        for i in open_:
-            fit = found[i]
-            start = (fit.hypothesis, fit.noise, fit.states)
-            again = refine(predictor, [start], iterations=iterations, tick=tick, share=SHARE)
-            if again and again[0].evidence > fit.evidence - APART:
-                found[i] = again[0]
-                if abs(again[0].evidence - fit.evidence) > SAME:
-                    left.append(i)
+        for structure in dict.fromkeys(found[i].noise.structure for i in open_):
+            some = [i for i in open_ if found[i].noise.structure == structure]
+            starts = [(found[i].hypothesis, found[i].noise, found[i].states) for i in some]
+            again = refine(predictor, starts, iterations=iterations, tick=tick, share=SHARE)
+            for i, fit in zip(some, again, strict=True) if len(again) == len(some) else ():
+                rise = fit.evidence - found[i].evidence
+                if rise > -APART:
+                    found[i] = fit
+                    left += [i] * (abs(rise) > SAME)
         open_ = left
     return [replace(fit, settled=True, fine=True) for fit in found]

@@ -41,7 +41,7 @@ from grounded.diagnosis.likelihood.noise import (
     cleaned,
     climbed,
     likelihood_slopes,
-    start_slopes,
+    started,
     working,
 )
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -298,14 +298,14 @@ def _climbed(
         there = slice(i * B, (i + 1) * B)
         working(noise, adjoint, own.G, data.dt, (d[:, there], r[:, there]))
     columns = kalman.innovations(g, d, r)[0]
+    phi = works[0].noise.structure.phi(data.dt)
+    starts = None if g.delayed is not None else started(g, white, phi)
     found = []
     for i, (work, delays, adjoint) in enumerate(zip(works, delays_each, adjoints, strict=True)):
         info = average(columns[:, i * B : (i + 1) * B])[:K, :K]
         in_log = adjoint if delays is None else delays.restored(adjoint)
-        slope = likelihood_slopes(work.noise, in_log, data.dt)
-        if delays is None:
-            own = np.arange(i * B, (i + 1) * B)
-            slope = slope + start_slopes(work.noise, g.of_runs(own), white[:, own], data.dt)
+        own = None if starts is None else starts[i * B : (i + 1) * B]
+        slope = likelihood_slopes(work.noise, in_log, data.dt, own)
         noise = climbed(work.noise, slope, info, int(data.valid.sum()))
         pairs = zip(slope, noise.logs, work.noise.logs, strict=False)
         found.append((noise, 0.5 * sum(float(s @ (a - b)) for s, a, b in pairs)))

@@ -274,7 +274,8 @@ class Claims:
         return averaged(self.search, self.best, self.ruler, self._alone)
 
     def _alone(self, fit: Fitted) -> tuple[Array, Array]:
-        return standard_deviations(self.predictor, fit, folds(self.data))
+        b = self.search.tempering.factor
+        return standard_deviations(self.predictor, fit, folds(self.data), b)
 
     def groups(self) -> tuple[tuple[str, ...], ...]:
         """Return groups of indistinguishable explanations, the claimed one first in each.
@@ -387,7 +388,7 @@ class Claims:
         h, model = self.best.hypothesis, self.data.model
         if h.spread == 0 or h.shift is None:
             return {}
-        stds, halves = standard_deviations(self.predictor, self.best, folds(self.data))
+        stds, halves = self._alone(self.best)
         scale, k = param_scale(model), len(h.theta)
         found = {}
         for at, index in enumerate(calibrated(self.data)):

@@ -9,7 +9,7 @@ from grounded.diagnosis.cause_words import ENDED, furthest_apart, value_of, with
 from grounded.diagnosis.error_report import Correction, Gap
 from grounded.diagnosis.report import Changed, Diagnosis, Estimate
 from grounded.result import listed
-from grounded_trials.wording import changed, count, figure, percent, ranges, with_unit
+from grounded_trials.wording import ALONE, changed, count, figure, percent, ranges, with_unit
 
 MOST = 3  # parameters whose dependence on held ones is stated one by one
 
@@ -135,7 +135,7 @@ def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> st
             change = abs(e.value - old) / abs(old) if old else math.inf
             more = "".join(f" ({text})" for text in ENDED[e.stopped])
             more += " (not identified, not adopted)" * (name not in known)
-            more += " (not determined alone, only with the others)" * (name in joint)
+            more += ALONE * (name in joint)
             moved.append((-change, changed(name, old, e.value, e.unit) + more))
     named = ", ".join(text for _, text in sorted(moved))
     return f"calibrated with the effects: {named}" * bool(moved)

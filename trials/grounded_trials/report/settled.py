@@ -16,7 +16,7 @@ from grounded.model import Model
 from grounded.task import Task
 from grounded_trials.report.diagnosis_words import made_from
 from grounded_trials.report.three_lines import gained, still_open, three_lines
-from grounded_trials.wording import changed
+from grounded_trials.wording import ALONE, changed
 from grounded_trials.workspace.adopting import joined, left_behind
 from grounded_trials.workspace.config import ModelTable
 from grounded_trials.workspace.diagnosing import read_diagnosis
@@ -52,7 +52,7 @@ def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> 
     """
     table, task = workspace.config.model, workspace.origin
     clauses = [_clause(effect, task.model) for effect in table.effects]
-    clauses += _moved(task.model, table.params)
+    clauses += _moved(task.model, table.params, diagnosis.jointly if diagnosis else set())
     if not clauses:
         return None
     if diagnosis is None or diagnosis.no_cause:
@@ -152,7 +152,13 @@ def _clause(entry: Mapping[str, Any], model: Model) -> str:
         return f"{name} ({', '.join(f'{k} = {v}' for k, v in given.items())})"
 
 
-def _moved(model: Model, params: Mapping[str, float]) -> list[str]:
-    """Return `m 1.00 -> 1.30 kg` for every parameter that grounded.toml changes."""
+def _moved(model: Model, params: Mapping[str, float], jointly: set[str]) -> list[str]:
+    """Return `m 1.00 -> 1.30 kg` for every parameter that grounded.toml changes.
+
+    Those that the trials identify only `jointly` are marked.
+    """
     known = {n: p for n, p in model.params.items() if n in params and params[n] != p.value}
-    return [changed(name, p.value, params[name], p.unit) for name, p in known.items()]
+    return [
+        changed(name, p.value, params[name], p.unit) + ALONE * (name in jointly)
+        for name, p in known.items()
+    ]
