@@ -273,7 +273,10 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
         return "no step improved", f"the last {PATIENCE} candidates did not improve"
     told = f"the last {PATIENCE} candidates gained {gained:.3g} in total, less than"
     if gained < PATIENCE * tolerance * abs(best.utility):
-        return "too little gained", f"{told} {100 * tolerance:g} % each ([search] tolerance)"
+        return (
+            "too little gained",
+            f"{told} {100 * tolerance:g} % each on average ([search] tolerance)",
+        )
     error, known = error_between(old, best, history)
     if known and gained < error:
         return "too little gained", f"{told} its standard error of {error:.2g} from repeats"

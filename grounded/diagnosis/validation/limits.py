@@ -244,7 +244,7 @@ def identifiable(
         known: the parameters that were calibrated; the others were held at their values.
     """
     information, known = _information(predictor, fit), known or {}
-    cov = np.linalg.inv(information + np.eye(len(information)))
+    cov = np.asarray(np.linalg.inv(information + np.eye(len(information))), float)
     model, found = predictor.data.model, []
     names = [model.param_names[i] for i in calibrated(predictor.data)]
     priors = np.array([model.params[name].spread for name in names])
