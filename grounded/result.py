@@ -131,7 +131,7 @@ class Result:
 
         figures = self.figures()
         if not figures:
-            raise GroundedError(f"this {type(self).__name__} has nothing to draw yet")
+            raise GroundedError(f"this {type(self).__name__} has no picture; print it")
         return notebook_figure(figures)
 
     def _repr_html_(self) -> str:

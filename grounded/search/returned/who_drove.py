@@ -15,7 +15,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.instruments.inputs import limits_of, span
 from grounded.policy import Policy, z_difference
-from grounded.result import with_unit
+from grounded.result import listed, with_unit
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
@@ -171,6 +171,11 @@ def suspicion(task: Task, trial: Trial, own: Candidate, others: Sequence[Candida
         name = name if same else ""
     elif found.alike:
         return Suspicion(found)
+    elif still := _at_zero(trial, own):
+        looks = (
+            f"{listed(still)} {'is' if len(still) == 1 else 'are'} 0 from the first step to the "
+        )
+        looks += "last: were the commands recorded?"
     elif found.until_s >= LEAST * trial.dt:
         looks = (
             f"up to {found.until_s:.1f} s they are alike: then somebody, or something, took over, "
@@ -190,6 +195,13 @@ def suspicion(task: Task, trial: Trial, own: Candidate, others: Sequence[Candida
         differs = f"{found.input} differs by {rms} (rms)"
     why = f"its commands are not what {own.id} sends on the logged states: {differs}; {looks}"
     return Suspicion(found, why, name)
+
+
+def _at_zero(trial: Trial, own: Candidate) -> list[str]:
+    """Return the inputs that are 0 in the whole log, though the candidate's plan moves them."""
+    moves = np.ptp(own.policy.feedforward, axis=0) > 0
+    silent = ~(trial.inputs != 0).any(axis=0)
+    return [n for n, m, s in zip(trial.input_names, moves, silent, strict=True) if m and s]
 
 
 def latest(task: Task) -> int:

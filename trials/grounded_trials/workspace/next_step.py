@@ -279,7 +279,7 @@ class Since:
     used: int = 0  # usable trials that the diagnosis was made from
     usable: int = 0  # trials that a diagnosis can use now
     newer: int = 0  # usable trials that arrived after the diagnosis
-    adopted: tuple[str, ...] = ()  # claimed effects that are part of the model now
+    adopted: tuple[str, ...] = ()  # effects that are part of the model now, claimed ones first
     missing: tuple[str, ...] = ()  # claimed effects that are not, if others are
     changed: bool = False  # the diagnosis was made with another model
 
@@ -320,6 +320,9 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
     missing = diagnosis.open(model.effects, model.params)
     other = [name for name in diagnosis.effects if _other_value(diagnosis, name, model.params)]
     adopted = tuple(name for name in diagnosis.effects if name not in (*missing, *other))
+    before = {e["name"] for e in made.adopted}
+    named = (str(e["name"]) for e in model.effects)
+    adopted += tuple(n for n in named if n not in before and n not in diagnosis.effects)
     same = [dict(e) for e in model.effects] == [dict(e) for e in made.adopted]
     return Since(
         used=sum(name in seen for name in usable),
