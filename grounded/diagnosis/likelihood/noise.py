@@ -38,7 +38,7 @@ from grounded.frozen import Array
 
 DOF = 4.0
 UNSEEN = 1e-2  # initial disturbance of a state that is never measured, as a fraction of its scale
-REMEMBERED = 40  # steps after which a start is taken to be forgotten
+REMEMBERED = 20  # steps after which a start is taken to be forgotten
 NOTHING = 1e-4  # fraction of a channel's one-step variance below which a variance counts as zero
 
 
