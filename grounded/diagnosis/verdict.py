@@ -7,10 +7,16 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from grounded.diagnosis.cause_words import clauses, disagreement, give_or_take, meaning
-from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, furthest, runaway
+from grounded.diagnosis.error_report import (
+    Credit,
+    Identifiable,
+    Remainder,
+    RulerRow,
+    furthest,
+    runaway,
+)
 from grounded.diagnosis.report import (
     Agreement,
-    Identifiable,
     Kind,
     Ranked,
     TrialValue,

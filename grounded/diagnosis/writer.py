@@ -12,6 +12,7 @@ from grounded.diagnosis.error_report import (
     Change,
     ChannelShare,
     Gap,
+    Identifiable,
     RulerRow,
     UtilityPrediction,
     Where,
@@ -22,7 +23,7 @@ from grounded.diagnosis.hypotheses.correction import correction
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.report import Diagnosis, Estimate, Identifiable, NoiseLevels
+from grounded.diagnosis.report import Diagnosis, Estimate, NoiseLevels
 from grounded.diagnosis.ruler_words import objection, open_noise
 from grounded.diagnosis.unconfirmed import another_look, marked, unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import by_trial

@@ -8,8 +8,8 @@ import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.error_report import Credit
-from grounded.diagnosis.report import Estimate, Identifiable
+from grounded.diagnosis.error_report import Credit, Identifiable
+from grounded.diagnosis.report import Estimate
 from grounded.diagnosis.validation.claims import Blame
 from grounded.diagnosis.verdict import _causes
 from grounded.effects import Library

@@ -304,8 +304,8 @@ def _climbed(
     for i, (work, delays, adjoint) in enumerate(zip(works, delays_each, adjoints, strict=True)):
         info = average(columns[:, i * B : (i + 1) * B])[:K, :K]
         in_log = adjoint if delays is None else delays.restored(adjoint)
-        own = None if starts is None else starts[i * B : (i + 1) * B]
-        slope = likelihood_slopes(work.noise, in_log, data.dt, own)
+        start = None if starts is None else starts[i * B : (i + 1) * B]
+        slope = likelihood_slopes(work.noise, in_log, data.dt, start)
         noise = climbed(work.noise, slope, info, int(data.valid.sum()))
         pairs = zip(slope, noise.logs, work.noise.logs, strict=False)
         found.append((noise, 0.5 * sum(float(s @ (a - b)) for s, a, b in pairs)))

@@ -11,13 +11,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from grounded.diagnosis.error_report import Identifiable
 from grounded.diagnosis.hypotheses.leftover import filter_of
 from grounded.diagnosis.likelihood.data import PIECES, Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.linearise import base_columns
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.diagnosis.report import Estimate, Identifiable
+from grounded.diagnosis.report import Estimate
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -247,7 +248,7 @@ def identifiable(
     model, found = predictor.data.model, []
     names = [model.param_names[i] for i in calibrated(predictor.data)]
     priors = np.array([model.params[name].spread for name in names])
-    jointly = _jointly(cov, names, priors, model, known)
+    jointly = _jointly(np.asarray(cov, float), names, priors, model, known)
     held_ = [i for i, name in enumerate(names) if known and name not in known]
     for i, name in enumerate(names):
         std = known[name].std if name in known else 0.0
