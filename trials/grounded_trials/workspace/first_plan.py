@@ -22,7 +22,7 @@ from grounded_trials.wording import rendered, with_unit
 from grounded_trials.workspace.config import made_changes
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import (
-    logged_target,
+    still_logged,
     tracked,
     tracking_error,
     weighed_groups,
@@ -69,7 +69,7 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
         found.append(
             f"[limits] are only the range used in {log}: enter the robot's real limits"
             + ", and draw the manoeuvre (`target`): target.csv is the run in that log"
-            * bool(logged_target(workspace))
+            * still_logged(workspace)
         )
     if first is not None and first.predicted_utility < 0:
         none = np.zeros(task.model.n)
