@@ -40,6 +40,13 @@ def figure(value: float | None, digits: int = 4) -> str:
     return f"{value:,.{decimals}f}"
 
 
+def spread(std: float) -> str:
+    """Format a standard deviation in two digits, without a power of ten down to 1e-6."""
+    if not 1e-6 <= std < 1e-3:
+        return figure(std, 2)
+    return f"{std:.{1 - math.floor(math.log10(std))}f}"
+
+
 def listed(names: Iterable[str]) -> str:
     """Join names as in `a`, `a and b` or `a, b and c`."""
     *most, last = [*names] or [""]

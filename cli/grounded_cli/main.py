@@ -90,10 +90,11 @@ class LazyGroup(click.Group):
 
             if not isinstance(error, GroundedError):
                 raise
-            from grounded_cli.options import next_line, placed
+            from grounded_cli.options import given, next_line
+            from grounded_trials.wording import placed
 
             then = "" if error.then is None else f"\n{next_line(error.then)}"
-            raise GroundedError(f"{placed(str(error))}{then}") from None
+            raise GroundedError(f"{placed(str(error), given())}{then}") from None
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Complete command names without importing any command."""

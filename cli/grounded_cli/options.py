@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import functools
-import re
-import shlex
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from grounded.errors import NextCommand
-from grounded_trials.wording import folded, rendered
+from grounded_trials.wording import ELSEWHERE, folded, rendered
 
 if TYPE_CHECKING:
     from grounded_trials import Workspace
 
 F = TypeVar("F", bound=Callable[..., Any])
-# commands that use no workspace: they are printed without -C
-ELSEWHERE = frozenset({"init", "recover", "demo", "experiment", "challenge", "completion"})
 _KEY = "grounded_cli.folder"
-_NAMED = re.compile(r"`grounded ([a-z][^`]*)`")
 
 
 def in_workspace(function: F) -> F:
@@ -110,19 +105,6 @@ def typed(then: NextCommand, folder: str | None = None) -> str:
     if folder is None and then.verb not in ELSEWHERE:
         folder = given()
     return rendered(then, folder)
-
-
-def placed(text: str) -> str:
-    """Add -C DIR to the commands in a text (`grounded VERB ...`) if it was given to this one."""
-
-    def as_typed(found: re.Match[str]) -> str:
-        try:
-            verb, *arguments = shlex.split(found[1])
-        except ValueError:  # an unbalanced quote, in text from an untrusted file
-            return found[0]
-        return f"`{typed(NextCommand(verb, tuple(arguments)))}`"
-
-    return _NAMED.sub(as_typed, text) if given() is not None else text
 
 
 def next_line(then: NextCommand, folder: str | None = None) -> str:

@@ -14,8 +14,8 @@ from contextlib import contextmanager
 from typing import Any, TextIO
 
 from grounded.result import plain
-from grounded_cli.options import placed
-from grounded_trials.wording import MARKS, columns, figure, glued, wrapped
+from grounded_cli.options import given
+from grounded_trials.wording import MARKS, columns, figure, glued, placed, wrapped
 
 number = figure
 BARS = "▁▂▃▄▅▆▇█"
@@ -93,7 +93,7 @@ def lines(text: str, first: str, rest: str) -> list[str]:
         first: the prefix of the first line.
         rest: the prefix of the other lines.
     """
-    return wrapped(placed(text), first, rest)
+    return wrapped(placed(text, given()), first, rest)
 
 
 def field(label: str, text: str, indent: str = "", width: int = LABEL) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from grounded.diagnosis.report import Changed, Estimate, TrialValue
 from grounded.model import Model
-from grounded.result import listed, number, percent, with_unit
+from grounded.result import listed, number, percent, spread, with_unit
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.effects import Effect
@@ -31,7 +31,8 @@ def give_or_take(estimate: Estimate) -> str:
         return quantity(estimate)
     places = math.floor(math.log10(max(abs(value), std))) - math.floor(math.log10(std)) + 2
     digits = min(max(places, 3), MOST_DIGITS)
-    return with_unit(f"{value:.{digits}g} +- {std:.2g}", estimate.unit)
+    scatter = spread(std) if std < 1e-4 else f"{std:.2g}"
+    return with_unit(f"{value:.{digits}g} +- {scatter}", estimate.unit)
 
 
 GREEK = (

@@ -10,7 +10,7 @@ import numpy as np
 from grounded.diagnosis.error_report import Credit, RulerRow, furthest
 from grounded.diagnosis.report import Diagnosis
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
-from grounded.result import measured, measured_alike, number, percent, shown
+from grounded.result import figure, measured, measured_alike, number, percent, shown
 
 MOST = 12  # bars
 APART = 0.01  # relative difference of errors below which curves coincide
@@ -65,7 +65,7 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
     errors = diagnosis.prediction_error
     if not errors:
         panels: list[Panel | Bars] = [_shrinkage(diagnosis)] if diagnosis.gap.measured else []
-        held = diagnosis.gap.held_out
+        held, apart = diagnosis.gap.held_out, False
     else:
         apart = any(not e.whole_trial for e in errors) and len(errors) > 1
         panels = _over_horizons(errors) if apart else _by_channel(errors[0])
@@ -74,6 +74,9 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
         return None
     where = "on held-out data" if held else "on the data used for the diagnosis"
     least = "" if any(e.floor_bound for e in errors) else " No model gets below the noise."
+    if apart and not any(v > 0 for e in errors for v in e.noise_floor.values()):
+        known = any(v == 0 for e in errors for v in e.noise_floor.values())
+        least = " Repeated trials agree exactly: the noise is 0." * known
     caption = f"Rms error of predictions, {where}.{least}"
     key = tuple(sorted(legend(panels), key=lambda one: one.role == "other"))
     return Figure("accuracy", "Predictions before and after", caption, tuple(panels), key)
@@ -86,13 +89,16 @@ def _over_horizons(errors: Sequence[RulerRow]) -> list[Panel | Bars]:
     ahead = np.array([e.horizon_s for e in errors if not e.whole_trial])
     at = np.array([APART_BY * ahead.max() if e.whole_trial else e.horizon_s for e in errors])
     whole = np.array([e.whole_trial for e in errors])
-    ticks = [(float(x), WHOLE if w else f"{x:.3g}") for x, w in zip(at, whole, strict=True)]
+    ticks = [
+        (float(x), WHOLE.replace(" ", "\n") if w else f"{x:.3g}")
+        for x, w in zip(at, whole, strict=True)
+    ]
     for channel, unit in units.items():
         curves = []
         for key, (role, name) in _told_apart(errors).items():
             values = np.array([getattr(e, key).get(channel, math.nan) for e in errors], float)
             for rows, note in ((~whole, ""), (whole, WHOLE)):
-                if np.isfinite(values[rows]).any():
+                if (values[rows] > 0).any():  # the axis is logarithmic
                     style = "line" if rows.sum() > 1 and not note else "points"
                     curves.append(
                         Curve(at[rows], values[rows], role, name, 2.0, style=style, note=note)
@@ -287,7 +293,7 @@ def _shares(shares: Sequence[tuple[str, float, str]], role: str) -> tuple[Bar, .
 def _ranking(diagnosis: Diagnosis) -> tuple[Bar, ...]:
     named = set(diagnosis.effects)
     return tuple(
-        Bar(r.effect, r.evidence, number(r.evidence), "best" if r.effect in named else "other")
+        Bar(r.effect, r.evidence, figure(r.evidence, 3), "best" if r.effect in named else "other")
         for r in diagnosis.ranking[:MOST]
     )
 

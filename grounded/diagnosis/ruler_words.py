@@ -215,7 +215,9 @@ def rest(rows: Sequence[RulerRow]) -> str:
     times, share, name, row = max(found, key=lambda one: one[:3])
     when = _when(row)
     least = "at least " * row.floor_bound
-    text = f"the state {name} is still off by {least}{times:.2g} times the noise {when}"
+    text = (
+        f"the state {name} is still off by {least}{float(f'{times:.2g}'):,g} times the noise {when}"
+    )
     if share < MATTERS:
         of = f"{100 * share:.1g} % of the crude model's error"
         return f"{text}, but that is only {of}: too little to look for a cause"

@@ -8,7 +8,7 @@ from html import escape
 from typing import TYPE_CHECKING
 
 from grounded.diagnosis.error_report import RulerRow, furthest
-from grounded.result import figure, html_table, percent, shown, with_unit
+from grounded.result import figure, html_table, percent, shown, spread, with_unit
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis, Ranked
@@ -148,7 +148,7 @@ def undetermined(width: float, value: float) -> bool:
 def _spread(std: float) -> str:
     if not math.isfinite(std):
         return " (any value fits)"
-    return f" +- {figure(std, 2)}" if std else ""
+    return f" +- {spread(std)}" if std else ""
 
 
 def as_html(diagnosis: Diagnosis, everything: str) -> str:

@@ -289,6 +289,8 @@ def loss_ticks(low: float, high: float, most: int = 5) -> list[float]:
         values = [v for v in values if low <= -math.log10(-v) <= high]
         if len(values) <= most:
             break
+    if len(values) > most + 2:  # many powers of ten: every second, third ... of them
+        values = values[:: -(-len(values) // most)]
     if len(values) < 2:
         values = [float(f"{-(10.0**-v):.2g}") for v in np.linspace(low, high, 4)]
     return sorted(values)

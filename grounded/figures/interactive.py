@@ -72,7 +72,8 @@ def plotted(panel: Panel | Bars, axis: str = "") -> dict[str, Any]:
             each |= {"type": "log", "tickvals": ticks, "ticktext": [f"{v:g}" for v in ticks]}
     if panel.x_ticks:
         at, labels = zip(*panel.x_ticks, strict=True)
-        across |= {"tickvals": list(at), "ticktext": list(labels)}
+        lines = [label.replace("\n", "<br>") for label in labels]
+        across |= {"tickvals": list(at), "ticktext": lines, "ticklabeloverflow": "allow"}
     if panel.equal:
         up |= {"scaleanchor": f"x{axis}"}
     if panel.loss:

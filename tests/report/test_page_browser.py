@@ -308,6 +308,25 @@ def test_print_shows_every_panel_in_light_colours(window, car_page):
     assert window.errors() == []
 
 
+@pytest.mark.parametrize("width", [390, 1280])
+def test_the_text_of_every_bar_is_in_its_panel(cart, tmp_path, window, width):
+    """`40 % of the time` behind a long bar was cut off at the panel's edge."""
+    path = tmp_path / "page.html"
+    path.write_text(page(gather(Folder(cart))))
+    window.resize(1400, 900)
+    window.open(path)
+    window.draw_all()
+    window.resize(width, 900)  # a drawn page whose window changes
+    time.sleep(1.0)
+    over = window.run(
+        "return [...document.querySelectorAll('.plot')].flatMap(p => {"
+        "const box = p.getBoundingClientRect();"
+        "return [...p.querySelectorAll('.barlayer text')].map(t => t.getBoundingClientRect())"
+        ".map(t => Math.max(t.right - box.right, box.left - t.left)); })"
+    )
+    assert len(over) > 5 and max(over) <= 0, (width, over)
+
+
 def test_hostile_names_run_nothing(cart, tmp_path, window):
     path = tmp_path / "page.html"
     path.write_text(page(hostile(cart)))

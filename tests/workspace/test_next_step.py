@@ -18,12 +18,11 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.search import standing as standing_of_a_search
 from grounded.search.candidate import Candidate
 from grounded_cli.main import COMMANDS, cli
-from grounded_cli.options import ELSEWHERE, placed
 from grounded_cli.propose import _came_true, _so_far
 from grounded_trials import Workspace
 from grounded_trials.report.gathering import gather
 from grounded_trials.store.documents import write_document
-from grounded_trials.wording import folded, rendered
+from grounded_trials.wording import ELSEWHERE, folded, placed, rendered
 from grounded_trials.workspace.adopting import diagnosed_again
 from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.diagnosing import _in_vain, read_diagnosis
@@ -375,14 +374,11 @@ def test_commands_inside_sentences_work_from_where_the_user_is(cart, tmp_path, m
     assert done.code == 1 and f"`grounded -C '{folder}' target`" in done.err
     monkeypatch.chdir(folder)
     assert "`grounded target`" in grounded("propose").err
-    with click.Context(cli, obj={}) as ctx:
-        ctx.meta["grounded_cli.folder"] = "my cart"
-        kept = "`grounded -C x run`", "`grounded init DIR`", "`grounded it's`", "grounded run"
-        assert placed(" ".join(kept)) == " ".join(kept)
-        assert (
-            placed("a `grounded ingest LOG --data`.")
-            == "a `grounded -C 'my cart' ingest LOG --data`."
-        )
+    kept = "`grounded -C x run`", "`grounded init DIR`", "`grounded it's`", "grounded run"
+    assert placed(" ".join(kept), "my cart") == " ".join(kept)
+    there = placed("a `grounded ingest LOG --data`.", "my cart")
+    assert there == "a `grounded -C 'my cart' ingest LOG --data`."
+    assert placed("a `grounded run`", None) == "a `grounded run`"
 
 
 def test_an_error_names_the_workspace_too_and_init_does_not(tmp_path):

@@ -8,15 +8,13 @@ import shutil
 from collections.abc import Sequence
 from itertools import pairwise
 from textwrap import TextWrapper
-from typing import TYPE_CHECKING
 
+from grounded.errors import NextCommand
 from grounded.result import figure as figure
 from grounded.result import percent as percent
 from grounded.result import shown as shown
+from grounded.result import spread as spread
 from grounded.result import with_unit as with_unit
-
-if TYPE_CHECKING:
-    from grounded.errors import NextCommand
 
 ITERATION = (
     "iter.: improvements that a candidate builds on; it decreases where the search returns to "
@@ -26,6 +24,9 @@ ALONE = " (not determined alone, only with the others)"  # of an adopted paramet
 PIECES = 4  # largest number of ranges that a list of trials names
 NARROW, WIDE = 60, 80  # columns: smallest and largest line width
 MARKS = "\ufdd0\ufdd1\ufdd2\ufdd3\ufdd4"  # colour marks in a text, of zero width
+# commands that use no workspace: they are printed without -C
+ELSEWHERE = frozenset({"init", "recover", "demo", "experiment", "challenge", "completion"})
+_NAMED = re.compile(r"`grounded ([a-z][^`]*)`")
 _WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")  # a word of a command; quotes stay together
 _GLUE = re.compile(
     r"(?<=[<>]) (?=[\d.-])| (?=[<>] )| (?=-> )| (?=%)"
@@ -114,6 +115,20 @@ def rendered(then: NextCommand, folder: str | None = None) -> str:
     """
     words = ["grounded", *(["-C", folder] if folder is not None else []), then.verb]
     return shlex.join([*words, *then.arguments])
+
+
+def placed(text: str, folder: str | None) -> str:
+    """Add -C DIR to the commands in a text (`grounded VERB ...`) if a folder is given."""
+
+    def as_typed(found: re.Match[str]) -> str:
+        try:
+            verb, *arguments = shlex.split(found[1])
+        except ValueError:  # an unbalanced quote, in text from an untrusted file
+            return found[0]
+        there = None if verb in ELSEWHERE else folder
+        return f"`{rendered(NextCommand(verb, tuple(arguments)), there)}`"
+
+    return _NAMED.sub(as_typed, text) if folder is not None else text
 
 
 def folded(command: str, lead: str = "next: ") -> str:

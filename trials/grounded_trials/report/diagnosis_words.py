@@ -9,8 +9,18 @@ from grounded.diagnosis.cause_words import ENDED, furthest_apart, value_of, with
 from grounded.diagnosis.error_report import Correction, Gap
 from grounded.diagnosis.report import Changed, Diagnosis, Estimate
 from grounded.result import listed
-from grounded_trials.wording import ALONE, changed, count, figure, percent, ranges, with_unit
+from grounded_trials.wording import (
+    ALONE,
+    changed,
+    count,
+    figure,
+    percent,
+    ranges,
+    spread,
+    with_unit,
+)
 
+DIVERGED = 100.0  # times the spread of measured utilities: larger errors are not stated
 MOST = 3  # parameters whose dependence on held ones is stated one by one
 
 
@@ -107,7 +117,7 @@ def _difference(one: Changed) -> Estimate:
 
 
 def _with_spread(estimate: Estimate) -> str:
-    text = f"{figure(estimate.value, 3)} +- {figure(estimate.std, 2)}"
+    text = f"{figure(estimate.value, 3)} +- {spread(estimate.std)}"
     return with_unit(text, estimate.unit)
 
 
@@ -167,10 +177,7 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
     found = diagnosis.utility_prediction
     if found is None or not found.trials:
         return ""
-    without, better = (
-        figure(value, 3) if math.isfinite(value) else "without bound (it diverges)"
-        for value in (found.before, found.after)
-    )
+    without, better = (_utility_error(v, found.spread) for v in (found.before, found.after))
     whole = count(found.trials, "whole trial")
     text = f"rms error of the predicted utility of {whole}: {without} by the model"
     if diagnosis.effects:
@@ -179,6 +186,15 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
         text += f"; the measured utilities vary by {figure(found.spread, 3)}"
     how = "; predicted open loop, though the trials ran with feedback"
     return text + how * found.feedback
+
+
+def _utility_error(error: float, spread: float) -> str:
+    """Format an error; of one far beyond the spread of real utilities, only that it diverges."""
+    if not math.isfinite(error):
+        return "without bound (it diverges)"
+    if spread > 0 and error > DIVERGED * spread:
+        return f"over {float(f'{DIVERGED * spread:.2g}'):,g} (it diverges)"
+    return figure(error, 3)
 
 
 def verdict_lines(diagnosis: Diagnosis) -> tuple[list[str], list[str]]:

@@ -69,6 +69,7 @@ class Log:
 
     trial: Trial
     residual: Array  # (T, n), as a run's
+    explained: Array | None = None  # (T, n), as a run's; of the last log only
 
 
 @dataclass(frozen=True, eq=False)

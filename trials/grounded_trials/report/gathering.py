@@ -61,7 +61,7 @@ def gather(workspace: Folder) -> Findings:
         method=_method(workspace),
         standing=now,
         runs=tuple(_runs(task, now, shown, better, lost)),
-        logs=tuple(Log(t, _residual(Planner(task, task), t)) for t in logs),
+        logs=tuple(_log(task, t, better if t is logs[-1] else None) for t in logs),
         others=len(contents.trials) - len(own) - len(data),
         lost=tuple(lost),
         diagnosis=diagnosis,
@@ -123,6 +123,11 @@ def _runs(
         explained = None if better is None else _residual(better.planner, trial)
         runs.append(Run(trial, tried.candidate, tried.accepted, utility, residual, explained))
     return runs
+
+
+def _log(task: Task, trial: Trial, better: Better | None) -> Log:
+    explained = None if better is None else _residual(better.planner, trial)
+    return Log(trial, _residual(Planner(task, task), trial), explained)
 
 
 def _drawable(trial: Trial) -> Trial:

@@ -24,6 +24,7 @@ LOGS = 2  # number of logs drawn; the table has all
 CHANNELS = 4  # number of states whose residuals are drawn
 POINTS = 1500  # points of a residual
 BINS = 24
+THIN = 200  # parts of the points: a bin with fewer is merged with the next one
 LAGS_S, LAGS = 1.0, 60  # largest lag of the autocorrelation, in [s] and in steps
 LEAST_STEPS = 30  # shortest trial whose residual is drawn
 
@@ -85,7 +86,8 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
         saw = "used this trial" if trial.id in diagnosis.made.trials else "did not use this trial"
         caption += f" The last diagnosis, {made_from(diagnosis)}, {saw}."
     if trial.steps < steps:
-        caption += f" Only its worst part, from {begin:g} s on, is drawn."
+        end = begin + trial.steps * trial.dt
+        caption += f" Only its worst part, from {begin:g} to {end:g} s, is drawn."
     return Figure(name, title, caption, tuple(panels), legend(panels))
 
 
@@ -118,9 +120,9 @@ def residual_figures(findings: Findings) -> list[Figure]:
     """Return the figures of the residual and of its autocorrelation."""
     run = findings.lately
     data: list[tuple[Trial, Array, Array | None]] = [
-        (r.trial, r.residual, r.explained) for r in ([run] if run is not None else [])
+        (one.trial, one.residual, one.explained)
+        for one in ([run] if run is not None else findings.logs[-1:])
     ]
-    data = data or [(one.trial, one.residual, None) for one in findings.logs[-1:]]
     if not data or data[0][0].finite_steps < LEAST_STEPS:
         return []
     trial, residual, explained = data[0]
@@ -216,9 +218,14 @@ def _binned(x: Array, y: Array) -> tuple[Array, Array]:
     """Return means of x and y in bins of x.
 
     Edges of equally full bins and of equally wide bins are combined, so that a line through the
-    means covers the whole range of x.
+    means covers the whole range of x. Bins with few points are merged, except for the last.
     """
     edges = np.union1d(_edges(x), np.linspace(x.min(), x.max(), _bins(x) + 1))
+    inner, before = [edges[0]], np.searchsorted(np.sort(x), edges)
+    for edge, low in zip(edges[1:-2], before[1:-2], strict=True):
+        if low - np.sum(x < inner[-1]) >= len(x) / THIN:
+            inner.append(edge)
+    edges = np.array([*inner, *edges[-2:]])
     which = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, max(len(edges) - 2, 0))
     parts = [which == k for k in np.unique(which)]
     return np.array([x[p].mean() for p in parts]), np.array([y[p].mean() for p in parts])
@@ -249,6 +256,6 @@ def _autocorrelation(
     band = Band(-bound, bound, "other", "white noise stays inside, 95 %")
     name = findings.task.model.state_names[state]
     return Panel(
-        f"{name}: autocorrelation of the residual", "lag [s]", "", tuple(curves), bands=(band,),
-        y_range=(-1.05, 1.05), note=note,
+        f"{name}: autocorrelation of the residual", "lag [s]", "correlation", tuple(curves),
+        bands=(band,), y_range=(-1.05, 1.05), note=note,
     )  # fmt: skip

@@ -20,6 +20,7 @@ from grounded.figures.figure import (
     without_astray,
 )
 from grounded.frozen import Array
+from grounded.result import listed
 from grounded.search.pictures import search_figure
 from grounded_trials.report.figures.gap import forecast_figures, residual_figures
 from grounded_trials.report.figures.paths import crash, name_of, named_paths, path_figure
@@ -30,9 +31,11 @@ from grounded_trials.report.findings import (
     selection,
 )
 from grounded_trials.report.scene import scene_of
-from grounded_trials.wording import figure, labelled, per_second, shown
+from grounded_trials.wording import figure, labelled, per_second, shown, with_unit
 from grounded_trials.workspace.off_target import tracked, tracking_error
 
+FLAT = 0.2  # share of the limits' range below which inputs are drawn without the limits
+CUT = 3.0  # the axis is shortened only if all values span more than this times the calm ones
 ITERATIONS = 5  # largest number of iterations whose bias is drawn
 
 
@@ -106,7 +109,13 @@ def input_figure(findings: Findings) -> Figure | None:
             _held(run.trial.inputs[:, j], task.dt, role, name_of(role, run)) for role, run in shown
         ]
         limits = [float(v) for v in (task.low[j], task.high[j]) if np.isfinite(v)]
-        panels.append(_timed(name, unit, curves, limits))
+        sent = [curve.y for curve in curves]
+        if np.ptp(fitted(sent)) < FLAT * np.ptp(fitted([*sent, np.array(limits)])):
+            note = f"{listed(figure(v, 3) for v in limits)}".replace("-", "−")
+            note = f"limit{'s' * (len(limits) > 1)} {with_unit(note, unit)}"
+            panels.append(replace(_timed(name, unit, curves), note=note))
+        else:
+            panels.append(_timed(name, unit, curves, limits))
     return Figure("inputs", "Inputs", "", tuple(panels), legend(panels))
 
 
@@ -175,6 +184,9 @@ def _timed(
     wild = [c.y for c in curves if c.role == "model"]
     values = without_astray(calm, wild, spare) if any(len(v) for v in calm) else wild
     low, high = fitted(values)
+    all_low, all_high = fitted([*calm, *wild])
+    if all_high - all_low <= CUT * (high - low):
+        low, high = all_low, all_high
     return Panel(
         labelled(name, unit),
         "time [s]",

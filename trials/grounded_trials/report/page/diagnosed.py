@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from grounded.diagnosis.cause_words import give_or_take
 from grounded.diagnosis.error_report import ChannelParts, Parts, Split, doubt_of
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
-from grounded.diagnosis.report import Diagnosis, TrialValue
+from grounded.diagnosis.report import Diagnosis, Estimate, TrialValue
 from grounded.diagnosis.verdict import told_apart
 from grounded_trials.report.diagnosis_words import (
     gap_sentence,
@@ -26,7 +27,7 @@ from grounded_trials.report.page.tables import (
     table,
 )
 from grounded_trials.report.settled import so_far
-from grounded_trials.wording import figure, percent, rendered, with_unit
+from grounded_trials.wording import percent, rendered
 from grounded_trials.workspace.next_step import DIAGNOSE, Since
 
 MOST = 6  # states whose error without each effect is drawn
@@ -83,7 +84,7 @@ def _by_trial(diagnosis: Diagnosis) -> list[Block]:
             p.effect,
             p.quantity,
             p.trial,
-            with_unit(f"{figure(p.value, 3)} ± {figure(p.std, 2)}", _unit(diagnosis, p)),
+            give_or_take(Estimate(p.value, p.std, unit=_unit(diagnosis, p))),
             "yes" if p.agrees else "no",
         )
         for p in found

@@ -6,6 +6,7 @@
   const plots = all(".plot");
   const hidden = new Map(); // for each figure, the names switched off in its legend
   let light = false; // true while printing
+  const SHEET = 330; // width of a panel on paper [px]
   let time = 0;
 
   // Values: decode typed arrays, replace roles by colours.
@@ -67,7 +68,27 @@
     for (const axis of ["xaxis", "yaxis"]) {
       zoomed[axis] = { ...coloured(layout[axis]), ...(own[axis] && plot.zoomed ? { range: own[axis].range } : {}) };
     }
+    if (kind === "bars") zoomed.xaxis = fitted(plot, zoomed.xaxis);
     return [traces, { ...shared, ...coloured(layout), ...zoomed }];
+  };
+  // Bars are as long as the texts behind them and the labels before them leave room for.
+  const pen = document.createElement("canvas").getContext("2d");
+  const fitted = (plot, axis) => {
+    const { data: [bars], layout: { yaxis } } = known(plot);
+    pen.font = '12px "Open Sans", verdana, arial, sans-serif';
+    const wide = (text) => pen.measureText(text).width + 8;
+    const inner = (light ? SHEET : plot.clientWidth) - 24 - Math.max(...yaxis.ticktext.map(wide));
+    const most = Math.max(...bars.x.map(Math.abs)) || 1;
+    const ends = (scale) => {
+      const reached = bars.text.map((text, i) => bars.x[i] * scale + (bars.x[i] < 0 ? -1 : 1) * wide(text));
+      return [Math.min(0, ...reached), Math.max(0, ...reached)];
+    };
+    let low = 0.1 * Math.max(inner, 1) / most, high = 10 * low; // pixels for a unit
+    for (let i = 0; i < 30; i++) {
+      const scale = (low + high) / 2, [left, right] = ends(scale);
+      if (right - left > inner) high = scale; else low = scale;
+    }
+    return { ...axis, range: ends(low).map((end) => end / low) };
   };
   const config = {
     displaylogo: false, responsive: true, doubleClick: "reset",
@@ -307,7 +328,7 @@
     for (const part of all("details")) part.open = true;
     for (const plot of plots) {
       draw(plot);
-      Plotly.relayout(plot, { autosize: false, width: 330, height: plot.clientHeight });
+      Plotly.relayout(plot, { autosize: false, width: SHEET, height: plot.clientHeight });
     }
   });
   addEventListener("afterprint", () => {
@@ -316,6 +337,9 @@
       plot.layout.width = plot.layout.height = undefined;
       draw(plot);
     }
+  });
+  addEventListener("resize", () => {
+    for (const plot of plots) if (plot.drawn && known(plot).kind === "bars") draw(plot);
   });
   night.addEventListener("change", () => { for (const plot of plots) if (plot.drawn) draw(plot); });
 

@@ -46,7 +46,7 @@ from grounded_trials.report.page.tables import (
 )
 from grounded_trials.report.settled import told
 from grounded_trials.report.three_lines import gained_most
-from grounded_trials.wording import count, figure, glued, rendered
+from grounded_trials.wording import count, figure, glued, placed, rendered
 from grounded_trials.workspace.next_step import DIAGNOSE
 from grounded_trials.workspace.proposing import not_counted
 
@@ -67,7 +67,8 @@ def page(findings: Findings, watched: int = 0) -> str:
     from jinja2 import Environment
 
     jinja = Environment(autoescape=True, finalize=typeset, trim_blocks=True, lstrip_blocks=True)
-    jinja.filters["glued"] = _unbroken
+    jinja.filters["glued"] = lambda text: _unbroken(placed(str(text), findings.folder))
+    jinja.filters["words"] = _words
     scripts = [_own("plotly-basic.min.js"), _own("page.js")]
     panels: list[dict[str, Any]] = []
 
@@ -107,11 +108,18 @@ def _unbroken(text: str) -> Any:
         parts = [str(text)]
     for k, part in enumerate(parts):
         if k % 2:
-            parts[k] = f"<code>{escape(part)}</code>"
+            parts[k] = f"<code>{_words(part)}</code>"
         else:
             plain = re.sub(r"-(?=\d)|\|", "\\g<0>\u2060", glued(part))
             parts[k] = str(escape(typeset(plain)))
     return Markup("".join(parts))
+
+
+def _words(command: str) -> Any:
+    """Return markup in which a line is broken between the words of a command, not at hyphens."""
+    from markupsafe import Markup, escape
+
+    return Markup(" ".join(f"<span>{escape(word)}</span>" for word in command.split(" ")))
 
 
 @cache

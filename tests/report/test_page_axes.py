@@ -1,0 +1,99 @@
+"""Axes of the page's panels: what they show, and how their numbers are written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded.diagnosis.error_report import UtilityPrediction
+from grounded.diagnosis.report import Diagnosis, Verdict
+from grounded.figures.figure import Curve, log_ticks
+from grounded.result import spread
+from grounded_trials import Workspace
+from grounded_trials.report.diagnosis_words import utility_sentence
+from grounded_trials.report.figures.gap import _binned, residual_figures
+from grounded_trials.report.figures.runs import _timed, input_figure
+from grounded_trials.report.gathering import gather
+from grounded_trials.store.trial_file import write_trial
+from grounded_trials.workspace.folder import Folder
+from reported import cart, copied
+
+__all__ = ["cart"]
+
+
+def test_a_run_is_not_cut_off_for_little():
+    """A first run 1.4 times too large for the axis was cut off."""
+    t = np.linspace(0.0, 0.07, 20)
+    near, far = (
+        _timed("y", "m", [Curve(t, k * t, "model"), Curve(t, 0.02 * t, "best")], spare=50.0)
+        for k in (1.4, 9.0)
+    )
+    assert near.note == "" and near.y_range[1] >= 1.4 * t.max()
+    assert far.note and far.y_range[1] < 9.0 * t.max()
+
+
+def test_every_axis_has_a_name(cart):
+    for figure in residual_figures(gather(Folder(cart))):
+        assert all(panel.x_name and panel.y_name for panel in figure.panels), figure.name
+
+
+@pytest.mark.parametrize(
+    ("std", "text"),
+    [(8.8e-4, "0.00088"), (9.06e-5, "0.000091"), (4.4e-6, "0.0000044"), (3e-8, "3.0e-08"),
+     (0.02, "0.020"), (0.0, "0")],
+)  # fmt: skip
+def test_a_small_standard_deviation_has_no_power_of_ten(std, text):
+    """It stood beside a value without one: 0.0181 +- 8.8e-04."""
+    assert spread(std) == text
+
+
+def test_powers_of_ten_that_are_too_many_are_left_out():
+    """Eleven labels of an axis 240 px high touched each other."""
+    ticks = log_ticks(-10.0, 2.5)
+    assert len(ticks) <= 7 and ticks[0] < 1e-8 and ticks[-1] >= 1.0
+    assert np.allclose(np.diff(np.log10(ticks)), np.log10(ticks[1] / ticks[0]))
+
+
+def test_inputs_far_from_their_limits_are_drawn_without_them(cart):
+    """A rudder of 0.02 rad was a flat line between limits of 0.8 rad."""
+    findings = gather(Folder(cart))
+    task = findings.task
+    wide = replace(findings, task=replace(task, low=task.low * 0 - 1e3, high=task.high * 0 + 1e3))
+    (near,), (far,) = input_figure(findings).panels, input_figure(wide).panels
+    assert len(near.rules) == 2 and not near.note
+    assert not far.rules and "1,000" in far.note
+    low, high = far.y_range
+    values = np.concatenate([curve.y for curve in far.curves])
+    assert high - low < 1.5 * np.ptp(values)
+
+
+def test_a_diverged_prediction_of_the_utility_has_no_number():
+    """7.52e+07 stood where trials differ by 487."""
+    found = UtilityPrediction(before=7.52e7, after=12.0, spread=487.0, trials=4, feedback=True)
+    text = utility_sentence(Diagnosis(Verdict("effect"), utility_prediction=found))
+    assert "e+0" not in text and "over 49,000 (it diverges)" in text
+
+
+def test_a_line_of_means_does_not_follow_single_points():
+    rng = np.random.default_rng(0)
+    x = np.concatenate([rng.uniform(0.0, 1.0, 3000), np.linspace(2.0, 4.0, 12)])
+    y = np.where(np.arange(len(x)) % 2, 1.0, -1.0)
+    at, mean = _binned(x, y)
+    assert np.abs(mean[at < 3.5]).max() < 0.5 and at[-1] > 3.5
+
+
+def test_what_the_diagnosis_adds_is_drawn_for_a_log_without_trials(cart, tmp_path):
+    """A workspace of logs showed the crude model's residual, never that of the diagnosis."""
+    w = Workspace(copied(cart, tmp_path / "cart"))
+    data = replace(w.trials()[-1].trial, candidate="")
+    for k, name in enumerate(("a", "b")):
+        one = replace(data, states=data.states + 0.01 * k)
+        write_trial(w.folder / f"{name}.mcap", one, {"kind": "data"})
+        w.ingest(w.folder / f"{name}.mcap", data=True)
+    findings = gather(w)
+    assert [log.explained is not None for log in findings.logs] == [False, True]
+    over, rest = residual_figures(replace(findings, runs=()))
+    for figure in (over, rest):
+        assert all([c.role for c in panel.curves] == ["model", "best"] for panel in figure.panels)
