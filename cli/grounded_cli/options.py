@@ -44,6 +44,11 @@ def given(ctx: click.Context | None = None) -> str | None:
     return None if ctx is None else ctx.meta.get(_KEY)
 
 
+def located(folder: str) -> None:
+    """Print the running command's further commands with the -C of a folder that it made."""
+    click.get_current_context().meta[_KEY] = folder
+
+
 def as_json(function: F) -> F:
     """Add the option --json, passed as `json_`."""
     return click.option("--json", "json_", is_flag=True, help="Print one JSON document.")(function)

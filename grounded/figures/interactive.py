@@ -40,9 +40,12 @@ PAPER = {
     "text": ("#1a1a1a", "#e8e8e8"),
     "grid": ("#e3e3e3", "#31363b"),
     "paper": ("#ffffff", "#16181b"),
+    "near": ("#00224e", "#4a7cc0"),  # a shade from least to most: Cividis, lighter on black
+    "middle": ("#7c7b78", "#a8a69c"),
+    "far": ("#fee838", "#fee838"),
 }
+SHADES = [[0.0, "@near"], [0.5, "@middle"], [1.0, "@far"]]
 SYMBOLS = {"disc": "circle", "ring": "circle-open", "cross": "x-thin", "dash": "line-ew"}
-FONT = 12
 
 
 def plotted(panel: Panel | Bars, axis: str = "") -> dict[str, Any]:
@@ -85,7 +88,6 @@ def plotted(panel: Panel | Bars, axis: str = "") -> dict[str, Any]:
         _flat(panel, band.low, band.high, axis) | {"fillcolor": f"@{band.role}/{FAINT}"}
         for band in panel.bands
     ]
-    layout["annotations"] = [_note(panel.note, axis)] if panel.note else []
     return {"data": data, "layout": layout}
 
 
@@ -139,7 +141,7 @@ def _curve(panel: Panel, curve: Curve) -> dict[str, Any]:
 
 def _shaded(values: Array, name: str) -> dict[str, Any]:
     bar = {"title": {"text": name, "side": "right"}, "thickness": 12, "outlinewidth": 0}
-    return {"color": values, "size": 7, "colorscale": "Cividis", "showscale": True, "colorbar": bar}
+    return {"color": values, "size": 7, "colorscale": SHADES, "showscale": True, "colorbar": bar}
 
 
 def _dots(panel: Panel, dots: Sequence[Dot]) -> dict[str, Any]:
@@ -181,13 +183,6 @@ def _line(panel: Panel, y: float, role: str, axis: str) -> dict[str, Any]:
     look = {"color": f"@{role}", "width": 1.2, "dash": dash}
     return _flat(panel, y, y, axis) | {
         "type": "line", "line": look, "layer": "above",
-    }  # fmt: skip
-
-
-def _note(text: str, axis: str) -> dict[str, Any]:
-    return {
-        "text": text, "xref": f"x{axis} domain", "yref": f"y{axis} domain", "x": 1, "y": 1,
-        "xanchor": "right", "yanchor": "top", "showarrow": False, "font": {"size": FONT - 1},
     }  # fmt: skip
 
 
@@ -277,7 +272,7 @@ def notebook_figure(figures: Sequence[Figure], height: int = 300) -> Any:
     rows = -(-len(panels) // 2)
     if not panels:
         return Drawn()
-    titles = [panel.title for panel in panels]
+    titles = [_titled(panel) for panel in panels]
     made = make_subplots(rows=rows, cols=columns, subplot_titles=titles)
     named: set[tuple[str, str]] = set()
     for k, panel in enumerate(panels):
@@ -289,14 +284,17 @@ def notebook_figure(figures: Sequence[Figure], height: int = 300) -> Any:
             trace["legendgroup"] = trace.get("name", "")
             named.add(key)
             made.add_trace(trace)
-        shapes, notes = (found["layout"].pop(key, []) for key in ("shapes", "annotations"))
+        shapes = found["layout"].pop("shapes", [])
         made.update_layout(found["layout"])
         for shape in shapes:
             made.add_shape(shape)
-        for note in notes:
-            made.add_annotation(note)
     made.update_layout(height=rows * height + 80, template="plotly_white", title=_title(figures))
     return made
+
+
+def _titled(panel: Panel | Bars) -> str:
+    note = "" if isinstance(panel, Bars) else panel.note
+    return f"{panel.title}<br><sub>{note}</sub>" if note else panel.title
 
 
 def _title(figures: Sequence[Figure]) -> Mapping[str, str] | None:

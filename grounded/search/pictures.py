@@ -89,7 +89,7 @@ def _utility(
         rules.append(Rule(optimum, "accepted", "optimum"))
         values.append(optimum)
     best = now.incumbent
-    if best is not None and math.isfinite(best.standard_error):
+    if best is not None and 0 < best.standard_error < math.inf:
         error = 2 * best.standard_error
         note = f"{figure(best.utility)} ± {figure(error, 2)}: two standard errors of the best"
         bands.append(Band(best.utility - error, best.utility + error, "other", note))

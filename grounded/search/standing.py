@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from grounded.errors import NextCommand
-from grounded.result import Result, document, figure, html_table
+from grounded.result import Result, document, figure, html_table, spread
 from grounded.search.candidate import Candidate, Tried, Way
 from grounded.search.certainty import error_between, judged, last_improvement
 from grounded.search.step_size import SearchOptions, Step
@@ -170,7 +170,7 @@ def _row(tried: Tried, verdict: str) -> tuple[str, ...]:
         figure(tried.candidate.damping, 2) if tried.candidate.base else "-",
         figure(tried.candidate.predicted_utility),
         figure(tried.utility),
-        figure(tried.standard_error, 2),
+        spread(tried.standard_error),
         str(len(tried.trials)),
         verdict,
     )

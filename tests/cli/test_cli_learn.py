@@ -63,6 +63,9 @@ def test_demo_prints_utilities_trials_and_the_optimum(tmp_path):
     folder = tmp_path / found["workspace"]
     assert (folder / "grounded.toml").is_file() and (folder / "reports").is_dir()
     assert all((tmp_path / path).is_file() for path in found["paths"].values())
+    assert "`grounded -C made run best`" in process(
+        "demo", "pendulum", "--dir", "made", cwd=tmp_path
+    ).out.replace("\n           ", " ")
     again = process("demo", "pendulum", cwd=tmp_path)
     assert again.code == 1 and holds(again.err, found["workspace"], "--dir")
 

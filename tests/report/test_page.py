@@ -75,6 +75,11 @@ def test_page_is_well_formed_and_needs_nothing_else(cart):
     assert len(ids) == len(set(ids))
 
 
+def unwrapped(text: str) -> str:
+    """Return a page whose commands are not divided into words that are not broken."""
+    return text.replace("<span>", "").replace("</span>", "")
+
+
 def _panels(text: str) -> list[dict[str, Any]]:
     data = text.split('<script type="application/json" id="data">')[1].split("</script>")[0]
     return list(json.loads(data)["panels"])
@@ -271,12 +276,12 @@ def test_a_browser_breaks_no_quantity(cart, whole):
 
 
 def test_page_without_a_diagnosis_names_the_command(car):
-    assert "grounded diagnose" in page(replace(gather(Folder(car)), folder=None))
+    assert "grounded diagnose" in unwrapped(page(replace(gather(Folder(car)), folder=None)))
 
 
 def test_commands_name_the_workspace_as_it_was_named(car):
     findings = replace(gather(Folder(car)), folder="my robot")
-    text = page(findings)
+    text = unwrapped(page(findings))
     assert "<code>grounded diagnose" not in text
     assert text.count("grounded -C &#39;my robot&#39; diagnose") >= 2
     assert f"grounded -C &#39;my robot&#39; {findings.then.verb}" in text

@@ -6,18 +6,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_page import unwrapped
 
 from grounded.diagnosis.error_report import UtilityPrediction
 from grounded.diagnosis.report import Diagnosis, Verdict
 from grounded.figures.figure import Curve, log_ticks
+from grounded.figures.interactive import notebook_figure
 from grounded.result import spread
+from grounded.search.pictures import search_figure
 from grounded_trials import Workspace
 from grounded_trials.report.diagnosis_words import utility_sentence
 from grounded_trials.report.figures.gap import _binned, residual_figures
+from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import _timed, input_figure
 from grounded_trials.report.gathering import gather
+from grounded_trials.report.page.page import page
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.next_step import Since
 from reported import cart, copied
 
 __all__ = ["cart"]
@@ -63,7 +69,7 @@ def test_inputs_far_from_their_limits_are_drawn_without_them(cart):
     wide = replace(findings, task=replace(task, low=task.low * 0 - 1e3, high=task.high * 0 + 1e3))
     (near,), (far,) = input_figure(findings).panels, input_figure(wide).panels
     assert len(near.rules) == 2 and not near.note
-    assert not far.rules and "1,000" in far.note
+    assert not far.rules and "1000" in far.note
     low, high = far.y_range
     values = np.concatenate([curve.y for curve in far.curves])
     assert high - low < 1.5 * np.ptp(values)
@@ -97,3 +103,38 @@ def test_what_the_diagnosis_adds_is_drawn_for_a_log_without_trials(cart, tmp_pat
     over, rest = residual_figures(replace(findings, runs=()))
     for figure in (over, rest):
         assert all([c.role for c in panel.curves] == ["model", "best"] for panel in figure.panels)
+
+
+@pytest.mark.extra("notebook", "png")
+def test_a_note_stands_above_its_panel(cart):
+    """It covered the curves in pictures and notebooks."""
+    figure = residual_figures(gather(Folder(cart)))[1]
+    made = notebook_figure([figure])
+    notes = [panel.note for panel in figure.panels]
+    assert all(notes) and [a.y >= 1 or a.yref == "paper" for a in made.layout.annotations]
+    for note in notes:
+        assert sum(note in a.text for a in made.layout.annotations) == notes.count(note)
+    assert len(made.layout.annotations) == len(figure.panels)
+    assert len(png(figure)) > 10_000
+
+
+def test_a_standard_error_of_zero_has_no_band(cart):
+    """Its legend named a band that had no height."""
+    now = gather(Folder(cart)).standing
+    best = now.incumbent
+    for error, bands in ((0.0, 0), (0.1, 1)):
+        one = replace(now, incumbent=replace(best, deviation=error))
+        figure = search_figure(one)
+        assert len(figure.panels[0].bands) == bands
+        assert any(key.shape == "band" for key in figure.key) == bool(bands)
+
+
+def test_the_command_of_the_next_trial_names_the_workspace(cart):
+    """`grounded diagnose --probe` did not work from where the page was made, and broke at `--`."""
+    findings = gather(Folder(cart))
+    assert findings.diagnosis is not None
+    probe = "doublets (`grounded diagnose --probe` makes it)"
+    findings = replace(findings, since=Since(), folder="my robot")
+    text = page(replace(findings, diagnosis=replace(findings.diagnosis, next_trial=probe)))
+    assert "<span>--probe</span>" in text
+    assert "grounded -C &#39;my robot&#39; diagnose --probe" in unwrapped(text)

@@ -17,7 +17,7 @@ import pytest
 from cli import grounded
 from facts import holding
 from grounded_trials.report.gathering import gather
-from grounded_trials.report.recording.recording import rate, write_recording
+from grounded_trials.report.recording.recording import rate, summary, verdict, write_recording
 from grounded_trials.workspace.folder import Folder
 from pace import slowness
 from reported import car, cart, many_flights
@@ -188,3 +188,17 @@ def test_the_viewer_shows_the_paths(car, tmp_path):
     for colour in ((213, 94, 0), (86, 180, 233), (170, 170, 170)):  # model's policy, best, desired
         near = (np.abs(left - colour).max(axis=2) < 25).sum()
         assert near > 300, colour
+
+
+def test_the_texts_begin_with_the_next_command_and_name_a_crash(cart):
+    """`next:` was below the fold, and the utility of a crashed first run was -inf."""
+    findings = gather(Folder(cart))
+    lines = verdict(findings).splitlines()
+    assert lines[0] == f"next: `{findings.next_command}`" and len(lines) > 3
+    assert findings.first is not None
+    crashed = tuple(
+        replace(run, utility=-np.inf) if run is findings.first else run for run in findings.runs
+    )
+    text = summary(replace(findings, runs=crashed))
+    assert "inf" not in text and "failed by the model's policy" in text
+    assert "0 logs" not in text

@@ -11,7 +11,7 @@ import click
 
 from grounded.errors import GroundedError, NextCommand
 from grounded_cli.learn import narrated
-from grounded_cli.options import as_json, next_line
+from grounded_cli.options import as_json, located, next_line
 from grounded_cli.status import summary
 from grounded_cli.terminal import field, number, progress, remark, say, show, show_json
 from grounded_trials.wording import count, rendered
@@ -46,6 +46,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     if target.exists() and any(target.iterdir()):
         raise GroundedError(f"{target} is not empty: name another folder with --dir, or remove it")
     workspace = Workspace.create(target, example=name)
+    located(str(target))  # for the commands in its texts
     say(f"workspace {target}: {name}, a crude model and a simulated real system\n")
     status = narrated(workspace)
     with progress("finding the optimum with the true model"):
@@ -112,7 +113,7 @@ def _tell(document: dict[str, Any], verdict: list[str]) -> None:
         if kind in ("html", "rrd"):
             show(field(kind, path))
     if "rrd" in document["paths"]:
-        show(f"\n{next_line(NextCommand('view'), document['workspace'])}")
+        show(f"\n{next_line(NextCommand('view'))}")
     else:
         page = document["paths"].get("html")
         opened = f"open {page} in a browser, then " * bool(page)

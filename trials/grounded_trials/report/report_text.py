@@ -30,6 +30,7 @@ from grounded_trials.wording import (
     legend,
     per_second,
     rendered,
+    spread,
     wrapped,
 )
 from grounded_trials.workspace.next_step import DIAGNOSE
@@ -122,7 +123,7 @@ def _candidate(tried: Tried, verdict: str) -> tuple[str, ...]:
         f"{tried.candidate.alpha:g}",
         figure(tried.candidate.predicted_utility),
         figure(tried.utility),
-        figure(tried.standard_error, 2),
+        spread(tried.standard_error),
         str(len(tried.trials)),
         verdict,
     )

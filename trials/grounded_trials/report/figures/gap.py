@@ -24,7 +24,7 @@ LOGS = 2  # number of logs drawn; the table has all
 CHANNELS = 4  # number of states whose residuals are drawn
 POINTS = 1500  # points of a residual
 BINS = 24
-THIN = 200  # parts of the points: a bin with fewer is merged with the next one
+LEAST = 3  # points of a bin; one with fewer, or half as many as usual, is merged with the next
 LAGS_S, LAGS = 1.0, 60  # largest lag of the autocorrelation, in [s] and in steps
 LEAST_STEPS = 30  # shortest trial whose residual is drawn
 
@@ -223,7 +223,7 @@ def _binned(x: Array, y: Array) -> tuple[Array, Array]:
     edges = np.union1d(_edges(x), np.linspace(x.min(), x.max(), _bins(x) + 1))
     inner, before = [edges[0]], np.searchsorted(np.sort(x), edges)
     for edge, low in zip(edges[1:-2], before[1:-2], strict=True):
-        if low - np.sum(x < inner[-1]) >= len(x) / THIN:
+        if low - np.sum(x < inner[-1]) >= max(LEAST, len(x) / _bins(x) / 2):
             inner.append(edge)
     edges = np.array([*inner, *edges[-2:]])
     which = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, max(len(edges) - 2, 0))

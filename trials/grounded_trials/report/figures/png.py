@@ -30,6 +30,7 @@ POSES = 6  # drawn poses of a moving body
 DPI = 200
 MARKERS = {"disc": "o", "ring": "o", "cross": "x", "dash": "_"}
 TITLE = 52  # characters per line of a panel's title
+NOTE, NOTE_SIZE = 68, 8.0  # characters per line of a panel's note, and its size [pt]
 OTHERS = 3  # largest number of single trials named in a legend
 STYLE: Any = {
     "font.size": 9.0, "axes.titlesize": 9.5, "axes.titleweight": "bold",
@@ -47,7 +48,7 @@ def png(figure: Figure) -> bytes:
         GroundedError: if matplotlib is not installed.
     """
     needs("matplotlib", "png")
-    from matplotlib import rc_context
+    from matplotlib import rc_context, rcParams
     from matplotlib.figure import Figure as Sheet
 
     panels = figure.panels
@@ -61,7 +62,14 @@ def png(figure: Figure) -> bytes:
         for i, row in enumerate(rows):
             for j, panel in enumerate(row):
                 axes = sheet.add_subplot(grid[i, j])
-                axes.set_title(typeset(textwrap.fill(panel.title, TITLE)))
+                note = "" if isinstance(panel, Bars) else textwrap.fill(panel.note, NOTE)
+                room = 1.2 * NOTE_SIZE * (note.count("\n") + 1) if note else 0.0
+                title = typeset(textwrap.fill(panel.title, TITLE))
+                axes.set_title(title, pad=rcParams["axes.titlepad"] + room)
+                axes.annotate(
+                    typeset(note), (0, 1), (0, 3), "axes fraction", "offset points",
+                    fontsize=NOTE_SIZE, va="bottom",
+                )  # fmt: skip
                 if isinstance(panel, Bars):
                     _bars(axes, panel, most=round((heights[i] - HEAD) / ROW))
                 else:
@@ -135,10 +143,6 @@ def _panel(axes: Any, panel: Panel) -> None:
     if panel.loss:
         ticks = loss_ticks(*up)
         axes.set_yticks(panel.height(np.array(ticks)), [f"{v:g}" for v in ticks])
-    if panel.note:
-        axes.text(
-            0.99, 0.97, panel.note, transform=axes.transAxes, ha="right", va="top", fontsize=8
-        )
 
 
 def _curve(axes: Any, panel: Panel, curve: Curve) -> None:
@@ -148,10 +152,12 @@ def _curve(axes: Any, panel: Panel, curve: Curve) -> None:
     if curve.style == "points":
         few = len(curve.x) <= FEW
         look: dict[str, Any] = {"ms": 5.0, "alpha": 0.7} if few else {"ms": 2.5, "alpha": 0.4}
+        look |= {"ms": 9.0} if panel.log else {}
         axes.plot(curve.x, y, ".", color=_colour(curve.role), mew=0, **look)
         return
     how = "steps-post" if curve.style == "steps" else "default"
-    axes.plot(curve.x, y, drawstyle=how, **_line(curve.role, curve.width))
+    dots = {"marker": ".", "ms": 7.0} if panel.log else {}
+    axes.plot(curve.x, y, drawstyle=how, **_line(curve.role, curve.width), **dots)
     if curve.motion is not None and curve.trial and curve.role != "other":
         for row in np.linspace(0, len(curve.motion.times) - 1, POSES).astype(int):
             for line, thick in curve.motion.lines(row):

@@ -35,7 +35,7 @@ from grounded_trials.wording import figure, labelled, per_second, shown, with_un
 from grounded_trials.workspace.off_target import tracked, tracking_error
 
 FLAT = 0.2  # share of the limits' range below which inputs are drawn without the limits
-CUT = 3.0  # the axis is shortened only if all values span more than this times the calm ones
+CUT = 5.0  # the axis is shortened only if all values span more than this times the calm ones
 ITERATIONS = 5  # largest number of iterations whose bias is drawn
 
 
@@ -111,8 +111,8 @@ def input_figure(findings: Findings) -> Figure | None:
         limits = [float(v) for v in (task.low[j], task.high[j]) if np.isfinite(v)]
         sent = [curve.y for curve in curves]
         if np.ptp(fitted(sent)) < FLAT * np.ptp(fitted([*sent, np.array(limits)])):
-            note = f"{listed(figure(v, 3) for v in limits)}".replace("-", "−")
-            note = f"limit{'s' * (len(limits) > 1)} {with_unit(note, unit)}"
+            ends = listed(f"{v:g}" for v in limits).replace("-", "−")
+            note = f"limit{'s' * (len(limits) > 1)} {with_unit(ends, unit)}"
             panels.append(replace(_timed(name, unit, curves), note=note))
         else:
             panels.append(_timed(name, unit, curves, limits))

@@ -339,6 +339,7 @@
     }
   });
   addEventListener("resize", () => {
+    if (light) return;
     for (const plot of plots) if (plot.drawn && known(plot).kind === "bars") draw(plot);
   });
   night.addEventListener("change", () => { for (const plot of plots) if (plot.drawn) draw(plot); });

@@ -134,7 +134,6 @@ def _hash(script: str) -> str:
 def _data(panel: Panel | Bars) -> dict[str, Any]:
     kind = "bars" if isinstance(panel, Bars) else panel.kind
     found: dict[str, Any] = _plain(plotted(panel))
-    found["layout"].pop("annotations", None)  # a note stands in the caption
     if not isinstance(panel, Bars) and any(curve.motion for curve in panel.curves):
         found["motions"] = [_motion(curve.motion) for curve in panel.curves]
     return found | {"kind": kind}

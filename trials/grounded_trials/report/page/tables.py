@@ -23,7 +23,7 @@ from grounded_trials.report.findings import (
     rms,
 )
 from grounded_trials.report.forecast import forecast_error
-from grounded_trials.wording import figure, legend, percent, rendered, shown, with_unit
+from grounded_trials.wording import figure, legend, percent, rendered, shown, spread, with_unit
 from grounded_trials.workspace.next_step import Since
 
 UNKNOWN = "–, not determined by these trials"
@@ -84,7 +84,7 @@ def candidate_table(findings: Findings) -> list[Block]:
             "damping": figure(c.damping, 2) if c.base else "-",
             "predicted utility": figure(c.predicted_utility),
             "real utility": figure(tried.utility),
-            "std. error": figure(tried.standard_error, 2),
+            "std. error": spread(tried.standard_error),
             "verdict ": findings.standing.verdict(tried),
             "trials ": " ".join(t.id for t in tried.trials) or "none",
         }

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from grounded.figures.body import Body
+from grounded.figures.figure import typeset
 from grounded.frozen import Array
 from grounded_trials.report.bodies import is_mechanism, reach
 from grounded_trials.report.findings import Findings
 from grounded_trials.report.scene import Scene
-from grounded_trials.wording import labelled, per_second
+from grounded_trials.wording import figure, labelled, per_second
 
 FAR = 1.1  # distance of the camera, times the size of the contents
 ASIDE = 1.5  # the same for a mechanism, whose parts have a width
@@ -122,7 +123,9 @@ def _overview(findings: Findings, space: Space) -> Any:
     bars = rrb.BarChartView(origin="/utilities", name="Utility by iteration", plot_legend=hidden)
     words = rrb.TextDocumentView(origin="/summary", name="Summary")
     left = rrb.Vertical(
-        rrb.TextDocumentView(origin="/verdict", name="Why the model was wrong, what to run next"),
+        rrb.TextDocumentView(
+            origin="/verdict", name="What to run next, and why the model was wrong"
+        ),
         space.view(["/paths/**"], space.title),
         rrb.Horizontal(bars, words, column_shares=[1, 2]),
         row_shares=[4, 5, 3],
@@ -161,7 +164,7 @@ def _trials(findings: Findings, space: Space) -> list[Any]:
         names = dict(NAMES)
         if run.explained is not None:
             names["explained"] = "bias of the model as diagnosed"
-        about = f"{run.label}, utility {run.utility:.4g}"
+        about = f"{run.label}, utility {figure(run.utility)}"
         shown.append((f"/trials/{run.trial.id}", about, names, ["path", "predicted/**", "body/**"]))
     for log in findings.logs[-TRIALS:]:
         shown.append((f"/data/{log.trial.id}", f"{log.trial.id}, data", NAMES, ["path", "body/**"]))
@@ -178,4 +181,4 @@ def _plot(origin: str, name: str, legend: bool = True) -> Any:
     import rerun.blueprint as rrb
 
     key = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
-    return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=key)
+    return rrb.TimeSeriesView(origin=origin, name=typeset(name), plot_legend=key)

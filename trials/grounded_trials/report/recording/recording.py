@@ -17,6 +17,7 @@ of one workspace have the same id, so that they can be merged (`rerun rrd merge`
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +28,7 @@ import numpy as np
 from grounded.errors import GroundedError, needs
 from grounded.figures.body import Body, Part
 from grounded.figures.figure import COLOURS as PAGE
-from grounded.figures.figure import rgb
+from grounded.figures.figure import rgb, typeset
 from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.report.bodies import body_in
@@ -36,7 +37,7 @@ from grounded_trials.report.forecast import forecast
 from grounded_trials.report.recording.layout import Space, blueprint
 from grounded_trials.report.scene import scene_of
 from grounded_trials.report.settled import told
-from grounded_trials.wording import count, labelled, per_second, percent
+from grounded_trials.wording import count, figure, labelled, per_second, percent
 from grounded_trials.workspace.off_target import tracked
 
 COLOURS = {role: rgb(dark) for role, (_, dark) in PAGE.items()}
@@ -282,13 +283,14 @@ def rate(residual: Array, dt: float) -> tuple[Array, float]:
 
 
 def verdict(findings: Findings) -> str:
-    """Return the diagnosis in a few lines, each cause's share, and the next command (Markdown)."""
-    diagnosis, lines = findings.diagnosis, []
+    """Return the next command, the diagnosis in a few lines, and each cause's share (Markdown)."""
+    diagnosis, lines = findings.diagnosis, [f"next: `{findings.next_command}`\n"]
     if diagnosis is None:
         lines.append("not diagnosed yet\n")
     else:
         lines += [
-            f"{line}\n" for line in told(diagnosis, findings.task, findings.since, findings.settled)
+            f"{_marked(line)}\n"
+            for line in told(diagnosis, findings.task, findings.since, findings.settled)
         ]
         if diagnosis.credit:
             lines += ["| credit | | of the improvement of predictions |", "|---|---|---|"]
@@ -296,7 +298,12 @@ def verdict(findings: Findings) -> str:
             bar = "█" * max(1, round(BAR * one.share)) if one.share > 0 else ""
             lines.append(f"| {one.of} | {percent(one.share)} | {bar} |")
         lines.append("")
-    return "\n".join([*lines, f"next: `{findings.next_command}`"])
+    return "\n".join(lines)
+
+
+def _marked(text: str) -> str:
+    """Return a text with ± and ², and with the names of tables as code: lines broke after [."""
+    return str(typeset(re.sub(r"\[\w+\]", "`\\g<0>`", text)))
 
 
 def summary(findings: Findings) -> str:
@@ -305,21 +312,23 @@ def summary(findings: Findings) -> str:
     left = findings.left_runs + findings.left_logs
     lines = [
         f"**{findings.name}**, {task.model.name}: {task.horizon} steps of {task.dt:g} s, "
-        f"{count(len(findings.runs), 'trial')}, {count(len(findings.logs), 'log')} of data"
-        + f" (not shown: {left})"
-        * bool(left),
+        f"{count(len(findings.runs), 'trial')}"
+        + f", {count(len(findings.logs), 'log')} of data" * bool(findings.logs)
+        + f" (not shown: {left})" * bool(left),
         "",
     ]
     known = []
     if first is not None:
-        known.append(f"{first.utility:.4g} by the model's policy ({first.candidate.id})")
+        known.append(f"{figure(first.utility)} by the model's policy ({first.candidate.id})")
     if best is not None:
-        known.append(f"{best.utility:.4g} best so far ({best.candidate.id})")
+        known.append(f"{figure(best.utility)} best so far ({best.candidate.id})")
     if findings.optimum is not None:
-        known.append(f"{findings.optimum:.4g} at the optimum")
+        known.append(f"{figure(findings.optimum)} at the optimum")
     lines.append(f"utility {', '.join(known)}" if known else "no candidate has been run yet")
     lines += ["", "grey: desired; orange: model's policy; blue: best so far; pink: its prediction"]
-    lines += ["", f"**{findings.standing.outcome}**: {findings.standing.sentence}", ""]
+    if findings.better is not None and best is not None:
+        lines[-1] += f"; yellow: limits, and the bias that the model {findings.better.name} leaves"
+    lines += ["", f"**{findings.standing.outcome}**: {_marked(findings.standing.sentence)}", ""]
     lines += [f"**left out**: {one.file}: {one.reason}\n" for one in findings.lost]
     return "\n".join(lines)
 
