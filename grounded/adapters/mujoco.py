@@ -160,6 +160,11 @@ class MujocoStepper(Stepper):
         self._made = np.array([s.nominal for s in settings])  # its current parameters
         self._prepare()
 
+    @property
+    def timestep(self) -> float:
+        """The simulation's step [s]; a control step is a whole multiple of it."""
+        return self._own
+
     def _prepare(self) -> None:
         mj, compiled = library("mujoco"), self._model
         self._lock = threading.Lock()
