@@ -16,6 +16,7 @@ from grounded.instruments.sound_trials import sound_trials
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from real_systems import ACROBOT, BAM_KP, EMPS, SYSID
+from shared_data import needs_data
 
 PAIRS = list(combinations(range(6), 2))
 
@@ -63,6 +64,7 @@ def test_a_log_without_an_exchange_has_none(turn):
     assert exchanged_states(model, trial.until(12), range(6)) is None
 
 
+@needs_data
 @pytest.mark.parametrize(
     "system", [ACROBOT, BAM_KP, EMPS, SYSID], ids=["acrobot", "bam", "emps", "sysid"]
 )
@@ -72,6 +74,7 @@ def test_no_log_of_a_real_system_shows_an_exchange(system):
         assert exchanged_states(model, trial.until(trial.known_steps), range(model.n)) is None
 
 
+@needs_data
 def test_an_exchange_in_a_real_log_is_named():
     model, trial = ACROBOT.model, ACROBOT.read()[0]
     for pair in combinations(range(4), 2):
