@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import _timed, input_figure
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
+from grounded_trials.report.reporting import Report
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.next_step import Since
@@ -138,3 +140,23 @@ def test_the_command_of_the_next_trial_names_the_workspace(cart):
     text = page(replace(findings, diagnosis=replace(findings.diagnosis, next_trial=probe)))
     assert "<span>--probe</span>" in text
     assert "grounded -C &#39;my robot&#39; diagnose --probe" in unwrapped(text)
+
+
+@pytest.mark.extra("notebook")
+def test_notebooks_show_words_before_numbers(cart):
+    """Status and report were nested lists of raw keys; bars covered their neighbours' labels."""
+    w = Workspace(cart)
+    status, report = w.status(), Report(gather(w), ())
+    for found in (status, report):
+        text = re.sub("<details>.*?</details>", "", found._repr_html_(), flags=re.DOTALL)
+        assert "<table>" in text and "next: <code>grounded" in text
+        assert "predicted_utility" not in text and "standard_error" not in text
+    assert "nan" not in report._repr_html_()
+    drawn = report.findings.diagnosis.plot()
+    left, right = drawn.layout.xaxis.domain, drawn.layout.xaxis2.domain
+    bars = [panel for f in report.findings.diagnosis.figures() for panel in f.panels][1::2]
+    longest = max(len(bar.label) for panel in bars if hasattr(panel, "bars") for bar in panel.bars)
+    assert right[0] - left[1] == pytest.approx(min(0.4, max(0.12, 0.008 * longest)))
+    names = [trace.name for trace in status.plot().data if trace.showlegend is not False]
+    assert {"no better", "predicted by the model", "best so far"} <= set(names)
+    assert len(names) == len(set(names))
