@@ -46,7 +46,8 @@ PAPER = {
     "far": ("#fee838", "#fee838"),
 }
 SHADES = [[0.0, "@near"], [0.5, "@middle"], [1.0, "@far"]]
-LETTER, SPACE = 0.008, 100  # width of a letter as a share of a figure, space between rows [px]
+LETTER, WIDE = 0.008, 7  # width of a letter: share of a figure, and [px]
+SPACE = 100  # between rows [px]
 SYMBOLS = {"disc": "circle", "ring": "circle-open", "cross": "x-thin", "dash": "line-ew"}
 
 
@@ -275,12 +276,11 @@ def notebook_figure(figures: Sequence[Figure], height: int = 300) -> Any:
     if not panels:
         return Drawn()
     titles = [_titled(panel) for panel in panels]
-    letters = [len(bar.label) for p in panels[1::2] if isinstance(p, Bars) for bar in p.bars]
-    between = max(0.12, LETTER * max(letters, default=0))  # room for the labels of bars
+    left, right = (max((_letters(panel) for panel in panels[k::2]), default=0) for k in (0, 1))
     heights = [max(map(partial(_tall, height), panels[2 * k : 2 * k + 2])) for k in range(rows)]
     made = make_subplots(
         rows=rows, cols=columns, subplot_titles=titles, row_heights=heights,
-        horizontal_spacing=min(between, 0.4),
+        horizontal_spacing=min(max(0.12, LETTER * right), 0.4),
         vertical_spacing=SPACE / (sum(heights) + SPACE * rows),
     )  # fmt: skip
     named: set[tuple[str, str]] = set()
@@ -311,7 +311,8 @@ def notebook_figure(figures: Sequence[Figure], height: int = 300) -> Any:
             made.add_scatter(x=[None], y=[None], mode=mode, name=key.name, marker=look, line=line)
     total = sum(heights) + SPACE * rows + 80
     made.update_layout(
-        height=total, template="plotly_white", title=_title(figures), margin={"t": 90, "b": 40},
+        height=total, template="plotly_white", title=_title(figures),
+        margin={"t": 90, "b": 40, "l": max(80, WIDE * left)},
         legend={"orientation": "h", "yanchor": "top", "y": -70 / total}, showlegend=True,
     )  # fmt: skip
     return made
@@ -319,7 +320,16 @@ def notebook_figure(figures: Sequence[Figure], height: int = 300) -> Any:
 
 def _tall(height: int, panel: Panel | Bars) -> int:
     """Return the height of a panel's plot [px]."""
-    return max(20 * len(panel.bars), 60) if isinstance(panel, Bars) else height - SPACE
+    if not isinstance(panel, Bars):
+        return height - SPACE
+    lines = max((in_lines(bar.label).count("<br>") + 1 for bar in panel.bars), default=1)
+    return max((4 + 15 * lines) * len(panel.bars), 60)
+
+
+def _letters(panel: Panel | Bars) -> int:
+    """Return the length of the longest line of a label of bars."""
+    bars = panel.bars if isinstance(panel, Bars) else ()
+    return max((len(part) for bar in bars for part in in_lines(bar.label).split("<br>")), default=0)
 
 
 def _titled(panel: Panel | Bars) -> str:

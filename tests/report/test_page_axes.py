@@ -12,7 +12,7 @@ from test_page import unwrapped
 from grounded.diagnosis.error_report import UtilityPrediction
 from grounded.diagnosis.report import Diagnosis, Verdict
 from grounded.figures.figure import Curve, log_ticks
-from grounded.figures.interactive import notebook_figure
+from grounded.figures.interactive import in_lines, notebook_figure
 from grounded.result import spread
 from grounded.search.pictures import search_figure
 from grounded_trials import Workspace
@@ -155,7 +155,8 @@ def test_notebooks_show_words_before_numbers(cart):
     drawn = report.findings.diagnosis.plot()
     left, right = drawn.layout.xaxis.domain, drawn.layout.xaxis2.domain
     bars = [panel for f in report.findings.diagnosis.figures() for panel in f.panels][1::2]
-    longest = max(len(bar.label) for panel in bars if hasattr(panel, "bars") for bar in panel.bars)
+    labels = [bar.label for panel in bars if hasattr(panel, "bars") for bar in panel.bars]
+    longest = max(len(line) for label in labels for line in in_lines(label).split("<br>"))
     assert right[0] - left[1] == pytest.approx(min(0.4, max(0.12, 0.008 * longest)))
     names = [trace.name for trace in status.plot().data if trace.showlegend is not False]
     assert {"no better", "predicted by the model", "best so far"} <= set(names)

@@ -77,7 +77,8 @@
     const { data: [bars], layout: { yaxis } } = known(plot);
     pen.font = '12px "Open Sans", verdana, arial, sans-serif';
     const wide = (text) => pen.measureText(text).width + 8;
-    const inner = (light ? SHEET : plot.clientWidth) - 24 - Math.max(...yaxis.ticktext.map(wide));
+    const labels = yaxis.ticktext.flatMap((text) => text.split("<br>"));
+    const inner = (light ? SHEET : plot.clientWidth) - 24 - Math.max(...labels.map(wide));
     const most = Math.max(...bars.x.map(Math.abs)) || 1;
     const ends = (scale) => {
       const reached = bars.text.map((text, i) => bars.x[i] * scale + (bars.x[i] < 0 ? -1 : 1) * wide(text));
