@@ -134,10 +134,12 @@
     if (!Object.keys(change).some((key) => /^[xy]axis/.test(key))) return;
     plot.zoomed = true;
     if (kind !== "time" && kind !== "forecast") return;
-    const range = plot.layout.xaxis.range, figure = plot.closest(".figure");
+    const own = plot.layout.xaxis.range, figure = plot.closest(".figure");
+    const { home } = known(plot), whole = own[0] === home[0] && own[1] === home[1]; // each has its own
     for (const other of kind === "time" ? plots : all(".plot", figure)) {
       if (other === plot || panels[other.dataset.panel].kind !== kind) continue;
       const { xaxis } = other.drawn ? other.layout : known(other).layout;
+      const range = whole ? known(other).home : own;
       if (xaxis.range[0] === range[0] && xaxis.range[1] === range[1]) continue;
       if (other.drawn) Plotly.relayout(other, { "xaxis.range": [...range] });
       else xaxis.range = [...range];
