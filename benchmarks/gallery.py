@@ -175,21 +175,20 @@ def page_of(name: str, place: Path) -> Path:
     """Learn, diagnose and write the report."""
     folder = place / name
     if name in DEMOS:
-        ours("demo", name, "--dir", str(folder))
+        ours(place, "demo", name, "--dir", name)
     else:
         folder.mkdir()
         MADE[name](folder)
         brief = ["--trials", "t0001,t0002", "--max-effects", "2"] if name == "arm" else []
         for words in (["learn"], ["diagnose", *brief], ["report", "--html"]):
-            ours("-C", str(folder), *words)
+            ours(place, "-C", name, *words)
     return folder / "reports" / "report.html"
 
 
-def ours(*words: str) -> None:
-    """Run a grounded command."""
-    done = subprocess.run(
-        [sys.executable, "-m", "grounded_cli.main", *words], capture_output=True, text=True
-    )
+def ours(place: Path, *words: str) -> None:
+    """Run a grounded command in a folder, so that the page names the workspace without a path."""
+    command = [sys.executable, "-m", "grounded_cli.main", *words]
+    done = subprocess.run(command, cwd=place, capture_output=True, text=True)
     if done.returncode:
         sys.exit(f"grounded {' '.join(words)}: {done.stderr}")
 

@@ -274,7 +274,9 @@ def _table(value: Any) -> str:
             if item not in (None, [], {}, "")
         )
         return f"<table>{rows}</table>"
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         shown = [_table(item) for item in value[:12]]
         return "<br>".join(shown + ["..."] * (len(value) > 12))
-    return escape(f"{value:.4g}" if isinstance(value, float) else str(value))
+    if isinstance(value, float):
+        return "-" if math.isnan(value) else escape(f"{value:.4g}")
+    return escape(str(value))

@@ -31,7 +31,7 @@ def give_or_take(estimate: Estimate) -> str:
         return quantity(estimate)
     places = math.floor(math.log10(max(abs(value), std))) - math.floor(math.log10(std)) + 2
     digits = min(max(places, 3), MOST_DIGITS)
-    scatter = spread(std) if std < 1e-4 else f"{std:.2g}"
+    scatter = spread(std) if 1e-6 <= std < 1e-4 else f"{std:.2g}"
     return with_unit(f"{value:.{digits}g} +- {scatter}", estimate.unit)
 
 

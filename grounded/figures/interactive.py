@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,8 @@ PAPER = {
     "far": ("#fee838", "#fee838"),
 }
 SHADES = [[0.0, "@near"], [0.5, "@middle"], [1.0, "@far"]]
+LETTER, WIDE = 0.008, 7  # width of a letter: share of a figure, and [px]
+SPACE = 100  # between rows [px]
 SYMBOLS = {"disc": "circle", "ring": "circle-open", "cross": "x-thin", "dash": "line-ew"}
 
 
@@ -273,23 +276,60 @@ def notebook_figure(figures: Sequence[Figure], height: int = 300) -> Any:
     if not panels:
         return Drawn()
     titles = [_titled(panel) for panel in panels]
-    made = make_subplots(rows=rows, cols=columns, subplot_titles=titles)
+    left, right = (max((_letters(panel) for panel in panels[k::2]), default=0) for k in (0, 1))
+    heights = [max(map(partial(_tall, height), panels[2 * k : 2 * k + 2])) for k in range(rows)]
+    made = make_subplots(
+        rows=rows, cols=columns, subplot_titles=titles, row_heights=heights,
+        horizontal_spacing=min(max(0.12, LETTER * right), 0.4),
+        vertical_spacing=SPACE / (sum(heights) + SPACE * rows),
+    )  # fmt: skip
     named: set[tuple[str, str]] = set()
     for k, panel in enumerate(panels):
         found = coloured(plotted(panel, str(k + 1) if k else ""))
         for trace in found["data"]:
+            known = (str(trace.get("line")), trace.get("name", ""))
+            context = trace["meta"]["role"] == "other" and trace["meta"]["trial"]
+            trace["showlegend"] = bool(trace.get("name")) and known not in named and not context
             trace["meta"] = None
-            key = (str(trace.get("line")), trace.get("name", ""))
-            trace["showlegend"] = bool(trace.get("name")) and key not in named
+            if "colorbar" in trace.get("marker", {}):
+                trace["marker"]["showscale"] = False  # it would be as high as all rows together
             trace["legendgroup"] = trace.get("name", "")
-            named.add(key)
+            named.add(known)
             made.add_trace(trace)
         shapes = found["layout"].pop("shapes", [])
         made.update_layout(found["layout"])
         for shape in shapes:
             made.add_shape(shape)
-    made.update_layout(height=rows * height + 80, template="plotly_white", title=_title(figures))
+    keys = {(k.role, k.name): k for figure in figures for k in figure.key if not k.trial}
+    for key in keys.values():
+        if all(key.name != name for _, name in named):  # marks have no names of their own
+            colour = coloured(f"@{key.role}")
+            mode = "markers" if key.shape in SYMBOLS else "lines"
+            look = {"symbol": SYMBOLS.get(key.shape), "size": 9, "color": colour}
+            look["line"] = {"width": 2, "color": colour}
+            line = {"color": colour, "width": 10 if key.shape == "band" else 2}
+            made.add_scatter(x=[None], y=[None], mode=mode, name=key.name, marker=look, line=line)
+    total = sum(heights) + SPACE * rows + 80
+    made.update_layout(
+        height=total, template="plotly_white", title=_title(figures),
+        margin={"t": 90, "b": 40, "l": max(80, WIDE * left)},
+        legend={"orientation": "h", "yanchor": "top", "y": -70 / total}, showlegend=True,
+    )  # fmt: skip
     return made
+
+
+def _tall(height: int, panel: Panel | Bars) -> int:
+    """Return the height of a panel's plot [px]."""
+    if not isinstance(panel, Bars):
+        return height - SPACE
+    lines = max((in_lines(bar.label).count("<br>") + 1 for bar in panel.bars), default=1)
+    return max((4 + 15 * lines) * len(panel.bars), 60)
+
+
+def _letters(panel: Panel | Bars) -> int:
+    """Return the length of the longest line of a label of bars."""
+    bars = panel.bars if isinstance(panel, Bars) else ()
+    return max((len(part) for bar in bars for part in in_lines(bar.label).split("<br>")), default=0)
 
 
 def _titled(panel: Panel | Bars) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from test_page import unwrapped
 from grounded.diagnosis.error_report import UtilityPrediction
 from grounded.diagnosis.report import Diagnosis, Verdict
 from grounded.figures.figure import Curve, log_ticks
-from grounded.figures.interactive import notebook_figure
+from grounded.figures.interactive import in_lines, notebook_figure
 from grounded.result import spread
 from grounded.search.pictures import search_figure
 from grounded_trials import Workspace
@@ -21,6 +22,7 @@ from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import _timed, input_figure
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
+from grounded_trials.report.reporting import Report
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.next_step import Since
@@ -138,3 +140,24 @@ def test_the_command_of_the_next_trial_names_the_workspace(cart):
     text = page(replace(findings, diagnosis=replace(findings.diagnosis, next_trial=probe)))
     assert "<span>--probe</span>" in text
     assert "grounded -C &#39;my robot&#39; diagnose --probe" in unwrapped(text)
+
+
+@pytest.mark.extra("notebook")
+def test_notebooks_show_words_before_numbers(cart):
+    """Status and report were nested lists of raw keys; bars covered their neighbours' labels."""
+    w = Workspace(cart)
+    status, report = w.status(), Report(gather(w), ())
+    for found in (status, report):
+        text = re.sub("<details>.*?</details>", "", found._repr_html_(), flags=re.DOTALL)
+        assert "<table>" in text and "next: <code>grounded" in text
+        assert "predicted_utility" not in text and "standard_error" not in text
+    assert "nan" not in report._repr_html_()
+    drawn = report.findings.diagnosis.plot()
+    left, right = drawn.layout.xaxis.domain, drawn.layout.xaxis2.domain
+    bars = [panel for f in report.findings.diagnosis.figures() for panel in f.panels][1::2]
+    labels = [bar.label for panel in bars if hasattr(panel, "bars") for bar in panel.bars]
+    longest = max(len(line) for label in labels for line in in_lines(label).split("<br>"))
+    assert right[0] - left[1] == pytest.approx(min(0.4, max(0.12, 0.008 * longest)))
+    names = [trace.name for trace in status.plot().data if trace.showlegend is not False]
+    assert {"no better", "predicted by the model", "best so far"} <= set(names)
+    assert len(names) == len(set(names))

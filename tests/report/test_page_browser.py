@@ -84,7 +84,7 @@ def test_time_panels_zoom_together(opened):
     for other in ("states-3", "error-0", "inputs-1"):
         assert _range(opened, other) == pytest.approx([low, high])
     assert _range(opened, "paths-0")[0] < 0  # a path's axes are no time
-    opened.key("states-0", "0")
+    opened.key("bias-0", "0")  # whose time ends a step earlier
     assert _range(opened, "states-3") == pytest.approx(home)
 
 

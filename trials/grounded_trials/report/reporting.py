@@ -40,6 +40,22 @@ class Report(Result):
         trials = len(self.findings.runs) + self.findings.left_runs
         return ", ".join([f"{trials} trials", *map(str, self.paths)])
 
+    def _repr_html_(self) -> str:
+        """Return the candidates, the diagnosis in three lines and the next command as HTML."""
+        from html import escape
+
+        from grounded.figures.figure import typeset
+        from grounded_trials.report.settled import told
+
+        findings, diagnosis = self.findings, self.findings.diagnosis
+        said: list[str] = []
+        if diagnosis is not None:
+            said = told(diagnosis, findings.task, findings.since, findings.settled)
+        lines = "".join(f"<p>{escape(typeset(line))}</p>" for line in said)
+        lines += f"<p>next: <code>{escape(findings.next_command)}</code></p>"
+        whole = f"<details><summary>All numbers</summary>{super()._repr_html_()}</details>"
+        return f"{findings.standing._repr_html_()}{lines}{whole}"
+
     def figures(self) -> Sequence[Figure]:
         """Return all figures of the page."""
         from grounded_trials.report.figures.runs import all_figures

@@ -75,6 +75,13 @@ class Status(Result):
         """Return the phase and the best candidate."""
         return self.standing.summary()
 
+    def _repr_html_(self) -> str:
+        """Return the candidates, the outcome and the next command as HTML."""
+        from html import escape
+
+        then = escape(rendered(self.then))
+        return f"{self.standing._repr_html_()}<p>next: <code>{then}</code></p>"
+
     def figures(self) -> Sequence[Figure]:
         """Return the figure of the utility by candidate."""
         return self.standing.figures()

@@ -77,7 +77,8 @@
     const { data: [bars], layout: { yaxis } } = known(plot);
     pen.font = '12px "Open Sans", verdana, arial, sans-serif';
     const wide = (text) => pen.measureText(text).width + 8;
-    const inner = (light ? SHEET : plot.clientWidth) - 24 - Math.max(...yaxis.ticktext.map(wide));
+    const labels = yaxis.ticktext.flatMap((text) => text.split("<br>"));
+    const inner = (light ? SHEET : plot.clientWidth) - 24 - Math.max(...labels.map(wide));
     const most = Math.max(...bars.x.map(Math.abs)) || 1;
     const ends = (scale) => {
       const reached = bars.text.map((text, i) => bars.x[i] * scale + (bars.x[i] < 0 ? -1 : 1) * wide(text));
@@ -133,10 +134,12 @@
     if (!Object.keys(change).some((key) => /^[xy]axis/.test(key))) return;
     plot.zoomed = true;
     if (kind !== "time" && kind !== "forecast") return;
-    const range = plot.layout.xaxis.range, figure = plot.closest(".figure");
+    const own = plot.layout.xaxis.range, figure = plot.closest(".figure");
+    const { home } = known(plot), whole = own[0] === home[0] && own[1] === home[1]; // each has its own
     for (const other of kind === "time" ? plots : all(".plot", figure)) {
       if (other === plot || panels[other.dataset.panel].kind !== kind) continue;
       const { xaxis } = other.drawn ? other.layout : known(other).layout;
+      const range = whole ? known(other).home : own;
       if (xaxis.range[0] === range[0] && xaxis.range[1] === range[1]) continue;
       if (other.drawn) Plotly.relayout(other, { "xaxis.range": [...range] });
       else xaxis.range = [...range];
