@@ -91,9 +91,8 @@ def _curve(site: Site) -> tuple[Quantity, ...]:
 
 def _curved(u: Array, t: Array, c: Mapping[str, Any]) -> Array:
     size, mid = np.abs(u / c["U"]), (1 + c["L"] / c["U"]) / 2
-    curved: Array = (1 + c["b"] * (size - mid) / (1 - c["L"] / c["U"])) * u
-    curved = curved + c["a"] * c["U"] * size
-    return curved
+    gain = 1 + c["b"] * (size - mid) / (1 - c["L"] / c["U"])
+    return np.asarray(gain * u + c["a"] * c["U"] * size)
 
 
 def _end_to_end(name: str, value: float) -> float:

@@ -248,7 +248,7 @@ def identifiable(
     model, found = predictor.data.model, []
     names = [model.param_names[i] for i in calibrated(predictor.data)]
     priors = np.array([model.params[name].spread for name in names])
-    jointly = _jointly(np.asarray(cov, float), names, priors, model, known)
+    jointly = _jointly(cov, names, priors, model, known)
     held_ = [i for i, name in enumerate(names) if known and name not in known]
     for i, name in enumerate(names):
         std = known[name].std if name in known else 0.0

@@ -78,6 +78,9 @@ class Ruler:
         count = -(-data.valid.sum(axis=1).astype(int) // self.steps[-1])
         self.piece0 = np.cumsum([0, *np.maximum(count, 1)])  # first piece of each run, and the end
         self.run_of: Any = np.repeat(np.arange(len(count)), np.diff(self.piece0))
+        self.single = len(data.used) == 1
+        # runs of one group count as one: those of a trial; in a single log, each for itself
+        self.group: Any = np.arange(len(count)) if self.single else data.trial_of
         self.fine_whole = self.fine  # over whole trials
         self._measured: dict[int, tuple[Fitted, Errors]] = {}
 
@@ -229,9 +232,9 @@ class Ruler:
             whole.sum(axis=(0, 1)) / counts,
             _jackknife(by / counts),
             self._pieces(before, after),
-            self.run_of if len(self.data.used) == 1 else self.data.trial_of[self.run_of],
-            self._by_trial(before, after),
-            len(self.data.used) == 1,
+            self.group[self.run_of],
+            self._by_group(before, after),
+            self.single,
         )
 
     def _matters(self) -> Array:
@@ -246,18 +249,11 @@ class Ruler:
         usual = n * (b.sum(axis=1, keepdims=True) / all_n + self.fine[self.shown] ** 2) + 1e-300
         return np.asarray((n / all_n * np.log((a + usual) / (b + usual))).sum(axis=(0, 2)))
 
-    def _by_trial(self, before: Errors, after: Errors) -> Array:
-        """Return the gain of each trial separately, the mean over channels and horizons, (S,).
-
-        Of a single trial, return that of each run.
-        """
-        of, used = self.data.trial_of, self.data.used
-        runs_count = np.arange(len(of))
-        trials = (
-            [runs_count == b for b in runs_count] if len(used) == 1 else [of == i for i in used]
-        )
+    def _by_group(self, before: Errors, after: Errors) -> Array:
+        """Return the gain of each group separately, the mean over channels and horizons, (S,)."""
+        groups = [self.group == i for i in np.unique(self.group)]
         runs = [self.by_run(e[..., self.shown]) for e in (before.total, after.total, before.count)]
-        a, b, n = (np.stack([e[:, own].sum(axis=1) for own in trials]) for e in runs)
+        a, b, n = (np.stack([e[:, own].sum(axis=1) for own in groups]) for e in runs)
         least, seen = n * self._matters() ** 2 + 1e-300, n > 0
         each = np.where(seen, 0.5 * np.log((a + least) / (b + least)), 0.0)
         return np.asarray(each.sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1))
