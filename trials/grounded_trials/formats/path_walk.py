@@ -293,7 +293,7 @@ def _apply(node: Node, functions: Sequence[Function]) -> tuple[Ints, Floats]:
     """Return the values at the end of a path after its functions, as (rows, values)."""
     first, rest = (functions[0].name, functions[1:]) if functions else ("", ())
     if first in ANGLES:
-        rows, values = node.rows, _angle(first, [_part(node, name) for name in QUATERNION])
+        rows, values = node.rows, _angle(first, node)
     elif first in AXES:
         rows, values = node.rows, _in_world(node, AXES.index(first))
     elif first == "norm":
@@ -316,11 +316,17 @@ def _part(node: Node, *names: str) -> Floats:
     return values
 
 
-def _angle(name: str, quaternion: list[Floats]) -> Floats:
-    """Return roll, pitch or yaw [rad] for R = Rz(yaw) Ry(pitch) Rx(roll); NaN for zero."""
+def _turn(node: Node, *names: str) -> list[Floats]:
+    """Return the quaternion (x, y, z, w) that names lead to, of length 1; NaN for zero."""
+    quaternion = [_part(node, *names, name) for name in QUATERNION]
     with np.errstate(invalid="ignore", divide="ignore"):
         norm = np.sqrt(sum(q**2 for q in quaternion))
-        x, y, z, w = (q / norm for q in quaternion)
+        return [q / norm for q in quaternion]
+
+
+def _angle(name: str, node: Node) -> Floats:
+    """Return roll, pitch or yaw [rad] for R = Rz(yaw) Ry(pitch) Rx(roll); NaN for zero."""
+    x, y, z, w = _turn(node)
     if name == "pitch":
         return np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
     if name == "roll":
@@ -330,10 +336,7 @@ def _angle(name: str, quaternion: list[Floats]) -> Floats:
 
 def _in_world(node: Node, axis: int) -> Floats:
     """Return one axis of R v, with R of the pose and v along the robot's axes [m/s]."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        q = [_part(node, *TURNED, name) for name in QUATERNION]
-        norm = np.sqrt(sum(part**2 for part in q))
-        x, y, z, w = (part / norm for part in q)
+    x, y, z, w = _turn(node, *TURNED)
     v = [_part(node, *MOVING, name) for name in AXES]
     row = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),

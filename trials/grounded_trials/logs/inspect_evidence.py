@@ -81,12 +81,13 @@ def weigh(
     measured = joint_units(joints)
     guesses = {name: _unit(guess, units[name], measured) for name, guess in guesses.items()}
     guesses |= _by_unit(guesses, model)
-    guesses |= _not_followed(guesses, model, log)
-    guesses |= _speed_asked(guesses, model, log)
     turning = [guesses[name] for name in model.state_names if units[name] in ("rad", "deg")]
     stated = Stated.by(log.files)
     angles = {p for g in turning for p in (g.path, *g.others)}
     signals = Signals(log, guesses.values(), angles, stated)
+    guesses |= _not_followed(guesses, model, log, signals)
+    guesses |= _speed_asked(guesses, model, log)
+    signals.read([p for g in guesses.values() for p in (g.path, *g.others) if p])
     guesses |= _speed(guesses, model, signals)
     pairs = [(q, w) for q, w in velocities(model).items() if q in guesses and w in guesses]
     for pair in sorted(pairs, key=lambda qw: not any(guesses[name].path for name in qw)):
@@ -180,7 +181,9 @@ def _by_unit(guesses: Mapping[str, Guess], model: Model) -> dict[str, Guess]:
     return found
 
 
-def _not_followed(guesses: Mapping[str, Guess], model: Model, log: LogReport) -> dict[str, Guess]:
+def _not_followed(
+    guesses: Mapping[str, Guess], model: Model, log: LogReport, signals: Signals
+) -> dict[str, Guess]:
     """Ask for the command of an angle if the angle does not follow it: a Pose may hold torques."""
     found = {}
     taken = {guesses[name].path for name in model.state_names}
@@ -188,7 +191,7 @@ def _not_followed(guesses: Mapping[str, Guess], model: Model, log: LogReport) ->
         guess, angle = guesses[name], guesses.get(without_role(name))
         if angle is None or not angle.path or not guess.is_angle or angle.name == name:
             continue
-        both = Signals(log, (guess, angle), (), Stated.by(log.files)).grid((angle.path, guess.path))
+        both = signals.grid((angle.path, guess.path))
         if both is not None and (value := _lagged(both[0], *both[1])) < FOLLOWS:
             asked = commands_of(log, replace(guess, path="", sure=False, field=None), taken)
             why = f"{angle.name} does not follow {guess.path} (correlation {value:.2f})"

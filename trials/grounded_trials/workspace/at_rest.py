@@ -112,14 +112,13 @@ def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> A
     middle, inside = task.past.copy(), np.isfinite(task.high - task.low)
     middle[inside] = 0.5 * (task.low[inside] + task.high[inside])
     for first in [*(task.past + move for move in BEGUN), middle]:
-        begun = np.clip(first, task.low, task.high)
-        one = replace(loose or task, target=still, input_target=None, past=begun)
-        x, u = (found[0] for found in trim(one, still, ~free))
-        exact = replace(one, model=task.model, smoothing=0.0, past=u)  # a curved input's kink at 0
-        x, u = (found[0] for found in trim(exact, np.stack([x, still[1]]), ~free))
-        moved = np.abs(moved_at_start(replace(task, start=x), u))[~clocks]
-        if (moved <= STILL * away).all():
-            return np.append(x, u)
+        x, u = still[0], np.clip(first, task.low, task.high)
+        for one in (loose or task, replace(task, smoothing=0.0)):  # a kink at 0, once near the rest
+            one = replace(one, target=still, input_target=None, past=u)
+            x, u = (found[0] for found in trim(one, np.stack([x, still[1]]), ~free))
+            moved = np.abs(moved_at_start(replace(task, start=x), u))[~clocks]
+            if (moved <= STILL * away).all():
+                return np.append(x, u)
     return None
 
 
