@@ -76,7 +76,8 @@ class Drone:
         self.model = mujoco.MjModel.from_xml_string(XML)
         self.data = mujoco.MjData(self.model)
         self.torque, self.thrust = np.zeros(3), MASS * 9.81
-        self.command, self.waiting = np.array([0.0, 0.0, 0.0, 0.667]), []  # type: ignore[var-annotated]
+        self.command = np.array([0.0, 0.0, 0.0, 0.667])
+        self.waiting: list[tuple[float, np.ndarray]] = []
 
     def send(self, command: Command) -> None:
         self.waiting.append((self.data.time + WITHHELD["delay"], np.asarray(command, float)))

@@ -65,8 +65,8 @@ def command(
     robot with one axis, goes from [task] start to rest, in the states' own units; --seconds,
     --speed and --accel set its pace. A step begins at [task] start. A swing-up brings the first
     angle that hangs under its weight upright; --to names another angle, or more states. A path
-    begins at [task] start; what --to names, such as the height of a drone, keeps its value. With
-    --hold a path ends at rest and stays there.
+    begins at the position in [task] start, along x; what --to names, such as the height of a drone,
+    keeps its value. With --hold a path ends at rest and stays there.
 
     The previous target is kept as target.csv.bak. [task] horizon is updated, and so are the weights
     in [reward] state unless you chose them, and input_change of inputs with [limits] if it is

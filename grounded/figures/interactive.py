@@ -218,6 +218,11 @@ def in_lines(label: str) -> str:
     return "<br>".join(line.rstrip() for line in lines)
 
 
+def label_lines(panel: Bars) -> int:
+    """Return in how many lines the longest label of bars is broken."""
+    return max((in_lines(bar.label).count("<br>") + 1 for bar in panel.bars), default=1)
+
+
 def coloured(value: Any, dark: bool = False) -> Any:
     """Replace the roles in a plotted value by colours."""
     if isinstance(value, dict):
@@ -322,8 +327,7 @@ def _tall(height: int, panel: Panel | Bars) -> int:
     """Return the height of a panel's plot [px]."""
     if not isinstance(panel, Bars):
         return height - SPACE
-    lines = max((in_lines(bar.label).count("<br>") + 1 for bar in panel.bars), default=1)
-    return max((4 + 15 * lines) * len(panel.bars), 60)
+    return max((4 + 15 * label_lines(panel)) * len(panel.bars), 60)
 
 
 def _letters(panel: Panel | Bars) -> int:

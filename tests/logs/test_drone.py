@@ -112,26 +112,3 @@ def test_a_hover_in_wind_is_found_though_its_limits_leave_out_zero(tmp_path):
     (note,) = [n for n in workspace.propose().proposal.notes if "the plan assumes" in n]
     thrust = float(re.search(r"start = .*thrust = ([\d.]+)", note)[1])
     assert thrust == pytest.approx(0.5 / np.cos(np.arctan(0.3 / 9.81)), abs=2e-3)
-
-
-def test_a_level_flight_looks_level_in_the_view_from_the_side(tmp_path):
-    """Scaled to the sensor's noise of millimetres, a level flight looked like a storm."""
-    from grounded.figures.figure import Curve
-    from grounded_trials.report.figures.paths import _level
-
-    x, noise = np.linspace(-2, 2, 50), 0.01 * np.sin(np.arange(50))
-    low, high = _level([Curve(x, 2 + noise, "best", "", 1.0)])
-    assert high - low == pytest.approx(0.4, rel=0.05) and low < 2 < high
-    assert _level([Curve(x, x, "best", "", 1.0)]) is None
-
-
-def test_long_names_are_broken_where_they_are_joined():
-    """In a small panel they were cut, and so were the values behind the bars."""
-    from grounded.figures.interactive import LONG, in_lines
-
-    whole = "without delay:roll_command+pitch_command+thrust"
-    lines = in_lines(whole).split("<br>")
-    assert max(map(len, lines)) <= LONG and "".join(lines).replace(" ", "") == whole.replace(
-        " ", ""
-    )
-    assert in_lines("without calibration") == "without calibration"

@@ -36,7 +36,7 @@ from grounded.figures.figure import (
     thinned,
     without_astray,
 )
-from grounded.figures.interactive import PAPER, coloured, packed, plotted
+from grounded.figures.interactive import LONG, PAPER, coloured, in_lines, packed, plotted
 from grounded.model import Model
 from grounded.models import pendulum
 from grounded.rollout import simulate
@@ -45,7 +45,7 @@ from grounded.search.pictures import search_figure
 from grounded.search.planner import Planner
 from grounded.trial import Trial
 from grounded_trials.report.figures.gap import _binned, forecast_figures, residual_figures
-from grounded_trials.report.figures.paths import path_figure
+from grounded_trials.report.figures.paths import _level, path_figure
 from grounded_trials.report.figures.png import _bars, png
 from grounded_trials.report.figures.runs import all_figures, error_figure, input_figure
 from grounded_trials.report.forecast import forecast, forecast_error
@@ -559,3 +559,21 @@ def test_both_compared_paths_are_drawn_where_both_were_run_twice(car, tmp_path):
     roles = [curve.role for curve in figure.panels[0].curves if curve.style == "line"]
     assert len(own) == 2 and roles.count("model") == roles.count("best") == 1
     assert roles.count("other") == len(runs)
+
+
+def test_a_level_flight_looks_level_in_the_view_from_the_side():
+    """Scaled to the sensor's noise of millimetres, a level flight looked like a storm."""
+    x, noise = np.linspace(-2, 2, 50), 0.01 * np.sin(np.arange(50))
+    low, high = _level([Curve(x, 2 + noise, "best", "", 1.0)])
+    assert high - low == pytest.approx(0.4, rel=0.05) and low < 2 < high
+    assert _level([Curve(x, x, "best", "", 1.0)]) is None
+
+
+def test_long_names_are_broken_where_they_are_joined():
+    """In a small panel they were cut, and so were the values behind the bars."""
+    whole = "without delay:roll_command+pitch_command+thrust"
+    lines = in_lines(whole).split("<br>")
+    assert max(map(len, lines)) <= LONG and "".join(lines).replace(" ", "") == whole.replace(
+        " ", ""
+    )
+    assert in_lines("without calibration") == "without calibration"

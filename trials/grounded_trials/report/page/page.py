@@ -23,7 +23,7 @@ from grounded.diagnosis.tables import instrument_lines
 from grounded.errors import needs
 from grounded.figures.body import Motion
 from grounded.figures.figure import Bars, Panel, typeset
-from grounded.figures.interactive import in_lines, packed, palette, plotted
+from grounded.figures.interactive import label_lines, packed, palette, plotted
 from grounded.search.pictures import search_figure
 from grounded_trials.report.diagnosis_words import error_lines
 from grounded_trials.report.figures.paths import crash, path_figure
@@ -169,8 +169,7 @@ def _plain(value: Any) -> Any:
 def _height(panel: Panel | Bars) -> int:
     """Return the height of a panel in the page [px]."""
     if isinstance(panel, Bars):
-        lines = max((in_lines(bar.label).count("<br>") + 1 for bar in panel.bars), default=1)
-        return 30 + max(26, 16 * lines) * max(len(panel.bars), 1)
+        return 30 + max(26, 16 * label_lines(panel)) * max(len(panel.bars), 1)
     return 420 if panel.kind == "path" else 240
 
 
