@@ -23,9 +23,8 @@ from grounded.diagnosis.hypotheses.search import (
     SPREADS,
     TO_THE_TOP,
     HypothesisSearch,
-    sweep,
-    tune,
 )
+from grounded.diagnosis.hypotheses.tuning import sweep, tune
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
@@ -261,6 +260,9 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
             search.structures(fit)
             search.calibrated(fit)
         larger = search.of_size(size + 1)
+        if larger:
+            _nested(search, larger[0])
+            best = search.of_size(size)[0]
         if not larger or search.score(larger[0]) < search.score(best) + CLAIM:
             break
         best = larger[0]
@@ -268,8 +270,23 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
             search.extended(search.without(best, name), 6)
         best = search.of_size(size + 1)[0]
         size += 1
+    for _ in range(most):  # what was fitted last may have given the chosen set its constants
+        chosen = search.chosen(most)
+        _nested(search, chosen)
+        if search.chosen(most) is chosen:
+            break
     settle(search, most)
     return search.chosen(most)
+
+
+def _nested(search: HypothesisSearch, larger: Fitted) -> None:
+    """Fit a set without each of its effects, with its constants and noise.
+
+    Otherwise a further effect would be credited with what better constants of the others gain.
+    """
+    h = larger.hypothesis
+    if len(h.names) > 1:
+        search.refined([(h.minus(n), larger.noise, larger.track) for n in h.names], TO_THE_TOP)
 
 
 def settle(search: HypothesisSearch, most: int) -> None:

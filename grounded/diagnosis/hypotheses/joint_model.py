@@ -25,8 +25,8 @@ from grounded.diagnosis.hypotheses.search import (
     TO_THE_TOP,
     HypothesisSearch,
     Start,
-    tune,
 )
+from grounded.diagnosis.hypotheses.tuning import tune
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.noise import Structure

@@ -27,7 +27,9 @@ from grounded.frozen import Array
 
 STRETCHES = (5, 10, 20)  # numbers of stretches tried, since the duration of misfits is unknown
 LONG = 4  # fewest steps of a stretch
-CHANCE = 0.01  # p-value of differing scores below which the model is taken to be wrong
+# p-values of differing scores between which the model is more and more taken to be wrong: with a
+# single one, an interval would double by the last bit
+CHANCE, CLEAR = 0.02, 0.005
 LEAST = 0.2  # smallest fraction of the information taken to be left without a stretch
 
 
@@ -84,9 +86,11 @@ def _by_stretch(predictor: Predictor, fit: Fitted) -> list[Array]:
         along = np.einsum("pij,pi->pj", turned, s)
         told = share > 1e-6
         surprise = float((along[told] ** 2 / share[told]).sum())
-        if chdtrc(max(int(told.sum()) - len(s[0]), 1), surprise) < CHANCE:
+        value = float(chdtrc(max(int(told.sum()) - len(s[0]), 1), surprise))
+        weight = min(float(np.log(max(value, 1e-300) / CHANCE) / np.log(CLEAR / CHANCE)), 1.0)
+        if weight > 0:
             moved = np.einsum("pij,pj->pi", turned, along / np.maximum(1 - share, LEAST))
-            found.append(moved @ axes.T)
+            found.append(weight * moved @ axes.T)
     return found
 
 
