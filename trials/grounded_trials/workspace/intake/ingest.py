@@ -200,7 +200,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     if accepted := [one.trial.steps for one in stored if one.trial.candidate == ran]:
         return cut_short(read, fell.steps, "") if fell and fell.steps in accepted else read
     units, by = other_units(task, whole, own, seen.ran)
-    units = () if other else units
+    units = units if not other and not _guessed(log) & {*units} else ()
     if not why and not units:
         told = _like(read, ran, seen.ran)
         if fell:
@@ -254,7 +254,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     if named:
         raise GroundedError(f"{path} can't be read as a run of {ran}: {'; '.join(named)}")
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
-    if log and (guessed := [n for n in log.names[0] if n not in log.logged]):
+    if guessed := sorted(_guessed(log)):
         said += (
             f" Or {listed(guessed)}, which [estimate] finds here, {_is(guessed)} not what "
             "its program used: make it log its own estimate, and map that in [log] too."
@@ -272,6 +272,11 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         f"anyway{begins}",
         NextCommand("ingest", (str(path), "--data")),
     )
+
+
+def _guessed(log: Recording | None) -> set[str]:
+    """Return the states that [estimate] finds: no column holds them, so none is in another unit."""
+    return {name for name in log.names[0] if name not in log.logged} if log else set()
 
 
 def _undo(identity: str) -> str:
