@@ -276,3 +276,11 @@ def test_a_log_that_begins_amid_driving_had_its_first_command_before(task):
     logged, t, v = late(0.3, held=2.0, v=0.5)
     error, at = off(with_estimates(logged, TABLE, task), t, v)
     assert np.abs(error[(at > 0.75) & (at < 1.2)]).max() < 0.1
+
+
+def test_seconds_under_a_column_of_milliseconds_are_told(task):
+    """The smoother's noise was NaN, with warnings of numpy."""
+    logged, _, _ = driven()
+    log = {n: replace(one, t=one.t[0] + (one.t - one.t[0]) // 1000) for n, one in logged.items()}
+    with pytest.raises(GroundedError, match="times 1000 they would be 0.01 s"):
+        with_estimates(log, TABLE, task)

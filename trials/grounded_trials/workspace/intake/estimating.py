@@ -28,6 +28,7 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task
 from grounded_trials.formats.messages import Ints
+from grounded_trials.logs.resample import stamped_otherwise
 from grounded_trials.logs.samples import Samples, check_overlap, tidy
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.toml_table import Table
@@ -97,6 +98,12 @@ def with_estimates(
     samples = [tidy(n, series[n], unwrap=n in model.angles) for n in table.measured]
     sent = [tidy(name, series[name], unwrap=False) for name in model.input_names]
     check_overlap(samples, sent)
+    first, last = max(int(s.t[0]) for s in samples), min(int(s.t[-1]) for s in samples)
+    if (lasts := 1e-9 * (last - first)) < task.dt:
+        raise GroundedError(
+            f"the log lasts {lasts:.3g} s, less than a step of [task] dt = {task.dt:g} s: states "
+            f"can't be estimated from it{stamped_otherwise((*samples, *sent), task.dt)}"
+        )
     clock = _Clock.of(samples, min(int(s.t[0]) for s in (*samples, *sent)), task)
     records = _records(samples, sent, clock, task.dt)
     if not records:
