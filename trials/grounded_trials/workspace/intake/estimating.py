@@ -98,8 +98,8 @@ def with_estimates(
     samples = [tidy(n, series[n], unwrap=n in model.angles) for n in table.measured]
     sent = [tidy(name, series[name], unwrap=False) for name in model.input_names]
     check_overlap(samples, sent)
-    first, last = max(int(s.t[0]) for s in samples), min(int(s.t[-1]) for s in samples)
-    if (lasts := 1e-9 * (last - first)) < task.dt:
+    lasts = 1e-9 * (min(int(s.t[-1]) for s in samples) - max(int(s.t[0]) for s in samples))
+    if lasts < task.dt:
         raise GroundedError(
             f"the log lasts {lasts:.3g} s, less than a step of [task] dt = {task.dt:g} s: states "
             f"can't be estimated from it{stamped_otherwise((*samples, *sent), task.dt)}"
@@ -217,7 +217,7 @@ def _smoothed(
 
     noise = fitted(records)
     first = records[0]
-    if task.latency.any() and (first.past != task.past).any():
+    if np.any(task.latency) and np.any(first.past != task.past):
         std = np.tile(WIDE * sizes, (len(first.times), 1))  # of pieces of it that begin later
         std[0, [name not in table.measured for name in model.state_names]] *= STILL / WIDE
         held = replace(first, past=task.past)

@@ -47,6 +47,7 @@ from grounded_trials.workspace.intake.reading import (
 )
 from grounded_trials.workspace.intake.run_start import (
     LOOSE,
+    Recording,
     loosely,
 )
 from grounded_trials.workspace.intake.stored_before import (

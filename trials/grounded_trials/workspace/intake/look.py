@@ -63,13 +63,13 @@ class Look:
                 told = best if best.other else seen if seen.why else replace(seen, why=best.why)
                 seen = replace(told, ran=seen.ran)
             guessed = [name for name in self.log.names[0] if name not in self.log.logged]
-            if seen.why and guessed and not sender.sure:
-                if found and on_other_speeds(self.log, own, candidates, start_of):
-                    if self.read is read:
-                        self._cut(read.log, apart, found, own, task)
-                    seen = replace(judged(self.whole), why="", other="")
-                    notes = (*self.read.notes, _other_speeds(ran, guessed))
-                    self.read = replace(self.read, notes=notes)
+            doubted = found and guessed and seen.why and not sender.sure
+            if found and doubted and on_other_speeds(self.log, own, candidates, start_of):
+                if self.read is read:
+                    self._cut(read.log, apart, found, own, task)
+                seen = replace(judged(self.whole), why="", other="")
+                notes = (*self.read.notes, _other_speeds(ran, guessed))
+                self.read = replace(self.read, notes=notes)
         elif log and read.cut and log.spanned and (seen.why or seen.other) and log.anywhere:
             begins = 1e-9 * (read.cut.start_ns - log.anywhere.whole.origin_ns)
             given = Start(begins, 0.0, alike=True, opens_alike=True)
