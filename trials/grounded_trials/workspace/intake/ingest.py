@@ -19,7 +19,8 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import listed
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.returned.other_scale import other_units
+from grounded.search.returned.as_predicted import odd_columns
+from grounded.search.returned.other_scale import other_units, units_tried
 from grounded.search.returned.who_drove import OTHERS, Following
 from grounded.search.safety import COASTS
 from grounded.task import Task
@@ -34,7 +35,13 @@ from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.intake.log_faults import dead_sensors, log_faults, mistaken_in
 from grounded_trials.workspace.intake.look import Look
 from grounded_trials.workspace.intake.odd_run import odd_run
-from grounded_trials.workspace.intake.read_otherwise import misled, pace_of, unit_of, units_told
+from grounded_trials.workspace.intake.read_otherwise import (
+    misled,
+    pace_of,
+    rather_exchanged,
+    unit_of,
+    units_told,
+)
 from grounded_trials.workspace.intake.reading import (
     NoneWaits,
     Read,
@@ -202,6 +209,10 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         return cut_short(read, fell.steps, "") if fell and fell.steps in accepted else read
     units, by = other_units(task, whole, own, seen.ran)
     units = units if not other and not _guessed(log) & {*units} else ()
+    if read.log and not why and not units:
+        logged = [name for name in task.model.state_names if name not in _guessed(log)]
+        tried = [(names, f) for names, f in units_tried(task.model) if {*names} <= {*logged}]
+        units, by = odd_columns(task.model, own, whole, tried)
     if not why and not units:
         told = _like(read, ran, seen.ran)
         if fell:
@@ -211,8 +222,10 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     if slow:  # a recording at another rate may look like one in another unit
         units = ()
     elif log and not units and not other:
-        units, by = unit_of(log, task, policy)
-    if fell and not (units or slow or misled(log, task, policy)):
+        units, by = unit_of(log, task, own)
+    if log and units and why and rather_exchanged(log, task, own, units, by):
+        units = ()
+    if fell and not (units or slow or misled(log, task, own)):
         return cut_short(read, fell.steps, fell.told)
     pace = slow and (
         f"a second of its stamps is {slow:g} s of the run (a recording played at another rate?): "
@@ -220,7 +233,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     )
     if candidate is not None:
         seem = f"with {listed(units)} times {by:.6g} it is its run: another unit, or sign?"
-        doubts = [seem if units else pace or misled(None if other else log, task, policy) or why]
+        doubts = [seem if units else pace or misled(None if other else log, task, own) or why]
         if log and not (found and found.opens_alike):
             doubts.append(
                 f"no start of {ran} was found in it: the run is assumed to begin with the first "
@@ -251,7 +264,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     named = [*(misread(read.log) if read.log else ())]
     named += [one.told(known, own=read.own) for one in odd]
     if not named and not other:
-        named += filter(None, [misled(log, task, policy)])
+        named += filter(None, [misled(log, task, own)])
     if named:
         raise GroundedError(f"{path} can't be read as a run of {ran}: {'; '.join(named)}")
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
