@@ -46,6 +46,13 @@ def apart(own: Candidate, trial: Trial) -> float:
     return float(np.nansum(np.log(np.fmax(far(own, trial), NEAR))))
 
 
+def like_predicted(own: Candidate, trial: Trial) -> bool:
+    """Return whether most states of a trial are near their prediction, as far as one is known."""
+    known = far(own, trial)
+    known = known[np.isfinite(known)]
+    return not len(known) or bool(np.median(known) < ALIKE)
+
+
 def multiplied(trial: Trial, names: Sequence[str], factor: float) -> Trial:
     """Return a trial with some columns multiplied by a factor."""
     states, inputs = (
@@ -58,9 +65,10 @@ def multiplied(trial: Trial, names: Sequence[str], factor: float) -> Trial:
 def odd_columns(
     model: Model, own: Candidate, trial: Trial, factors: Sequence[tuple[Sequence[str], float]]
 ) -> tuple[tuple[str, ...], float]:
-    """Return states in another unit, which only the prediction tells, and the factor; (), 1.
+    """Return states in another unit or of the other sign that commands don't tell; (), 1 if none.
 
-    A policy that hardly uses a speed sends the same commands whatever its unit.
+    A policy that hardly uses a speed sends the same commands whatever its unit. A real motion may
+    be opposite to a small predicted one: a sign must also be wrong by the model's motion.
 
     Args:
         model: with the states.
@@ -76,10 +84,26 @@ def odd_columns(
     for names, by in factors:
         which = [i for i, name in enumerate(model.state_names) if name in names and known[i]]
         rest = [i for i in np.flatnonzero(known) if i not in which]
-        if not which or not rest or 1 / GROSS < abs(by) < GROSS:
+        if not which or not rest or (by != -1 and 1 / GROSS < abs(by) < GROSS):
             continue
         mended = multiplied(trial, names, by)
         nearer, now = apart(own, mended), far(own, mended)
-        if nearer < least and now[which].max() < ALIKE and np.median(as_it_is[rest]) < TELLS:
-            best, least = (tuple(names), float(by)), nearer
+        if not (nearer < least and now[which].max() < ALIKE and np.median(as_it_is[rest]) < TELLS):
+            continue
+        if by == -1 and not _moves_better(model, trial, mended):
+            continue
+        best, least = (tuple(names), float(by)), nearer
     return best
+
+
+def _moves_better(model: Model, trial: Trial, mended: Trial) -> bool:
+    """Return whether the model predicts a trial's motion clearly better without a fault."""
+    from grounded.instruments.mistaken import CLEAR, STARTS
+    from grounded.instruments.short_runs import Ahead
+
+    before, after = (Ahead(model, one, range(model.n), STARTS) for one in (trial, mended))
+    if not before.enough or not after.enough:
+        return False
+    ones = np.ones(model.m)
+    with np.errstate(all="ignore"):
+        return before.plain(ones).score - after.plain(ones).score > CLEAR

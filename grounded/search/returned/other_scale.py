@@ -47,6 +47,7 @@ NEARLY = 0.1  # largest difference of commands with another unit, relative to an
 EXACT, CLOSE = 0.01, 0.05  # the same for a unit that is certain, and for any factor
 # largest share of the original difference left by a unit, and by any factor (many are tried)
 UNITS_LEAVE, LEAVES = 0.5, 0.25
+ALL = 0.05  # share left by a factor that is stated although the commands are nearly alike
 LARGEST = 100.0  # largest factor, or its inverse
 ONE, FAR = 0.03, 0.2  # factors nearer to 1 are ignored; FAR if the commands are alike without one
 ROUNDS = 12  # Gauss-Newton iterations; more than two are only needed at limits or wrapped angles
@@ -66,9 +67,11 @@ def other_units(
     Returns:
         Signals and factor; (), 1 if none helps or is needed, or if the log is too noisy to compare.
     """
-    if plain is None or (plain.alike and plain.error < NEARLY):
+    if plain is None or (plain.alike and plain.error < EXACT):
         return (), 1.0
     trial, late = trial.until(task.horizon), latest(task)
+    if plain.alike and plain.error < NEARLY:  # only a factor that explains all of it counts
+        return _any_factor(task.model, own, trial, plain, late, ALL * _left(plain), ONE)
     least, best = np.inf, (tuple[str, ...](), 1.0, np.inf, np.inf)
     for names, factor in units_tried(task.model):
         found = follows(own.policy, mended := multiplied(trial, names, factor), late)
@@ -109,12 +112,21 @@ def any_factor(task: Task, own: Candidate, trial: Trial) -> tuple[tuple[str, ...
 
 
 def _any_factor(
-    model: Model, own: Candidate, trial: Trial, plain: Following, late: int, most: float
+    model: Model,
+    own: Candidate,
+    trial: Trial,
+    plain: Following,
+    late: int,
+    most: float,
+    least: float | None = None,
 ) -> tuple[tuple[str, ...], float]:
-    """Return the columns and factor that fit best and leave less than `most`; (), 1 for none."""
+    """Return the columns and factor that fit best and leave less than `most`; (), 1 for none.
+
+    Factors within `least` of 1 are ignored: FAR if the commands are alike without one, else ONE.
+    """
     best, found, policy = min(most, CLOSE), (tuple[str, ...](), 1.0), own.policy
     trial = trial.until(min(trial.finite_steps, policy.horizon))
-    least = FAR if plain.alike else ONE
+    least = (FAR if plain.alike else ONE) if least is None else least
     for names in _scaled_together(model):
         for start in (1.0, -1.0):
             by = _factor(policy, trial, names, start)

@@ -42,6 +42,7 @@ ROUNDS = 2  # rounds of coordinate search over the topics' ages
 EXACT = 1e-3  # median difference, relative to an input's size, of the candidate that ran
 LUCK = float(np.log(2) / 2)  # [nats] per step: half the squares, which lower gains also give
 FEW, FEWEST = 4, 0.2  # smallest number of informative steps in a part, and their share to be exact
+THEIRS = 0.05  # largest median difference, relative to size, of another that is said to have run
 CLEARLY = 6.0  # [nats] of evidence, beyond LUCK, for another candidate
 LATEST = 3  # steps by which commands may be logged late
 USUAL = 0.03  # median difference of commands on speeds that the program had differently, at most
@@ -253,7 +254,7 @@ def sender_of(
         fit = None if one.id == own.id else acted_on(log, one.policy, at)
         if fit is None or _one(mine, fit):
             continue
-        if (for_it := nats(mine, fit)) <= best:
+        if fit.left > THEIRS or (for_it := nats(mine, fit)) <= best:
             continue
         if fit.exact or (not late and (there := _following(log, one.policy, at)) and there.alike):
             best, name, theirs = for_it, one.id, fit

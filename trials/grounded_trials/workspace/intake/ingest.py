@@ -70,6 +70,7 @@ from grounded_trials.workspace.proposing import candidate_named, latest_candidat
 from grounded_trials.workspace.unknown_id import refuse_ids
 
 ASIDE = "set aside"  # the verdict on a run that does not count
+WHOLE = 0.9  # share of a run that a log must last to be one, or else the error says so
 EXACT = 0.1  # largest difference, relative to the resolution of commands, of an exact match
 
 
@@ -204,7 +205,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         read = replace(read, warnings=(*read.warnings, loosely(found.loose_s, ran)))
     why, other = seen.why, seen.other
     fell, stored = look.fell, read.log.stored if read.log else ()
-    task, policy = workspace.task, own.policy
+    task = workspace.task
     if accepted := [one.trial.steps for one in stored if one.trial.candidate == ran]:
         return cut_short(read, fell.steps, "") if fell and fell.steps in accepted else read
     units, by = other_units(task, whole, own, seen.ran)
@@ -218,7 +219,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         if fell:
             read = cut_short(read, fell.steps, fell.told)
         return replace(read, warnings=(*read.warnings, *told))
-    slow = pace_of(log, task, policy) if log and not other else None
+    slow = pace_of(log, task, own) if log and not other else None
     if slow:  # a recording at another rate may look like one in another unit
         units = ()
     elif log and not units and not other:
@@ -260,10 +261,13 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             NextCommand("ingest", (str(path), "--data")),
         )
     known = replace(read.trial, id="").until(read.trial.known_steps)
-    odd = [*mistaken_in(workspace.base_model, known), *dead_sensors(workspace.base_model, whole)]
+    odd = []
+    if not seen.silent:  # without them the model can't tell what moves the robot
+        odd += [*mistaken_in(workspace.base_model, known)]
+        odd += [*dead_sensors(workspace.base_model, whole)]
     named = [*(misread(read.log) if read.log else ())]
     named += [one.told(known, own=read.own) for one in odd]
-    if not named and not other:
+    if not named and not other and not seen.silent:
         named += filter(None, [misled(log, task, own)])
     if named:
         raise GroundedError(f"{path} can't be read as a run of {ran}: {'; '.join(named)}")
@@ -273,7 +277,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             f" Or {listed(guessed)}, which [estimate] finds here, {_is(guessed)} not what "
             "its program used: make it log its own estimate, and map that in [log] too."
         )
-    said += read.hole
+    said += read.hole + (_lasting(log, task) if log else "")
     if other:
         raise GroundedError(
             f"{said} Ingest it with --candidate {other}, with --candidate {ran} anyway, or with "
@@ -285,6 +289,18 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         f"{said} Ingest it with --data for fitting and diagnosis, or with --candidate {ran} "
         f"anyway{begins}",
         NextCommand("ingest", (str(path), "--data")),
+    )
+
+
+def _lasting(log: Recording, task: Task) -> str:
+    """Return a sentence on a log that is too short for a run of the task, or ""."""
+    end = min(int(one.t.max()) for one in log.logged.values())
+    lasts = 1e-9 * (end - log.whole.origin_ns) - log.first
+    if not lasts < WHOLE * task.horizon * task.dt:
+        return ""
+    return (
+        f" It ends {max(lasts, 0.0):.2g} s after its first command, while a run lasts "
+        f"{task.horizon * task.dt:.3g} s: was its beginning or its end cut off?"
     )
 
 

@@ -15,7 +15,7 @@ from grounded.model import Model
 from grounded.policy import Policy
 from grounded.result import listed
 from grounded.search.candidate import Candidate
-from grounded.search.returned.as_predicted import apart, multiplied
+from grounded.search.returned.as_predicted import apart, like_predicted, multiplied
 from grounded.search.returned.other_scale import (
     NEARLY,
     THOUSAND,
@@ -38,17 +38,18 @@ CLEARLY = 0.5  # [nats] by which an exchange must bring a log nearer to the pred
 PACES = (2.0, 0.5)  # rates of a recording that are tried
 
 
-def pace_of(log: Recording, task: Task, policy: Policy) -> float | None:
-    """Return how many seconds of a policy's run one second of the log's stamps is; None if one.
+def pace_of(log: Recording, task: Task, own: Candidate) -> float | None:
+    """Return how many seconds of a candidate's run one second of the log's stamps is; None if one.
 
     Args:
-        log: a log in which no run of the policy was found.
+        log: a log in which no run of the candidate was found.
         task: the task with the control step.
-        policy: the policy.
+        own: the candidate.
     """
     for pace in PACES:
         paced = {name: _paced(one, pace) for name, one in log.logged.items()}
-        if _run_in(recording(paced, task, log.complete), policy):
+        run = _run_in(recording(paced, task, log.complete), own.policy)
+        if run and like_predicted(own, run):  # slow commands fit many policies
             return pace
     return None
 
