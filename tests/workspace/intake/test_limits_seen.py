@@ -168,7 +168,7 @@ def test_a_robot_that_leaves_safety_after_its_run_is_seen_to(tmp_path, rolls):
 def test_what_a_task_has_already_is_not_advised(tmp_path, rests, weighed):
     """`--hold` and terminal weights were advised to a task with both."""
     task = make(tmp_path / "w").task
-    target = np.array(task.target)
+    target = np.zeros_like(task.target)  # both states are given
     target[:, 0] = np.linspace(0, 1, len(target))
     if rests:
         target[-len(target) // 4 :, 0] = 1.0
