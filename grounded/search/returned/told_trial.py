@@ -48,11 +48,11 @@ def odd_trial(task: Task, candidates: Sequence[Candidate], trial: Trial, *, firs
             f"{listed(names)} {'is' if len(names) == 1 else 'are'} in {unit}, not in {units}: "
             f"times {by:.4g}, its commands are those of {own.id}"
         )
-    if not names and not seen.why:
+    columns = _odd_columns(task.model, whole) if first else ""
+    if not columns and not names and not seen.why:
         names, by = odd_columns(task.model, own, whole, list(units_tried(task.model)))
         if names:
             return f"only with {listed(names)} times {by:.4g} is it like what {own.id} was to do"
-    columns = _odd_columns(task.model, whole) if first else ""
     if columns or not seen.why:
         return columns
     if names:
