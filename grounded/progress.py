@@ -32,7 +32,8 @@ def interruptible(so_far: Callable[[], str]) -> Iterator[None]:
 class Stages:
     """Reports each stage with the share done and the time left, from the usual number of calls.
 
-    Close to the usual number, the end is uncertain: the time taken so far is shown instead.
+    The number of calls varies by a factor of two either way, and later ones take longer (`LATER`).
+    Close to the usual number, the end is unknown: the time taken so far is shown instead.
 
     Args:
         tell: shows a line; None for no output.
@@ -51,15 +52,16 @@ class Stages:
         self.count += 1
         if self.tell is None:
             return
-        share, taken = self.count / self.usual, time.monotonic() - self.began
+        share, taken = (self.count / self.usual) ** LATER, time.monotonic() - self.began
         if share > NEARLY:
-            return self.tell(f"{stage}, longer than usual, {_told(taken)} so far")
+            return self.tell(f"{stage}, {_told(taken)} so far, longer than usual")
         left = taken * (1 - share) / share
         shrinks, self.left = left < self.left, left  # no estimate is shown if the end recedes
-        about = f", about {_told(left)} left" if self.count > 10 and shrinks else ""
-        self.tell(f"{stage}, {100 * share:.0f} % done{about}")
+        about = f", {_told(left)} left" if self.count > 10 and shrinks else ""
+        self.tell(f"{stage}, about {100 * share:.0f} % done{about}")
 
 
+LATER = 1.3  # exponent of the share of calls that gives the share of time (three diagnoses)
 NEARLY = 0.9  # share of the usual number of calls from which on no estimate is shown
 
 

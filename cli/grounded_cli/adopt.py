@@ -26,13 +26,16 @@ BESIDE = (
 
 BIASED = (
     "the robot is steered by its sensor of {state}, which reads {by}: [task] start and the target "
-    "are off by that unless this sensor measured them. Add it there, or correct the readings: "
-    "[log.state.{state}] offset = {off:.3g}, and the same in the robot's program"
+    "are off by that unless this sensor measured them. Do one of two things: keep the effect and "
+    "add {bias:.3g} to them; or correct the readings ([log.state.{state}] offset {off:+.3g}, and "
+    "the same in the robot's program), remove sensor_bias:{state} from [model] effects and ingest "
+    "the logs again"
 )
 SCALED = (
     "the target, [task] start and the reported distance of {state} from the target are in readings "
-    "of its sensor, which shows {by:.3g} % {more} than the true value: for true values correct "
-    "[log.state.{state}] scale, and the scale in the robot's program"
+    "of its sensor, which shows {by:.3g} % {more} than the true value. For true values correct "
+    "[log.state.{state}] scale and the scale in the robot's program, remove sensor_scale:{state} "
+    "from [model] effects and ingest the logs again"
 )
 DRAW = "draw the manoeuvre first (`grounded target --help`), or propose anyway to repeat that drive"
 REMEASURE = (
@@ -74,9 +77,9 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
     for effect in done.effects:
         family, _, state = str(effect["name"]).partition(":")
         if family == "sensor_bias" and effect["name"] in effects:
-            high = with_unit(f"{abs(effect['b']):.3g}", units[state])
-            low = "low" if effect["b"] < 0 else "high"
-            remark("note", BIASED.format(state=state, by=f"{high} too {low}", off=-effect["b"]))
+            b = effect["b"]
+            high, low = with_unit(f"{abs(b):.3g}", units[state]), "low" if b < 0 else "high"
+            remark("note", BIASED.format(state=state, by=f"{high} too {low}", off=-b, bias=b))
         if family == "sensor_scale" and effect["name"] in effects:
             more, by = "more" if effect["k"] > 0 else "less", 100 * abs(effect["k"])
             remark("note", SCALED.format(state=state, by=by, more=more))

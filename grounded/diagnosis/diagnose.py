@@ -242,4 +242,4 @@ def _again(effect: Effect, known: float, data: Data) -> Effect:
 
 
 MOST_NAMES = 50  # 36 states and 12 inputs already give 1,649 effects, each of which is filtered
-USUAL = 160  # typical number of progress ticks: stages, and blocks of hypotheses refined
+USUAL = 350  # typical number of progress ticks: stages, and blocks of hypotheses refined

@@ -43,7 +43,8 @@ class Record:
         start: prior mean of the first state, used for states that no channel measures, (n,); or of
             the state at each time, (T + 1, n), so that parts of the record have one too; None for
             zero.
-        start_std: prior standard deviation of the first state, (n,); None for 1 in each unit.
+        start_std: prior standard deviation of the first state, (n,), or of the state at each time,
+            (T + 1, n); None for 1 in each unit.
         id: id of the trial it came from.
 
     Raises:
@@ -176,12 +177,17 @@ def cut(record: Record, seconds: float) -> list[Record]:
 def part(record: Record, first: int, last: int) -> Record:
     """Return rows first .. last of a record with all commands (latency needs earlier ones)."""
     rows = slice(first, last + 1)
-    start = record.start
+    start, std = record.start, record.start_std
+    if std is not None and std.ndim == 2:
+        std = std[rows]
+    elif first > 0 and start is not None and start.ndim == 1:
+        std = None  # it was that of a start that is not this part's
     if start is not None and start.ndim == 2:
         start = start[rows]
     elif first > 0:
         start = None
-    return replace(record, times=record.times[rows], measured=record.measured[rows], start=start)
+    times, measured = record.times[rows], record.measured[rows]
+    return replace(record, times=times, measured=measured, start=start, start_std=std)
 
 
 def records_of(model: Model, trials: Sequence[Trial | Record]) -> list[Record]:
@@ -283,7 +289,8 @@ def _start(
     used a second time.
     """
     mean = np.zeros(n) if record.start is None else np.array(np.atleast_2d(record.start)[0])
-    given = np.full(n, START_STD) if record.start_std is None else np.array(record.start_std)
+    std = np.full(n, START_STD) if record.start_std is None else record.start_std
+    given = np.array(np.atleast_2d(std)[0])
     var, channel = given**2, np.full(n, -1)
     for c, i in enumerate(measurement.states):
         finite = np.flatnonzero(np.isfinite(record.measured[:, c]))

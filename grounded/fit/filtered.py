@@ -70,7 +70,7 @@ def _with_true(
     if record.start is not None:
         whole = record.start.ndim == 2
         start[: None if whole else 1] = record.start
-    std = np.full(n, START_STD) if record.start_std is None else record.start_std
+    std = np.full(n, START_STD) if record.start_std is None else np.atleast_2d(record.start_std)[0]
     for column, tau, angle in zip(columns, taus, angles, strict=True):
         ahead, off = _ahead(record.times, record.measured[:, column], tau, angle)
         start, std = np.column_stack([start, ahead]), np.append(std, off)

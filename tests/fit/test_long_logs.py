@@ -70,7 +70,7 @@ def test_stages_tell_share_and_time_and_what_was_taken_where_the_end_is_not_know
     for _ in range(50):
         stages("refine")
     share = [int(found[1]) for text in told if (found := re.search(r"(\d+) % done", text))]
-    assert share == sorted(share) and share[0] == 5 and share[-1] == 90
+    assert share == sorted(share) and share[0] == 2 and 80 < share[-1] <= 90
     assert all("so far" in text for text in told[18:])
     assert any("s left" in line for line in told)
 

@@ -24,10 +24,12 @@ def record(
     rate=RATE,
     late=0,
     noise=(0.002, 0.01),
+    differs=0,
 ):
     """Run a policy on the model against a load, and log everything as a table.
 
     `late`: rows by which program and log receive the position late. `noise`: of x [m], v [m/s].
+    `differs`: rows over which the program differentiates x, in place of the speed.
     """
     model, dt, rng = w.task.model, policy.dt, np.random.default_rng(seed)
     z, force, rows, sent = np.array(w.task.start, float), 0.0, [], policy.past.copy()
@@ -39,6 +41,8 @@ def record(
         felt = z + rng.normal(0, noise)
         past.append(felt[0])
         felt[0] = past[max(0, k - late)]
+        if differs:
+            felt[1] = (past[k] - past[max(0, k - differs)]) * rate / differs
         step, part = divmod(k - begin, every)
         if 0 <= step < policy.horizon and part == 0:
             force = float(follow(policy, step, felt, sent)[0])

@@ -18,6 +18,7 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
+from grounded.search.returned.as_predicted import apart, multiplied
 from grounded.search.returned.who_drove import (
     DECISIVE,
     FINE,
@@ -46,6 +47,7 @@ NEARLY = 0.1  # largest difference of commands with another unit, relative to an
 EXACT, CLOSE = 0.01, 0.05  # the same for a unit that is certain, and for any factor
 # largest share of the original difference left by a unit, and by any factor (many are tried)
 UNITS_LEAVE, LEAVES = 0.5, 0.25
+ALL = 0.05  # share left by a factor that is stated although the commands are nearly alike
 LARGEST = 100.0  # largest factor, or its inverse
 ONE, FAR = 0.03, 0.2  # factors nearer to 1 are ignored; FAR if the commands are alike without one
 ROUNDS = 12  # Gauss-Newton iterations; more than two are only needed at limits or wrapped angles
@@ -65,48 +67,74 @@ def other_units(
     Returns:
         Signals and factor; (), 1 if none helps or is needed, or if the log is too noisy to compare.
     """
-    if plain is None or (plain.alike and plain.error < NEARLY):
+    if plain is None or (plain.alike and plain.error < EXACT):
         return (), 1.0
     trial, late = trial.until(task.horizon), latest(task)
-    least, best = UNITS_LEAVE * _left(plain), (tuple[str, ...](), 1.0, np.inf)
+    if plain.alike and plain.error < NEARLY:  # only a factor that explains all of it counts
+        return _any_factor(task.model, own, trial, plain, late, ALL * _left(plain), ONE)
+    least, best = np.inf, (tuple[str, ...](), 1.0, np.inf, np.inf)
     for names, factor in units_tried(task.model):
-        found = follows(own.policy, _multiplied(trial, names, factor), late)
+        found = follows(own.policy, mended := multiplied(trial, names, factor), late)
         if found is None or not found.alike or found.error >= NEARLY:
             continue
-        if (left := _left(found)) < least and (
-            not plain.alike or evidence(plain, found) > DECISIVE
-        ):
-            least, best = left, (tuple(names), float(factor), found.error)
-    names, factor, error = best
+        if (left := _left(found)) >= UNITS_LEAVE * _left(plain):
+            continue
+        if plain.alike and not evidence(plain, found) > DECISIVE:
+            continue
+        if (away := _farther(own, trial, mended)) is None:
+            continue
+        if (by := away + np.log(left + FINE)) < least:
+            least, best = by, (tuple(names), float(factor), found.error, left)
+    names, factor, error, left = best
     if names and error >= EXACT:
-        any_, by = _any_factor(task.model, own.policy, trial, plain, late, 0.5 * least)
+        any_, by = _any_factor(task.model, own, trial, plain, late, 0.5 * left)
         return (any_, by) if any_ else (names, factor)
     if names:
         return names, factor
-    return _any_factor(task.model, own.policy, trial, plain, late, LEAVES * _left(plain))
+    return _any_factor(task.model, own, trial, plain, late, LEAVES * _left(plain))
 
 
-def any_factor(task: Task, policy: Policy, trial: Trial) -> tuple[tuple[str, ...], float]:
-    """Return columns and a factor with which a trial is a run of a policy; (), 1 for none."""
+def _farther(own: Candidate, trial: Trial, mended: Trial) -> float | None:
+    """Return how much farther from its prediction a log is without a fault [nats], if not at all.
+
+    None if it is farther: then that is not what is wrong with it.
+    """
+    away = apart(own, mended) - apart(own, trial)
+    return away if away <= 0 else None
+
+
+def any_factor(task: Task, own: Candidate, trial: Trial) -> tuple[tuple[str, ...], float]:
+    """Return columns and a factor with which a trial is a run of a candidate; (), 1 for none."""
     trial, late = trial.until(task.horizon), latest(task)
-    if (plain := follows(policy, trial, late)) is None:
+    if (plain := follows(own.policy, trial, late)) is None:
         return (), 1.0
-    return _any_factor(task.model, policy, trial, plain, late, LEAVES * _left(plain))
+    return _any_factor(task.model, own, trial, plain, late, LEAVES * _left(plain))
 
 
 def _any_factor(
-    model: Model, policy: Policy, trial: Trial, plain: Following, late: int, most: float
+    model: Model,
+    own: Candidate,
+    trial: Trial,
+    plain: Following,
+    late: int,
+    most: float,
+    least: float | None = None,
 ) -> tuple[tuple[str, ...], float]:
-    """Return the columns and factor that fit best and leave less than `most`; (), 1 for none."""
-    best, found = min(most, CLOSE), (tuple[str, ...](), 1.0)
+    """Return the columns and factor that fit best and leave less than `most`; (), 1 for none.
+
+    Factors within `least` of 1 are ignored: FAR if the commands are alike without one, else ONE.
+    """
+    best, found, policy = min(most, CLOSE), (tuple[str, ...](), 1.0), own.policy
     trial = trial.until(min(trial.finite_steps, policy.horizon))
-    least = FAR if plain.alike else ONE
+    least = (FAR if plain.alike else ONE) if least is None else least
     for names in _scaled_together(model):
         for start in (1.0, -1.0):
             by = _factor(policy, trial, names, start)
             if not 1 / LARGEST < abs(by) < LARGEST or abs(by - 1) < least:
                 continue
-            fit = follows(policy, _multiplied(trial, names, by), late)
+            fit = follows(policy, mended := multiplied(trial, names, by), late)
+            if _farther(own, trial, mended) is None:
+                continue
             if fit and fit.alike and _left(fit) < best and evidence(plain, fit) > DECISIVE:
                 best = _left(fit)
                 found = names, -1.0 if abs(by + 1) < ONE else float(f"{by:.3g}")
@@ -114,10 +142,10 @@ def _any_factor(
 
 
 def any_offset(
-    task: Task, policy: Policy, trial: Trial, names: Sequence[str]
+    task: Task, own: Candidate, trial: Trial, names: Sequence[str]
 ) -> tuple[str, float] | None:
-    """Return the state in `names` and the offset to subtract so that a trial is a policy's run."""
-    trial, late = trial.until(task.horizon), latest(task)
+    """Return the state in `names` and the offset without which a trial is a candidate's run."""
+    trial, late, policy = trial.until(task.horizon), latest(task), own.policy
     if (plain := follows(policy, trial, late)) is None or plain.alike:
         return None
     trial = trial.until(min(trial.finite_steps, policy.horizon))
@@ -126,7 +154,9 @@ def any_offset(
         by = _solved(partial(_off_from, policy, trial, name), 0.0, 1e-4)
         if not np.isfinite(by):
             continue
-        fit = follows(policy, _less(trial, name, by), late)
+        fit = follows(policy, mended := _less(trial, name, by), late)
+        if _farther(own, trial, mended) is None:
+            continue
         if fit and fit.alike and _left(fit) < best and evidence(plain, fit) > DECISIVE:
             best, found = _left(fit), (name, float(f"{by:.3g}"))
     return found
@@ -164,7 +194,7 @@ def _of_one_unit(model: Model) -> list[tuple[str, ...]]:
 
 def _factor(policy: Policy, trial: Trial, names: Sequence[str], start: float) -> float:
     """Return the factor of columns with which the policy sends the logged commands best."""
-    return _solved(lambda by: _off(policy, _multiplied(trial, names, by)), start, 1e-4 * start)
+    return _solved(lambda by: _off(policy, multiplied(trial, names, by)), start, 1e-4 * start)
 
 
 def _solved(off: Callable[[float], Array], start: float, small: float) -> float:
@@ -195,14 +225,6 @@ def _off(policy: Policy, trial: Trial) -> Array:
 
 def _off_from(policy: Policy, trial: Trial, name: str, zero: float) -> Array:
     return _off(policy, _less(trial, name, zero))
-
-
-def _multiplied(trial: Trial, names: Sequence[str], factor: float) -> Trial:
-    states, inputs = (
-        np.array([factor if name in names else 1.0 for name in every])
-        for every in (trial.state_names, trial.input_names)
-    )
-    return replace(trial, states=trial.states * states, inputs=trial.inputs * inputs)
 
 
 def _less(trial: Trial, name: str, constant: float) -> Trial:

@@ -17,7 +17,8 @@ from grounded.instruments.sound_trials import sound_trials
 from grounded.model import Model
 from grounded.result import listed, with_unit
 from grounded.search.candidate import Candidate
-from grounded.search.returned.other_scale import other_units, unit_named
+from grounded.search.returned.as_predicted import odd_columns
+from grounded.search.returned.other_scale import other_units, unit_named, units_tried
 from grounded.search.returned.who_drove import suspicion
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
@@ -48,6 +49,10 @@ def odd_trial(task: Task, candidates: Sequence[Candidate], trial: Trial, *, firs
             f"times {by:.4g}, its commands are those of {own.id}"
         )
     columns = _odd_columns(task.model, whole) if first else ""
+    if not columns and not names and not seen.why:
+        names, by = odd_columns(task.model, own, whole, list(units_tried(task.model)))
+        if names:
+            return f"only with {listed(names)} times {by:.4g} is it like what {own.id} was to do"
     if columns or not seen.why:
         return columns
     if names:

@@ -26,6 +26,7 @@ WINDOWS = 8  # parts of a trial that must each be alike (within 2x): somebody ma
 DECISIVE = 12.0  # [nats] of evidence that another candidate ran; by chance in 1 of 10^6 runs
 # it is the other's run if its difference is below SAME of the own one's, or below CLEAR of an input
 SAME, CLEAR = 0.5, 0.01
+OUT = 0.1  # of an input's width: a command usually as far beyond its limits is another signal
 ROUGH = 4.0  # steps over which noise may be correlated; longer deviations count more
 FINE = 1e-4  # resolution of logged commands at best, relative to an input's size
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # ages of the states acted on that are tried, in steps
@@ -38,7 +39,7 @@ class Following:
     """The comparison of a trial's commands with what a policy sends on its states."""
 
     alike: bool
-    beyond: str  # the input that is beyond its limits by more than their width on average, or ""
+    beyond: str  # the input that is far beyond its limits on average, or usually, or ""
     error: float  # rms over steps and inputs, in units of each input's largest value
     input: str  # the input that differs most
     rms: float  # its rms difference, in its unit
@@ -96,7 +97,8 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     first = parts[bad.index(True)] if any(bad) else parts[0][:1]
     left = first[int(np.argmax((off[first] > 2 * room[first]).any(axis=1)))]
     beyond = np.abs(trial.inputs[:T] - np.clip(trial.inputs[:T], policy.low, policy.high))
-    past_limits = beyond.mean(axis=0) - width  # > 0: such commands are only alike due to clipping
+    # > 0: commands are only alike due to clipping, or most are not of this input
+    past_limits = np.maximum(beyond.mean(axis=0) - width, np.median(beyond, axis=0) - OUT * width)
     sane = not (past_limits > 0).any()
     alike, j = bool(sane and share.max() <= 1 and not any(bad)), int(np.argmax(share))
     return Following(
@@ -147,6 +149,7 @@ class Suspicion:
     ran: Following | None  # the comparison with its candidate
     why: str = ""  # why it is not its candidate's run, or ""
     other: str = ""  # the candidate whose run it is instead, or ""
+    silent: tuple[str, ...] = ()  # inputs that are 0 throughout, though its plan moves them
 
 
 def suspicion(task: Task, trial: Trial, own: Candidate, others: Sequence[Candidate]) -> Suspicion:
@@ -194,7 +197,7 @@ def suspicion(task: Task, trial: Trial, own: Candidate, others: Sequence[Candida
         rms = with_unit(f"{found.rms:.3g}", task.model.inputs[found.input])
         differs = f"{found.input} differs by {rms} (rms)"
     why = f"its commands are not what {own.id} sends on the logged states: {differs}; {looks}"
-    return Suspicion(found, why, name)
+    return Suspicion(found, why, name, () if name else tuple(_at_zero(trial, own)))
 
 
 def _at_zero(trial: Trial, own: Candidate) -> list[str]:

@@ -68,6 +68,18 @@ def test_an_estimated_speed_knows_what_came_before_the_run_and_after_it(blind, t
     assert np.sqrt(np.mean(np.square(off))) < 0.03
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_run_is_known_though_its_program_s_speeds_lag(blind, tmp_path, seed):
+    """A crane's exact runs were said to be those of other candidates, one never exported."""
+    policy = blind.candidate("c0002")[0].policy
+    path = record(blind, tmp_path / "a.csv", policy, 0.8, seed=seed, differs=16)
+    found = blind.ingest(path)
+    assert found.candidate == "c0002"
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    k = round(0.8 * RATE) + 5 * np.arange(policy.horizon)
+    np.testing.assert_allclose(blind.trials()[-1].trial.inputs[:, 0], table[k, 3], atol=1e-4)
+
+
 ITS_OWN = LOGGED + "[estimate]\nmeasured = { x = 0.002 }\n"
 ROUGH = (0.002, 0.5)  # m, m/s: a speed by differences
 

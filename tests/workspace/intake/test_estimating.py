@@ -245,3 +245,42 @@ def test_a_mapped_state_that_estimate_leaves_out_is_told(tmp_path):
     warned = w.ingest(tmp_path / "all.csv", data=True).warnings
     told = ("v is in [log]", "an estimate in its place", "measured")
     assert any(holds(one, *told) for one in warned)
+
+
+def late(before, until=3.0, delay=0.06, held=0.0, v=0.0, seed=0):
+    """A log of a cart that receives its commands late; `before` of it, they were those held."""
+    t = np.arange(-1.0, until, fine := 1e-3)
+    sent = np.where(t < 0, held, 3.0 * np.cos(np.floor(t / 0.05) * 0.05))
+    x, path = 0.0, []
+    for u in np.interp(t - delay, t, sent):
+        path.append((x, v))
+        x, v = x + fine * v, v + fine * (u - 0.4 * v)
+    x, v = np.transpose(path)
+    at = np.arange(round((1.0 - before) / fine), len(t), 10)
+    noise = np.random.default_rng(seed).normal(0, 0.002, len(at))
+    log = {"x": series(t[at] + 1, x[at] + noise), "force": series(t[at] + 1, sent[at], "/csv.f")}
+    return log, t + 1, v
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_log_that_begins_with_a_run_knows_what_was_held_before(task, seed):
+    """Its first command was taken to have been held before, so it seemed to start in motion."""
+    task = replace(task, latency=np.array([0.06]))
+    logged, t, v = late(0.0, seed=seed)
+    error, at = off(with_estimates(logged, TABLE, task), t, v)
+    assert np.abs(error[at < 1.2]).max() < 0.02
+
+
+def test_a_log_that_begins_amid_driving_had_its_first_command_before(task):
+    task = replace(task, latency=np.array([0.06]))
+    logged, t, v = late(0.3, held=2.0, v=0.5)
+    error, at = off(with_estimates(logged, TABLE, task), t, v)
+    assert np.abs(error[(at > 0.75) & (at < 1.2)]).max() < 0.1
+
+
+def test_seconds_under_a_column_of_milliseconds_are_told(task):
+    """The smoother's noise was NaN, with warnings of numpy."""
+    logged, _, _ = driven()
+    log = {n: replace(one, t=one.t[0] + (one.t - one.t[0]) // 1000) for n, one in logged.items()}
+    with pytest.raises(GroundedError, match=r"times 1000 they would be 0\.01 s"):
+        with_estimates(log, TABLE, task)

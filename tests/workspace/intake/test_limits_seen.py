@@ -12,6 +12,7 @@ from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.intake.trial_check import _to_stay
 from grounded_trials.workspace.intake.where_to_mend import where_to_mend
 from recorded import record, waiting
 from workspaces import CONFIG, make
@@ -160,3 +161,19 @@ def test_a_robot_that_leaves_safety_after_its_run_is_seen_to(tmp_path, rolls):
     told = [one for one in Workspace(w.folder).ingest(file).warnings if "after its end" in one]
     assert len(told) == (rolls > 0)
     assert not told or holds(told[0], "[safety] x = [-9,", "m.")
+
+
+@pytest.mark.parametrize("rests", [False, True])
+@pytest.mark.parametrize("weighed", [False, True])
+def test_what_a_task_has_already_is_not_advised(tmp_path, rests, weighed):
+    """`--hold` and terminal weights were advised to a task with both."""
+    task = make(tmp_path / "w").task
+    target = np.zeros_like(task.target)  # both states are given
+    target[:, 0] = np.linspace(0, 1, len(target))
+    if rests:
+        target[-len(target) // 4 :, 0] = 1.0
+    reward = replace(task.reward, terminal=np.array([1.0, float(weighed)]))
+    said = _to_stay(replace(task, target=target, reward=reward), [0])
+    assert ("let the target rest at its end" in said) == (not rests)
+    assert ("[reward] terminal" in said) == (not weighed)
+    assert ("for longer" in said) == (rests and weighed)

@@ -153,7 +153,7 @@ def test_a_run_with_exchanged_commands_names_them(w, tmp_path):
     said = str(refused.value)
     assert holds(said, plan.id, "port", "starboard") and "somebody" not in said
     recording = read_foreign(w, path, mapping_of(w, path)).recording
-    assert exchanged_in(recording, w.task, plan.policy) == ("port", "starboard")
+    assert exchanged_in(recording, w.task, plan) == ("port", "starboard")
     toml = w.folder / "grounded.toml"
     toml.write_text(
         toml.read_text()

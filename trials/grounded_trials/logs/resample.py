@@ -149,7 +149,7 @@ def to_grid(
     moved, uneven = (0, "") if rest is None else first_step(sent, start, dt, unknown)
     start += moved
     stop = min(until, _end(span, series, start, origin, until))
-    count = _steps(start, stop, dt, steps, origin, _stamped_otherwise(samples.values(), dt))
+    count = _steps(start, stop, dt, steps, origin, stamped_otherwise(samples.values(), dt))
     grid = start + np.round(dt * 1e9 * np.arange(count + 1)).astype(np.int64)
     middle = start + np.round(dt * 1e9 * (np.arange(count) + 0.5)).astype(np.int64)
     columns, reports = [], []
@@ -250,7 +250,7 @@ def _crossing(crossing: Crossing, series: Series, which: str, after: int | None)
     return int(t[np.argmax(beyond)])
 
 
-def _stamped_otherwise(samples: Iterable[Samples], dt: float) -> str:
+def stamped_otherwise(samples: Iterable[Samples], dt: float) -> str:
     """Return a hint if the times seem to be in another unit, by the interval of the samples."""
     many = [one for one in samples if len(one.t) >= MANY]
     every = max((one.interval for one in many), default=0.0)

@@ -178,7 +178,8 @@ def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
         return "pendulum", "the log has an angle and a torque"
     if flat := next((t.topic for t in log.topics if _in_the_plane(t)), None):
         return "rover", f"{flat} moves in a plane, and there is no steering signal"
-    return "generic", "the kind of robot is unknown, --kind sets it; names are the log's"
+    known = ", ".join(KINDS[:-1])
+    return "generic", f"the kind of robot is unknown, --kind sets it ({known}); names are the log's"
 
 
 def of_arms(joints: Joints) -> Joints:

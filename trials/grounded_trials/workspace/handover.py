@@ -271,7 +271,7 @@ class Check:
         for stored in self.workspace.store.list() if aside else ():
             if stored.id in aside and self._ran(stored) == name:
                 why = aside[stored.id]
-                yield f"its trial {stored.id} is set aside{why and ': ' + why}"
+                yield f"{stored.id}, a run of {name}, is set aside{why and ': ' + why}"
 
     def _ran(self, stored: Stored) -> str:
         with suppress(GroundedError):

@@ -42,8 +42,11 @@ ROUNDS = 2  # rounds of coordinate search over the topics' ages
 EXACT = 1e-3  # median difference, relative to an input's size, of the candidate that ran
 LUCK = float(np.log(2) / 2)  # [nats] per step: half the squares, which lower gains also give
 FEW, FEWEST = 4, 0.2  # smallest number of informative steps in a part, and their share to be exact
+THEIRS = 0.05  # largest median difference, relative to size, of another that is said to have run
 CLEARLY = 6.0  # [nats] of evidence, beyond LUCK, for another candidate
 LATEST = 3  # steps by which commands may be logged late
+USUAL = 0.03  # median difference of commands on speeds that the program had differently, at most
+MOST = 0.75  # share of a run's parts in which commands must be that near, within 2x
 ONE = 3e-3  # rms difference, relative to size, below which two candidates count as equal
 
 
@@ -70,6 +73,13 @@ class ActedOn:
         """Whether the commands are exact, also in every part of the run."""
         parts = (one[np.isfinite(one)] for one in np.array_split(self.off, WINDOWS))
         return self.exact and all(len(one) < FEW or np.mean(one < EXACT) > FEWEST for one in parts)
+
+    @property
+    def usually(self) -> bool:
+        """Whether most commands are about the policy's, as with other estimates of the speeds."""
+        parts = [one[np.isfinite(one)] for one in np.array_split(self.off, WINDOWS)]
+        near = [np.median(one) < 2 * USUAL for one in parts if len(one) >= FEW]
+        return self.left < USUAL and bool(near) and float(np.mean(near)) >= MOST
 
     @property
     def left(self) -> float:
@@ -244,7 +254,7 @@ def sender_of(
         fit = None if one.id == own.id else acted_on(log, one.policy, at)
         if fit is None or _one(mine, fit):
             continue
-        if (for_it := nats(mine, fit)) <= best:
+        if fit.left > THEIRS or (for_it := nats(mine, fit)) <= best:
             continue
         if fit.exact or (not late and (there := _following(log, one.policy, at)) and there.alike):
             best, name, theirs = for_it, one.id, fit
@@ -259,6 +269,36 @@ def sender_of(
         f"{name}. Was {own.id} copied to the robot?"
     )
     return Sender(mine, name, why)
+
+
+def on_other_speeds(
+    log: Recording,
+    own: Candidate,
+    candidates: Sequence[Candidate],
+    start_of: Callable[[Candidate], Start | None],
+) -> bool:
+    """Return whether a log is the own candidate's run, whose program had other speeds than it has.
+
+    A program that differentiates positions has speeds that lag those of the smoother. Its commands
+    then differ most where they change fastest, by more than those of some candidates: so the usual
+    difference tells whose run it is, not the mean square.
+
+    Args:
+        log: the log, with speeds that were estimated.
+        own: the candidate that it is said to have run.
+        candidates: candidates that may have been run instead.
+        start_of: returns where a candidate's run seems to begin in the log.
+    """
+    found = start_of(own)
+    mine = acted_on(log, own.policy, log.first if found is None else found.seconds)
+    if mine is None or not mine.usually:
+        return False
+    for one in candidates:
+        begun = None if one.id == own.id else start_of(one)
+        fit = begun and acted_on(log, one.policy, begun.seconds)
+        if fit and not _one(mine, fit) and fit.left <= mine.left:
+            return False
+    return True
 
 
 def rival_in(

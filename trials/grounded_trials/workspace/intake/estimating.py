@@ -7,7 +7,10 @@
 The measured states are smoothed with the model that plans (the crude one with all adopted effects),
 on a time grid about as fine as they were sampled. The process noise is estimated from the same log
 by maximum likelihood, where commands change, since model errors show in motion and not while the
-robot waits. The whole log is smoothed before a run is located in it, since the samples before the
+robot waits. What was sent before the log is not in it: with a latency, that acts on its first
+samples. Either its first command was held before, or the log begins with a run, before which the
+robot received the task's held input (and waited at its start); the likeliest is used. The whole log
+is smoothed before a run is located in it, since the samples before the
 start and after the end of a run carry information about its speeds.
 """
 
@@ -25,6 +28,7 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task
 from grounded_trials.formats.messages import Ints
+from grounded_trials.logs.resample import stamped_otherwise
 from grounded_trials.logs.samples import Samples, check_overlap, tidy
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.toml_table import Table
@@ -35,6 +39,7 @@ OVERLAP_S = 1.5  # overlap of the pieces on each side [s]
 LEAST = 3  # smallest number of rows that can be smoothed
 MARGIN_S = 0.5  # time after the last change of a command that still counts as motion [s]
 WIDE = 10.0  # std of an initial state, relative to the state's size
+STILL = 0.02  # std of the state of a robot that waits at a run's start, relative to the same
 EXACT = 1e-3  # relative tolerance for a step to be a multiple of a simulator's own
 SIZED = 256  # instants at which the size of states is computed
 
@@ -93,6 +98,12 @@ def with_estimates(
     samples = [tidy(n, series[n], unwrap=n in model.angles) for n in table.measured]
     sent = [tidy(name, series[name], unwrap=False) for name in model.input_names]
     check_overlap(samples, sent)
+    lasts = 1e-9 * (min(int(s.t[-1]) for s in samples) - max(int(s.t[0]) for s in samples))
+    if lasts < task.dt:
+        raise GroundedError(
+            f"the log lasts {lasts:.3g} s, less than a step of [task] dt = {task.dt:g} s: states "
+            f"can't be estimated from it{stamped_otherwise((*samples, *sent), task.dt)}"
+        )
     clock = _Clock.of(samples, min(int(s.t[0]) for s in (*samples, *sent)), task)
     records = _records(samples, sent, clock, task.dt)
     if not records:
@@ -196,11 +207,26 @@ def _smoothed(
     measurement = of_states(model, list(table.measured))
     options = {"latency": task.latency, "measurement": measurement}
     records = [replace(record, start_std=WIDE * sizes) for record in records]
-    found = noise_of(model, _moving(records), known=known, sizes=sizes, **options)  # type: ignore[arg-type]
-    process = np.array(found.noise.process)
-    for name, std in table.process.items():
-        process[model.state_names.index(name)] = std * np.sqrt(found.noise.dt / task.dt)
-    noise = NoiseStd(process=process, measurement=known, dt=found.noise.dt)
+
+    def fitted(records: list[Record]) -> NoiseStd:
+        found = noise_of(model, _moving(records), known=known, sizes=sizes, **options)  # type: ignore[arg-type]
+        process = np.array(found.noise.process)
+        for name, std in table.process.items():
+            process[model.state_names.index(name)] = std * np.sqrt(found.noise.dt / task.dt)
+        return NoiseStd(process=process, measurement=known, dt=found.noise.dt)
+
+    noise = fitted(records)
+    first = records[0]
+    if np.any(task.latency) and np.any(first.past != task.past):
+        std = np.tile(WIDE * sizes, (len(first.times), 1))  # of pieces of it that begin later
+        std[0, [name not in table.measured for name in model.state_names]] *= STILL / WIDE
+        held = replace(first, past=task.past)
+        rivals = [first, held, replace(held, start=task.start, start_std=std)]
+        begun = [next(_overlapping(one))[0] for one in rivals]
+        likely = [one.loglik for one in smooth_trials(model, begun, noise, **options)]  # type: ignore[arg-type]
+        if likeliest := int(np.argmax(np.nan_to_num(likely, nan=-np.inf))):
+            records = [rivals[likeliest], *(replace(one, past=task.past) for one in records[1:])]
+            noise = fitted(records)
     parts = [one for record in records for one in _overlapping(record)]
     smooth = smooth_trials(model, [one for one, _ in parts], noise, **options)  # type: ignore[arg-type]
     kept = [one.states[core] for one, (_, core) in zip(smooth, parts, strict=True)]

@@ -19,7 +19,8 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import listed
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.returned.other_scale import other_units
+from grounded.search.returned.as_predicted import odd_columns
+from grounded.search.returned.other_scale import other_units, units_tried
 from grounded.search.returned.who_drove import OTHERS, Following
 from grounded.search.safety import COASTS
 from grounded.task import Task
@@ -34,7 +35,13 @@ from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.intake.log_faults import dead_sensors, log_faults, mistaken_in
 from grounded_trials.workspace.intake.look import Look
 from grounded_trials.workspace.intake.odd_run import odd_run
-from grounded_trials.workspace.intake.read_otherwise import misled, pace_of, unit_of, units_told
+from grounded_trials.workspace.intake.read_otherwise import (
+    misled,
+    pace_of,
+    rather_exchanged,
+    unit_of,
+    units_told,
+)
 from grounded_trials.workspace.intake.reading import (
     NoneWaits,
     Read,
@@ -47,6 +54,7 @@ from grounded_trials.workspace.intake.reading import (
 )
 from grounded_trials.workspace.intake.run_start import (
     LOOSE,
+    Recording,
     loosely,
 )
 from grounded_trials.workspace.intake.stored_before import (
@@ -62,6 +70,7 @@ from grounded_trials.workspace.proposing import candidate_named, latest_candidat
 from grounded_trials.workspace.unknown_id import refuse_ids
 
 ASIDE = "set aside"  # the verdict on a run that does not count
+WHOLE = 0.9  # share of a run that a log must last to be one, or else the error says so
 EXACT = 0.1  # largest difference, relative to the resolution of commands, of an exact match
 
 
@@ -196,22 +205,28 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         read = replace(read, warnings=(*read.warnings, loosely(found.loose_s, ran)))
     why, other = seen.why, seen.other
     fell, stored = look.fell, read.log.stored if read.log else ()
-    task, policy = workspace.task, own.policy
+    task = workspace.task
     if accepted := [one.trial.steps for one in stored if one.trial.candidate == ran]:
         return cut_short(read, fell.steps, "") if fell and fell.steps in accepted else read
     units, by = other_units(task, whole, own, seen.ran)
-    units = () if other else units
+    units = units if not other and not _guessed(log) & {*units} else ()
+    if read.log and not why and not units:
+        logged = [name for name in task.model.state_names if name not in _guessed(log)]
+        tried = [(names, f) for names, f in units_tried(task.model) if {*names} <= {*logged}]
+        units, by = odd_columns(task.model, own, whole, tried)
     if not why and not units:
         told = _like(read, ran, seen.ran)
         if fell:
             read = cut_short(read, fell.steps, fell.told)
         return replace(read, warnings=(*read.warnings, *told))
-    slow = pace_of(log, task, policy) if log and not other else None
+    slow = pace_of(log, task, own) if log and not other else None
     if slow:  # a recording at another rate may look like one in another unit
         units = ()
     elif log and not units and not other:
-        units, by = unit_of(log, task, policy)
-    if fell and not (units or slow or misled(log, task, policy)):
+        units, by = unit_of(log, task, own)
+    if log and units and why and rather_exchanged(log, task, own, units, by):
+        units = ()
+    if fell and not (units or slow or misled(log, task, own)):
         return cut_short(read, fell.steps, fell.told)
     pace = slow and (
         f"a second of its stamps is {slow:g} s of the run (a recording played at another rate?): "
@@ -219,7 +234,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     )
     if candidate is not None:
         seem = f"with {listed(units)} times {by:.6g} it is its run: another unit, or sign?"
-        doubts = [seem if units else pace or misled(None if other else log, task, policy) or why]
+        doubts = [seem if units else pace or misled(None if other else log, task, own) or why]
         if log and not (found and found.opens_alike):
             doubts.append(
                 f"no start of {ran} was found in it: the run is assumed to begin with the first "
@@ -246,20 +261,23 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             NextCommand("ingest", (str(path), "--data")),
         )
     known = replace(read.trial, id="").until(read.trial.known_steps)
-    odd = [*mistaken_in(workspace.base_model, known), *dead_sensors(workspace.base_model, whole)]
+    odd = []
+    if not seen.silent:  # without them the model can't tell what moves the robot
+        odd += [*mistaken_in(workspace.base_model, known)]
+        odd += [*dead_sensors(workspace.base_model, whole)]
     named = [*(misread(read.log) if read.log else ())]
     named += [one.told(known, own=read.own) for one in odd]
-    if not named and not other:
-        named += filter(None, [misled(log, task, policy)])
+    if not named and not other and not seen.silent:
+        named += filter(None, [misled(log, task, own)])
     if named:
         raise GroundedError(f"{path} can't be read as a run of {ran}: {'; '.join(named)}")
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
-    if log and (guessed := [n for n in log.names[0] if n not in log.logged]):
+    if guessed := sorted(_guessed(log)):
         said += (
             f" Or {listed(guessed)}, which [estimate] finds here, {_is(guessed)} not what "
             "its program used: make it log its own estimate, and map that in [log] too."
         )
-    said += read.hole
+    said += read.hole + (_lasting(log, task) if log else "")
     if other:
         raise GroundedError(
             f"{said} Ingest it with --candidate {other}, with --candidate {ran} anyway, or with "
@@ -272,6 +290,23 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         f"anyway{begins}",
         NextCommand("ingest", (str(path), "--data")),
     )
+
+
+def _lasting(log: Recording, task: Task) -> str:
+    """Return a sentence on a log that is too short for a run of the task, or ""."""
+    end = min(int(one.t.max()) for one in log.logged.values())
+    lasts = 1e-9 * (end - log.whole.origin_ns) - log.first
+    if not lasts < WHOLE * task.horizon * task.dt:
+        return ""
+    return (
+        f" It ends {max(lasts, 0.0):.2g} s after its first command, while a run lasts "
+        f"{task.horizon * task.dt:.3g} s: was its beginning or its end cut off?"
+    )
+
+
+def _guessed(log: Recording | None) -> set[str]:
+    """Return the states that [estimate] finds: no column holds them, so none is in another unit."""
+    return {name for name in log.names[0] if name not in log.logged} if log else set()
 
 
 def _undo(identity: str) -> str:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
 
+from grounded.result import listed
 from grounded.search.candidate import Candidate
 from grounded.search.returned.who_drove import suspicion
 from grounded.task import Task
 from grounded.trial import interpolate_gaps
-from grounded_trials.workspace.intake.acted_on import rival_in, sender_of
+from grounded_trials.workspace.intake.acted_on import on_other_speeds, rival_in, sender_of
 from grounded_trials.workspace.intake.fell import fall_in, who_fell
 from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.intake.missed_steps import not_sent
@@ -49,17 +51,7 @@ class Look:
             start_of = cache(partial(_start_of, self.log))
             self.found = found = start_of(own)
             if found and elsewhere(self.log, found, own.policy, seen.why):
-                begins = found.seconds + (_sooner(apart, read.log) if apart else 0)
-                note = f"the log begins {begins:.3f} s before {ran} does: that part is left out"
-                there = cut_log(read.log, ran, begins)
-                warnings, notes = list(there.warnings), list(read.notes)
-                if found.missed:
-                    warnings.insert(0, not_sent(task, ran, found.missed))
-                else:
-                    notes.append(note)
-                self.read = replace(there, warnings=tuple(warnings), notes=tuple(notes))
-                cut = apart.cut(ran, found.seconds)[0] if apart else self.read.trial
-                self.whole = interpolate_gaps(cut).trial
+                self._cut(read.log, apart, found, own, task)
                 seen = judged(self.whole)
             sender = sender_of(self.log, own, candidates, start_of)
             if sender.sure:
@@ -70,6 +62,14 @@ class Look:
                 best = judged(rival)  # cut where the other candidate fits best
                 told = best if best.other else seen if seen.why else replace(seen, why=best.why)
                 seen = replace(told, ran=seen.ran)
+            guessed = [name for name in self.log.names[0] if name not in self.log.logged]
+            doubted = found and guessed and seen.why and not sender.sure
+            if found and doubted and on_other_speeds(self.log, own, candidates, start_of):
+                if self.read is read:
+                    self._cut(read.log, apart, found, own, task)
+                seen = replace(judged(self.whole), why="", other="")
+                notes = (*self.read.notes, _other_speeds(ran, guessed))
+                self.read = replace(self.read, notes=notes)
         elif log and read.cut and log.spanned and (seen.why or seen.other) and log.anywhere:
             begins = 1e-9 * (read.cut.start_ns - log.anywhere.whole.origin_ns)
             given = Start(begins, 0.0, alike=True, opens_alike=True)
@@ -83,6 +83,21 @@ class Look:
                 self.fell, seen = None, replace(seen, other=name)
         self.suspicion = seen
 
+    def _cut(
+        self, log: ForeignLog, apart: ForeignLog | None, found: Start, own: Candidate, task: Task
+    ) -> None:
+        """Cut the run from a log where it begins, with a note."""
+        ran, begins = own.id, found.seconds + (_sooner(apart, log) if apart else 0)
+        there = cut_log(log, ran, begins)
+        warnings, notes = list(there.warnings), list(self.read.notes)
+        if found.missed:
+            warnings.insert(0, not_sent(task, ran, found.missed))
+        else:
+            notes.append(f"the log begins {begins:.3f} s before {ran} does: that part is left out")
+        self.read = replace(there, warnings=tuple(warnings), notes=tuple(notes))
+        cut = apart.cut(ran, found.seconds)[0] if apart else self.read.trial
+        self.whole = interpolate_gaps(cut).trial
+
     @property
     def doubt(self) -> tuple[bool, float]:
         """Whether it is another's run, and how far the commands are from the candidate's."""
@@ -93,6 +108,15 @@ class Look:
 def _start_of(log: Recording, candidate: Candidate) -> Start | None:
     """Return where a candidate's run seems to begin in a log."""
     return log.start_of(candidate.policy)
+
+
+def _other_speeds(ran: str, guessed: Sequence[str]) -> str:
+    """Return the note on a run whose program had other speeds than the smoother finds."""
+    return (
+        f"most of its commands are within a few percent of those of {ran} on the {listed(guessed)} "
+        "that [estimate] finds here; its program used its own. To have them judged exactly, let it "
+        "log its own, and map them in [log] too"
+    )
 
 
 def _sooner(log: ForeignLog, stored: ForeignLog) -> float:

@@ -14,6 +14,8 @@ import numpy as np
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.result import listed
+from grounded.search.candidate import Candidate
+from grounded.search.returned.as_predicted import apart, like_predicted, multiplied
 from grounded.search.returned.other_scale import (
     NEARLY,
     THOUSAND,
@@ -22,7 +24,7 @@ from grounded.search.returned.other_scale import (
     unit_named,
     units_tried,
 )
-from grounded.search.returned.who_drove import follows
+from grounded.search.returned.who_drove import FINE, follows
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.logs.signals import Series
@@ -32,32 +34,35 @@ from grounded_trials.workspace.intake.run_start import TRIED, Recording, recordi
 
 PAIRS = 28  # largest number of pairs of states, and of inputs, that are tried exchanged
 WORSE = 2.0  # factor by which a log must follow a policy worse than with two columns exchanged
+CLEARLY = 0.5  # [nats] by which an exchange must bring a log nearer to the prediction than a unit
 PACES = (2.0, 0.5)  # rates of a recording that are tried
 
 
-def pace_of(log: Recording, task: Task, policy: Policy) -> float | None:
-    """Return how many seconds of a policy's run one second of the log's stamps is; None if one.
+def pace_of(log: Recording, task: Task, own: Candidate) -> float | None:
+    """Return how many seconds of a candidate's run one second of the log's stamps is; None if one.
 
     Args:
-        log: a log in which no run of the policy was found.
+        log: a log in which no run of the candidate was found.
         task: the task with the control step.
-        policy: the policy.
+        own: the candidate.
     """
     for pace in PACES:
         paced = {name: _paced(one, pace) for name, one in log.logged.items()}
-        if _run_in(recording(paced, task, log.complete), policy):
+        run = _run_in(recording(paced, task, log.complete), own.policy)
+        if run and like_predicted(own, run):  # slow commands fit many policies
             return pace
     return None
 
 
-def unit_of(log: Recording, task: Task, policy: Policy) -> tuple[tuple[str, ...], float]:
-    """Return signals and a factor with which the log contains a run of a policy; (), 1 for none.
+def unit_of(log: Recording, task: Task, own: Candidate) -> tuple[tuple[str, ...], float]:
+    """Return signals and a factor with which the log contains a run of a candidate; (), 1 for none.
 
     Args:
-        log: a log in which no run of the policy was found.
+        log: a log in which no run of the candidate was found.
         task: the task with the control step.
-        policy: the policy.
+        own: the candidate.
     """
+    policy, best, least = own.policy, (tuple[str, ...](), 1.0), np.inf
     tried = set[tuple[tuple[str, ...], float]]()
     for group, by in units_tried(task.model):
         names = tuple(name for name in group if name in log.logged)
@@ -65,33 +70,36 @@ def unit_of(log: Recording, task: Task, policy: Policy) -> tuple[tuple[str, ...]
             continue
         tried.add((names, by))
         scaled = {n: replace(log.logged[n], values=log.logged[n].values * by) for n in names}
-        known = None  # for inputs alone, the estimates need not be repeated
-        if set(names) <= set(task.model.input_names):
-            known = {**log.series, **scaled}
-        run = _run_in(recording({**log.logged, **scaled}, task, log.complete, known), policy)
+        run = _run_in(recording({**log.logged, **scaled}, task, log.complete), policy)
         fit = run and follows(policy, run.until(policy.horizon), 0)
-        if fit and fit.error < NEARLY:
-            return names, by
+        if not run or not fit or not fit.error < NEARLY:
+            continue
+        if (away := apart(own, run) - apart(own, multiplied(run, names, 1 / by))) > 0:
+            continue  # farther from the prediction than as it is logged
+        if (left := away + np.log(fit.error + FINE)) < least:
+            best, least = (names, by), left
+    if best[0]:
+        return best
     for begins in log.openings[:TRIED]:
         if trial := log.trial_from(begins):
-            names, by = any_factor(task, policy, trial)
+            names, by = any_factor(task, own, trial)
             if names:
                 return names, by
     return (), 1.0
 
 
-def misled(log: Recording | None, task: Task, policy: Policy) -> str:
+def misled(log: Recording | None, task: Task, own: Candidate) -> str:
     """Return another fault of a log that hides its run, and how to correct it; or ""."""
     if log is None:
         return ""
-    if pair := exchanged_in(log, task, policy):
+    if pair := exchanged_in(log, task, own):
         a, b = pair
         of = "state" if a in task.model.state_names else "input"
         return (
             f"{a} and {b} seem to be in each other's column: exchange the paths in "
             f"[log.{of}.{a}] and [log.{of}.{b}], or the column headers in the log"
         )
-    if off := offset_in(log, task, policy):
+    if off := offset_in(log, task, own):
         name, by = off
         much = with_unit(f"{abs(by):.3g}", task.model.states[name])
         return (
@@ -103,17 +111,36 @@ def misled(log: Recording | None, task: Task, policy: Policy) -> str:
     return ""
 
 
-def exchanged_in(log: Recording, task: Task, policy: Policy) -> tuple[str, str] | None:
-    """Return two states, or inputs, whose exchange makes the log contain a run of a policy.
+def exchanged_in(log: Recording, task: Task, own: Candidate) -> tuple[str, str] | None:
+    """Return two states, or inputs, whose exchange makes the log contain a run of a candidate.
 
     Args:
-        log: a log in which no run of the policy was found.
+        log: a log in which no run of the candidate was found.
         task: the task with the control step.
-        policy: the policy.
+        own: the candidate.
     """
+    found = _exchange(log, task, own)
+    return found and found[0]
+
+
+def rather_exchanged(
+    log: Recording, task: Task, own: Candidate, names: Sequence[str], by: float
+) -> bool:
+    """Return whether two exchanged columns explain a log better than another unit of some."""
+    found = _exchange(log, task, own)
+    if found is None or (as_logged := log.trial_from(found[1])) is None:
+        return False
+    return found[2] < apart(own, multiplied(as_logged, names, by)) - CLEARLY
+
+
+def _exchange(
+    log: Recording, task: Task, own: Candidate
+) -> tuple[tuple[str, str], float, float] | None:
+    """Return two exchanged columns, where the run begins then, and how far it is [nats]."""
     if (as_it_is := log.trial_from(log.first)) is None:
         return None
-    apart = follows(policy, as_it_is.until(policy.horizon), 0)
+    policy, best, least = own.policy, None, np.inf
+    as_logged = follows(policy, as_it_is.until(policy.horizon), 0)
     inputs = list(combinations(task.model.input_names, 2))[:PAIRS]
     states = [name for name in task.model.state_names if name in log.logged]
     if policy.gain is None or not policy.gain.any():
@@ -121,25 +148,35 @@ def exchanged_in(log: Recording, task: Task, policy: Policy) -> tuple[str, str] 
     for a, b in (*inputs, *list(combinations(states, 2))[:PAIRS]):
         one, other = log.logged[a], log.logged[b]
         back = {a: replace(other, spec=one.spec), b: replace(one, spec=other.spec)}
-        run = _run_in(recording({**log.logged, **back}, task, log.complete), policy)
+        if (mended := recording({**log.logged, **back}, task, log.complete)) is None:
+            continue
+        begun = mended.start_of(policy)
+        run = mended.trial_from(begun.seconds) if begun and begun.alike else None
         fit = run and follows(policy, run.until(policy.horizon), 0)
-        if fit and fit.error < NEARLY and not (apart and apart.error < WORSE * fit.error):
-            return a, b
-    return None
+        if not begun or not run or not fit or not fit.error < NEARLY:
+            continue
+        if as_logged and as_logged.error < WORSE * fit.error:
+            continue
+        there, far = log.trial_from(begun.seconds), apart(own, run)
+        if there is not None and far > apart(own, there):
+            continue  # farther from the prediction than as it is logged
+        if (left := far + np.log(fit.error + FINE)) < least:
+            best, least = ((a, b), begun.seconds, far), left
+    return best
 
 
-def offset_in(log: Recording, task: Task, policy: Policy) -> tuple[str, float] | None:
-    """Return a state and its constant error, without which the log contains a run of a policy.
+def offset_in(log: Recording, task: Task, own: Candidate) -> tuple[str, float] | None:
+    """Return a state and its constant error, without which the log contains a candidate's run.
 
     Args:
-        log: a log in which no run of the policy was found.
+        log: a log in which no run of the candidate was found.
         task: the task with the control step.
-        policy: the policy.
+        own: the candidate.
     """
     for begins in (log.first, *log.openings[:TRIED]):
         if trial := log.trial_from(begins):
             names = [name for name in task.model.state_names if name in log.logged]
-            if found := any_offset(task, policy, trial, names):
+            if found := any_offset(task, own, trial, names):
                 return found
     return None
 

@@ -231,9 +231,21 @@ def _moved_on(task: Task, whole: Trial) -> list[str]:
     later, then = measured_alike([far[worst], far[end]], task.model.states[names[0]])
     return [
         f"{(worst - end) * task.dt:.2g} s after the run {what} was {later} from its target, at its "
-        f"end {then}: [reward] only judges the run. To make the robot stay there, let the target "
-        "rest at its end (target --hold), or weigh the rates at the end ([reward] terminal)"
+        f"end {then}: [reward] only judges the run. To make the robot stay there, "
+        f"{_to_stay(task, states)}"
     ]
+
+
+def _to_stay(task: Task, states: Sequence[int]) -> str:
+    """Return what would make a robot stay at the end of its target that the task lacks."""
+    from grounded.instruments.kinematics import integrals
+
+    end = task.target[-max(2, len(task.target) // 20) :, states]
+    rates = [one.j for one in integrals(task.model) if one.exact and one.i in states]
+    ways = ["let the target rest at its end (target --hold)"] * bool(np.ptp(end, axis=0).any())
+    if not rates or not (task.reward.terminal[rates] > 0).all():
+        ways.append("weigh the rates at the end ([reward] terminal)")
+    return ", or ".join(ways) or "let the target rest for longer (target --hold)"
 
 
 def _left_afterwards(task: Task, whole: Trial) -> list[str]:

@@ -1,0 +1,61 @@
+"""A fault of a log is only stated if the log without it is nearer to the candidate's prediction."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded.search.returned.as_predicted import apart, like_predicted, multiplied, odd_columns
+from grounded.search.returned.other_scale import other_units, units_tried
+from grounded.search.returned.who_drove import follows
+from recorded import waiting
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    w = waiting(tmp_path_factory.mktemp("as_predicted"))
+    own = w.candidate("c0002")[0]
+    run = own.predicted_run
+    noise = np.random.default_rng(0).normal(0, [0.002, 0.01], run.states.shape)
+    return w.task, own, replace(run, states=run.states + noise)
+
+
+def said(made, trial):
+    task, own, _ = made
+    return odd_columns(task.model, own, trial, list(units_tried(task.model)))
+
+
+def test_a_sound_run_is_near_its_prediction_and_no_column_is_odd(made):
+    task, own, run = made
+    assert like_predicted(own, run) and said(made, run) == ((), 1.0)
+    assert other_units(task, run, own, follows(own.policy, run, 1)) == ((), 1.0)
+
+
+@pytest.mark.parametrize("by", [1e3, 1e-3, 180 / np.pi, -1.0])
+def test_a_column_farther_from_the_prediction_is_told_whatever_its_size(made, by):
+    _, own, run = made
+    wrong = multiplied(run, ["v"], by)
+    assert apart(own, wrong) > apart(own, run) + 1
+    if abs(by) > 100 or abs(by) < 0.01 or by == -1:
+        names, factor = said(made, wrong)
+        assert names == ("v",) and factor * by == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.1])
+def test_a_factor_of_the_commands_is_told_where_it_explains_all_of_a_small_difference(made, factor):
+    """0.8 of a command was stored in silence: the commands are nearly alike."""
+    task, own, _ = made
+    exact = own.predicted_run
+    wrong = multiplied(exact, ["force"], factor)
+    names, by = other_units(task, wrong, own, follows(own.policy, wrong, 1))
+    assert names == ("force",) and by == pytest.approx(1 / factor, rel=0.01)
+
+
+def test_a_real_motion_opposite_to_a_small_predicted_one_is_no_wrong_sign(made):
+    """Only where the model's motion also contradicts the sign it is one."""
+    *_, run = made
+    x = np.array(run.states)
+    x[:, 1] *= -1
+    x[:, 0] = x[0, 0] + np.cumsum(np.r_[0.0, x[:-1, 1]]) * run.dt  # it really went the other way
+    other = replace(run, states=x, inputs=-run.inputs)
+    assert said(made, other) == ((), 1.0)
