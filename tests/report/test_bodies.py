@@ -164,3 +164,19 @@ def test_a_carriage_is_no_wider_than_its_way_and_what_hangs_from_it_is_no_tip():
     assert _body(cart_pole.model).watched == "the tip" == _body(pendulum.model).watched
     crane = replace(cart_pole.model, roles={"rail": "x", "hanging": ("theta",)})
     assert "load" in _body(crane).watched
+
+
+def test_a_rope_is_thin_and_its_load_is_at_its_end():
+    """The rope of a crane of 0.55 m was a rod, 6.6 cm thick."""
+    params = {"L": Param(0.55, "m")}
+    crane = replace(cart_pole.model, roles={"rail": "x", "hanging": ("theta",)}, params=params)
+    body, states = _body(crane), np.array([[0.3, 0.4, 0.0, 0.0]])
+    parts = {part.name: k for k, part in enumerate(body.parts)}
+    rope, load = (body.parts[parts[name]] for name in ("link1", "load"))
+    assert rope.size[0] < 0.005 and rope.size[1] == 0.55 and load.shape == "box"
+    poses = body.poses(states)
+    assert len(poses) == len(body.parts)
+    np.testing.assert_allclose(poses[parts["load"]][0], body.path(states))
+    (_, width), *_ = motion(body, states, 0.1).lines(0)
+    assert width == 2 * rope.size[0]
+    assert "load" not in [part.name for part in _body(cart_pole.model).parts]

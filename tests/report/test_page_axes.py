@@ -17,18 +17,26 @@ from grounded.result import spread
 from grounded.search.pictures import search_figure
 from grounded_trials import Workspace
 from grounded_trials.report.diagnosis_words import utility_sentence
-from grounded_trials.report.figures.gap import _binned, residual_figures
+from grounded_trials.report.figures.gap import _binned, forecast_figures, residual_figures
 from grounded_trials.report.figures.png import png
-from grounded_trials.report.figures.runs import _timed, input_figure
+from grounded_trials.report.figures.runs import (
+    _timed,
+    all_figures,
+    bias_figure,
+    input_figure,
+    state_figure,
+)
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
 from grounded_trials.report.reporting import Report
+from grounded_trials.report.scene import reading_order
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.next_step import Since
-from reported import cart, copied
+from grounded_trials.workspace.off_target import tracked
+from reported import car, cart, copied
 
-__all__ = ["cart"]
+__all__ = ["car", "cart"]
 
 
 def test_a_run_is_not_cut_off_for_little():
@@ -62,6 +70,20 @@ def test_powers_of_ten_that_are_too_many_are_left_out():
     ticks = log_ticks(-10.0, 2.5)
     assert len(ticks) <= 7 and ticks[0] < 1e-8 and ticks[-1] >= 1.0
     assert np.allclose(np.diff(np.log10(ticks)), np.log10(ticks[1] / ticks[0]))
+
+
+def test_charts_begin_with_the_position_and_what_has_a_target(car):
+    """A car's charts began with its steering angle, which has no target."""
+    findings = gather(Folder(car))
+    task, names = findings.task, findings.task.model.state_names
+    order = [names[i] for i in reading_order(task)]
+    wanted = [names[i] for i in tracked(task)]
+    assert sorted(order) == sorted(names) and order[:2] == ["x", "y"]
+    assert set(order[: len(wanted)]) == set(wanted) and list(names[:2]) != order[:2]
+    for figure in (state_figure(findings), bias_figure(findings), *forecast_figures(findings)):
+        assert [panel.title.split(" [")[0] for panel in figure.panels] == order, figure.name
+    drawn = [figure.name for figure in all_figures(findings)]
+    assert drawn.index("states") < drawn.index("inputs") < drawn.index("error")
 
 
 def test_inputs_far_from_their_limits_are_drawn_without_them(cart):

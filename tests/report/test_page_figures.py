@@ -544,6 +544,9 @@ def test_a_crash_is_marked_where_it_happened(car):
     (cross,) = figure.panels[0].dots
     x = findings.task.model.state_names.index("x")
     assert cross.shape == "cross" and cross.x == states[19, x] and "0.95 s" in cross.note
+    cut = replace(short, trial=replace(run.trial, states=states[:20], inputs=run.trial.inputs[:19]))
+    (same,) = path_figure(replace(findings, runs=(cut, *findings.runs[1:]))).panels[0].dots
+    assert same.note == cross.note  # its log ends there: it ended "after 0.95 s of 0.95 s"
 
 
 def test_both_compared_paths_are_drawn_where_both_were_run_twice(car, tmp_path):

@@ -16,6 +16,7 @@ import pytest
 
 from cli import grounded
 from facts import holding
+from grounded_trials.report.figures.paths import ended
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.recording.recording import rate, summary, verdict, write_recording
 from grounded_trials.workspace.folder import Folder
@@ -67,6 +68,30 @@ def test_rerun_accepts_the_recording_and_finds_all_of_it(cart, tmp_path):
     for run in findings.runs:
         for part in ("path", "predicted", "body", "state", "input", "bias", "explained"):
             assert f"/trials/{run.trial.id}/{part}" in found
+
+
+@needs_tool
+def test_crashes_are_marked_where_and_when(car, tmp_path):
+    findings = gather(Folder(car))
+    (first, *rest), names = findings.runs, findings.task.model.state_names
+    states, inputs = first.trial.states[:20], first.trial.inputs[:19]
+    cut = replace(first.trial, states=states, inputs=inputs)
+    short = replace(first, trial=cut, utility=-np.inf)
+    path = tmp_path / "crash.rrd"
+    write_recording(replace(findings, runs=(short, *rest)), path)
+    assert _rerun("rrd", "verify", path).returncode == 0
+    told = ended(short)
+    assert f"{19 * findings.task.dt:.2f} s of" in told
+    found, shown = _entities(path), _rerun("rrd", "print", "-vvv", path).stdout
+    assert told in shown and ended(rest[0]) not in shown
+    for at in (f"/paths/crashes/{first.trial.id}", f"/trials/{first.trial.id}/crash"):
+        assert f"{at} " in found
+        assert f"{at} ".replace(first.trial.id, rest[0].trial.id) not in found
+    assert f"/trials/{first.trial.id}/state/ended " in found
+    assert f"/state/{names[0]}/ended_model_policy " in found
+    assert f"/state/{names[0]}/ended_best " not in found
+    write_recording(findings, path)
+    assert "/crash" not in _entities(path) and "/ended" not in _entities(path)
 
 
 @needs_tool

@@ -38,6 +38,8 @@ AIRCRAFT = (
 ZEROS = {"hanging": (-np.pi / 2, 1), "upright": (np.pi / 2, -1), "level": (0.0, 1)}
 LENGTH = 0.07  # size of a body of unknown length, as a fraction of the paths' size
 SLIM = 0.06  # radius of a link, as a fraction of the longest link
+ROPE = 0.005  # radius of a crane's rope, as a fraction of the longest one
+LOAD = 0.05  # half edge of a crane's load, as a fraction of the longest rope
 CARRIAGE = (0.25, 0.12, 0.1)  # half edges of the carriage, as fractions of the links' length
 
 
@@ -137,23 +139,32 @@ class Links:
     wide: float = CARRIAGE[0]  # half width of the carriage
 
     @property
+    def hangs(self) -> bool:
+        """Whether it is a load on ropes below a carriage, as of a crane."""
+        return bool(self.rail) and (self.zero, self.sign) == ZEROS["hanging"]
+
+    @property
     def watched(self) -> str:
         """The end of the last link."""
-        hangs = self.rail and (self.zero, self.sign) == ZEROS["hanging"]
-        return "the load, at the end of the last link" if hangs else "the tip"
+        return "the load, at the end of the rope" if self.hangs else "the tip"
 
     @property
     def parts(self) -> Sequence[Part]:
-        """The links, then the carriage."""
+        """The links or ropes, the load if there is one, then the carriage."""
+        longest = max(self.lengths)
+        thin = longest * (ROPE if self.hangs else SLIM)
         links = [
-            Part(f"link{i}", "capsule", (SLIM * max(self.lengths), length))
-            for i, length in enumerate(self.lengths, 1)
+            Part(f"link{i}", "capsule", (thin, length)) for i, length in enumerate(self.lengths, 1)
         ]
+        load = [Part("load", "box", (LOAD * longest,) * 3)] * self.hangs
         size = tuple(self.wide / CARRIAGE[0] * part for part in CARRIAGE)
-        return links + [Part("carriage", "box", size)] * bool(self.rail)
+        return [*links, *load, *[Part("carriage", "box", size)] * bool(self.rail)]
 
     def poses(self, states: Array) -> list[Pose]:
-        """Return the pose of each link at its joint, with z along the link, then the carriage's."""
+        """Return the pose of each link at its joint, with z along it; the load's, the carriage's.
+
+        The load turns with the rope that it hangs on.
+        """
         joints, along = self._chain(states)
         found: list[Pose] = []
         for joint, angle in zip(joints, along, strict=False):
@@ -161,8 +172,9 @@ class Links:
             columns = [(sin, no, -cos), (no, no + 1, no), (cos, no, sin)]
             turned = np.stack([np.stack(c, axis=-1) for c in columns], axis=-1)
             found.append((joint, turned))
+        load = [(joints[-1], found[-1][1])] * self.hangs
         still = np.tile(np.eye(3), (len(states), 1, 1))
-        return found + [(joints[0], still)] * bool(self.rail)
+        return [*found, *load, *[(joints[0], still)] * bool(self.rail)]
 
     def path(self, states: Array) -> Array:
         """Return the positions of the tip (T, 3)."""

@@ -17,7 +17,8 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded_trials.workspace.off_target import position_axes, roles_of
+from grounded.task import Task
+from grounded_trials.workspace.off_target import position_axes, roles_of, tracked
 
 NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # to east, north, up
 
@@ -60,6 +61,13 @@ class Scene:
         psi = np.zeros(len(states)) if self.heading is None else states[:, self.heading]
         angle = np.pi / 2 - psi if self.map and self.heading is not None else psi
         return np.asarray(Rotation.from_euler("z", angle[:, None]).as_matrix())
+
+
+def reading_order(task: Task) -> list[int]:
+    """Return the states in the order of charts: position, other states with a target, the rest."""
+    wanted = tracked(task)
+    every = [*position_axes(task.model), *wanted, *range(task.model.n)]
+    return list(dict.fromkeys(every))
 
 
 def scene_of(model: Model) -> Scene:

@@ -17,6 +17,7 @@ from grounded.trial import Trial
 from grounded_trials.report.diagnosis_words import made_from
 from grounded_trials.report.findings import Findings, Run
 from grounded_trials.report.forecast import forecast
+from grounded_trials.report.scene import reading_order
 from grounded_trials.wording import labelled, per_second, percent, shown
 
 SPAN_S = 30.0  # [s] of a long log that are drawn, where the errors are largest
@@ -63,7 +64,8 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
     after = forecast(better.planner, trial, findings.ahead_s) if better is not None else None
     times = np.arange(trial.steps + 1, dtype=np.float64) * trial.dt + begin
     panels = []
-    for i, (state, unit) in enumerate(findings.task.model.states.items()):
+    for i in reading_order(findings.task):
+        state, unit = list(findings.task.model.states.items())[i]
         t, values = crude.curve(i, trial.dt)
         curves = [
             Curve(times, trial.states[:, i], "real", "real"),

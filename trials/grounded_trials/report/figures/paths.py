@@ -140,6 +140,13 @@ def crash(run: Run | Log) -> int | None:
     return last if short else None
 
 
+def ended(run: Run) -> str:
+    """Return when a run that ended early did: `t0007 (c0006) ended after 1.24 s of 3.00 s`."""
+    planned = len(run.candidate.predicted_states) - 1  # the trial itself may be shorter
+    last, whole = run.trial.finite_steps * run.trial.dt, planned * run.trial.dt
+    return f"{run.label} ended after {last:.2f} s of {whole:.2f} s"
+
+
 def _seen_in(findings: Findings, view: View) -> Panel:
     """Draw every run's path, the compared ones on top, and the predictions as ghosts."""
     dt = findings.task.dt
@@ -160,7 +167,7 @@ def _seen_in(findings: Findings, view: View) -> Panel:
         if role in ("predicted", "desired")
     ]
     curves = tuple(_path(view, states, dt, *words) for states, *words in drawn)
-    dots = tuple(d for _, _, r in runs for d in _crash_mark(r, view, dt))
+    dots = tuple(d for _, _, r in runs for d in _crash_mark(r, view))
     y_range = _level(curves) if view.side else None
     return Panel(
         view.title, *view.names, curves, dots, equal=view.equal, y_range=y_range, kind="path"
@@ -177,13 +184,14 @@ def _level(curves: Sequence[Curve]) -> tuple[float, float] | None:
     return middle - half, middle + half
 
 
-def _crash_mark(run: Run, view: View, dt: float) -> list[Dot]:
+def _crash_mark(run: Run, view: View) -> list[Dot]:
     last = crash(run)
     if last is None:
         return []
     x, y = (float(v) for v in view.place(run.trial.states[[last]])[0])
-    note = f"{run.label} ended after {last * dt:.2f} s of {run.trial.steps * dt:.2f} s"
-    return [Dot(x, y, "model", note, "cross", trial=run.trial.id)] if np.isfinite(x + y) else []
+    if not np.isfinite(x + y):
+        return []
+    return [Dot(x, y, "model", ended(run), "cross", trial=run.trial.id)]
 
 
 def _enlarged(findings: Findings, view: View) -> list[Panel]:

@@ -30,7 +30,7 @@ from grounded_trials.report.findings import (
     prediction_error,
     selection,
 )
-from grounded_trials.report.scene import scene_of
+from grounded_trials.report.scene import reading_order, scene_of
 from grounded_trials.wording import figure, labelled, per_second, shown, with_unit
 from grounded_trials.workspace.off_target import tracked, tracking_error
 
@@ -41,7 +41,7 @@ ITERATIONS = 5  # largest number of iterations whose bias is drawn
 
 def all_figures(findings: Findings) -> list[Figure]:
     """Return all figures of a report in reading order, without empty ones."""
-    runs = (path_figure, state_figure, error_figure, input_figure, bias_figure)
+    runs = (path_figure, state_figure, input_figure, error_figure, bias_figure)
     made = [search_figure(findings.standing, findings.optimum), *(draw(findings) for draw in runs)]
     if findings.diagnosis is not None:
         made += gap_figures(findings.diagnosis)
@@ -66,7 +66,8 @@ def state_figure(findings: Findings) -> Figure | None:
     if len(named_paths(findings)) < 2:
         return None
     known, panels = tracked(task), []
-    for i, (name, unit) in enumerate(task.model.states.items()):
+    for i in reading_order(task):
+        name, unit = list(task.model.states.items())[i]
         curves = [
             _over_time(states[:, i], task.dt, role, words)
             for role, words, states in named_paths(findings)
@@ -85,8 +86,8 @@ def error_figure(findings: Findings) -> Figure | None:
     scene = scene_of(task.model)
     if scene.spatial and set(scene.axes) <= set(tracked(task)):
         panels.append(_distance(findings, list(scene.axes)))
-    for i in tracked(task):
-        name, unit = task.model.state_names[i], list(task.model.states.values())[i]
+    for i in (i for i in reading_order(task) if i in tracked(task)):
+        name, unit = list(task.model.states.items())[i]
         curves = [
             _over_time(tracking_error(task, run.trial)[:, i], task.dt, role, name_of(role, run))
             for role, run in shown
@@ -126,7 +127,8 @@ def bias_figure(findings: Findings) -> Figure | None:
     if not runs:
         return None
     panels = []
-    for i, (name, unit) in enumerate(task.model.states.items()):
+    for i in reading_order(task):
+        name, unit = list(task.model.states.items())[i]
         curves = []
         for k, run in enumerate(runs):
             role = "model" if k == 0 else "best" if k == len(runs) - 1 else STEPS[(k - 1) % 3]

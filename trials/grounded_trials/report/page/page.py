@@ -186,8 +186,8 @@ def _sections(findings: Findings) -> list[tuple[str, list[Block]]]:
     return [
         ("Paths", [Block("run"), *paths] if paths and findings.runs else paths),
         ("States", drawn(state_figure(findings))),
-        ("Tracking error", drawn(error_figure(findings)) + error_table(findings)),
         ("Inputs", drawn(input_figure(findings))),
+        ("Tracking error", drawn(error_figure(findings)) + error_table(findings)),
         ("Utility", _utility(findings)),
         ("Bias", drawn(bias_figure(findings))),
         ("Gap: model against reality", gap_section(findings)),

@@ -15,7 +15,7 @@ from grounded.figures.figure import typeset
 from grounded.frozen import Array
 from grounded_trials.report.bodies import is_mechanism, reach
 from grounded_trials.report.findings import Findings
-from grounded_trials.report.scene import Scene
+from grounded_trials.report.scene import Scene, reading_order
 from grounded_trials.wording import figure, labelled, per_second
 
 FAR = 1.1  # distance of the camera, times the size of the contents
@@ -85,10 +85,10 @@ def blueprint(findings: Findings, space: Space) -> Any:
     """Return the views: overview, effects on and off, states, inputs, bias, one tab per trial."""
     import rerun.blueprint as rrb
 
-    model = findings.task.model
-    states = [_plot(f"/state/{n}", labelled(n, u)) for n, u in model.states.items()]
+    model, ordered = findings.task.model, _ordered(findings)
+    states = [_plot(f"/state/{n}", labelled(n, u)) for n, u in ordered.items()]
     inputs = [_plot(f"/input/{n}", labelled(n, u)) for n, u in model.inputs.items()]
-    biases = [_plot(f"/bias/{n}", labelled(n, per_second(u))) for n, u in model.states.items()]
+    biases = [_plot(f"/bias/{n}", labelled(n, per_second(u))) for n, u in ordered.items()]
     tabs = [
         _overview(findings, space),
         *_effects(findings, space),
@@ -112,7 +112,9 @@ def _overview(findings: Findings, space: Space) -> Any:
 
     model, reward = findings.task.model, findings.task.reward
     weighed = reward.state + reward.terminal != 0
-    chosen = sorted(model.states, key=lambda n: not weighed[model.state_names.index(n)])[:FIRST]
+    chosen = sorted(_ordered(findings), key=lambda n: not weighed[model.state_names.index(n)])[
+        :FIRST
+    ]
     named = [(f"/state/{n}", f"{n} [{model.states[n]}]") for n in chosen]
     named += [(f"/input/{n}", labelled(n, u)) for n, u in list(model.inputs.items())[:2]]
     named += [
@@ -147,7 +149,7 @@ def _effects(findings: Findings, space: Space) -> list[Any]:
         )
         for key, words in (("off", findings.plain), ("on", f"model {better.name}"))
     ]
-    units = findings.task.model.states
+    units = _ordered(findings)
     plots = [
         _plot(f"/ahead/{n}", labelled(n, u), legend=k == 0)
         for k, (n, u) in enumerate(units.items())
@@ -165,7 +167,9 @@ def _trials(findings: Findings, space: Space) -> list[Any]:
         if run.explained is not None:
             names["explained"] = "bias of the model as diagnosed"
         about = f"{run.label}, utility {figure(run.utility)}"
-        shown.append((f"/trials/{run.trial.id}", about, names, ["path", "predicted/**", "body/**"]))
+        shown.append(
+            (f"/trials/{run.trial.id}", about, names, ["path", "predicted/**", "body/**", "crash"])
+        )
     for log in findings.logs[-TRIALS:]:
         shown.append((f"/data/{log.trial.id}", f"{log.trial.id}, data", NAMES, ["path", "body/**"]))
     tabs = []
@@ -175,6 +179,12 @@ def _trials(findings: Findings, space: Space) -> list[Any]:
         view = space.view(contents, about)
         tabs.append(rrb.Horizontal(view, rrb.Vertical(*plots), name=at.split("/")[-1]))
     return tabs
+
+
+def _ordered(findings: Findings) -> dict[str, str]:
+    """Return the units of the states by name, in the order of charts."""
+    units = list(findings.task.model.states.items())
+    return dict(units[i] for i in reading_order(findings.task))
 
 
 def _plot(origin: str, name: str, legend: bool = True) -> Any:

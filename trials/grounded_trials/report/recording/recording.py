@@ -7,6 +7,7 @@
     /trials/t0007/...         all of one trial: path, prediction, body, state, input, bias
     /data/t0003/...           the same for a log that ran no candidate
     /verdict                  why the model was wrong, the share of each cause, what to run next
+    /paths/crashes/t0007      where a run ended early; see `crashes.py`
     /utilities, /summary      utility by iteration, and a summary in Markdown
 
 There is one timeline, `time`, in seconds since the start of a trial. Numbers are logged as whole
@@ -32,8 +33,10 @@ from grounded.figures.figure import rgb, typeset
 from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.report.bodies import body_in
+from grounded_trials.report.figures.paths import crash
 from grounded_trials.report.findings import Findings, Run, selection
 from grounded_trials.report.forecast import forecast
+from grounded_trials.report.recording.crashes import LABELS, mark_place, mark_time
 from grounded_trials.report.recording.layout import Space, blueprint
 from grounded_trials.report.scene import scene_of
 from grounded_trials.report.settled import told
@@ -101,6 +104,7 @@ class _Recorder:
         self.forecasts()
         for run in findings.runs:
             self.trial(run)
+        self.crashes()
         for one in findings.logs:
             self.moving(f"data/{one.trial.id}", one.trial, "best", "/path", 1.5)
             self.signals(f"data/{one.trial.id}", one.trial, one.residual)
@@ -199,6 +203,25 @@ class _Recorder:
         if run.explained is not None:
             self.columns(f"{at}/explained", *rate(run.explained, self.dt), self.per_second)
 
+    def crashes(self) -> None:
+        """Mark where and when runs ended early, in the overview and by trial."""
+        points = self.body.path(self.task.target)
+        points = points[np.isfinite(points).all(axis=1)]
+        early = [run for run in self.findings.runs if crash(run) is not None]
+        reached = [self.body.path(run.trial.states[: run.trial.finite_steps + 1]) for run in early]
+        size = float(np.ptp(np.vstack([points, *reached]), axis=0).max()) if early else 0.0
+        colour, every = COLOURS["model"], list(range(self.task.model.n))
+        for run in early:
+            name, few = run.trial.id, len(early) <= LABELS
+            mark_place(self.stream, f"paths/crashes/{name}", self.body, run, size, colour, few)
+            mark_place(self.stream, f"trials/{name}/crash", self.body, run, size, colour, True)
+            mark_time(self.stream, f"trials/{name}/state/ended", run, self.dt, every, colour)
+        for role, one in self.compared.items():
+            for i, name in enumerate(self.task.model.state_names):
+                if one is not None:
+                    at = f"state/{name}/ended_{role}"
+                    mark_time(self.stream, at, one, self.dt, [i], COLOURS[role])
+
     def signals(self, at: str, trial: Trial, residual: Array) -> None:
         """Record states, inputs and bias, each as one entity with named columns."""
         model = self.task.model
@@ -265,7 +288,7 @@ class _Recorder:
         import rerun as rr
 
         steps, width = values.shape
-        names = [labelled(name, unit) for name, unit in units.items()]
+        names = [typeset(labelled(name, unit)) for name, unit in units.items()]
         colours = [SERIES[i % len(SERIES)] for i in range(width)]
         self.stream.log(at, rr.SeriesLines(colors=colours, names=names), static=True)
         scalars = rr.Scalars.columns(scalars=np.ascontiguousarray(values).reshape(-1))
@@ -328,6 +351,8 @@ def summary(findings: Findings) -> str:
     lines += ["", "grey: desired; orange: model's policy; blue: best so far; pink: its prediction"]
     if findings.better is not None and best is not None:
         lines[-1] += f"; yellow: limits, and the bias that the model {findings.better.name} leaves"
+    if any(crash(run) is not None for run in findings.runs):
+        lines[-1] += "; crosses: where and when a run ended early"
     lines += ["", f"**{findings.standing.outcome}**: {_marked(findings.standing.sentence)}", ""]
     lines += [f"**left out**: {one.file}: {one.reason}\n" for one in findings.lost]
     return "\n".join(lines)
