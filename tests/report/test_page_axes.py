@@ -16,6 +16,7 @@ from grounded.figures.interactive import in_lines, notebook_figure
 from grounded.result import spread
 from grounded.search.pictures import search_figure
 from grounded_trials import Workspace
+from grounded_trials.report.calmed import WINDOWS, averaged, window_of
 from grounded_trials.report.diagnosis_words import utility_sentence
 from grounded_trials.report.figures.gap import _binned, forecast_figures, residual_figures
 from grounded_trials.report.figures.png import png
@@ -26,15 +27,17 @@ from grounded_trials.report.figures.runs import (
     input_figure,
     state_figure,
 )
+from grounded_trials.report.findings import Log
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
+from grounded_trials.report.page.tables import forecast_table
 from grounded_trials.report.reporting import Report
 from grounded_trials.report.scene import reading_order
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.next_step import Since
 from grounded_trials.workspace.off_target import tracked
-from reported import car, cart, copied
+from reported import car, cart, copied, many_flights
 
 __all__ = ["car", "cart"]
 
@@ -84,6 +87,54 @@ def test_charts_begin_with_the_position_and_what_has_a_target(car):
         assert [panel.title.split(" [")[0] for panel in figure.panels] == order, figure.name
     drawn = [figure.name for figure in all_figures(findings)]
     assert drawn.index("states") < drawn.index("inputs") < drawn.index("error")
+
+
+def test_a_bias_hidden_by_noise_is_drawn_as_means_over_time():
+    """At 50 Hz, 5 mm of noise was a bias of 0.35 m/s, and both curves of a drone were one block."""
+    findings = many_flights(1)
+    (run,), dt = findings.runs, findings.task.dt
+    steps, n = run.residual.shape
+    noise = np.random.default_rng(0).normal(0, 0.005, (steps + 1, n))
+    course = 0.1 * dt * np.sin(np.linspace(0, 7, steps))[:, None]
+    noisy = replace(run, residual=course + np.diff(noise, axis=0))
+    figure, window = bias_figure(replace(findings, runs=(noisy,))), -(-steps // WINDOWS)
+    for panel in figure.panels:
+        (curve,) = panel.curves
+        np.testing.assert_allclose(np.diff(curve.x), window * dt)
+        assert curve.x[0] == pytest.approx(0.5 * (window - 1) * dt) and panel.note
+        drawn = np.interp(curve.x, dt * np.arange(steps), course[:, 0] / dt)
+        assert np.abs(curve.y - drawn).max() < 0.05 < np.ptp(noise) / dt
+
+
+def test_a_calm_bias_is_drawn_step_by_step(cart):
+    findings = gather(Folder(cart))
+    for panel in bias_figure(findings).panels:
+        assert len(panel.curves[0].x) == len(findings.improvements[0].residual) and not panel.note
+    steady = np.full(300, 2.0) + np.random.default_rng(0).normal(0, 0.5, 300)
+    noise = np.random.default_rng(0).normal(0, 0.5, 300)
+    slow = np.sin(np.linspace(0, 20, 300))
+    assert window_of([steady]) == window_of([slow, 0.2 * noise]) == 1 < window_of([noise])
+    assert window_of([noise[:100]]) == window_of([np.full(300, np.nan)]) == window_of([]) == 1
+    np.testing.assert_allclose(averaged(np.arange(7.0), 3), [1.0, 4.0])
+
+
+@pytest.mark.parametrize(("logs", "states_first"), [(1, True), (24, False)])
+def test_many_logs_are_rows_of_the_table_of_forecasts(cart, logs, states_first):
+    """Twelve logs with two models each made 24 columns, most of them off the screen."""
+    findings = gather(Folder(cart))
+    trial = findings.runs[0].trial
+    data = tuple(
+        Log(replace(trial, id=f"d{k:02d}"), findings.runs[0].residual) for k in range(logs)
+    )
+    few = replace(findings, runs=(), logs=data, better=None)
+    _, made = forecast_table(few)
+    states = findings.task.model.states
+    assert len(made.header) == (2 + logs if states_first else 2 + len(states))
+    assert len(made.rows) == (len(states) if states_first else logs)
+    assert all(len(row) == len(made.header) for row in made.rows)
+    _, single = forecast_table(replace(few, logs=data[:1]))
+    of_first = [row[2] for row in single.rows]
+    assert of_first == ([row[2] for row in made.rows] if states_first else list(made.rows[0][2:]))
 
 
 def test_inputs_far_from_their_limits_are_drawn_without_them(cart):

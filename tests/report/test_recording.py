@@ -174,7 +174,7 @@ def test_an_unwritable_place_is_a_sentence(cart, tmp_path):
 
 def test_the_bias_of_long_trials_is_averaged_not_thinned_out():
     residual = np.random.default_rng(0).normal(size=(3000, 2))
-    rates, dt = rate(residual, 0.02)
+    rates, dt = rate(residual, 0.02, 1)
     assert len(rates) <= 600 and dt == pytest.approx(0.1)
     np.testing.assert_allclose(rates.mean(axis=0), residual.mean(axis=0) / 0.02)
     same, dt = rate(residual[:100], 0.02)

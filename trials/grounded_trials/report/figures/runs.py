@@ -22,6 +22,7 @@ from grounded.figures.figure import (
 from grounded.frozen import Array
 from grounded.result import listed
 from grounded.search.pictures import search_figure
+from grounded_trials.report.calmed import averaged, window_of
 from grounded_trials.report.figures.gap import forecast_figures, residual_figures
 from grounded_trials.report.figures.paths import crash, name_of, named_paths, path_figure
 from grounded_trials.report.findings import (
@@ -129,23 +130,33 @@ def bias_figure(findings: Findings) -> Figure | None:
     panels = []
     for i in reading_order(task):
         name, unit = list(task.model.states.items())[i]
-        curves = []
+        drawn = []
         for k, run in enumerate(runs):
             role = "model" if k == 0 else "best" if k == len(runs) - 1 else STEPS[(k - 1) % 3]
-            words = f"iteration {run.candidate.iteration}"
-            curves.append(_over_time(run.residual[:, i] / task.dt, task.dt, role, words, 1.0))
+            drawn.append((run.residual[:, i], role, f"iteration {run.candidate.iteration}", 1.0))
         best = findings.best
         if best is not None and best.explained is not None and findings.better is not None:
-            rest = best.explained[:, i] / task.dt
             words = f"last iteration, model {findings.better.name}"
-            curves.append(_over_time(rest, task.dt, "predicted", words))
-        panels.append(_timed(name, per_second(unit), curves))
+            drawn.append((best.explained[:, i], "predicted", words, 1.5))
+        window = window_of([values for values, *_ in drawn])
+        curves = [_means(values / task.dt, window, task.dt, *how) for values, *how in drawn]
+        panel = _timed(name, per_second(unit), curves)
+        if window > 1:
+            note = f"means over {window * task.dt:.2g} s: single steps are mostly noise"
+            panel = replace(panel, note="; ".join(filter(None, (panel.note, note))))
+        panels.append(panel)
     caption = (
         f"What must be added to the rate of change of the {findings.plain} for it to replay the "
         "trial. A curve with the same shape in all iterations is a property of the system, not of "
         "a run."
     )
     return Figure("bias", "Bias of the model", caption, tuple(panels), legend(panels))
+
+
+def _means(values: Array, window: int, dt: float, role: str, name: str, width: float) -> Curve:
+    """Return a curve of means over `window` steps, each in the middle of its steps."""
+    curve = _over_time(averaged(values, window), window * dt, role, name, width)
+    return replace(curve, x=curve.x + 0.5 * (window - 1) * dt)
 
 
 def _over_time(values: Array, dt: float, role: str, name: str, width: float = 1.5) -> Curve:

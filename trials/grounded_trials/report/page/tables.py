@@ -23,9 +23,19 @@ from grounded_trials.report.findings import (
     rms,
 )
 from grounded_trials.report.forecast import forecast_error
-from grounded_trials.wording import figure, legend, percent, rendered, shown, spread, with_unit
+from grounded_trials.wording import (
+    figure,
+    labelled,
+    legend,
+    percent,
+    rendered,
+    shown,
+    spread,
+    with_unit,
+)
 from grounded_trials.workspace.next_step import Since
 
+FEW = 4  # columns of errors from which the table of forecasts has a row for each trial instead
 UNKNOWN = "–, not determined by these trials"
 
 
@@ -124,12 +134,19 @@ def forecast_table(findings: Findings) -> list[Block]:
     planners = [(findings.plain, findings.crude)]
     if findings.better is not None:
         planners.append((findings.better.name, findings.better.planner))
-    names = [f"{t.id or t.candidate}, {words}" for t in trials for words, _ in planners]
-    ahead = findings.ahead_s
-    columns = [forecast_error(planner, t, ahead) for t in trials for _, planner in planners]
+    model, ahead = findings.task.model, findings.ahead_s
+    names = [(t.id or t.candidate, words) for t in trials for words, _ in planners]
+    errors = [forecast_error(planner, t, ahead) for t in trials for _, planner in planners]
     title = Block("heading", f"Prediction error {ahead:.3g} s ahead, rms")
-    rows = by_state(findings.task.model, columns)
-    return [title, table("forecasts", ("state", "unit", *names), rows)]
+    if len(errors) <= max(FEW, model.n):
+        words = (f"{trial}, {name}" for trial, name in names)
+        made = table("forecasts", ("state", "unit", *words), by_state(model, errors))
+    else:  # many logs are rows: as columns they left the screen
+        states = (labelled(name, shown(unit)) for name, unit in model.states.items())
+        each = zip(names, errors, strict=True)
+        rows = [(*name, *(figure(float(v), 3) for v in values)) for name, values in each]
+        made = table("forecasts", ("trial", "model ", *states), rows)
+    return [title, made]
 
 
 def effect_table(diagnosis: Diagnosis, since: Since) -> Block:

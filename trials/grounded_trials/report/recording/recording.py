@@ -33,6 +33,7 @@ from grounded.figures.figure import rgb, typeset
 from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.report.bodies import body_in
+from grounded_trials.report.calmed import averaged, window_of
 from grounded_trials.report.figures.paths import crash
 from grounded_trials.report.findings import Findings, Run, selection
 from grounded_trials.report.forecast import forecast
@@ -154,13 +155,19 @@ class _Recorder:
     def biases(self) -> None:
         """Record the crude model's bias by iteration, and that of the model with effects."""
         best, better = self.findings.best, self.findings.better
-        shown = selection(self.findings.improvements, ITERATIONS)
+        shown, found = selection(self.findings.improvements, ITERATIONS), []
         for number, run in enumerate(shown):
             last = number == len(shown) - 1 and number > 0
             colour = "best" if last else ("model_policy", "accepted", "other")[number % 3]
-            self.rates(f"iteration {run.candidate.iteration}", run.residual, colour)
+            found.append((f"iteration {run.candidate.iteration}", run.residual, colour))
         if best is not None and best.explained is not None and better is not None:
-            self.rates(f"left, {better.name}", best.explained, "limit")
+            found.append((f"left, {better.name}", best.explained, "limit"))
+        for i, name in enumerate(self.task.model.state_names):
+            window = window_of([residual[:, i] for _, residual, _ in found])
+            for key, residual, colour in found:
+                values, dt = rate(residual[:, [i]], self.dt, window)
+                at = f"bias/{name}/{key.replace(' ', '_').replace(',', '')}"
+                self.line(at, values[:, 0], dt, colour, key, 1.0, 0.5 * (dt - self.dt))
 
     def forecasts(self) -> None:
         """Record the best run, and its forecasts by the model without effects and with them."""
@@ -182,12 +189,6 @@ class _Recorder:
             words = self.findings.plain if key == "off" else f"model {self.findings.better.name}"
             for i, name in enumerate(self.task.model.state_names):
                 self.line(f"ahead/{name}/{key}", states[:, i], self.dt, colour, words)
-
-    def rates(self, key: str, residual: Array, colour: str) -> None:
-        rates, dt = rate(residual, self.dt)
-        for i, name in enumerate(self.task.model.state_names):
-            at = f"bias/{name}/{key.replace(' ', '_').replace(',', '')}"
-            self.line(at, rates[:, i], dt, colour, key, 1.0)
 
     def trial(self, run: Run) -> None:
         """Record all of one trial under its own name."""
@@ -272,15 +273,16 @@ class _Recorder:
         self.stream.log(at, strip, static=True)
 
     def line(
-        self, at: str, values: Array, dt: float, colour: str, name: str = "", width: float = 1.5
-    ) -> None:
+        self, at: str, values: Array, dt: float, colour: str, name: str = "", width: float = 1.5,
+        begin: float = 0.0,
+    ) -> None:  # fmt: skip
         """Record the finite values of a curve over time, named by default after its colour."""
         import rerun as rr
 
         style = rr.SeriesLines(colors=COLOURS[colour], names=name or colour, widths=width)
         self.stream.log(at, style, static=True)
         keep = np.flatnonzero(np.isfinite(values))
-        times = [rr.TimeColumn("time", duration=keep * dt)]
+        times = [rr.TimeColumn("time", duration=keep * dt + begin)]
         self.stream.send_columns(at, times, rr.Scalars.columns(scalars=values[keep]))
 
     def columns(self, at: str, values: Array, dt: float, units: Mapping[str, str]) -> None:
@@ -292,17 +294,23 @@ class _Recorder:
         colours = [SERIES[i % len(SERIES)] for i in range(width)]
         self.stream.log(at, rr.SeriesLines(colors=colours, names=names), static=True)
         scalars = rr.Scalars.columns(scalars=np.ascontiguousarray(values).reshape(-1))
-        times = [rr.TimeColumn("time", duration=np.arange(steps) * dt)]
+        middle = 0.5 * (dt - self.dt)  # of means over several steps
+        times = [rr.TimeColumn("time", duration=np.arange(steps) * dt + middle)]
         self.stream.send_columns(at, times, scalars.partition([width] * steps))
 
 
-def rate(residual: Array, dt: float) -> tuple[Array, float]:
-    """Return a residual per second (T, n) and its interval [s]; averaged over steps for large T."""
-    step = -(-len(residual) // FINE)
-    if step <= 1:
-        return residual / dt, dt
-    whole = residual[: len(residual) // step * step]
-    return whole.reshape(-1, step, residual.shape[1]).mean(axis=1) / dt, step * dt
+def rate(residual: Array, dt: float, window: int | None = None) -> tuple[Array, float]:
+    """Return a residual per second (T, n) and its interval [s]; averaged if long or noisy.
+
+    Args:
+        residual: (T, n).
+        dt: its interval [s].
+        window: steps to average over; by default the most that any of its columns needs.
+    """
+    if window is None:
+        window = max(window_of([column]) for column in residual.T)
+    step = max(window, -(-len(residual) // FINE))
+    return averaged(residual, step) / dt, step * dt
 
 
 def verdict(findings: Findings) -> str:
