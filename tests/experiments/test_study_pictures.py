@@ -60,7 +60,7 @@ def results():
         for level in (1.0, 2.0)
     ]
     theorem = [
-        Theorem1Row(e, s, e * (1 + s), (e * (1 + s)) ** 2, 2.0, 9)
+        Theorem1Row(e, s, e * (1 + s), (e * (1 + s)) ** 2, 2.0, 9, 40.0 + s)
         for e in (0.01, 0.1)
         for s in (0, 1)
     ]
@@ -79,6 +79,23 @@ def results():
         "baselines": BaselinesResult(tuple(lines)),
         "noise": NoiseResult(tuple(outcomes)),
     }
+
+
+def test_the_bounds_of_theorem1_are_drawn_in_both_panels():
+    """Only the second panel had one, with a K of its own for each point."""
+    result = results()["theorem1"]
+    for panel, bound in zip(
+        PICTURES["theorem1"](result).panels,
+        (lambda e, K: K * e, lambda e, K: 2 * (K * e) ** 2),
+        strict=True,
+    ):
+        curves = {curve.role: curve for curve in panel.curves}
+        for role, K in (("limit", 2.0), ("model", 41.0)):
+            drawn = 10.0 ** curves[role].y
+            np.testing.assert_allclose(drawn, [bound(e, K) for e in (0.01, 0.1)])
+            for dot in panel.dots:
+                at = np.interp(dot.x, curves[role].x, curves[role].y)
+                assert dot.y <= at + 1e-12
 
 
 def test_every_study_has_its_picture():
