@@ -16,9 +16,15 @@ import pytest
 
 from cli import grounded
 from facts import holding
+from grounded.diagnosis.error_report import Credit
+from grounded_trials.report.bodies import body_in
 from grounded_trials.report.figures.paths import ended
+from grounded_trials.report.findings import Log
 from grounded_trials.report.gathering import gather
-from grounded_trials.report.recording.recording import rate, summary, verdict, write_recording
+from grounded_trials.report.recording.layout import Space, blueprint
+from grounded_trials.report.recording.recording import rate, write_recording
+from grounded_trials.report.recording.texts import credit, summary, verdict
+from grounded_trials.report.scene import scene_of
 from grounded_trials.workspace.folder import Folder
 from pace import slowness
 from reported import car, cart, many_flights
@@ -26,6 +32,7 @@ from workspaces import make
 
 __all__ = ["car", "cart"]
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+rrb = pytest.importorskip("rerun.blueprint")
 RERUN = Path(sys.executable).with_name("rerun")
 needs_tool = pytest.mark.skipif(not RERUN.exists(), reason="the rerun program is not installed")
 
@@ -92,6 +99,31 @@ def test_crashes_are_marked_where_and_when(car, tmp_path):
     assert f"/state/{names[0]}/ended_best " not in found
     write_recording(findings, path)
     assert "/crash" not in _entities(path) and "/ended" not in _entities(path)
+
+
+def _origins(container):
+    """The origins of a blueprint's views, in order."""
+    parts = getattr(container, "contents", None)
+    if hasattr(container, "class_identifier"):
+        return [container.origin]
+    return [origin for part in parts or () for origin in _origins(part)]
+
+
+@pytest.mark.parametrize("logs", [False, True])
+def test_the_verdict_and_its_credit_are_seen_when_a_recording_opens(cart, logs):
+    """The credit was below the fold of the verdict; with logs alone, both were in a hidden tab."""
+    findings = gather(Folder(cart))
+    causes = (Credit("calibration", 1.0),)
+    findings = replace(findings, diagnosis=replace(findings.diagnosis, credit=causes))
+    if logs:
+        run = findings.runs[0]
+        findings = replace(findings, runs=(), logs=(Log(run.trial, run.residual),))
+    scene, body = scene_of(findings.task.model), body_in(findings)
+    root = blueprint(findings, Space(findings, scene, body)).root_container
+    shown = root
+    while shown.active_tab is not None or isinstance(shown, rrb.Tabs):
+        shown = shown.contents[shown.active_tab or 0]
+    assert _origins(shown)[:2] == ["/verdict", "/credit"]
 
 
 @needs_tool
@@ -219,7 +251,14 @@ def test_the_texts_begin_with_the_next_command_and_name_a_crash(cart):
     """`next:` was below the fold, and the utility of a crashed first run was -inf."""
     findings = gather(Folder(cart))
     lines = verdict(findings).splitlines()
-    assert lines[0] == f"next: `{findings.next_command}`" and len(lines) > 3
+    assert lines[0] == f"next: `{findings.next_command}`" and len(lines) > 2
+    assert credit(findings) == ""  # this diagnosis has none
+    causes = (Credit("calibration", 0.75), Credit("delay:force", 0.25))
+    known = replace(findings, diagnosis=replace(findings.diagnosis, credit=causes))
+    rows = credit(known).splitlines()[2:]
+    assert [row.count("█") for row in rows] == [15, 5]
+    assert "█" not in verdict(known)
+    assert credit(replace(known, diagnosis=None)) == ""
     assert findings.first is not None
     crashed = tuple(
         replace(run, utility=-np.inf) if run is findings.first else run for run in findings.runs

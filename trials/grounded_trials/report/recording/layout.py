@@ -19,6 +19,7 @@ from grounded_trials.report.scene import Scene, reading_order
 from grounded_trials.wording import figure, labelled, per_second
 
 FAR = 1.1  # distance of the camera, times the size of the contents
+TALL = 1.35  # the distance in a view that is higher than wide, times that
 ASIDE = 1.5  # the same for a mechanism, whose parts have a width
 
 
@@ -38,8 +39,11 @@ class Space:
         axes = [labelled(*one) for one in zip(self.scene.names, self.scene.units, strict=True)]
         return "Paths: " + " over ".join(reversed(axes)) if len(axes) == 2 else "Paths"
 
-    def view(self, contents: Sequence[str], name: str) -> Any:
-        """Return a view of some entities; y points up from above, z from the side."""
+    def view(self, contents: Sequence[str], name: str, tall: bool = False) -> Any:
+        """Return a view of some entities; y points up from above, z from the side.
+
+        A `tall` view is higher than wide: the camera is farther away, since it sees less aside.
+        """
         import rerun.blueprint as rrb
 
         (centre, extent), up = self._bounds, (0, 0, 1)
@@ -50,6 +54,7 @@ class Space:
             direction = np.array([0.0, -1.0, 0.7])
         else:
             direction, up = np.array([0.0, 0.0, 1.0]), (0, 1, 0)
+        distance *= TALL if tall else 1.0
         eye = rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
             position=centre + distance * direction / np.linalg.norm(direction),
@@ -97,8 +102,12 @@ def blueprint(findings: Findings, space: Space) -> Any:
         rrb.Grid(*biases, name="Bias"),
         rrb.Tabs(*_trials(findings, space), name="By trial"),
     ]
+    only_logs = bool(findings.logs) and not findings.runs
+    shown = rrb.Tabs(*tabs, active_tab=len(tabs) - 1 if only_logs else 0)
+    if only_logs:  # opens at the logs, with the answer above them
+        shown = rrb.Vertical(_answer(findings), shown, row_shares=_rows(findings))
     return rrb.Blueprint(
-        rrb.Tabs(*tabs, active_tab=len(tabs) - 1 if findings.logs and not findings.runs else 0),
+        shown,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline="time"),
@@ -125,15 +134,31 @@ def _overview(findings: Findings, space: Space) -> Any:
     bars = rrb.BarChartView(origin="/utilities", name="Utility by iteration", plot_legend=hidden)
     words = rrb.TextDocumentView(origin="/summary", name="Summary")
     left = rrb.Vertical(
-        rrb.TextDocumentView(
-            origin="/verdict", name="What to run next, and why the model was wrong"
-        ),
         space.view(["/paths/**"], space.title),
         rrb.Horizontal(bars, words, column_shares=[1, 2]),
-        row_shares=[4, 5, 3],
+        row_shares=[3, 2],
     )
     right = rrb.Grid(*plots, grid_columns=2)
-    return rrb.Horizontal(left, right, name="Overview", column_shares=[1, 1])
+    below = rrb.Horizontal(left, right, column_shares=[1, 1])
+    return rrb.Vertical(_answer(findings), below, name="Overview", row_shares=_rows(findings))
+
+
+def _answer(findings: Findings) -> Any:
+    """Return the views of the verdict and, beside it, of the credit: both seen at once."""
+    import rerun.blueprint as rrb
+
+    told = rrb.TextDocumentView(
+        origin="/verdict", name="What to run next, and why the model was wrong"
+    )
+    if findings.diagnosis is None or not findings.diagnosis.credit:
+        return told
+    worth = rrb.TextDocumentView(origin="/credit", name="What each cause is worth")
+    return rrb.Horizontal(told, worth, column_shares=[3, 2])
+
+
+def _rows(findings: Findings) -> list[float]:
+    """Return the shares of the height of the answer and of what is below it."""
+    return [1, 8] if findings.diagnosis is None else [2, 5]
 
 
 def _effects(findings: Findings, space: Space) -> list[Any]:
@@ -176,7 +201,7 @@ def _trials(findings: Findings, space: Space) -> list[Any]:
     for at, about, names, drawn in shown:
         contents = ["/paths/desired", *(f"{at}/{part}" for part in drawn)]
         plots = [_plot(f"{at}/{key}", name) for key, name in names.items()]
-        view = space.view(contents, about)
+        view = space.view(contents, about, tall=True)
         tabs.append(rrb.Horizontal(view, rrb.Vertical(*plots), name=at.split("/")[-1]))
     return tabs
 

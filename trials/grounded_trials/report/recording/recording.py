@@ -6,7 +6,7 @@
     /ahead/...                the best run, and forecasts restarted every second: effects off, on
     /trials/t0007/...         all of one trial: path, prediction, body, state, input, bias
     /data/t0003/...           the same for a log that ran no candidate
-    /verdict                  why the model was wrong, the share of each cause, what to run next
+    /verdict, /credit         what to run next, why the model was wrong; the share of each cause
     /paths/crashes/t0007      where a run ended early; see `crashes.py`
     /utilities, /summary      utility by iteration, and a summary in Markdown
 
@@ -18,7 +18,6 @@ of one workspace have the same id, so that they can be merged (`rerun rrd merge`
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -39,9 +38,9 @@ from grounded_trials.report.findings import Findings, Run, selection
 from grounded_trials.report.forecast import forecast
 from grounded_trials.report.recording.crashes import LABELS, mark_place, mark_time
 from grounded_trials.report.recording.layout import Space, blueprint
+from grounded_trials.report.recording.texts import credit, summary, verdict
 from grounded_trials.report.scene import scene_of
-from grounded_trials.report.settled import told
-from grounded_trials.wording import count, figure, labelled, per_second, percent
+from grounded_trials.wording import labelled, per_second
 from grounded_trials.workspace.off_target import tracked
 
 COLOURS = {role: rgb(dark) for role, (_, dark) in PAGE.items()}
@@ -49,7 +48,6 @@ COLOURS |= {"desired": (170, 170, 170), "other": (110, 110, 110), "model_policy"
 SERIES = [COLOURS[role] for role in ("best", "limit", "accepted", "step2", "predicted", "model")]
 ITERATIONS = 4  # largest number of iterations whose bias is drawn
 FINE = 600  # steps above which the bias of a trial is averaged, to keep files small
-BAR = 24  # characters of a bar of 100 % credit
 Colour = tuple[int, int, int]
 FRAMES = 600  # largest number of poses of a body in an animation
 VERTICES = 1000  # largest number of points of a path in space
@@ -95,7 +93,9 @@ class _Recorder:
         log, findings = self.stream.log, self.findings
         log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         log("summary", rr.TextDocument(summary(findings), media_type="text/markdown"), static=True)
-        log("verdict", rr.TextDocument(verdict(findings), media_type="text/markdown"), static=True)
+        for name, text in (("verdict", verdict(findings)), ("credit", credit(findings))):
+            if text:
+                log(name, rr.TextDocument(text, media_type="text/markdown"), static=True)
         values = [u for u in findings.standing.utilities if np.isfinite(u)]
         if values:
             log("utilities", rr.BarChart(values, color=COLOURS["best"]), static=True)
@@ -311,59 +311,6 @@ def rate(residual: Array, dt: float, window: int | None = None) -> tuple[Array, 
         window = max(window_of([column]) for column in residual.T)
     step = max(window, -(-len(residual) // FINE))
     return averaged(residual, step) / dt, step * dt
-
-
-def verdict(findings: Findings) -> str:
-    """Return the next command, the diagnosis in a few lines, and each cause's share (Markdown)."""
-    diagnosis, lines = findings.diagnosis, [f"next: `{findings.next_command}`\n"]
-    if diagnosis is None:
-        lines.append("not diagnosed yet\n")
-    else:
-        lines += [
-            f"{_marked(line)}\n"
-            for line in told(diagnosis, findings.task, findings.since, findings.settled)
-        ]
-        if diagnosis.credit:
-            lines += ["| credit | | of the improvement of predictions |", "|---|---|---|"]
-        for one in diagnosis.credit:
-            bar = "█" * max(1, round(BAR * one.share)) if one.share > 0 else ""
-            lines.append(f"| {one.of} | {percent(one.share)} | {bar} |")
-        lines.append("")
-    return "\n".join(lines)
-
-
-def _marked(text: str) -> str:
-    """Return a text with ± and ², and with the names of tables as code: lines broke after [."""
-    return str(typeset(re.sub(r"\[\w+\]", "`\\g<0>`", text)))
-
-
-def summary(findings: Findings) -> str:
-    """Return a summary of the workspace and of what is left out (Markdown)."""
-    task, best, first = findings.task, findings.best, findings.first
-    left = findings.left_runs + findings.left_logs
-    lines = [
-        f"**{findings.name}**, {task.model.name}: {task.horizon} steps of {task.dt:g} s, "
-        f"{count(len(findings.runs), 'trial')}"
-        + f", {count(len(findings.logs), 'log')} of data" * bool(findings.logs)
-        + f" (not shown: {left})" * bool(left),
-        "",
-    ]
-    known = []
-    if first is not None:
-        known.append(f"{figure(first.utility)} by the model's policy ({first.candidate.id})")
-    if best is not None:
-        known.append(f"{figure(best.utility)} best so far ({best.candidate.id})")
-    if findings.optimum is not None:
-        known.append(f"{figure(findings.optimum)} at the optimum")
-    lines.append(f"utility {', '.join(known)}" if known else "no candidate has been run yet")
-    lines += ["", "grey: desired; orange: model's policy; blue: best so far; pink: its prediction"]
-    if findings.better is not None and best is not None:
-        lines[-1] += f"; yellow: limits, and the bias that the model {findings.better.name} leaves"
-    if any(crash(run) is not None for run in findings.runs):
-        lines[-1] += "; crosses: where and when a run ended early"
-    lines += ["", f"**{findings.standing.outcome}**: {_marked(findings.standing.sentence)}", ""]
-    lines += [f"**left out**: {one.file}: {one.reason}\n" for one in findings.lost]
-    return "\n".join(lines)
 
 
 def drawn(part: Part, colour: Colour, ghost: bool = False) -> Any:
