@@ -29,9 +29,9 @@ from grounded.effects import (
 )
 from grounded.effects.family import coupled
 from grounded.effects.medium import over_ground, through_it
-from grounded.effects.registry import partner
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.places import partner
 from grounded.trial import Trial
 
 FINE = 6  # integration steps per control step

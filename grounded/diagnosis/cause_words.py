@@ -69,7 +69,7 @@ def all_called(model: Model, names: Sequence[str]) -> str:
 
 def _noun(model: Model, name: str) -> str:
     """Return the noun that a name needs in front of it in a sentence; "" if it needs none."""
-    from grounded.effects import places
+    from grounded import places
 
     # one of two velocities, `vx` beside `vy`, is not the speed
     own = places.role(model, "speed") or len([u for u in model.states.values() if u == "m/s"]) == 1

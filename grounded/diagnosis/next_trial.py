@@ -50,7 +50,8 @@ def next_trial(
         further: whether more effects should be looked for first (`Verdict.look_for`).
         ended: whether all parameters that moved stopped at their bounds (`at_bounds`).
     """
-    from grounded.effects import like_a_load, places
+    from grounded import places
+    from grounded.effects import like_a_load
 
     if claims.known.no_cause:
         return "Run two or more trials in which every input changes."

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.effects import places
+from grounded import places
 from grounded.effects.family import (
     LEAST_LIMIT,
     Effect,

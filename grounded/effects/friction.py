@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.effects import places
+from grounded import places
 from grounded.effects.family import Quantity, RateFamily, Site, Values, beyond, per, width
 
 HALTS = 2.0  # most that friction may take off in a control step, in units of the largest speed

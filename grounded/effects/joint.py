@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.effects import places
+from grounded import places
 from grounded.effects.family import Effect, LossFamily, Quantity, Site, coupled, width
 from grounded.effects.losses import PARTS, dry
 from grounded.frozen import Array

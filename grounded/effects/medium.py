@@ -26,8 +26,8 @@ from typing import Any
 
 import numpy as np
 
+from grounded import places
 from grounded.compile.names import Named
-from grounded.effects import places
 from grounded.effects.family import (
     Effect,
     MediumFamily,

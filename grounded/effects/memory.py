@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
 
 from grounded.compile.names import Named
 from grounded.frozen import Array
-from grounded.model import Model, is_clock
+from grounded.model import Model
+from grounded.places import true_values
 from grounded.trial import Trial
 
 
@@ -17,25 +17,6 @@ def settled(model: Model, a: Named, p: Named) -> dict[str, Any]:
     """Return the settled memories of inputs under constant inputs a, by `input_family`."""
     found = getattr(model.step, "settled", None)
     return {} if found is None else dict(found(a, p))
-
-
-def true_values(names: Sequence[str], memory: Collection[str]) -> dict[int, int]:
-    """Return the memory states that hold true values behind a delayed log.
-
-    Args:
-        names: names of all states, (n,).
-        memory: those that adopted effects added.
-
-    Returns:
-        {index of the memory state: index of the state that logs it}.
-    """
-    own = [(k, n) for k, n in enumerate(names) if n not in memory]
-    return {
-        i: k
-        for i, name in enumerate(names)
-        for k, n in own
-        if name in memory and name.startswith(f"{n}_true") and not is_clock(name)
-    }
 
 
 def shifted(signal: Array, held: Array, steps: float) -> Array:

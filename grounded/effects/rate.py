@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.effects import places
+from grounded import places
 from grounded.effects.family import (
     Quantity,
     RateFamily,

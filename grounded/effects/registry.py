@@ -22,7 +22,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.effects import actuator, friction, geometry, joint, medium, places, rate, sensor
+from grounded import places
+from grounded.effects import actuator, friction, geometry, joint, medium, rate, sensor
 from grounded.effects.correction import correction
 from grounded.effects.family import (
     Effect,
@@ -39,6 +40,7 @@ from grounded.effects.sensed import moved_model
 from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.places import derived_states, outright_states
 
 
 def _shift(site: Site) -> tuple[Quantity, ...]:
@@ -159,35 +161,6 @@ class Library:
 
 def _build(family: Family, target: str, model: Model, scales: Scales) -> Effect:
     return family.at(Site(model, tuple(target.split("+")), scales))
-
-
-def derived_states(model: Model) -> set[str]:
-    """Return heading rates on which nothing depends, carried along only to be measured.
-
-    They have no rate effects of their own; those on the heading change them, too (`partner`).
-    """
-    named = places.role(model, "heading_rate")
-    if not named:
-        return set()
-    f_x, _ = model.system.linearise(*places.samples(model), model.values, places.probe(model, 0.01))
-    i = model.state_names.index(named[0])
-    others = np.delete(f_x[:, :, i], i, axis=1)
-    return {named[0]} if float(np.abs(others).max()) < 1e-12 else set()
-
-
-def outright_states(model: Model) -> set[str]:
-    """Return states that the model sets regardless of their previous value, without dynamics."""
-    f_x, _ = model.system.linearise(*places.samples(model), model.values, places.probe(model, 0.01))
-    own = np.abs(f_x[:, np.arange(model.n), np.arange(model.n)]).max(axis=0)
-    return {name for name, size in zip(model.state_names, own, strict=True) if size < 1e-9}
-
-
-def partner(model: Model, target: str) -> str | None:
-    """Return the carried heading rate that follows the heading `target`, or None."""
-    if target != places.heading(model):
-        return None
-    idle = derived_states(model)
-    return next(iter(idle), None)
 
 
 SAMPLES = 40

@@ -47,12 +47,11 @@ from grounded.effects.family import (
 )
 from grounded.effects.losses import step_with
 from grounded.effects.medium import medium_of, over_ground, through_it
-from grounded.effects.places import integrated
 from grounded.effects.plain_step import Step, own_state, param_name, plain_step, quantities_of
-from grounded.effects.registry import partner
 from grounded.effects.sensed import behind_logs, late_step, sensor_step
 from grounded.errors import GroundedError
 from grounded.model import Model, Param
+from grounded.places import integrated, partner
 
 
 def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:

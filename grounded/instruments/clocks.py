@@ -27,10 +27,10 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.instruments.finding import Finding
-from grounded.instruments.kinematics import integrals
 from grounded.instruments.other_units import unusable
 from grounded.instruments.short_runs import Ahead, Fit
 from grounded.model import Model
+from grounded.places import integrals
 from grounded.result import listed
 from grounded.trial import Trial
 

@@ -16,8 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.frozen import wrapped
-from grounded.instruments.kinematics import Integral, pieces
+from grounded.instruments.kinematics import pieces
 from grounded.model import Model
+from grounded.places import Integral
 from grounded.trial import Trial
 
 STRETCHES = 24  # least number of stretches over all trials

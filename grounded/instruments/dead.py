@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.frozen import Array, wrapped
-from grounded.instruments.kinematics import Integral, integrals, pieces
+from grounded.instruments.kinematics import pieces
 from grounded.instruments.other_units import unusable
 from grounded.model import Model
+from grounded.places import Integral, integrals
 from grounded.trial import Trial
 
 LEAST = 20  # fewest samples

@@ -14,7 +14,6 @@ from itertools import combinations
 
 import numpy as np
 
-from grounded.instruments.kinematics import integrals
 from grounded.instruments.mistaken import (
     FEWER,
     HALF,
@@ -29,6 +28,7 @@ from grounded.instruments.other_units import unusable
 from grounded.instruments.short_runs import Ahead, Fit
 from grounded.instruments.swapped import swapped_columns
 from grounded.model import Model
+from grounded.places import integrals
 from grounded.trial import Trial
 
 CLEAR = 3.0  # [nats] by which all errors together must fall

@@ -15,13 +15,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.effects import places
-from grounded.effects.memory import true_values
-from grounded.effects.registry import partner
+from grounded import places
 from grounded.frozen import Array, wrapped
 from grounded.instruments.finding import Finding
 from grounded.instruments.lag import SURE, Lag, lag_between
 from grounded.model import Model
+from grounded.places import Integral, integrals, true_values
 from grounded.trial import Trial, stretches
 
 SHORT = 1e-6  # [s] time step from which the rates are computed
@@ -32,30 +31,6 @@ AGREE = 0.9  # length of the mean unit vector above which directions agree
 TURNED_AWAY = np.deg2rad(20)  # more than any side slip causes
 OFF = 0.03  # scale error that is reported, beyond both of its bounds
 SAME_WAY = 0.95  # coherence of speed and distance: below it something drifts or slips
-
-
-@dataclass(frozen=True)
-class Integral:
-    """The rate of state i is c times state j; `exact` if the model says so, not only its roles."""
-
-    i: int
-    j: int
-    c: float
-    exact: bool = True
-
-
-def integrals(model: Model) -> list[Integral]:
-    """Return the pairs of position and velocity, and of angle and rate, of a model.
-
-    A heading rate that the model only carries along is included, with `exact` false.
-    """
-    names = model.state_names
-    found = [
-        Integral(names.index(name), names.index(other), c)
-        for name, (other, c) in places.integrated(model).items()
-    ]
-    carried = [(i, k) for i, n in enumerate(names) if (k := partner(model, n))]
-    return found + [Integral(i, names.index(k), 1.0, exact=False) for i, k in carried]
 
 
 def logged_behind(model: Model, shown: Sequence[int]) -> list[tuple[Integral, bool]]:

@@ -16,19 +16,14 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import wrapped
 from grounded.instruments.finding import DEGREES, Finding
-from grounded.instruments.kinematics import (
-    AGREE,
-    TURNED_AWAY,
-    Turned,
-    integrals,
-    travelled,
-)
+from grounded.instruments.kinematics import AGREE, TURNED_AWAY, Turned, travelled
 from grounded.instruments.odd_trial import Odd, missed
 from grounded.instruments.other_units import FACTORS, described, unusable
 from grounded.instruments.rate_ratios import spread
 from grounded.instruments.rows import Gap, Row, gaps, per_step
 from grounded.instruments.swapped import exchanged
 from grounded.model import Model
+from grounded.places import integrals
 from grounded.result import listed
 from grounded.trial import Trial
 

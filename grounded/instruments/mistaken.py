@@ -17,14 +17,14 @@ from itertools import combinations, product
 
 import numpy as np
 
-from grounded.effects import places
+from grounded import places
 from grounded.frozen import Array
 from grounded.instruments.finding import DEGREES, Finding
 from grounded.instruments.inputs import OVER
-from grounded.instruments.kinematics import integrals
 from grounded.instruments.other_units import unusable
 from grounded.instruments.short_runs import Ahead, Fit
 from grounded.model import Model
+from grounded.places import integrals
 from grounded.result import listed, with_unit
 from grounded.trial import Trial
 

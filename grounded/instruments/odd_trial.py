@@ -17,9 +17,9 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.instruments.finding import DEGREES
-from grounded.instruments.kinematics import integrals
 from grounded.instruments.rate_ratios import Ratios, size_of, spread
 from grounded.model import Model
+from grounded.places import integrals
 from grounded.trial import Trial
 
 AHEAD = 0.25  # [s]

@@ -18,10 +18,10 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
-from grounded.instruments.kinematics import Integral
 from grounded.instruments.odd_trial import AHEAD, NEAR, SIMILAR, STAMPS, Odd, missed, predicted
 from grounded.instruments.rate_ratios import Ratios, ratios_of, size_of, spread
 from grounded.model import Model
+from grounded.places import Integral
 from grounded.trial import Trial
 
 MILLION = STAMPS**2  # mm for m, and multiplied by a thousand instead of divided

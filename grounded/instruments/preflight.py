@@ -46,9 +46,7 @@ from grounded.instruments.kinematics import (
     AGREE,
     OFF,
     TURNED_AWAY,
-    Integral,
     differenced,
-    integrals,
     judge_speed,
     lag_of,
     logged_behind,
@@ -72,6 +70,7 @@ from grounded.instruments.single import judge_signal, signal_of
 from grounded.instruments.swapped import judge_columns
 from grounded.instruments.way import judge_way, rate_agrees
 from grounded.model import Model
+from grounded.places import Integral, integrals
 from grounded.task import Task
 from grounded.trial import Trial
 

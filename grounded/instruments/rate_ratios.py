@@ -11,8 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from grounded.frozen import Array
-from grounded.instruments.kinematics import Integral, integrals, over_steps, pieces
+from grounded.instruments.kinematics import over_steps, pieces
 from grounded.model import Model
+from grounded.places import Integral, integrals
 from grounded.trial import Trial
 
 TOGETHER = 0.95  # cosine between displacements by position and by velocity, in the best window

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.effects import places
+from grounded import places
 from grounded.frozen import Array, wrapped
-from grounded.instruments.kinematics import SHORT, integrals, pieces
+from grounded.instruments.kinematics import SHORT, pieces
 from grounded.model import Model
+from grounded.places import integrals
 from grounded.trial import Trial
 
 STRETCH = 0.3  # [s] shortest stretch

@@ -10,8 +10,8 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.instruments.finding import Finding
-from grounded.instruments.kinematics import integrals
 from grounded.model import Model
+from grounded.places import integrals
 from grounded.trial import Trial
 
 STUCK = 8  # equal samples before a jump

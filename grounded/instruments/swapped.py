@@ -15,8 +15,9 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
-from grounded.instruments.kinematics import Integral, integrals, over_steps, pieces
+from grounded.instruments.kinematics import over_steps, pieces
 from grounded.model import Model
+from grounded.places import Integral, integrals
 from grounded.trial import Trial
 
 BROKEN, WHOLE = 0.8, 0.97  # cosine of displacements by position and velocity: bad, and good

@@ -93,7 +93,7 @@ class Planner:
         n, names = self.task.model.n, self.plan.model.state_names
         if len(names) == n:
             return self.plan
-        from grounded.effects.memory import true_values
+        from grounded.places import true_values
 
         terminal, target = self.plan.reward.terminal.copy(), self.plan.target.copy()
         for true, logged in true_values(names, names[n:]).items():

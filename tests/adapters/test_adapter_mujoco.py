@@ -20,8 +20,8 @@ from grounded.adapters.stepper import Stepper  # noqa: E402
 from grounded.adapters.tangent import Coordinates  # noqa: E402
 from grounded.diagnosis.diagnose import diagnose  # noqa: E402
 from grounded.errors import GroundedError  # noqa: E402
-from grounded.instruments.kinematics import integrals  # noqa: E402
 from grounded.model import Model  # noqa: E402
+from grounded.places import integrals  # noqa: E402
 from grounded.task import Task  # noqa: E402
 from grounded.trial import Trial  # noqa: E402
 from grounded.utility import Reward  # noqa: E402

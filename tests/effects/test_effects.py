@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from grounded import GroundedError, Model, Param, Trial
+from grounded import GroundedError, Model, Param, Trial, places
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -17,7 +17,6 @@ from grounded.effects import (
     Scales,
     memory_of,
     memory_start,
-    places,
     scales_of,
     wrap,
 )

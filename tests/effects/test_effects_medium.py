@@ -15,9 +15,9 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import linearise, sensitivities_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Effect, Library, scales_of, wrap, wrapping_order
-from grounded.effects.places import body_velocity
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
+from grounded.places import body_velocity
 from grounded.search.planner import planner_with
 from grounded.task import Task
 from grounded.utility import Reward

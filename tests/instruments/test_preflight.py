@@ -11,11 +11,12 @@ from grounded.diagnosis.diagnose import diagnose
 from grounded.errors import GroundedError, NextCommand
 from grounded.instruments.constant import constant_of
 from grounded.instruments.dead import dead_rates
-from grounded.instruments.kinematics import integrals, turned
+from grounded.instruments.kinematics import turned
 from grounded.instruments.lag import at_samples, lag_between
 from grounded.instruments.preflight import preflight
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
+from grounded.places import integrals
 from real_systems import DART_STEERING, EMPS, SERVO
 from shared_data import data, needs_data
 

@@ -14,8 +14,8 @@ from cli import grounded
 from facts import holds
 from grounded import Model
 from grounded.errors import GroundedError
-from grounded.instruments.kinematics import integrals
 from grounded.models.cart_pole import model as cart_pole
+from grounded.places import integrals
 from grounded_trials import Workspace
 from grounded_trials.logs.inspect_pairs import velocities
 from grounded_trials.logs.joint_names import from_base

@@ -18,11 +18,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from grounded import places
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.linearise import gains_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.ruler import folds
-from grounded.effects import places
 from grounded.effects.family import per
 from grounded.filter import kalman
 from grounded.frozen import Array

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.effects import Effect, places
+from grounded import places
+from grounded.effects import Effect
 from grounded.model import Model
 
 SLIGHT = 1e-9  # fraction of a step's largest slope that counts as no dependence

@@ -14,11 +14,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from grounded import places
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import Structure
-from grounded.effects import Effect, places
+from grounded.effects import Effect
 from grounded.effects.family import coupled
 from grounded.effects.joint import joint_friction, load_friction
 

@@ -21,10 +21,10 @@ import numpy as np
 
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.effects import Scales, scales_of
-from grounded.effects.memory import true_values
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.places import true_values
 from grounded.trial import Trial
 
 LONGEST_RUN, SHORTER_RUN = 200, 150  # most steps of a run; the second applies to a simulator

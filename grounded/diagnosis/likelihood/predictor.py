@@ -44,12 +44,11 @@ from grounded.effects import (
 from grounded.effects.family import braked, coupled
 from grounded.effects.losses import Left, Loads, ahead, loads, loads_from, solved
 from grounded.effects.medium import medium_of, through_it
-from grounded.effects.places import integrated
 from grounded.effects.plain_step import quantities_of
-from grounded.effects.registry import partner
 from grounded.effects.sensed import behind_logs, logged, moved_model, seen_names
 from grounded.engine import SentOnce
 from grounded.frozen import Array
+from grounded.places import integrated, partner
 from grounded.rollout import each_stepped
 
 MOST_KEPT = 4_000_000  # numbers in the cache of one received input, or of whole trials

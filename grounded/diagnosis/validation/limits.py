@@ -31,11 +31,10 @@ from grounded.effects import (
     SensorLagFamily,
 )
 from grounded.effects.actuator import backlash
-from grounded.effects.places import told_by
 from grounded.filter import kalman
 from grounded.frozen import Array
-from grounded.instruments.kinematics import integrals
 from grounded.model import Model, Param
+from grounded.places import integrals, told_by
 from grounded.result import listed
 from grounded.trial import Trial
 

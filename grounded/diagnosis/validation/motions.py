@@ -33,9 +33,9 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, ParamFamily, param_name
-from grounded.effects.places import dynamic
 from grounded.frozen import Array
 from grounded.model import Model, Param
+from grounded.places import dynamic
 
 REPEATS = 0.03  # fraction of a signal's power below which trials make the same motion
 TENTHS = 10  # stretches whose means are compared

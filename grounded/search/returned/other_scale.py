@@ -179,7 +179,7 @@ def _scaled_together(model: Model) -> Iterator[tuple[str, ...]]:
 
 def _of_one_sensor(model: Model) -> list[tuple[str, ...]]:
     """Return pairs of a position and its velocity: a reversed encoder flips both."""
-    from grounded.instruments.kinematics import integrals
+    from grounded.places import integrals
 
     names = model.state_names
     return [(names[one.i], names[one.j]) for one in integrals(model) if one.exact]

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.instruments.kinematics import integrals
 from grounded.model import Model
+from grounded.places import integrals
 from grounded_trials.formats.messages import Floats
 from grounded_trials.logs.following import DEGREE, SAME, Follows, follows, scale_of
 from grounded_trials.logs.inspect_guess import SIMULATED_S, Guess

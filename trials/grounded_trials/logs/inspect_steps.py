@@ -16,9 +16,9 @@ from itertools import islice
 
 import numpy as np
 
-from grounded.effects.places import probe
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.places import probe
 from grounded_trials.formats.messages import Floats
 from grounded_trials.logs.inspect_guess import Guess
 from grounded_trials.logs.inspect_pairs import COMBINATIONS, Signals, moved_to

@@ -85,7 +85,7 @@ def anchored(planner: Planner, trial: Trial) -> Trial:
     The true value of a state that is logged late or with a lag follows from the model alone, and
     drifts. The model's residual of that state is the drift, and is added to the memory.
     """
-    from grounded.effects.memory import true_values
+    from grounded.places import true_values
 
     lifted, n = planner.lift(trial), planner.task.model.n
     names = planner.plan.model.state_names

@@ -15,8 +15,8 @@ import numpy as np
 
 from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
-from grounded.instruments.kinematics import integrals
 from grounded.model import Model
+from grounded.places import integrals
 from grounded.task import MAX_HORIZON
 from grounded_trials.logs.inspect_pairs import velocities
 from grounded_trials.workspace.off_target import position_names

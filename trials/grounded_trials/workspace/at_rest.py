@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.instruments.kinematics import integrals
 from grounded.model import is_clock
+from grounded.places import integrals
 from grounded.task import Task
 from grounded_trials.wording import with_unit
 from grounded_trials.workspace.config import FILE

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded import places
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -29,7 +30,6 @@ from grounded.effects import (
     RateFamily,
     Scales,
     memory_start,
-    places,
     scales_of,
     wrap,
 )

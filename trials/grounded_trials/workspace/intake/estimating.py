@@ -21,11 +21,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.effects.places import probe
 from grounded.errors import GroundedError
 from grounded.estimate.record import Record
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.places import probe
 from grounded.task import Task
 from grounded_trials.formats.messages import Ints
 from grounded_trials.logs.resample import stamped_otherwise

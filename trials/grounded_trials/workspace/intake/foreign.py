@@ -313,7 +313,7 @@ def _hashed(files: Sequence[Path]) -> str:
 
 def _rates(model: Model) -> tuple[str, ...]:
     """Return the states that are velocities, which are zero while the robot is at rest."""
-    from grounded.instruments.kinematics import integrals
+    from grounded.places import integrals
 
     said = (model.roles.get("speed"), model.roles.get("heading_rate"))
     found = {model.state_names[one.j] for one in integrals(model)} | {*said}

@@ -78,8 +78,8 @@ def log_faults(workspace: Folder, trial: Trial) -> tuple[Fault, ...]:
 
 
 def _exchanged(model: Model, known: Trial) -> Iterator[Fault]:
-    from grounded.instruments.kinematics import integrals
     from grounded.instruments.swapped import exchanged, swapped_columns
+    from grounded.places import integrals
 
     if pair := swapped_columns(model, known, relations=integrals(model)):
         yield Fault(exchanged(pair), "Exchange their paths in [log]")

@@ -238,7 +238,7 @@ def _moved_on(task: Task, whole: Trial) -> list[str]:
 
 def _to_stay(task: Task, states: Sequence[int]) -> str:
     """Return what would make a robot stay at the end of its target that the task lacks."""
-    from grounded.instruments.kinematics import integrals
+    from grounded.places import integrals
 
     end = task.target[-max(2, len(task.target) // 20) :, states]
     rates = [one.j for one in integrals(task.model) if one.exact and one.i in states]

@@ -1,4 +1,4 @@
-"""Targets of effects in a model: its states and inputs by their meaning.
+"""The states and inputs of a model by their meaning: where effects act, what sensors relate.
 
 Roles come from the model (`Model.roles`). Without roles, a position is a pair of states called x
 and y (or north and east), a heading is an angle called psi, yaw, heading or theta, and a speed is a
@@ -8,12 +8,13 @@ Effects whose targets can't be determined are not candidates.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from grounded.frozen import Array
-from grounded.model import Model
+from grounded.model import Model, is_clock
 
 POSITIONS = (("x", "y"), ("north", "east"), ("px", "py"), ("pos_x", "pos_y"))
 HEADINGS = ("psi", "yaw", "heading", "theta")
@@ -171,6 +172,30 @@ def integrated(model: Model) -> dict[str, tuple[str, float]]:
     return found
 
 
+@dataclass(frozen=True)
+class Integral:
+    """The rate of state i is c times state j; `exact` if the model says so, not only its roles."""
+
+    i: int
+    j: int
+    c: float
+    exact: bool = True
+
+
+def integrals(model: Model) -> list[Integral]:
+    """Return the pairs of position and velocity, and of angle and rate, of a model.
+
+    A heading rate that the model only carries along is included, with `exact` false.
+    """
+    names = model.state_names
+    found = [
+        Integral(names.index(name), names.index(other), c)
+        for name, (other, c) in integrated(model).items()
+    ]
+    carried = [(i, k) for i, n in enumerate(names) if (k := partner(model, n))]
+    return found + [Integral(i, names.index(k), 1.0, exact=False) for i, k in carried]
+
+
 def told_by(model: Model, pair: Sequence[str]) -> set[str]:
     """Return the states from which a common delay of the sensors of a pair is identifiable.
 
@@ -210,3 +235,51 @@ def following(model: Model) -> list[str]:
         if driven and alone and own.min() < 1 - 1e-6 and np.abs(own).max() > 1e-9:
             found.append(name)
     return [name for name in found if name not in position(model)]
+
+
+def derived_states(model: Model) -> set[str]:
+    """Return heading rates on which nothing depends, carried along only to be measured.
+
+    They have no rate effects of their own; those on the heading change them, too (`partner`).
+    """
+    named = role(model, "heading_rate")
+    if not named:
+        return set()
+    f_x, _ = model.system.linearise(*samples(model), model.values, probe(model, 0.01))
+    i = model.state_names.index(named[0])
+    others = np.delete(f_x[:, :, i], i, axis=1)
+    return {named[0]} if float(np.abs(others).max()) < 1e-12 else set()
+
+
+def outright_states(model: Model) -> set[str]:
+    """Return states that the model sets regardless of their previous value, without dynamics."""
+    f_x, _ = model.system.linearise(*samples(model), model.values, probe(model, 0.01))
+    own = np.abs(f_x[:, np.arange(model.n), np.arange(model.n)]).max(axis=0)
+    return {name for name, size in zip(model.state_names, own, strict=True) if size < 1e-9}
+
+
+def partner(model: Model, target: str) -> str | None:
+    """Return the carried heading rate that follows the heading `target`, or None."""
+    if target != heading(model):
+        return None
+    idle = derived_states(model)
+    return next(iter(idle), None)
+
+
+def true_values(names: Sequence[str], memory: Collection[str]) -> dict[int, int]:
+    """Return the memory states that hold true values behind a delayed log.
+
+    Args:
+        names: names of all states, (n,).
+        memory: those that adopted effects added.
+
+    Returns:
+        {index of the memory state: index of the state that logs it}.
+    """
+    own = [(k, n) for k, n in enumerate(names) if n not in memory]
+    return {
+        i: k
+        for i, name in enumerate(names)
+        for k, n in own
+        if name in memory and name.startswith(f"{n}_true") and not is_clock(name)
+    }
