@@ -130,7 +130,7 @@ def bias_figure(findings: Findings) -> Figure | None:
     panels = []
     for i in reading_order(task):
         name, unit = list(task.model.states.items())[i]
-        drawn = []
+        drawn: list[tuple[Array, str, str, float]] = []
         for k, run in enumerate(runs):
             role = "model" if k == 0 else "best" if k == len(runs) - 1 else STEPS[(k - 1) % 3]
             drawn.append((run.residual[:, i], role, f"iteration {run.candidate.iteration}", 1.0))

@@ -103,7 +103,7 @@ def blueprint(findings: Findings, space: Space) -> Any:
         rrb.Tabs(*_trials(findings, space), name="By trial"),
     ]
     only_logs = bool(findings.logs) and not findings.runs
-    shown = rrb.Tabs(*tabs, active_tab=len(tabs) - 1 if only_logs else 0)
+    shown: Any = rrb.Tabs(*tabs, active_tab=len(tabs) - 1 if only_logs else 0)
     if only_logs:  # opens at the logs, with the answer above them
         shown = rrb.Vertical(_answer(findings), shown, row_shares=_rows(findings))
     return rrb.Blueprint(
