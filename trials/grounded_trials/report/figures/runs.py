@@ -139,7 +139,10 @@ def bias_figure(findings: Findings) -> Figure | None:
             words = f"last iteration, model {findings.better.name}"
             drawn.append((best.explained[:, i], "predicted", words, 1.5))
         window = window_of([values for values, *_ in drawn])
-        curves = [_means(values / task.dt, window, task.dt, *how) for values, *how in drawn]
+        curves = [
+            _means(values / task.dt, window, task.dt, role, words, width)
+            for values, role, words, width in drawn
+        ]
         panel = _timed(name, per_second(unit), curves)
         if window > 1:
             note = f"means over {window * task.dt:.2g} s: single steps are mostly noise"
