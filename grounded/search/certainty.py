@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded.frozen import Array
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.scatter import (
     Repeats,
     beyond_noise,
     by_pieces,
     noise_cost,
-    white_noise,
+    sensor_noise,
     with_errors,
 )
 from grounded.task import Task
@@ -25,7 +26,6 @@ from grounded.trial import Trial, scattered
 if TYPE_CHECKING:
     from grounded.search.step_size import SearchOptions
 
-FAR = 1e100  # bound on the noise of a diverged run, in the state's unit
 PART = 0.3  # share of a gain due to different start states from which on it is reported
 FEW = 4.0  # degrees of freedom below which the sentence mentions the few repeats
 
@@ -78,21 +78,17 @@ def judged(
         history.append(tried)
     best_one = incumbent and incumbent.candidate
     asked = [t.candidate is best_one or not t.candidate.grounded for t in history]
-    told = with_chances(
-        with_errors(
-            [_with_noise(task, t) if ask else t for ask, t in zip(asked, history, strict=True)]
-        )
-    )
+    noise = sensor_noise(trials, task.model.n)
+    noisy = [_with_noise(task, t, noise) if a else t for a, t in zip(asked, history, strict=True)]
+    told = with_chances(with_errors(noisy))
     best = next((t for t in told if t.candidate is best_one), None)
     return told, best, iteration
 
 
-def _with_noise(task: Task, tried: Tried) -> Tried:
+def _with_noise(task: Task, tried: Tried, noise: Array) -> Tried:
     """Return the candidate with the mean cost of the noise in its logs; unchanged without logs."""
     if not tried.trials:
         return tried
-    each = np.minimum([white_noise(trial.states) for trial in tried.trials], FAR)
-    noise = np.sqrt(np.mean(each**2, axis=0))
     return replace(tried, noise_cost=noise_cost(task, tried.candidate.policy, noise))
 
 

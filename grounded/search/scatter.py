@@ -36,6 +36,8 @@ from grounded.trial import Trial
 PIECES = 4  # parts of a run
 MEDIAN = 0.6745  # median of |x| of a standard normal x
 ORDERS = (2, 3, 4, 5)  # orders of differences
+LATEST = 9  # trials from which the noise of the sensors is estimated
+HUGE = 1e100  # bound on the noise of a diverged run, in the state's unit
 FAR = 2.0  # largest ratio of costs of candidates whose scatter is pooled
 
 
@@ -93,6 +95,16 @@ def white_noise(states: Array) -> Array:
             white = MEDIAN * math.sqrt(math.comb(2 * order, order))
             found[j] = min(found[j], median(known) / white if len(known) else np.inf)
     return np.where(np.isfinite(found), found, 0.0)
+
+
+def sensor_noise(trials: Sequence[Trial], n: int) -> Array:
+    """Return the white noise (std) of each state's sensor, (n,); 0 without a trial.
+
+    It is the median over the latest trials. The estimate of a single short run is off by a third
+    either way.
+    """
+    each = [white_noise(trial.states) for trial in trials[-LATEST:]]
+    return median(np.minimum(each, HUGE)) if each else np.zeros(n)
 
 
 def noise_cost(task: Task, policy: Policy, noise: Array) -> float:

@@ -10,7 +10,14 @@ from grounded.plant import Noise, Plant
 from grounded.search.candidate import Tried
 from grounded.search.certainty import error_between, in_doubt
 from grounded.search.improve import propose
-from grounded.search.scatter import PIECES, Repeats, by_pieces, noise_cost, with_errors
+from grounded.search.scatter import (
+    PIECES,
+    Repeats,
+    by_pieces,
+    noise_cost,
+    sensor_noise,
+    with_errors,
+)
 from grounded.search.standing import standing
 from grounded.search.step_size import SearchOptions
 from small_tasks import cart_task, drive, other
@@ -99,6 +106,12 @@ def test_what_noise_in_a_log_costs_is_no_doubt_in_the_model():
     assert 0.3 < told / lost < 1.4  # from 41 rows of one log
     assert not now.doubt
     assert now.incumbent.promised == pytest.approx(made.predicted_utility - told)
+    # one estimate from all logs, for what is promised before a run and for what is judged after it
+    assert told == pytest.approx(noise_cost(task, policy, sensor_noise(runs[:1], 2)))
+    more = standing(task, [made], runs[:3], SearchOptions(repeats=3), made.model).history[0]
+    assert more.noise_cost == pytest.approx(noise_cost(task, policy, sensor_noise(runs[:3], 2)))
+    each = [float(noise_cost(task, policy, sensor_noise([run], 2))) for run in runs[:3]]
+    assert min(each) < more.noise_cost < max(each)
 
 
 def test_a_notebook_shows_the_candidates_and_the_phase():

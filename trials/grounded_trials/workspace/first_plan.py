@@ -14,7 +14,7 @@ import numpy as np
 
 from grounded.errors import NextCommand
 from grounded.result import listed, measured, measured_alike, percent
-from grounded.search.scatter import white_noise
+from grounded.search.scatter import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import step_rewards
@@ -30,7 +30,6 @@ from grounded_trials.workspace.off_target import (
 from grounded_trials.workspace.task_file import limited_changes, seen_in
 
 if TYPE_CHECKING:
-    from grounded.frozen import Array
     from grounded.search.candidate import Candidate
     from grounded.search.standing import Proposal
 
@@ -236,7 +235,7 @@ def _shaken(workspace: Folder, first: Candidate) -> list[str]:
     task, gain, found = workspace.task, first.policy.gain, []
     if gain is None:
         return []
-    noise = sensor_noise(workspace)
+    noise = sensor_noise(workspace.task_trials(), workspace.base_model.n)
     parts = gain[:, :, : task.model.n] ** 2 * noise**2  # (H, m, n)
     pieces = np.array_split(parts, min(PIECES, len(parts)))  # gains grow towards an end
     each = np.sqrt([piece.sum(axis=2).mean(axis=0) for piece in pieces])  # (pieces, m)
@@ -258,12 +257,6 @@ def _shaken(workspace: Folder, first: Candidate) -> list[str]:
             f"increase [reward] input_change of {name}"
         )
     return found
-
-
-def sensor_noise(workspace: Folder) -> Array:
-    """Return the white noise (std) of each state, (n,), in the latest log; 0 without a log."""
-    trials = workspace.task_trials(measured=True)
-    return white_noise(trials[-1].states) if trials else np.zeros(workspace.base_model.n)
 
 
 def _most_missed(task: Task, plan: Trial) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
-from grounded.search.scatter import noise_cost
+from grounded.search.scatter import noise_cost, sensor_noise
 from grounded_trials.wording import ranges, rendered
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.handover import Void, checked_candidate, outside_limits
@@ -140,9 +140,8 @@ def propose_in(workspace: Folder) -> Proposed:
     then = PROPOSE if held else to_run(workspace, candidate.id)
     cost = 0.0
     if not candidate.grounded:  # else the model replays a log, and its noise is included
-        from grounded_trials.workspace.first_plan import sensor_noise
-
-        cost = noise_cost(workspace.task, candidate.policy, sensor_noise(workspace))
+        noise = sensor_noise(workspace.task_trials(), workspace.base_model.n)
+        cost = noise_cost(workspace.task, candidate.policy, noise)
     return Proposed(proposal, path, then, cost)
 
 
