@@ -29,11 +29,12 @@ from grounded.diagnosis.ruler_words import objection, open_noise
 from grounded.diagnosis.unconfirmed import another_look, marked, unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import Compared, by_trial
 from grounded.diagnosis.validation.claims import Claims
-from grounded.diagnosis.validation.decide import SLIGHT, SURE, Decision
+from grounded.diagnosis.validation.decide import SLIGHT, Decision
 from grounded.diagnosis.validation.held_out import shrinkage, utility_prediction
 from grounded.diagnosis.validation.limits import Limits, identifiable, joints_without_input
 from grounded.diagnosis.validation.measured import Measured, root_mean_square
 from grounded.diagnosis.validation.motions import how_many
+from grounded.diagnosis.validation.own_numbers import SURE
 from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.verdict import verdict

@@ -17,7 +17,8 @@ from grounded.diagnosis.hypotheses.leftover import whiteness
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.report import Estimate, Ranked
 from grounded.diagnosis.ruler_words import rest
-from grounded.diagnosis.validation.claims import Blame, has_size, loss
+from grounded.diagnosis.validation.blame import Blame, loss
+from grounded.diagnosis.validation.claims import has_size
 from grounded.diagnosis.validation.prediction_error import _stump
 from grounded.diagnosis.verdict import sentence, verdict
 from grounded.effects import Library

@@ -18,7 +18,7 @@ from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked, Verdict
-from grounded.diagnosis.validation.decide import SURE
+from grounded.diagnosis.validation.own_numbers import SURE
 from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.effects import Library
 from grounded.effects.actuator import delay_again

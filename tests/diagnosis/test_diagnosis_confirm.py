@@ -132,6 +132,8 @@ def test_what_predicts_no_better_is_not_claimed(wavy):
     one = sorted(names)[0]
     assert not decide(search, best, Said(lambda c: 1.0), 3).causes
     assert not decide(search, best, Said(lambda c: 1.0 + len(c)), 3).causes  # worse
+    hardly = decide(search, best, Said(lambda c: 0.95 if c else 1.0), 3)  # by 5 % everywhere
+    assert not hardly.causes and names <= {one.name for one in hardly.doubtful}
     needed = decide(search, best, Said(lambda c: 0.2 if one in c else 1.0), 3)
     assert needed.causes == (one,)
     whole = decide(search, best, Said(lambda c: 0.5 ** len(names & set(c))), 3)
@@ -186,7 +188,8 @@ def test_noise_can_not_hide_what_predicts_far_better(wavy):
     null = search.best_null()
     found = decide(search, null, Said(lambda c: 0.1 if c else 1.0), 3)
     assert found.causes and found.fit is not null
-    assert not decide(search, null, Said(lambda c: 0.95 if c else 1.0), 3).causes  # too little
+    for little in (0.95, 0.8):  # what noise explains alone must be far worse explained by it
+        assert not decide(search, null, Said(lambda c, r=little: r if c else 1.0), 3).causes
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import Credit, Identifiable
 from grounded.diagnosis.report import Estimate
-from grounded.diagnosis.validation.claims import Blame
+from grounded.diagnosis.validation.blame import Blame
 from grounded.diagnosis.verdict import _causes
 from grounded.effects import Library
 from grounded_trials.report.diagnosis_words import error_lines, held_sentence

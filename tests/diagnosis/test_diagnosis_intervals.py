@@ -9,7 +9,7 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.intervals import _fisher, standard_deviations
-from grounded.diagnosis.validation.claims import moved_parameters
+from grounded.diagnosis.validation.blame import moved_parameters
 from grounded.diagnosis.validation.limits import counted_once
 from grounded.diagnosis.validation.ruler import folds
 

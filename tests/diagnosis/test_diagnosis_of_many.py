@@ -9,7 +9,7 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses.attribution import attribute, promised
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.validation.decide import SURE
+from grounded.diagnosis.validation.own_numbers import SURE
 from grounded.diagnosis.writer import Writer
 from grounded.effects import Library
 

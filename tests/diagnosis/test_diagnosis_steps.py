@@ -13,7 +13,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
-from grounded.diagnosis.validation import decide
+from grounded.diagnosis.validation import decide, own_numbers
 from grounded.diagnosis.validation.averaged import averaged
 from grounded.diagnosis.validation.gain import Gain
 from grounded.diagnosis.validation.ruler import folds
@@ -147,13 +147,13 @@ def test_a_rival_under_the_same_noise_does_not_overrule_what_steps_bear_out(sear
 def test_what_ties_with_a_parameter_is_named_as_that(search):
     gain, own = fit_of(search, "input_gain:u"), fit_of(search, "parameter:k")
     assert abs(search.score(gain) - search.score(own)) < 3
-    assert decide._own_numbers(search, gain, Coarse(0.0)).hypothesis.names == ("parameter:k",)
+    assert own_numbers.own_numbers(search, gain, Coarse(0.0)).hypothesis.names == ("parameter:k",)
     likelier = replace(gain, evidence=gain.evidence + 10.0)
-    assert decide._own_numbers(search, likelier, Coarse(0.0)) is likelier
+    assert own_numbers.own_numbers(search, likelier, Coarse(0.0)) is likelier
     better = Coarse(3.0, largest=0.1)
-    assert decide._own_numbers(search, gain, better) is gain
+    assert own_numbers.own_numbers(search, gain, better) is gain
     rubs = fit_of(search, FRICTION)
-    assert decide._own_numbers(search, rubs, Coarse(0.0)) is rubs
+    assert own_numbers.own_numbers(search, rubs, Coarse(0.0)) is rubs
 
 
 @pytest.fixture(scope="module")
@@ -181,11 +181,11 @@ def test_calibration_takes_the_place_of_a_further_effect_unless_that_is_beyond_d
 ):
     fit, free = calibrated
     near, sure = (more_likely(search, fit, nats) for nats in (6.0, 10.0))
-    assert decide._calibrated_instead(search, near, Coarse(0.0)) is free
-    assert decide._calibrated_instead(search, sure, Coarse(0.0)) is sure
-    assert decide._calibrated_instead(search, near, Coarse(3.0, largest=0.1)) is near
+    assert own_numbers._calibrated_instead(search, near, Coarse(0.0)) is free
+    assert own_numbers._calibrated_instead(search, sure, Coarse(0.0)) is sure
+    assert own_numbers._calibrated_instead(search, near, Coarse(3.0, largest=0.1)) is near
     alone = fit_of(search, FRICTION)
-    assert decide._calibrated_instead(search, alone, Coarse(0.0)) is alone
+    assert own_numbers._calibrated_instead(search, alone, Coarse(0.0)) is alone
 
 
 def test_calibration_takes_the_place_of_several_effects_that_are_not_each_beyond_doubt(
@@ -198,8 +198,8 @@ def test_calibration_takes_the_place_of_several_effects_that_are_not_each_beyond
     three = replace(fit, hypothesis=fit.hypothesis.plus(limit, {"c": 1.5}))
     nats = search.score(free) - search.score(three)
     near, sure = (more_likely(search, three, nats + more) for more in (14.0, 18.0))
-    assert decide._calibrated_instead(search, near, Coarse(0.0)) is free
-    assert decide._calibrated_instead(search, sure, Coarse(0.0)) is sure
+    assert own_numbers._calibrated_instead(search, near, Coarse(0.0)) is free
+    assert own_numbers._calibrated_instead(search, sure, Coarse(0.0)) is sure
 
 
 def test_effects_are_also_fitted_with_parameters_that_seem_right_without_them():
@@ -239,6 +239,22 @@ def test_a_parameter_that_is_hardly_off_needs_predictions_not_single_steps(searc
     assert decide._pays(search, Coarse(0.01), bare, off_by(0.2), True)
     assert not decide._pays(search, Coarse(0.01), bare, off_by(0.05), True)
     assert decide._pays(search, Coarse(3.0, 0.1), bare, off_by(0.05), True)
+
+
+def test_a_sensor_that_is_wrong_for_certain_need_not_change_predictions(search):
+    model, _ = sled()
+    candidates = Library().candidates(model, search.data.scales)
+    scale = next(e for e in candidates if e.name == "sensor_scale:v")
+    bare, friction = fit_of(search), fit_of(search, FRICTION)
+    sensed = replace(friction, hypothesis=Hypothesis().plus(scale, {"g": 0.1}))
+    faint = Coarse(3.0, largest=0.05)
+    base = search.score(search.best_null())
+    sure = more_likely(search, sensed, 60.0 + base - search.score(sensed))
+    unsure = more_likely(search, sensed, 20.0 + base - search.score(sensed))
+    assert decide._seen(search, faint, bare, sure)
+    assert not decide._seen(search, faint, bare, unsure)
+    assert not decide._seen(search, faint, bare, more_likely(search, friction, 60.0))
+    assert decide._seen(search, Coarse(3.0, largest=0.2), bare, unsure)
 
 
 def test_intervals_are_those_of_all_likely_fits_of_the_same_effects(search, calibrated):

@@ -18,7 +18,7 @@ from grounded.diagnosis.report import (
 )
 from grounded.diagnosis.ruler_words import improvement, rest
 from grounded.diagnosis.tables import EFFECTS, effect_table, error_table
-from grounded.diagnosis.validation.claims import Blame
+from grounded.diagnosis.validation.blame import Blame
 from grounded.diagnosis.verdict import UNSURE, verdict
 from grounded.effects import Library
 from grounded.model import Model, Param

@@ -9,10 +9,12 @@ Read `ruler`, then `decide`. The modules, from the measurement to the claims:
     visits             where an effect acts, and whether only few trials show it
     motions            in how many different motions an effect is seen
     decide             the decision between likely hypotheses, by the ruler
+    own_numbers        the model's own numbers in place of effects that tie with them
     measured           errors, noise floor, credit and leftover of a decision
     held_out           the noise-normalised gap and utilities, held out
     prediction_error   where the gap is, by channel, time and region
     split              explained, unexplained and irreducible parts of the error
+    blame              which of the model's own parameters are off
     claims             the claimed effects with intervals, their rivals and look-alikes
     averaged           intervals averaged over models
     limits             what the data can't determine

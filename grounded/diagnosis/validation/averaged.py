@@ -21,7 +21,7 @@ import numpy as np
 from grounded.diagnosis.hypotheses.explored import FittedHypotheses
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.validation.decide import BETTER
+from grounded.diagnosis.validation.gain import BETTER
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.frozen import Array
 

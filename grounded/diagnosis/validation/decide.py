@@ -15,7 +15,8 @@ under every other noise structure, are compared by the `ruler`:
     4. An effect without a mechanism that a single motion shows is dropped, however often the motion
        was repeated.
     5. The remaining effects must be likelier than none.
-    6. A hypothesis that predicts no better than the crude model is not claimed.
+    6. A hypothesis is not claimed if predictions hardly gain in any channel at any horizon, except
+       sensors' faults with very high evidence, which need not matter for what comes next.
     7. A likely effect that was dropped is reported as doubtful; perhaps too few trials show it.
 
 A cause is an effect or the calibration of the model's own parameters.
@@ -24,7 +25,6 @@ A cause is an effect or the calibration of the model's own parameters.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 
@@ -34,21 +34,23 @@ from grounded.diagnosis.hypotheses.plainest import plainer
 from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
+from grounded.diagnosis.validation.gain import BETTER
 from grounded.diagnosis.validation.motions import of_no_size, repeats
+from grounded.diagnosis.validation.own_numbers import SURE, equations, own_numbers
 from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.diagnosis.validation.single_steps import borne_out
 from grounded.diagnosis.validation.visits import acting, few_trials
-from grounded.effects import ParamFamily
+from grounded.effects import ParamFamily, SensorFamily
 
 CALIBRATION = "calibration"
 RIVALS = 8  # likeliest hypotheses that are measured
 LEAST = 0.01  # smallest log gain of a cause in its best channel
 PAYS = (2.0, LEAST)  # scatters and log gain that a cause must reach
 ALONE = (1.0, LEAST)  # the same for a single effect, or calibration, with evidence above SURE
-SURE = 8.0  # nats (odds of 3,000 to 1) above which an effect counts as certain by evidence
 WHITE = 0.9  # tempering factor above which the innovations count as white
-BETTER = (2.0, 0.05)  # scatters and log gain by which a less likely rival must predict better
 OVERRULES = (3.0, 0.1)  # the same for a rival that is likely under another noise structure only
+FROM_NONE = (3.0, 0.3)  # the same if the likeliest hypothesis has no cause: that noise is all
+SEEN = 0.08  # log gain of a claim, in some channel at some horizon, below which it is not made
 SLIGHT = 0.02  # smallest share of the total gain, in some channel, of a cause that is named
 AMOUNTS = 0.1  # a rival's advantage must be this part of what the likeliest gains,
 FAR = 1.5  # of at most this log gain (errors down to a quarter) if it has another noise structure
@@ -103,13 +105,20 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
     white = search.tempering.factor > WHITE
     ruler.beside(crude)
     search, proposed = _proposed(search, best, crude, ruler, most, white)
-    proposed = _own_numbers(search, _plainest(search, proposed, ruler, white), ruler)
+    proposed = own_numbers(search, _plainest(search, proposed, ruler, white), ruler)
     fit, without, doubtful = _pruned(search, proposed, ruler, white)
     if proposed.hypothesis.spread > 0 and (other := _likelier(search, fit, ruler)):
         fit, without, more = _pruned(search, other, ruler, white)
         doubtful += more
     if not _likely(search, fit):
         fit, without, _ = _pruned(search, search.best_null(), ruler, white)
+    if causes(fit) and not _seen(search, ruler, crude, fit):
+        doubtful += [
+            Doubtful(n, nats, fit)
+            for n in equations(fit)
+            if (nats := search.score(fit) - search.score(without[n])) > LIKELY
+        ]
+        fit = crude
     if not causes(fit) or not _pays(search, ruler, crude, fit, white):
         search, fit, without = whole, crude, {}
     search.settled([fit, *without.values(), search.best_null()])
@@ -124,61 +133,6 @@ def _plainest(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool) 
         if not _pays(search, ruler, plain_form, fit, white):
             return _plainest(search, plain_form, ruler, white)
     return fit
-
-
-def _own_numbers(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
-    """Replace effects by shifts of the model's parameters, if these tie and predict as well.
-
-    A parameter declared uncertain, or an adopted delay, is more probably off than an equation
-    missing.
-    """
-    h, score = fit.hypothesis, search.score
-    params = {e.name for e in search.candidates if e.known or isinstance(e.family, ParamFamily)}
-    for name in [n for n in _effects(fit) if n not in params] if h.spread == 0 else ():
-        rest = {*h.names} - {name}
-        sets = {tuple(sorted({*rest, param})) for param in params - rest}
-
-        def likeliest(sets: set[tuple[str, ...]] = sets) -> Fitted:
-            exact = [f for (_, w, names), f in search.fits.items() if names in sets and not w]
-            return max(exact, key=score, default=fit)
-
-        if score(fit) - score(likeliest()) < 2 * TIE:
-            search.finished([likeliest()], TO_THE_TOP)
-        other = likeliest()
-        ties = other is not fit and score(fit) - score(other) < TIE
-        if ties and not ruler.gain(other, fit).beyond(*BETTER):
-            return _own_numbers(search, other, ruler)
-    return _calibrated_instead(search, fit, ruler)
-
-
-def _calibrated_instead(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
-    """Replace further effects by calibration of all parameters, unless they are much likelier.
-
-    If all parameters are slightly off, no single shift equals an effect with two values, but all
-    shifts together do. So each effect beside another cause must be worth SURE nats.
-    """
-    h, score, names = fit.hypothesis, search.score, _effects(fit)
-    if h.spread > 0 or len(h.names) < 2:
-        return fit
-    rests = {
-        tuple(sorted({*h.names} - {*some})): SURE * count
-        for count in range(1, min(len(names), len(h.names) - 1) + 1)
-        for some in combinations(names, count)
-    }
-
-    def lacks(other: Fitted) -> float:
-        """Return the nats that another fit lacks to replace this one; below zero, it does."""
-        return score(fit) - score(other) - rests[tuple(sorted(other.hypothesis.names))]
-
-    def nearest() -> Fitted:
-        free = [f for (_, w, some), f in search.fits.items() if w and some in rests]
-        return min(free, key=lacks, default=fit)
-
-    if (other := nearest()) is not fit and lacks(other) < SURE:
-        search.finished([other], TO_THE_TOP)
-        other = nearest()
-    as_good = other is not fit and lacks(other) < 0
-    return fit if not as_good or ruler.gain(other, fit).beyond(*BETTER) else other
 
 
 def _likelier(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted | None:
@@ -239,6 +193,19 @@ def _pays(
     return alone and borne_out(search, before, after, LARGE_GAIN)
 
 
+def _seen(search: HypothesisSearch, ruler: Ruler, crude: Fitted, fit: Fitted) -> bool:
+    """Check whether the claim as a whole shows in predictions, in some channel at some horizon.
+
+    Evidence of dozens of nats for causes that change predictions by a few percent was, on blind
+    cases, nearly always evidence of something else. A sensor's fault need not change what comes
+    next: it counts by very high evidence alone.
+    """
+    if not ruler.held_out or ruler.gain(crude, fit).largest > SEEN:
+        return True
+    sensed = all(isinstance(e.family, SensorFamily) for e in fit.hypothesis.effects)
+    return sensed and search.score(fit) - search.score(search.best_null()) > LARGE_GAIN
+
+
 def _as_given(fit: Fitted, names: set[str]) -> bool:
     """Check whether all of these are parameters with shifts far below their priors."""
     pairs = [(e, v) for e, v in fit.hypothesis.pairs if e.name in names]
@@ -296,7 +263,8 @@ def _proposed(
         if other is None or (structure, spread) == (best.noise.structure, best.hypothesis.spread):
             continue
         rival = other.chosen(most)
-        if causes(rival) and _overrules(ruler, crude, found, rival, *OVERRULES, far=FAR):
+        bar = OVERRULES if causes(found) else FROM_NONE
+        if causes(rival) and _overrules(ruler, crude, found, rival, *bar, far=FAR):
             if rival.hypothesis.effects:
                 other.finished(other.of_size(len(rival.hypothesis.effects))[:2], TO_THE_TOP)
                 rival = other.chosen(most)
@@ -320,7 +288,7 @@ def _pruned(
         gains = {name: ruler.gain(less, fit) for name, less in without.items()}
         least = SLIGHT * ruler.since_outset(fit)
         undone = counterparts(search.predictor, fit.hypothesis)
-        repeated = {n: repeats(search, fit, without[n], n) for n in _effects(fit)}
+        repeated = {n: repeats(search, fit, without[n], n) for n in equations(fit)}
         idle = (
             undone
             or [n for n, count in repeated.items() if count]
@@ -335,7 +303,7 @@ def _pruned(
             return fit, without, doubtful
         name = _least_needed(search, ruler, without, min(idle, key=lambda n: gains[n].mean), idle)
         nats = search.score(fit) - search.score(without[name])
-        if nats > LIKELY and name in _effects(fit) and name not in undone:
+        if nats > LIKELY and name in equations(fit) and name not in undone:
             doubtful.append(Doubtful(name, nats, fit, repeated[name], gains[name].alone))
         fit = without[name]
 
@@ -352,11 +320,6 @@ def _least_needed(
         if likelier and not ruler.gain(without[other], without[name]).beyond(*BETTER):
             name = other
     return name
-
-
-def _effects(fit: Fitted) -> list[str]:
-    """Return the names of the effects that are not parameters."""
-    return [e.name for e in fit.hypothesis.effects if not isinstance(e.family, ParamFamily)]
 
 
 def fit_without(search: HypothesisSearch, fit: Fitted, name: str, ruler: Ruler) -> Fitted:

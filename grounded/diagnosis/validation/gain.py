@@ -25,6 +25,7 @@ from grounded.frozen import Array
 MOST, FEW = 0.8, 4  # one of FEW trials that holds MOST of what trials gain stands alone
 AGAIN = 2.0  # scatters that the gain of all pieces must have without the best trial
 CLEAR = 0.1  # log gain of a trial (10 % smaller errors) from which it shows an effect
+BETTER = (2.0, 0.05)  # scatters and log gain by which a less likely rival must predict better
 CHANCE = 0.01  # p-value of the gains of single trials below which they are significant
 
 

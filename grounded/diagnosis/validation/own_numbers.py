@@ -1,0 +1,74 @@
+"""The model's own numbers in place of effects, where these tie and predict as well."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+from grounded.diagnosis.hypotheses.explored import TIE
+from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.validation.gain import BETTER
+from grounded.diagnosis.validation.ruler import Ruler
+from grounded.effects import ParamFamily
+
+SURE = 8.0  # nats (odds of 3,000 to 1) above which an effect counts as certain by evidence
+
+
+def own_numbers(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
+    """Replace effects by shifts of the model's parameters, if these tie and predict as well.
+
+    A parameter declared uncertain, or an adopted delay, is more probably off than an equation
+    missing.
+    """
+    h, score = fit.hypothesis, search.score
+    params = {e.name for e in search.candidates if e.known or isinstance(e.family, ParamFamily)}
+    for name in [n for n in equations(fit) if n not in params] if h.spread == 0 else ():
+        rest = {*h.names} - {name}
+        sets = {tuple(sorted({*rest, param})) for param in params - rest}
+
+        def likeliest(sets: set[tuple[str, ...]] = sets) -> Fitted:
+            exact = [f for (_, w, names), f in search.fits.items() if names in sets and not w]
+            return max(exact, key=score, default=fit)
+
+        if score(fit) - score(likeliest()) < 2 * TIE:
+            search.finished([likeliest()], TO_THE_TOP)
+        other = likeliest()
+        ties = other is not fit and score(fit) - score(other) < TIE
+        if ties and not ruler.gain(other, fit).beyond(*BETTER):
+            return own_numbers(search, other, ruler)
+    return _calibrated_instead(search, fit, ruler)
+
+
+def _calibrated_instead(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
+    """Replace further effects by calibration of all parameters, unless they are much likelier.
+
+    If all parameters are slightly off, no single shift equals an effect with two values, but all
+    shifts together do. So each effect beside another cause must be worth SURE nats.
+    """
+    h, score, names = fit.hypothesis, search.score, equations(fit)
+    if h.spread > 0 or len(h.names) < 2:
+        return fit
+    rests = {
+        tuple(sorted({*h.names} - {*some})): SURE * count
+        for count in range(1, min(len(names), len(h.names) - 1) + 1)
+        for some in combinations(names, count)
+    }
+
+    def lacks(other: Fitted) -> float:
+        """Return the nats that another fit lacks to replace this one; below zero, it does."""
+        return score(fit) - score(other) - rests[tuple(sorted(other.hypothesis.names))]
+
+    def nearest() -> Fitted:
+        free = [f for (_, w, some), f in search.fits.items() if w and some in rests]
+        return min(free, key=lacks, default=fit)
+
+    if (other := nearest()) is not fit and lacks(other) < SURE:
+        search.finished([other], TO_THE_TOP)
+        other = nearest()
+    as_good = other is not fit and lacks(other) < 0
+    return fit if not as_good or ruler.gain(other, fit).beyond(*BETTER) else other
+
+
+def equations(fit: Fitted) -> list[str]:
+    """Return the names of the effects that are not parameters."""
+    return [e.name for e in fit.hypothesis.effects if not isinstance(e.family, ParamFamily)]
