@@ -2,10 +2,10 @@
 
 Such a velocity is a weighted sum of past differences of its position, with weights that sum to 1.
 The weights, fitted by least squares, give its age and the time it averages over, whatever the shape
-of the filter. The velocity then also carries the position's noise: the weights hold for second
-differences of both, in which noise prevails. For a separate sensor they only fit the motion. Two
-later differences get weights too. The next one may have some, as resampling interpolates between
-rows; a filter knows nothing of the one after it.
+of the filter. Such a velocity also carries the position's noise, exactly. If it is from a sensor of
+its own, however late or slow, weights that fit its motion add the position's noise to it, and leave
+at least that as a remainder. Two later differences get weights too. The next one may have some, as
+resampling interpolates between rows; a filter knows nothing of the one after it.
 """
 
 from __future__ import annotations
@@ -15,16 +15,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.frozen import Array, wrapped
+from grounded.frozen import Array, median, wrapped
 from grounded.instruments.kinematics import OFF, Integral, pieces
 from grounded.instruments.lag import SURE
 from grounded.model import Model
 from grounded.trial import Trial
 
-PAST, LATER = 8, 2  # differences before and after the sample that get a weight
+PAST, LATER = 24, 2  # differences before and after the sample that get a weight
 ENOUGH = 10  # samples per weight
 FORESEEN = 0.1  # weight of the second later difference above which it is no causal filter
-BESIDE, LEAST = 1.1, 0.05  # the best fit to second differences, above which the weights don't hold
+CARRIED = 0.5  # of the noise that the weights take from the position: a larger remainder is another
+MEDIAN = 0.6745  # median of |x| of a standard normal x
 UNEXPLAINED = 0.2  # of the velocity's size: a larger remainder comes from another sensor
 
 
@@ -59,7 +60,7 @@ def derived(
     Returns:
         None if it has another scale, is not explained by the position's past, or averages less.
     """
-    dt, rows, said = trials[0].dt, list[Array](), list[Array]()
+    dt, rows, said, seen = trials[0].dt, list[Array](), list[Array](), list[Array]()
     for piece in pieces(trials, (relation.i, relation.j)):
         moved = np.diff(piece[:, 0])[:, None]
         wrapped(moved, [model.angle_mask[relation.i]])
@@ -67,6 +68,7 @@ def derived(
             windows = np.lib.stride_tricks.sliding_window_view(moved[:, 0] / dt, PAST + LATER)
             rows.append(windows[:, ::-1])
             said.append(relation.c * piece[PAST : PAST + len(windows), 1])
+            seen.append(np.concatenate([[0.0], np.cumsum(moved)]))
     count = sum(map(len, said))
     if count < ENOUGH * (PAST + LATER):
         return None
@@ -76,7 +78,8 @@ def derived(
     size = float(w @ w)
     if rank < a.shape[1] or not float(rest @ rest) < UNEXPLAINED**2 * size:
         return None
-    if not _carries_noise(rows, said, weights):
+    passed = _noise(seen) * float(np.linalg.norm(np.diff(np.pad(weights, 1)))) / dt
+    if not np.sqrt(rest @ rest / count) < CARRIED * passed:
         return None
     covariance = np.linalg.inv(a.T @ a) * float(rest @ rest) / count
     gain = float(weights.sum())
@@ -92,10 +95,7 @@ def derived(
     return Derived(gain, float(np.sqrt(covariance.sum())), age, float(np.sqrt(wide)))
 
 
-def _carries_noise(rows: Sequence[Array], said: Sequence[Array], weights: Array) -> bool:
-    """Check whether the weights explain second differences about as well as the best ones do."""
-    a = np.concatenate([np.diff(x, 2, axis=0) for x in rows])
-    w = np.concatenate([np.diff(x, 2) for x in said])
-    own = np.linalg.lstsq(a, w, rcond=None)[0]
-    best, size = (float(np.linalg.norm(x)) for x in (w - a @ own, w))
-    return float(np.linalg.norm(w - a @ weights)) < BESIDE * best + LEAST * size
+def _noise(positions: Sequence[Array]) -> float:
+    """Return the standard deviation of the white noise of a position, from fourth differences."""
+    each = np.concatenate([np.abs(np.diff(q, 4)) for q in positions])
+    return float(median(each)) / (MEDIAN * np.sqrt(70))

@@ -16,8 +16,8 @@ SWING = Model(
 )
 
 
-def swung(kind, noise=2e-4, steps=700):
-    """A swing; w is filtered from q's differences, or a sensor of its own, 2 steps late."""
+def swung(kind, noise=2e-4, steps=700, keep=0.5):
+    """A swing; w is filtered from q's differences, or an own sensor: 2 steps late, or slow."""
     rng, fine = np.random.default_rng(3), 20
     t = DT / fine * np.arange((steps + 1) * fine)
     rates, q, w = [], [], []
@@ -31,8 +31,13 @@ def swung(kind, noise=2e-4, steps=700):
     if kind == "filtered":
         logged, last = np.zeros(steps + 1), 0.0
         for k in range(2, steps + 1):  # the rate of the loop's last round
-            last = 0.5 * last + 0.5 * (seen[k - 1] - seen[k - 2]) / DT
+            last = keep * last + (1 - keep) * (seen[k - 1] - seen[k - 2]) / DT
             logged[k] = last
+    elif kind == "slow":
+        slow, logged = np.zeros(len(w)), np.zeros(steps + 1)
+        for k in range(1, len(w)):
+            slow[k] = slow[k - 1] + (w[k] - slow[k - 1]) / (2 * fine)
+        logged = slow[::fine] + 1e-4 * rng.standard_normal(steps + 1)
     else:
         logged = np.concatenate([np.zeros(2 * fine), w])[: len(w)][::fine]
         logged = logged + 2e-3 * rng.standard_normal(steps + 1)
@@ -40,10 +45,11 @@ def swung(kind, noise=2e-4, steps=700):
     return [Trial(states, u[4:-1, None], DT, ("q", "w"), ("u",))]
 
 
+@pytest.mark.parametrize("keep", [0.5, 0.8])
 @pytest.mark.parametrize("noise", [2e-4, 2e-3])
-def test_a_rate_filtered_from_positions_is_not_used_and_no_scale_is_claimed(noise):
+def test_a_rate_filtered_from_positions_is_not_used_and_no_scale_is_claimed(noise, keep):
     """It was taken for a rate 0.08 s late: `offset:omega`, a false `rate_gain`, L 16 sigma off."""
-    found = preflight(SWING, swung("filtered", noise))
+    found = preflight(SWING, swung("filtered", noise, keep=keep))
     kinds = {f.kind for f in found.findings if f.signal == "w"}
     assert kinds == {"smoothed"}
     assert np.isnan(found.trials[0].states[:, 1]).all()
@@ -54,4 +60,12 @@ def test_a_late_sensor_of_its_own_is_still_used(noise):
     found = preflight(SWING, swung("late", noise))
     (one,) = (f for f in found.findings if f.signal == "w")
     assert one.kind == "delay" and abs(one.delay_s - 2 * DT) < 0.1 * DT
+    assert np.isfinite(found.trials[0].states[:, 1]).any()
+
+
+@pytest.mark.parametrize("noise", [2e-4, 2e-3])
+def test_a_slow_sensor_of_its_own_is_still_used(noise):
+    """Weights of past differences fit its motion, but not its noise: it was left out, too."""
+    found = preflight(SWING, swung("slow", noise))
+    assert "smoothed" not in {f.kind for f in found.findings}
     assert np.isfinite(found.trials[0].states[:, 1]).any()
