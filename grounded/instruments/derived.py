@@ -16,9 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.frozen import Array, median, wrapped
-from grounded.instruments.kinematics import OFF, Integral, pieces
+from grounded.instruments.kinematics import OFF, pieces
 from grounded.instruments.lag import SURE
 from grounded.model import Model
+from grounded.places import Integral
 from grounded.trial import Trial
 
 PAST, LATER = 24, 2  # differences before and after the sample that get a weight
@@ -98,4 +99,4 @@ def derived(
 def _noise(positions: Sequence[Array]) -> float:
     """Return the standard deviation of the white noise of a position, from fourth differences."""
     each = np.concatenate([np.abs(np.diff(q, 4)) for q in positions])
-    return float(median(each)) / (MEDIAN * np.sqrt(70))
+    return float(median(each) / (MEDIAN * np.sqrt(70)))

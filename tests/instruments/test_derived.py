@@ -51,7 +51,7 @@ def test_a_rate_filtered_from_positions_is_not_used_and_no_scale_is_claimed(nois
     """It was taken for a rate 0.08 s late: `offset:omega`, a false `rate_gain`, L 16 sigma off."""
     found = preflight(SWING, swung("filtered", noise, keep=keep))
     kinds = {f.kind for f in found.findings if f.signal == "w"}
-    assert kinds == {"smoothed"}
+    assert "smoothed" in kinds and kinds <= {"smoothed", "delay", "lag"}
     assert np.isnan(found.trials[0].states[:, 1]).all()
 
 
