@@ -37,9 +37,9 @@ CHANNELS, REGIONS = 2, 3  # named in a line, in the details
 @chosen_trials
 @click.option(
     "--max-effects",
-    type=click.IntRange(1, 6),
+    type=click.IntRange(1, 12),
     metavar="K",
-    help="Claim at most K effects, 1 to 6 (default: 3, more if they leave a gap).",
+    help="Claim at most K effects, 1 to 12 (default: 3, more if they leave a gap).",
 )
 @click.option("--without", multiple=True, metavar="F1,F2,...", help="Families to exclude.")
 @click.option(

@@ -64,7 +64,7 @@ class DiagnosisOptions:
 
     Args:
         library: the families that may be blamed.
-        max_effects: largest number of effects at once, 1 to 6; None: 3, or more while the errors
+        max_effects: largest number of effects at once, 1 to 12; None: 3, or more while the errors
             are above the noise.
         horizon: how far ahead the gap is measured [s].
         hidden: names of states without a sensor, such as the memory of adopted effects.

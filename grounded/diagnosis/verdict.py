@@ -41,7 +41,7 @@ if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
 
 UNEXPLAINED = "A gap remains that no known effect explains: "
 BOTH = "A gap remains if both groups get the same values: "  # groups of trials that differ
-MOST_EFFECTS, FURTHER = 6, 2  # most effects blamed at once; how many more the next search allows
+MOST_EFFECTS, FURTHER = 12, 2  # most effects blamed at once; how many more the next search allows
 NAMED = 3  # parameters, channels or leftovers named in one sentence
 
 
@@ -122,8 +122,14 @@ def verdict(
     words += [one.sentence() for one in claims.one_clock[:1]]
     more = 0
     if remainder and len(claims.names) == most:
-        words.append(f"A gap remains: {left}; no more than {most} effects were looked for.")
         more = min(most + FURTHER, MOST_EFFECTS) * any(one.above for one in remainder)
+        if 0 < more <= most:
+            words.append(
+                f"{most} effects are named, the most in one diagnosis, and more is left:"
+                f" {left}; adopt these effects and diagnose again."
+            )
+        else:
+            words.append(f"A gap remains: {left}; no more than {most} effects were looked for.")
     elif remainder:
         words.append(unexplained)
     elif above := rest(rows):

@@ -88,6 +88,14 @@ def a_mean(name: str, position: str, over: float) -> Finding:
     return Finding(name, f"{text}it adds nothing to {position}", "smoothed", corrected=True)
 
 
+def derived_from(position: str, age: float) -> str:
+    """Return what is said of a velocity that a filter computes from its position."""
+    return (
+        f"is a filtered derivative of {position}, {age:.2g} s old on average; not used here: it "
+        f"adds nothing to {position}"
+    )
+
+
 def in_degrees(name: str, unit: str) -> Finding:
     """Return the finding of a signal that was converted from degrees to radians."""
     text, log = f"is in degrees, not in {unit}", f"scale = {1 / DEGREES:.8g}"

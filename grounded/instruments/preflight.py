@@ -32,11 +32,13 @@ from grounded.frozen import Array
 from grounded.instruments.clocks import told_by_the_clock
 from grounded.instruments.constant import constant_of
 from grounded.instruments.dead import judge_dead
+from grounded.instruments.derived import Derived, derived
 from grounded.instruments.finding import (
     DEGREES,
     Finding,
     Preflight,
     a_mean,
+    derived_from,
     in_degrees,
     put_right,
     scaled,
@@ -53,7 +55,7 @@ from grounded.instruments.kinematics import (
     own_lag,
     travelled,
 )
-from grounded.instruments.lag import LEAST_S, SURE, Lag, earlier
+from grounded.instruments.lag import LEAST_S, SAME, SURE, SURELY, Lag, earlier
 from grounded.instruments.late_position import late_positions
 from grounded.instruments.mismatch import (
     Mismatch,
@@ -231,6 +233,10 @@ class _Bench:
                 continue
             lag = lag_of(self.model, relation, self.trials)
             clear = lag if lag is not None and lag.coherence > ALIKE else None
+            if clear and (found := self.derived(relation, clear)):
+                yield from self.late(relation, clear)
+                yield self.filtered(relation, found)
+                continue
             copied = relation.exact and differenced(self.model, relation, self.trials)
             if clear:
                 yield from self.unit(relation, clear)
@@ -326,6 +332,19 @@ class _Bench:
         self.put(relation.j, [np.full_like(x, np.nan) for x in self.column(relation.j)])
         self.shown.remove(relation.j)
         return a_mean(w, q, over)
+
+    def derived(self, relation: Integral, lag: Lag) -> Derived | None:
+        """Return how a late velocity follows from its position through a filter, if it does."""
+        if not relation.exact or lag.sign < 0 or lag.delay < self.dt:
+            return None
+        return derived(self.model, relation, self.trials, SMOOTH * self.dt)
+
+    def filtered(self, relation: Integral, found: Derived) -> Finding:
+        """Drop a velocity that a filter computes from its position: neither is a delay or scale."""
+        q, w = (self.model.state_names[k] for k in (relation.i, relation.j))
+        if abs(found.gain - 1) + SURELY * found.gain_std < SAME:
+            self.refuted |= {f"sensor_scale:{w}", f"sensor_scale:{q}", f"rate_gain:{q}"}
+        return replace(self.smoothed(relation, found.over), finding=derived_from(q, found.age))
 
     def positions(self) -> Iterator[Finding]:
         """Correct both positions of a plane that share a delay."""

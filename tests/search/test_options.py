@@ -36,8 +36,8 @@ def test_numbers_of_numpy_are_options():
 @pytest.mark.parametrize(
     ("given", "facts"),
     [
-        ({"max_effects": 9}, ("max_effects", "1", "6", "9")),
-        ({"max_effects": 0}, ("max_effects", "1", "6", "0")),
+        ({"max_effects": 13}, ("max_effects", "1", "12", "13")),
+        ({"max_effects": 0}, ("max_effects", "1", "12", "0")),
         ({"max_effects": "1"}, ("max_effects", "'1'")),
         ({"horizon": -1.0}, ("horizon", "-1.0")),
         ({"library": ["delay"]}, ("library", "list")),

@@ -194,7 +194,7 @@ effects = [
         (lambda w: w.diagnose("t0001"), ("['t0001']",)),
         (lambda w: w.diagnose([1]), ("trials", "int")),
         (lambda w: w.preflight("t0001"), ("['t0001']",)),
-        (lambda w: w.diagnose(max_effects=9), ("max_effects", "6")),
+        (lambda w: w.diagnose(max_effects=13), ("max_effects", "12")),
     ],
 )
 def test_arguments_of_another_type(cart, tmp_path, call, facts):

@@ -13,6 +13,7 @@ from cli import grounded, plain, process
 from facts import holds
 from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.report import Diagnosis, Made
+from grounded.diagnosis.verdict import MOST_EFFECTS
 from grounded.effects import Library
 from grounded.errors import GroundedError, NextCommand
 from grounded.search import standing as standing_of_a_search
@@ -726,8 +727,9 @@ def test_more_effects_are_looked_for_before_those_at_the_limit_are_adopted(cart,
         found = Diagnosis.from_json({**DIAGNOSIS, "verdict": verdict, "diagnosed": made | one})
         then = after_diagnosis(Folder(folder), found)
         assert rendered(then) == f"grounded diagnose{words} --without delay --max-effects 5"
-    six, seven = (grounded("diagnose", "--max-effects", str(k)).err for k in (6, 7))
-    assert "max-effects" in seven and "max-effects" not in six
+    allowed, beyond = MOST_EFFECTS, MOST_EFFECTS + 1
+    most, over = (grounded("diagnose", "--max-effects", str(k)).err for k in (allowed, beyond))
+    assert "max-effects" in over and "max-effects" not in most
 
 
 def test_an_adoption_is_undone_and_not_proposed_again_until_a_new_diagnosis(cart, tmp_path):

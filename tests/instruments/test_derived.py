@@ -1,0 +1,71 @@
+"""Velocities that the robot's program computes from positions, as an overhead crane's did."""
+
+import numpy as np
+import pytest
+
+from grounded import Model, Trial
+from grounded.instruments.preflight import preflight
+
+DT = 0.04
+SWING = Model(
+    name="swing",
+    states={"q": "rad", "w": "rad/s"},
+    inputs={"u": "rad/s^2"},
+    params={},
+    derivative=lambda s, a, p: {"q": s.w, "w": a.u - 12.0 * s.q},
+)
+
+
+def swung(kind, noise=2e-4, steps=700, keep=0.5):
+    """A swing; w is filtered from q's differences, or an own sensor: 2 steps late, or slow."""
+    rng, fine = np.random.default_rng(3), 20
+    t = DT / fine * np.arange((steps + 1) * fine)
+    rates, q, w = [], [], []
+    for a, b, c in ((0.35, 3.4, 0.0), (0.1, 1.3, 1.0), (0.05, 6.0, 2.0)):
+        q.append(a * np.sin(b * t + c))
+        w.append(a * b * np.cos(b * t + c))
+        rates.append(-a * b * b * np.sin(b * t + c))
+    q, w = sum(q), sum(w)
+    u = (sum(rates) + 12.0 * q)[::fine]
+    seen = q[::fine] + noise * rng.standard_normal(steps + 1)
+    if kind == "filtered":
+        logged, last = np.zeros(steps + 1), 0.0
+        for k in range(2, steps + 1):  # the rate of the loop's last round
+            last = keep * last + (1 - keep) * (seen[k - 1] - seen[k - 2]) / DT
+            logged[k] = last
+    elif kind == "slow":
+        slow, logged = np.zeros(len(w)), np.zeros(steps + 1)
+        for k in range(1, len(w)):
+            slow[k] = slow[k - 1] + (w[k] - slow[k - 1]) / (2 * fine)
+        logged = slow[::fine] + 1e-4 * rng.standard_normal(steps + 1)
+    else:
+        logged = np.concatenate([np.zeros(2 * fine), w])[: len(w)][::fine]
+        logged = logged + 2e-3 * rng.standard_normal(steps + 1)
+    states = np.stack([seen, logged], axis=1)[4:]
+    return [Trial(states, u[4:-1, None], DT, ("q", "w"), ("u",))]
+
+
+@pytest.mark.parametrize("keep", [0.5, 0.8])
+@pytest.mark.parametrize("noise", [2e-4, 2e-3])
+def test_a_rate_filtered_from_positions_is_not_used_and_no_scale_is_claimed(noise, keep):
+    """It was taken for a rate 0.08 s late: `offset:omega`, a false `rate_gain`, L 16 sigma off."""
+    found = preflight(SWING, swung("filtered", noise, keep=keep))
+    kinds = {f.kind for f in found.findings if f.signal == "w"}
+    assert "smoothed" in kinds and kinds <= {"smoothed", "delay", "lag"}
+    assert np.isnan(found.trials[0].states[:, 1]).all()
+
+
+@pytest.mark.parametrize("noise", [2e-4, 2e-3, 1e-2])
+def test_a_late_sensor_of_its_own_is_still_used(noise):
+    found = preflight(SWING, swung("late", noise))
+    (one,) = (f for f in found.findings if f.signal == "w")
+    assert one.kind == "delay" and abs(one.delay_s - 2 * DT) < 0.1 * DT
+    assert np.isfinite(found.trials[0].states[:, 1]).any()
+
+
+@pytest.mark.parametrize("noise", [2e-4, 2e-3])
+def test_a_slow_sensor_of_its_own_is_still_used(noise):
+    """Weights of past differences fit its motion, but not its noise: it was left out, too."""
+    found = preflight(SWING, swung("slow", noise))
+    assert "smoothed" not in {f.kind for f in found.findings}
+    assert np.isfinite(found.trials[0].states[:, 1]).any()
