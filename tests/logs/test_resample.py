@@ -261,3 +261,15 @@ def test_what_is_held_or_sent_seldom_may_end_before_others_begin() -> None:
     assert set(grid(later, seldom).inputs[:, 0]) == {5.0}
     with pytest.raises(GroundedError, match=holding("clocks", "[log.state.x] delay_s = 19.500")):
         grid(later, command())
+
+
+def test_slow_sensors_in_rows_of_a_faster_one_are_named_once_with_their_rate() -> None:
+    """A camera of 25 Hz in rows at 62.5 Hz, 2 or 3 rows a sample, was said to have 31.2 Hz, twice."""
+    t = np.arange(-0.5, 3.0, 0.016)
+    seen = np.floor(t / 0.04 + 1e-9) * 0.04
+    x, y = series(t, np.sin(3 * seen)), series(t, np.cos(2 * seen))
+    fast = series(t, np.sin(t))
+    found = to_grid({"x": x, "y": y, "z": fast, "u": command()}, 0.05, ["x", "y", "z"], ["u"])
+    (told,) = (w for w in found.warnings if "Hz" in w)
+    assert re.match(r"'x' and 'y' change at 25(\.\d)? Hz", told) and "62.5 Hz" in told
+    assert "0.012 s late" in told and "'z'" not in told

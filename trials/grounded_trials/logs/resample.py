@@ -31,7 +31,7 @@ from grounded_trials.logs.signal_report import (
     SignalReport,
     check_clocks,
     report_of,
-    staircase,
+    staircases,
     warnings_of,
 )
 from grounded_trials.logs.signals import Clock, Series, SignalSpec
@@ -158,7 +158,7 @@ def to_grid(
         value = whole[name].linear if how[name] == "linear" else whole[name].hold
         columns.append(value(at, dt, start))
         reports.append(report_of(samples[name], series[name], columns[-1], at, start))
-    stairs = [staircase(s, start, int(grid[-1]), dt) for s in tracked]
+    stairs = staircases(tracked, start, int(grid[-1]), dt)
     held = np.array([s.before(start - round(dt * 0.5e9)) for s in sent])
     if still and rest is not None:
         held = np.where(np.isfinite(held), held, rest)
@@ -175,7 +175,7 @@ def to_grid(
         row_s=rows_apart(sent, [samples[name] for name in states]),
         last_ns=min(int(samples[name].t[-1]) for name in states),
         reports=tuple(reports),
-        warnings=(*warnings_of(tuple(reports), late), *filter(None, (uneven, *stairs))),
+        warnings=(*warnings_of(tuple(reports), late), *filter(None, (uneven,)), *stairs),
     )
 
 

@@ -7,12 +7,13 @@ values, `warnings_of` turns reports into sentences.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from grounded.errors import GroundedError
+from grounded.result import listed
 from grounded_trials.formats.messages import Floats, Ints
 from grounded_trials.logs.samples import MIXED_S, Samples
 from grounded_trials.logs.signals import Series
@@ -120,34 +121,43 @@ def _furthest(skews: Mapping[str, float | None]) -> tuple[str, str, float]:
     return first, last, known[last] - known[first]
 
 
-def staircase(samples: Samples, first: int, last: int, dt: float) -> str:
-    """Return a warning if a signal is late because rows repeat each of its values; else "".
+def staircases(series: Sequence[Samples], first: int, last: int, dt: float) -> list[str]:
+    """Return warnings on signals that are late because rows repeat each of their values.
 
     A table has a row per sample of its fastest signal, so rows repeat the samples of a slower
     sensor. A quantised signal also repeats values, but changes by few different steps.
 
     Args:
-        samples: of a state.
+        series: of states.
         first: the trial's start [ns].
         last: the trial's end [ns].
         dt: control step [s]; values held for up to half of it don't matter.
+
+    Returns:
+        One warning for all signals that change at the same rate.
     """
-    inside = (samples.t >= first) & (samples.t <= last)
-    y = samples.y[inside]
-    new = np.flatnonzero(np.append(True, np.diff(y) != 0)) if len(y) else np.empty(0, int)
-    lengths, sizes = np.diff(new), np.abs(np.diff(y[new]))
-    if len(lengths) < LEAST_RUNS or np.mean(lengths >= 2) < REPEATED:
-        return ""
-    each = float(np.median(lengths))
-    apart = each * samples.interval
-    if apart <= dt / 2 or float(np.median(sizes)) < COARSE * float(sizes.min()):
-        return ""
-    late = (each - 1) / 2 * samples.interval
-    return (
-        f"'{samples.name}' changes only every {each:g} rows: its samples at {1 / apart:.3g} Hz are "
-        f"held and {late:.2g} s late on average. Leave its cell empty in rows that repeat a value "
-        "(or log the sensor's own messages): then it is interpolated"
-    )
+    slow: dict[str, list[str]] = {}
+    for samples in series:
+        inside = (samples.t >= first) & (samples.t <= last)
+        t, y = samples.t[inside], samples.y[inside]
+        new = np.flatnonzero(np.append(True, np.diff(y) != 0)) if len(y) else np.empty(0, int)
+        lengths, sizes = np.diff(new), np.abs(np.diff(y[new]))
+        if len(lengths) < LEAST_RUNS or np.mean(lengths >= 2) < REPEATED:
+            continue
+        apart = float(t[new[-1]] - t[new[0]]) * 1e-9 / len(lengths)
+        if apart <= dt / 2 or float(np.median(sizes)) < COARSE * float(sizes.min()):
+            continue
+        late = (apart - samples.interval) / 2
+        rates = f"{1 / apart:.3g} Hz, but rows come at {1 / samples.interval:.3g} Hz"
+        slow.setdefault(f"{rates}: samples are held and {late:.2g} s late", []).append(samples.name)
+    advice = "Leave cells empty in rows that repeat a value (or log the sensor's own messages)"
+    found = []
+    for text, names in slow.items():
+        which, s = listed(map(repr, names)), "s" * (len(names) == 1)
+        found.append(
+            f"{which} change{s} at {text} on average. {advice}: then they are interpolated"
+        )
+    return found
 
 
 def warnings_of(reports: tuple[SignalReport, ...], late: float) -> tuple[str, ...]:
