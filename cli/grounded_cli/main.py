@@ -85,6 +85,9 @@ class LazyGroup(click.Group):
         """Run a command; append the command to type next to the message of a GroundedError."""
         try:
             return super().invoke(ctx)
+        except click.NoSuchOption as error:
+            error.possibilities = error.possibilities or _meant(error)
+            raise
         except Exception as error:
             from grounded.errors import GroundedError
 
@@ -107,6 +110,14 @@ class LazyGroup(click.Group):
         """List the commands without importing any."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+
+def _meant(error: click.NoSuchOption) -> list[str]:
+    """Return the options whose help text has the word of an unknown one (--radius: --size)."""
+    word = error.option_name.strip("-").lower()
+    own = error.ctx.command.params if error.ctx else []
+    some = [o for o in own if isinstance(o, click.Option) and word in (o.help or "").lower()]
+    return [option.opts[0] for option in some] if len(word) > 2 else []
 
 
 @click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})

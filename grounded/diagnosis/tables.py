@@ -68,10 +68,21 @@ def credit_of(diagnosis: Diagnosis, effect: str) -> str:
 
 
 def instrument_lines(findings: Iterable[Finding]) -> list[str]:
-    """Return a line per sensor finding: the signal, the finding, and how to correct it for good."""
-    lines = []
+    """Return a line per sensor finding: the signal, the finding, and how to correct it for good.
+
+    A signal that is not used gets one line, with its delay in it: nothing of it is corrected here.
+    """
+    lines, findings = [], list(findings)
+    unused = {one.signal: one for one in findings if one.kind == "smoothed"}
+    late = {one.signal for one in findings if one.kind == "delay"} & {*unused}
     for one in findings:
-        done = "; corrected here" * (one.corrected and one.kind != "smoothed")
+        done = "; corrected here" * (one.corrected and one.signal not in unused)
+        if one.kind == "lag" and one.signal in unused:
+            continue  # `unused` says how old it is
+        if one.kind == "smoothed" and one.signal in late:
+            continue  # said with the delay
+        if one.kind == "delay" and one.signal in late:
+            done = f"; {unused[one.signal].finding}"
         more = f"; to correct it for good, set {one.log} in its table of [log]" * bool(one.log)
         more += f"; {one.advice}" * bool(one.advice)
         lines.append(f"{one.signal}: {one.finding}{done}{more}")

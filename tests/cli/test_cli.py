@@ -80,6 +80,7 @@ def test_version():
     [
         (["propse"], "no command 'propse': did you mean 'propose'"),
         (["propose", "--jsn"], "--json"),
+        (["target", "circle", "--radius", "1"], "'--size'"),
         (["init"], "--from run1.mcap"),
         (["init", "x"], "--blank --model"),
         (["ingest"], "Missing argument"),

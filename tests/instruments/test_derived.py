@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from grounded import Model, Trial
+from grounded.diagnosis.tables import instrument_lines
+from grounded.instruments.finding import a_mean, put_right
 from grounded.instruments.preflight import preflight
 
 DT = 0.04
@@ -69,3 +71,16 @@ def test_a_slow_sensor_of_its_own_is_still_used(noise):
     found = preflight(SWING, swung("slow", noise))
     assert "smoothed" not in {f.kind for f in found.findings}
     assert np.isfinite(found.trials[0].states[:, 1]).any()
+
+
+def test_a_signal_that_is_not_used_has_one_line():
+    """One line said "corrected here", the next "not used here"."""
+    for kind, keep in (("filtered", 0.5), ("filtered", 0.8)):
+        found = preflight(SWING, swung(kind, keep=keep)).findings
+        assert {"smoothed"} < {f.kind for f in found if f.signal == "w"}
+        (line,) = (one for one in instrument_lines(found) if one.startswith("w:"))
+        assert "not used here" in line and "corrected here" not in line
+    late = put_right("w", "0.02 s later than the derivative of q", "delay", "delay_s = 0.02")
+    (line,) = instrument_lines([late, a_mean("w", "q", 0.04)])
+    assert "0.02 s later" in line and "mean over 0.04 s" in line and "delay_s = 0.02" in line
+    assert "corrected here" not in line and "corrected here" in instrument_lines([late])[0]

@@ -264,7 +264,7 @@ def test_what_is_held_or_sent_seldom_may_end_before_others_begin() -> None:
 
 
 def test_slow_sensors_in_rows_of_a_faster_one_are_named_once_with_their_rate() -> None:
-    """A camera of 25 Hz in rows at 62.5 Hz, 2 or 3 rows a sample, was said to have 31.2 Hz, twice."""
+    """A camera of 25 Hz in rows at 62.5 Hz, 2 or 3 a sample, was said to have 31.2 Hz, twice."""
     t = np.arange(-0.5, 3.0, 0.016)
     seen = np.floor(t / 0.04 + 1e-9) * 0.04
     x, y = series(t, np.sin(3 * seen)), series(t, np.cos(2 * seen))
