@@ -86,8 +86,9 @@ class LazyGroup(click.Group):
         try:
             return super().invoke(ctx)
         except click.NoSuchOption as error:
-            error.possibilities = error.possibilities or _meant(error)
-            raise
+            if error.possibilities:
+                raise
+            raise click.NoSuchOption(error.option_name, None, _meant(error), error.ctx) from None
         except Exception as error:
             from grounded.errors import GroundedError
 

@@ -302,6 +302,8 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     if not gain < max(missed[-1], candidate.likely_off):
         return promise
     doubt = f"{promise}, which is no more than such an error"
+    if not gain < max(missed):
+        doubt = f"{promise}, less than its likely error, {number(candidate.likely_off)}"
     blind = missed[-1] > MISSED * abs(last[-1].utility)
     if blind or candidate.doubtful or not gain < LITTLE * abs(best.utility):  # a note may say it
         return doubt

@@ -43,6 +43,8 @@ from grounded.trial import Trial
 if TYPE_CHECKING:
     from grounded.search.first_policy import Tick
 
+RISKY = 0.2  # of the best cost: likely loss of a step above which the own derivatives are asked
+
 
 def propose(
     task: Task,
@@ -165,6 +167,8 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
         about = About(make, incumbent, options, way)
         stepping = keeping_promises(about)
         found = stepping.step_from(step, promised)
+        if stepping.corrected and found and found.candidate:
+            found = _surer(stepping, step, found)
         least = options.tolerance * abs(stepping.already)
         if way == ways[0] and (own := about.own_plan(found)) is not None:
             found = own
@@ -177,6 +181,22 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
     return unsafe or Proposal(
         _ended(make, incumbent, promised, least, options.tolerance, ruinous), None, False
     )
+
+
+def _surer(about: About, step: Step, corrected: Proposal) -> Proposal:
+    """Return a step by the model's own derivatives if the corrected ones may lose much, else that.
+
+    Derivatives corrected by noisy trials promise much, within a larger likely error.
+    """
+    made = corrected.candidate
+    assert made is not None
+    if not made.expected_gain < RISKY * about.incumbent.utility:
+        return corrected
+    own = About(about.make, about.incumbent, about.options, about.way, about.original, plainly=True)
+    found = own.step_from(step, [])
+    if found is None or found.candidate is None:
+        return corrected
+    return found if found.candidate.expected_gain > made.expected_gain else corrected
 
 
 def _ended(

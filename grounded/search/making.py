@@ -49,6 +49,7 @@ class About:
         options: SearchOptions,
         way: Way,
         original: bool = False,
+        plainly: bool = False,
     ) -> None:
         self.make, self.incumbent, self.options, self.way = make, incumbent, options, way
         self.original = original
@@ -69,7 +70,7 @@ class About:
         if options.damps and len(make.now.history) > 1 and not self._kept():
             from grounded.search.mispredictions import believed
 
-            trusted = self._refuted() < REFUTED
+            trusted = not plainly and self._refuted() < REFUTED
             found = believed(planner, incumbent, make.now.history, self.real, trusted)
             self.alternatives = found.alternatives
             self.real, self.corrected, self.missed = found.problem, found.corrected, found.missed

@@ -52,9 +52,9 @@ def test_an_effect_that_keeps_its_promises_makes_all_steps():
     assert not any(c.of_original for c in candidates)
 
 
-def step(name, base, model, promised, utility, of_original=False, accepted=True):
+def step(name, base, model, promised, utility, of_original=False, accepted=True, doubtful=False):
     fields = {"id": name, "base": base, "model": model, "predicted_gain": promised}
-    made = SimpleNamespace(**fields, of_original=of_original)
+    made = SimpleNamespace(**fields, of_original=of_original, doubtful=doubtful)
     return SimpleNamespace(candidate=made, utility=utility, accepted=accepted)
 
 
@@ -66,6 +66,7 @@ def test_promises_are_counted_for_each_model():
         step("c4", "c2", "better", 1.0, -4.0),  # gains at most what it promised
         step("c5", "c4", "better", 2.0, -3.0, of_original=True),
         step("c6", "c5", "better", 2.0, -1.0, accepted=None),  # awaits its trial
+        step("c7", "c5", "better", 9.0, -300.0, accepted=False, doubtful=True),  # no promise
     )
     adopted, original = promises(history, "better")
     assert adopted == Promises(3.0, -1.0)
