@@ -99,6 +99,13 @@ class Policy:
         """H, the number of control steps."""
         return len(self.feedforward)
 
+    def after(self, steps: int) -> Policy:
+        """Return the policy without its first steps."""
+        gain = None if self.gain is None else self.gain[steps:]
+        reference = None if self.reference is None else self.reference[steps:]
+        left = self.feedforward[steps:]
+        return replace(self, feedforward=left, gain=gain, reference=reference)
+
     @property
     def z_names(self) -> tuple[str, ...]:
         """Names of the entries of z: the states, then past inputs such as `steering[t-1]`."""

@@ -47,7 +47,7 @@ NEARLY = 0.1  # largest difference of commands with another unit, relative to an
 EXACT, CLOSE = 0.01, 0.05  # the same for a unit that is certain, and for any factor
 # largest share of the original difference left by a unit, and by any factor (many are tried)
 UNITS_LEAVE, LEAVES = 0.5, 0.25
-ALL = 0.05  # share left by a factor that is stated although the commands are nearly alike
+ALL = 0.05  # share left by a factor or offset that is stated although commands are nearly alike
 LARGEST = 100.0  # largest factor, or its inverse
 ONE, FAR = 0.03, 0.2  # factors nearer to 1 are ignored; FAR if the commands are alike without one
 ROUNDS = 12  # Gauss-Newton iterations; more than two are only needed at limits or wrapped angles
@@ -144,12 +144,17 @@ def _any_factor(
 def any_offset(
     task: Task, own: Candidate, trial: Trial, names: Sequence[str]
 ) -> tuple[str, float] | None:
-    """Return the state in `names` and the offset without which a trial is a candidate's run."""
+    """Return the state in `names` and the offset without which a trial is a candidate's run.
+
+    A position's weak gain may hide an offset: the trial then counts as a run of the candidate, but
+    follows it far better without the offset.
+    """
     trial, late, policy = trial.until(task.horizon), latest(task), own.policy
-    if (plain := follows(policy, trial, late)) is None or plain.alike:
+    if (plain := follows(policy, trial, late)) is None or plain.error < EXACT:
         return None
     trial = trial.until(min(trial.finite_steps, policy.horizon))
-    best, found = min(LEAVES * _left(plain), CLOSE), None
+    most = ALL if plain.alike else LEAVES
+    best, found = min(most * _left(plain), CLOSE), None
     for name in names:
         by = _solved(partial(_off_from, policy, trial, name), 0.0, 1e-4)
         if not np.isfinite(by):

@@ -48,6 +48,33 @@ def test_a_state_from_another_zero_is_named_with_the_offset(w, tmp_path, by, bef
     assert Workspace(w.folder).ingest(run).candidate == "c0002"
 
 
+def test_an_offset_that_hardly_changes_the_commands_is_named(w, tmp_path):
+    """A balancing robot's x, 0.5 m off, with 2.6 V/m of gain in 5 V: `the run counts`."""
+    run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0)
+    table = np.loadtxt(run, delimiter=",", skiprows=1)
+    by = 0.05 * np.ptp(table[:, 1])
+
+    def moved(table):
+        table[:, 1] += by
+
+    said = str(refused(w, edited(run, moved)))
+    assert holds(said, "ran c0002", "[log.state.x]", "offset")
+    assert float(said.split("Add ")[1].split(" ")[0]) == pytest.approx(-by, rel=0.02)
+
+
+def test_a_log_without_the_run_s_beginning_says_so(w, tmp_path):
+    """`Up to 3.1 s they are alike: then somebody, or something, took over`."""
+    run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0)
+    lines, dt = run.read_text().splitlines(), w.task.dt
+    times = np.array([float(line.split(",")[0]) for line in lines[1:]])
+    rows = round(8 * dt / float(np.median(np.diff(times))))
+    run.write_text("\n".join([lines[0], *lines[1 + rows :]]))
+    said = str(refused(w, run))
+    assert holds(said, "c0002", "record from before the run") and "somebody" not in said
+    late = float(said.split("its first row is ")[1].split(" ")[0])
+    assert late == pytest.approx(8 * dt, abs=1.01 * dt)
+
+
 def test_two_states_in_each_other_s_column_are_named(w, tmp_path):
     def exchanged(table):
         table[:, [1, 2]] = table[:, [2, 1]]

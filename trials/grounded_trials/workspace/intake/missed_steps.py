@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.intake.run_start import Recording
 
 MOST = 5  # largest number of missed steps that is tried
+COARSE = 100  # steps of a run at which a log may begin, first tried
+ALIKE = 0.05  # median difference of commands, relative to their size, below which they are alike
 BY_FAR = 0.25  # the difference of the commands must fall below this share of that elsewhere
 
 
@@ -64,6 +66,38 @@ def _left(log: Recording, policy: Policy, first: float, missed: int) -> float:
     size = np.maximum(np.abs(policy.feedforward).max(axis=0), np.abs(sent).max(axis=0)) + 1e-12
     off = np.sqrt((((asked - sent) / size) ** 2).mean(axis=1))
     return float(np.median(off[missed:]))
+
+
+def begins_late(log: Recording, policy: Policy) -> float:
+    """Return by how much a log begins after a policy's run did [s]; 0 if it does not.
+
+    Its commands are then those of later steps, each with the gains of its own step.
+
+    Args:
+        log: the log in which no run of the policy was found.
+        policy: the policy, for the states and inputs of the log.
+    """
+    trial = log.trial_from(log.first)
+    if trial is None:
+        return 0.0
+    past = policy.past if trial.start_inputs is None else trial.start_inputs
+    most = min(trial.finite_steps, policy.horizon)
+
+    def left(k: int) -> float:
+        """Return the median difference of commands if the log begins at step k."""
+        T = min(most, policy.horizon - k)
+        if T < LEAST:
+            return np.inf
+        sent = np.clip(trial.inputs[:T], policy.low, policy.high)
+        asked = policy.after(k).commands(trial.states[None, :T], past, sent[None])[0]
+        size = np.abs(policy.feedforward).max(axis=0) + 1e-12
+        return float(np.median(np.sqrt((((asked - sent) / size) ** 2).mean(axis=1))))
+
+    stride = max(1, policy.horizon // COARSE)
+    best = min(range(0, policy.horizon, stride), key=left)
+    best = min(range(max(0, best - stride), best + stride + 1), key=left)
+    sure = best > 0 and left(best) < min(ALIKE, BY_FAR * left(0))
+    return best * policy.dt if sure else 0.0
 
 
 def not_sent(task: Task, ran: str, missed: int) -> str:

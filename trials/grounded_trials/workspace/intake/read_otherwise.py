@@ -30,6 +30,7 @@ from grounded.trial import Trial
 from grounded_trials.logs.signals import Series
 from grounded_trials.wording import with_unit
 from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.intake.missed_steps import begins_late
 from grounded_trials.workspace.intake.run_start import TRIED, Recording, recording
 
 PAIRS = 28  # largest number of pairs of states, and of inputs, that are tried exchanged
@@ -92,6 +93,11 @@ def misled(log: Recording | None, task: Task, own: Candidate) -> str:
     """Return another fault of a log that hides its run, and how to correct it; or ""."""
     if log is None:
         return ""
+    if late := begins_late(log, own.policy):
+        return (
+            f"its first row is {late:.3g} s after {own.id} began: record from before the run, and "
+            "cut nothing off; without its beginning the run can't be judged"
+        )
     if pair := exchanged_in(log, task, own):
         a, b = pair
         of = "state" if a in task.model.state_names else "input"
@@ -99,16 +105,32 @@ def misled(log: Recording | None, task: Task, own: Candidate) -> str:
             f"{a} and {b} seem to be in each other's column: exchange the paths in "
             f"[log.{of}.{a}] and [log.{of}.{b}], or the column headers in the log"
         )
-    if off := offset_in(log, task, own):
-        name, by = off
-        much = with_unit(f"{abs(by):.3g}", task.model.states[name])
-        return (
-            f"{name} seems to be {much} too {'large' if by > 0 else 'small'}: does its zero "
-            f"differ from that of the program? Add {-by:.3g} to the offset in "
-            f"[log.state.{name}] (a missing offset is 0); if the log is right, the robot's program "
-            "measures it wrong"
-        )
-    return ""
+    return _off_zero(task, offset_in(log, task, own))
+
+
+def zero_in(log: Recording, task: Task, own: Candidate, trial: Trial) -> str:
+    """Return how a run's log is off from what its program measured, and how to correct it; or "".
+
+    Args:
+        log: the log of the run.
+        task: the task.
+        own: the candidate, whose run it is, as far as its commands tell.
+        trial: the run.
+    """
+    logged = [name for name in task.model.state_names if name in log.logged]
+    return _off_zero(task, any_offset(task, own, trial, logged))
+
+
+def _off_zero(task: Task, off: tuple[str, float] | None) -> str:
+    if off is None:
+        return ""
+    name, by = off
+    much = with_unit(f"{abs(by):.3g}", task.model.states[name])
+    return (
+        f"{name} seems to be {much} too {'large' if by > 0 else 'small'}: does its zero differ "
+        f"from that of the program? Add {-by:.3g} to the offset in [log.state.{name}] (a missing "
+        "offset is 0); if the log is right, the robot's program measures it wrong"
+    )
 
 
 def exchanged_in(log: Recording, task: Task, own: Candidate) -> tuple[str, str] | None:
