@@ -64,9 +64,9 @@ def test_a_gain_follows_the_mass_that_is_held(found):
 def test_table_and_document_say_it(found):
     again = type(found).from_json(found.to_json())
     assert [one.given for one in again.identifiable] == [one.given for one in found.identifiable]
-    assert "held" in dict(error_lines(again, {})) and "k +1 % for 1 % more m" in held_sentence(
-        again
-    )
+    assert "held" in dict(
+        error_lines(again, {})
+    ) and "k changes by +1 % with 1 % more m" in held_sentence(again)
     free = replace(found, identifiable=tuple(replace(i, given={}) for i in found.identifiable))
     assert "held" not in dict(error_lines(free, {}))
 
@@ -109,5 +109,5 @@ def test_a_line_names_no_twenty_parameters():
     parts = [Identifiable(n, "weak", 1.0, 0.01, {"J": 0.9 + k / 1e3}) for k, n in enumerate(names)]
     known = {n: Estimate(1.0, 0.1, "1/rad") for n in names}
     said = held_sentence(SimpleNamespace(identifiable=parts, parameters=known))
-    assert "20 values" in said and "+0.9 to +0.92 % for 1 % more J" in said and "C3" not in said
+    assert "20 others" in said and "+0.9 to +0.92 % with 1 % more J" in said and "C3" not in said
     assert "C0" in held_sentence(SimpleNamespace(identifiable=parts[:2], parameters=known))

@@ -160,16 +160,17 @@ def held_sentence(diagnosis: Diagnosis) -> str:
             continue
         for name, by in one.given.items():
             held.setdefault(name, []).append(by)
-        parts = [f"{by:+.2g} % for 1 % more {name}" for name, by in one.given.items()]
+        parts = [f"{by:+.2g} % with 1 % more {name}" for name, by in one.given.items()]
         free = with_unit(f"+- {figure(one.prior * one.left, 2)}", e.unit)
-        said.append(f"{one.parameter} {listed(parts)} ({free} if all are free)")
+        said.append(f"{one.parameter} changes by {listed(parts)} ({free} if all are free)")
     if len(said) > MOST:
         said = [
-            f"{len(some)} values {min(some):+.2g} to {max(some):+.2g} % for 1 % more {name}"
+            f"{len(some)} others change by {min(some):+.2g} to {max(some):+.2g} % with 1 % more "
+            f"{name}"
             for name, some in held.items()
         ]
-    told = f"{listed(held)} as in the model, not identifiable here: {', '.join(said)}"
-    return told * bool(said)
+    told = f"these trials cannot identify {listed(held)}: the values hold for the model's own"
+    return f"{told}; {', '.join(said)}" * bool(said)
 
 
 def utility_sentence(diagnosis: Diagnosis) -> str:
