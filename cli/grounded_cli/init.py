@@ -148,7 +148,7 @@ def _tell(begun: Begun) -> None:
         remark("note", note)
     look = "; look at what is UNSURE in its [log]" if begun.unsure else ""
     if begun.then == begun.look:
-        look = "; map its inputs in [log] to numbers of the log"
+        look = "; map its states and inputs in [log] to numbers of the log"
     show()
     sentence(f"read {begun.workspace}/model.py and grounded.toml{look}")
     show(next_line(begun.then, None if begun.again else begun.workspace))

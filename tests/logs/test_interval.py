@@ -126,7 +126,8 @@ def test_the_interval_of_a_loop_is_that_of_its_rows(hz):
 def test_jitter_does_not_make_an_odd_interval():
     assert [round_interval(0.0333333 * off) for off in (0.98, 1.0, 1.02)] == [0.0333333] * 3
     assert round_interval(0.0303) == pytest.approx(1 / 33, rel=1e-5)
-    assert (round_interval(1e-5), round_interval(90.0)) == (0.001, 0.5)
+    assert (round_interval(1e-5), round_interval(90.0)) == (0.001, 90.0)
+    assert [round_interval(rows) for rows in (0.996, 1.999, 2.5, 10.02)] == [1.0, 2.0, 2.5, 10.0]
 
 
 def test_a_camera_s_log_has_its_interval(tmp_path):

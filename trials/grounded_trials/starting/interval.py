@@ -69,14 +69,16 @@ def interval_of(
 
 
 def round_interval(rows: float) -> float:
-    """Round the interval of a log's rows [s] to a usual rate, else to whole Hz or ms.
+    """Round the interval of a log's rows [s] to a usual rate, else to whole Hz, ms or seconds.
 
-    Intervals outside the range of `STEPS` become the nearest end of it.
+    It is at least the smallest of `STEPS`. Slow processes are logged every few seconds.
     """
     usual = min(STEPS, key=lambda step: abs(np.log(step / rows)))
-    if abs(usual / rows - 1) < NEAR or not STEPS[0] < rows < STEPS[-1]:
+    if abs(usual / rows - 1) < NEAR or not STEPS[0] < rows:
         return usual
-    whole = (1e-3 * max(round(1e3 * rows), 1), 1 / max(round(1 / rows), 1))
+    whole = [1e-3 * max(round(1e3 * rows), 1), 1 / max(round(1 / rows), 1)]
+    if rows > NEARLY_ALL:
+        whole = [float(round(rows))]
     nearest = min(whole, key=lambda step: abs(step - rows))
     return float(f"{nearest if abs(nearest / rows - 1) < NEAR else rows:.6g}")
 
