@@ -263,7 +263,8 @@ def improvements_in(findings: Findings) -> list[Improved]:
     reached = next((one for *_, one in found if arrives and one.what.startswith(AT_END)), None)
     found.sort(key=lambda each: each[:3])
     least = MOVED * sum(abs(moved) for _, _, moved, _ in found)
-    told = [one for k, (*_, moved, one) in enumerate(found[:SHOWN]) if not k or -moved >= least]
+    large = [one for k, (*_, moved, one) in enumerate(found) if not k or -moved >= least]
+    told = large[:SHOWN]
     return told if reached is None or reached in told else [*told[: SHOWN - 1], reached]
 
 
