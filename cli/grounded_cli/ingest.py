@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 CLOCKS = {"header": "header stamps", "log": "log times", "publish": "publish times"}
 AGAIN = "run again"  # a verdict
+BEST = ("better", "maybe better")  # verdicts on what was the best when its run arrived
 # verdict -> what it means for the search
 VERDICTS = {
     "first": ": what the search improves on",
@@ -98,8 +99,8 @@ def following(log: str, candidate: str | None, json_: bool) -> None:
 
 
 def _best(workspace: Workspace, one: Ingested) -> Tried | None:
-    """Return the best candidate after a repeated run, which may have changed it; else None."""
-    if one.verdict != AGAIN:
+    """Return the best candidate if it may be another than that of the log; else None."""
+    if one.verdict != AGAIN and not one.known:
         return None
     from grounded_trials.workspace.proposing import standing_in
 
@@ -116,9 +117,13 @@ def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
     if not one.candidate:
         show(field("data", "for fit and diagnose: it ran no candidate", "  "))
     else:
-        meaning = _earlier(one) or VERDICTS.get(one.verdict, "")
-        text = f"utility {number(one.utility)}, {one.verdict}{meaning}"
-        if one.verdict == AGAIN and best is not None and best.candidate.id != one.candidate:
+        passed = best is not None and best.candidate.id != one.candidate
+        passed = passed and (one.verdict == AGAIN or (one.known and one.verdict in BEST))
+        meaning = VERDICTS.get(one.verdict, "")
+        if passed and one.verdict in BEST:
+            meaning = " than those before it"
+        text = f"utility {number(one.utility)}, {one.verdict}{_earlier(one) or meaning}"
+        if passed and best is not None:
             text += f"; the best is now {best.candidate.id}, {number(best.utility)}"
         show(field(one.candidate, text, "  "))
     if one.off_target:

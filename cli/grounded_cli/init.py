@@ -150,7 +150,7 @@ def _tell(begun: Begun) -> None:
     if begun.then == begun.look:
         look = "; map its states and inputs in [log] to numbers of the log"
     show()
-    sentence(f"read {begun.workspace}/model.py and grounded.toml{look}")
+    sentence(f"read {begun.workspace}/model.py and {begun.workspace}/grounded.toml{look}")
     show(next_line(begun.then, None if begun.again else begun.workspace))
 
 

@@ -86,9 +86,10 @@ class LazyGroup(click.Group):
         try:
             return super().invoke(ctx)
         except click.NoSuchOption as error:
-            if error.possibilities:
+            if error.possibilities or not (meant := _meant(error)):
                 raise
-            raise click.NoSuchOption(error.option_name, None, _meant(error), error.ctx) from None
+            text = f"{error.message} Did you mean {' or '.join(map(repr, meant))}?"
+            raise click.NoSuchOption(error.option_name, text, ctx=error.ctx) from None
         except Exception as error:
             from grounded.errors import GroundedError
 

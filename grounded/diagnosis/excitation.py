@@ -122,7 +122,7 @@ def probe(
         The probe; None if there are neither ties nor values, or no probe is safe.
     """
     open_ = [g for g in diagnosis.indistinguishable if g not in diagnosis.equivalent]
-    ties = [g for g in open_ if all(diagnosis.values(n) for n in g[:2])]
+    ties = [g for g in open_ if all(diagnosis.quantities.get(n) for n in g[:2])]
     if not ties:
         return _teaching(task, policy, diagnosis, trials, library or Library())
     group = ties[0]

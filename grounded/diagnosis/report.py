@@ -25,7 +25,7 @@ from grounded.diagnosis.error_report import (
     Where,
 )
 from grounded.diagnosis.ruler_words import contested
-from grounded.errors import NextCommand
+from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.instruments.finding import Finding, late_effects
 from grounded.result import Document, number
 
@@ -301,12 +301,27 @@ class Diagnosis(Document):
         return next((row for row in self.ranking if row.effect == effect), None)
 
     def values(self, effect: str) -> dict[str, float]:
-        """Return an effect's quantities, constants included; empty if it is not known."""
-        for curve in self.correction.curves if self.correction is not None else ():
-            if effect == curve.effect:
-                return dict(curve.quantities)
-        row = self.ranked(effect)
-        return self.late_sensors.get(effect, {}) if row is None else row.values
+        """Return an effect's quantities, constants included, each in the model's unit.
+
+        Args:
+            effect: a name in `quantities`; the claimed ones are `effects`.
+
+        Raises:
+            GroundedError: if the diagnosis has no values of this effect.
+        """
+        found = self.quantities
+        if effect not in found:
+            there = f": {nearest(effect, found)}" if found else "; it has none of any effect"
+            raise GroundedError(f"this diagnosis has no values of '{effect}'{there}")
+        return found[effect]
+
+    @property
+    def quantities(self) -> dict[str, dict[str, float]]:
+        """Quantities by effect: of ranked effects, late sensors and the correction's curves."""
+        curves = self.correction.curves if self.correction is not None else ()
+        ranked = {row.effect: row.values for row in reversed(self.ranking)}
+        drawn = {curve.effect: dict(curve.quantities) for curve in curves}
+        return self.late_sensors | ranked | drawn
 
     def _repr_html_(self) -> str:
         from grounded.diagnosis.tables import as_html

@@ -13,6 +13,7 @@ from cli import grounded, process
 from facts import holds
 from grounded.result import listed
 from grounded_cli.ingest import _tell
+from grounded_trials import Workspace
 from grounded_trials.workspace.intake.ingested import Ingested
 from reported import cart, copied
 from workspaces import CONFIG, MODEL, make
@@ -205,6 +206,21 @@ def test_a_rerun_says_who_is_best_now_where_it_is_another(capsys):
     assert re.search(r"best is now c0003,\s+-0\.1143", capsys.readouterr().out)
     _tell("q5", replace(one, candidate="c0003"), best, small_tasks.cart)
     assert "best" not in capsys.readouterr().out
+
+
+def test_a_log_that_was_stored_before_is_not_the_best_of_today(cart, tmp_path):
+    """`ingest` of the second of eight runs again said "better: the best so far"."""
+    folder = copied(cart, tmp_path / "w")
+    now = grounded("-C", folder, "status", "--json").json
+    best, tried = now["best"]["candidate"], now["history"]
+    older = [one for one in tried if one["verdict"] == "better" and one["candidate"] != best]
+    files = {one.trial.candidate: one.stored.path for one in Workspace(folder).trials()}
+    assert older
+    for name in (older[0]["candidate"], best):
+        out = grounded("-C", folder, "ingest", files[name]).out
+        assert ("best so far" in out, f"best is now {best}" in " ".join(out.split())) == (
+            (True, False) if name == best else (False, True)
+        )
 
 
 def test_a_range_is_rounded_to_what_a_person_measures():

@@ -103,6 +103,15 @@ def test_an_older_document_is_read_with_what_it_has():
     assert again(oldest) == oldest
 
 
+def test_values_of_an_effect_that_is_not_there_are_an_error_that_names_what_is():
+    """They were {}, which a script takes for an effect without quantities."""
+    found = Diagnosis.from_json(DIAGNOSIS)
+    with pytest.raises(GroundedError, match=r"'drag:v'.*viscous_friction:v"):
+        found.values("drag:v")
+    with pytest.raises(GroundedError, match="none of any effect"):
+        Diagnosis.from_json({"verdict": {"kind": "none"}}).values("drag:v")
+
+
 def test_null_is_nan_and_what_is_missing_is_the_default():
     value = {"value": None, "std": None, "interval": None, "unit": None}
     read = Estimate.from_json(value)

@@ -216,6 +216,18 @@ model = Model(states={"x": "m", "v": "m/s"}, inputs={"force": "N"},
 """
 
 
+def test_init_names_the_files_to_read_where_they_are(tmp_path):
+    """It said `read w/model.py and grounded.toml`."""
+    (tmp_path / "cart.py").write_text(CART)
+    t = np.arange(100) * 0.05
+    rows = np.column_stack([t, np.sin(t), np.cos(t), np.sin(3 * t)])
+    np.savetxt(tmp_path / "r.csv", rows, "%.5f", ",", header="t,x,v,force", comments="")
+    made = ("init", tmp_path / "w", "--from", tmp_path / "r.csv", "--model", tmp_path / "cart.py")
+    told = grounded(*made).out.split()
+    for name in ("model.py", "grounded.toml"):
+        assert str(tmp_path / "w" / name) in [word.rstrip(";") for word in told]
+
+
 def test_weights_that_were_made_of_the_limits_seen_follow_those_that_are_given(tmp_path):
     """They stayed as the log's narrow range had made them: 700 times too heavy."""
     (tmp_path / "cart.py").write_text(CART)

@@ -11,7 +11,7 @@ from facts import holds
 from grounded import Model, Task, Trial
 from grounded.task import Reward
 from grounded_trials import Workspace
-from grounded_trials.report.findings import improvements_in
+from grounded_trials.report.findings import AT_END, improvements_in
 from grounded_trials.report.gathering import gather
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import off_target_of, position_axes, reaches
@@ -158,6 +158,18 @@ def test_a_run_that_ended_early_has_no_end_and_a_lost_one_no_line():
     assert off_target_of(task(**ALONG), [run(np.full((11, 4), np.nan))]) == ()
     free = replace(task(), target=np.full((H + 1, 4), np.nan))
     assert off_target_of(free, [run(off(0.5))]) == () == off_target_of(task(**ALONG), [])
+
+
+def test_status_and_the_page_name_the_states_in_one_order(cart):
+    """A ball's page began with its speed, `status` with its place."""
+    findings = gather(Folder(cart))
+    reward = replace(findings.task.reward, state=np.array([1.0, 1e4]))  # the speed costs most
+    target = np.where(np.isfinite(findings.task.target), findings.task.target, 0.0)
+    task = replace(findings.task, reward=reward, target=target)
+    findings = replace(findings, task=task)
+    told = off_target_of(findings.task, [run.trial for run in findings.runs])
+    shown = [one.what.removeprefix(AT_END)[0] for one in improvements_in(findings)]
+    assert [one.what for one in told] == ["x", "v"] == list(dict.fromkeys(shown))
 
 
 def test_status_and_ingest_say_the_number_of_the_page(cart, tmp_path):

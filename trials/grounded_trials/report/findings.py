@@ -228,7 +228,8 @@ def improvements_in(findings: Findings) -> list[Improved]:
     """Return the rms errors from the target of the model's own policy and of the best trial.
 
     Errors of the last state are added if the reward weighs it, or if the target is to be reached.
-    Errors that changed the utility most come first.
+    Rates come after the states whose rates they are, as in `off_target_of`; apart from that, errors
+    that changed the utility most come first.
     """
     task, runs, found = findings.task, compared(findings), []
     if not runs:
@@ -238,8 +239,11 @@ def improvements_in(findings: Findings) -> list[Improved]:
     note = f"; {', '.join(short)} ended early" if short else ""
     arrives = reaches(task)
     worse = "; here the best trial is worse than the first, but better in other terms of the reward"
-    for names, what in weighed_groups(task):
+    groups = weighed_groups(task)
+    rates = {f"{task.model.states[names[0]]}/s" for names, _ in groups}
+    for names, what in groups:
         states = [task.model.state_names.index(name) for name in names]
+        rate = task.model.states[names[0]] in rates
         errors = [[e[:, states] for e in off_target(findings, r)] for _, r in runs]
         unit = shown(task.model.states[names[0]])
         far = "distance from the desired position" if len(names) > 1 else f"{what}, off its target"
@@ -254,11 +258,13 @@ def improvements_in(findings: Findings) -> list[Improved]:
             before = missed[0] if len(missed) > 1 else float("nan")
             moved = abs(costs[0] - costs[-1]) if len(costs) > 1 else costs[0]
             paid = worse * (missed[-1] > WORSE * missed[0])
-            found.append((moved, Improved(words + note + paid, unit, before, missed[-1])))
-    reached = next((one for _, one in found if arrives and one.what.startswith(AT_END)), None)
-    found.sort(key=lambda each: (each[1].is_same, -each[0]))
-    least = MOVED * sum(moved for moved, _ in found)
-    told = [one for k, (moved, one) in enumerate(found[:SHOWN]) if not k or moved >= least]
+            one = Improved(words + note + paid, unit, before, missed[-1])
+            found.append((one.is_same, rate, -moved, one))
+    reached = next((one for *_, one in found if arrives and one.what.startswith(AT_END)), None)
+    found.sort(key=lambda each: each[:3])
+    least = MOVED * sum(abs(moved) for _, _, moved, _ in found)
+    large = [one for k, (*_, moved, one) in enumerate(found) if not k or -moved >= least]
+    told = large[:SHOWN]
     return told if reached is None or reached in told else [*told[: SHOWN - 1], reached]
 
 
