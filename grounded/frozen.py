@@ -1,7 +1,8 @@
-"""Read-only arrays for frozen dataclasses, checks of input, medians and wrapped angles."""
+"""Read-only arrays for frozen dataclasses, checks of input, medians, noise and wrapped angles."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from grounded.errors import GroundedError
 
 Array = NDArray[np.float64]
+MEDIAN = 0.6745  # median of |x| of a standard normal x
+ORDERS = (2, 3, 4, 5)  # orders of differences
 
 
 def readonly(values: ArrayLike, dtype: Any = np.float64) -> Any:
@@ -62,6 +65,22 @@ def median(values: Array) -> Array:
     ordered = np.sort(values, axis=0)
     middle = ordered[[(len(values) - 1) // 2, len(values) // 2]].mean(axis=0)
     return np.where(np.isnan(ordered[-1]), np.nan, middle)
+
+
+def white_noise(states: Array) -> Array:
+    """Estimate the standard deviation of each sensor's white noise (n,) from states (H + 1, n).
+
+    The k-th differences of white noise have (2k)! / k!^2 times its variance, whereas those of a
+    motion that is smooth over k samples vanish. So the smallest estimate of several orders contains
+    the least motion. It is 0 for a state without samples.
+    """
+    found = np.full(states.shape[1], np.inf)
+    for order in ORDERS:
+        for j, column in enumerate(np.abs(np.diff(states, n=order, axis=0)).T):
+            known = column[np.isfinite(column)]
+            white = MEDIAN * math.sqrt(math.comb(2 * order, order))
+            found[j] = min(found[j], median(known) / white if len(known) else np.inf)
+    return np.where(np.isfinite(found), found, 0.0)
 
 
 def wrapped(d: Array, angles: ArrayLike) -> Array:

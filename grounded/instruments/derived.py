@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.frozen import Array, median, wrapped
+from grounded.frozen import Array, median, white_noise, wrapped
 from grounded.instruments.kinematics import OFF, pieces
 from grounded.instruments.lag import SURE
 from grounded.model import Model
@@ -26,7 +26,6 @@ PAST, LATER = 24, 2  # differences before and after the sample that get a weight
 ENOUGH = 10  # samples per weight
 FORESEEN = 0.1  # weight of the second later difference above which it is no causal filter
 CARRIED = 0.5  # of the noise that the weights take from the position: a larger remainder is another
-MEDIAN = 0.6745  # median of |x| of a standard normal x
 UNEXPLAINED = 0.2  # of the velocity's size: a larger remainder comes from another sensor
 
 
@@ -79,7 +78,8 @@ def derived(
     size = float(w @ w)
     if rank < a.shape[1] or not float(rest @ rest) < UNEXPLAINED**2 * size:
         return None
-    passed = _noise(seen) * float(np.linalg.norm(np.diff(np.pad(weights, 1)))) / dt
+    noise = float(median(np.concatenate([white_noise(q[:, None]) for q in seen])))
+    passed = noise * float(np.linalg.norm(np.diff(np.pad(weights, 1)))) / dt
     if not np.sqrt(rest @ rest / count) < CARRIED * passed:
         return None
     covariance = np.linalg.inv(a.T @ a) * float(rest @ rest) / count
@@ -94,9 +94,3 @@ def derived(
     if wide - SURE * std < least**2:
         return None
     return Derived(gain, float(np.sqrt(covariance.sum())), age, float(np.sqrt(wide)))
-
-
-def _noise(positions: Sequence[Array]) -> float:
-    """Return the standard deviation of the white noise of a position, from fourth differences."""
-    each = np.concatenate([np.abs(np.diff(q, 4)) for q in positions])
-    return float(median(each) / (MEDIAN * np.sqrt(70)))

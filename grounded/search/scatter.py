@@ -27,16 +27,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.frozen import Array, median
+from grounded.frozen import Array, median, white_noise
 from grounded.policy import Policy
 from grounded.search.candidate import Tried
 from grounded.task import Task
 from grounded.trial import Trial
 
 PIECES = 4  # parts of a run
-MEDIAN = 0.6745  # median of |x| of a standard normal x
-ORDERS = (2, 3, 4, 5)  # orders of differences
-LATEST = 9  # trials from which the noise of the sensors is estimated
+LATEST, ROWS = 9, 10_000  # trials from which the noise of the sensors is estimated; rows of each
 HUGE = 1e100  # bound on the noise of a diverged run, in the state's unit
 FAR = 2.0  # largest ratio of costs of candidates whose scatter is pooled
 
@@ -81,29 +79,13 @@ def beyond_noise(trials: Sequence[Trial], off: Array, start: Array) -> Array:
     return np.asarray(np.abs(np.mean(off, axis=0)) > least)
 
 
-def white_noise(states: Array) -> Array:
-    """Estimate the standard deviation of each sensor's white noise (n,) from states (H + 1, n).
-
-    The k-th differences of white noise have (2k)! / k!^2 times its variance, whereas those of a
-    motion that is smooth over k samples vanish. So the smallest estimate of several orders contains
-    the least motion. It is 0 for a state without samples.
-    """
-    found = np.full(states.shape[1], np.inf)
-    for order in ORDERS:
-        for j, column in enumerate(np.abs(np.diff(states, n=order, axis=0)).T):
-            known = column[np.isfinite(column)]
-            white = MEDIAN * math.sqrt(math.comb(2 * order, order))
-            found[j] = min(found[j], median(known) / white if len(known) else np.inf)
-    return np.where(np.isfinite(found), found, 0.0)
-
-
 def sensor_noise(trials: Sequence[Trial], n: int) -> Array:
     """Return the white noise (std) of each state's sensor, (n,); 0 without a trial.
 
     It is the median over the latest trials. The estimate of a single short run is off by a third
-    either way.
+    either way. Of a long log its first rows are enough.
     """
-    each = [white_noise(trial.states) for trial in trials[-LATEST:]]
+    each = [white_noise(trial.states[:ROWS]) for trial in trials[-LATEST:]]
     return median(np.minimum(each, HUGE)) if each else np.zeros(n)
 
 
