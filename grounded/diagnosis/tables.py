@@ -74,15 +74,14 @@ def instrument_lines(findings: Iterable[Finding]) -> list[str]:
     """
     lines, findings = [], list(findings)
     unused = {one.signal: one for one in findings if one.kind == "smoothed"}
-    late = {one.signal for one in findings if one.kind == "delay"} & {*unused}
+    late = {one.signal for one in findings if one.kind == "delay"}
     for one in findings:
-        done = "; corrected here" * (one.corrected and one.signal not in unused)
-        if one.kind == "lag" and one.signal in unused:
-            continue  # `unused` says how old it is
-        if one.kind == "smoothed" and one.signal in late:
-            continue  # said with the delay
-        if one.kind == "delay" and one.signal in late:
-            done = f"; {unused[one.signal].finding}"
+        left_out = unused.get(one.signal)
+        if left_out and (one.kind == "lag" or (one is left_out and one.signal in late)):
+            continue  # `left_out` says how old it is, or is said with the delay
+        done = "; corrected here" * (one.corrected and not left_out)
+        if left_out and one.kind == "delay":
+            done = f"; {left_out.finding}"
         more = f"; to correct it for good, set {one.log} in its table of [log]" * bool(one.log)
         more += f"; {one.advice}" * bool(one.advice)
         lines.append(f"{one.signal}: {one.finding}{done}{more}")

@@ -142,17 +142,17 @@ def _any_factor(
 
 
 def any_offset(
-    task: Task, own: Candidate, trial: Trial, names: Sequence[str]
+    task: Task, own: Candidate, trial: Trial, names: Sequence[str], plain: Following | None
 ) -> tuple[str, float] | None:
     """Return the state in `names` and the offset without which a trial is a candidate's run.
 
     A position's weak gain may hide an offset: the trial then counts as a run of the candidate, but
-    follows it far better without the offset.
+    follows it far better without the offset. `plain` compares its commands as they are.
     """
-    trial, late, policy = trial.until(task.horizon), latest(task), own.policy
-    if (plain := follows(policy, trial, late)) is None or plain.error < EXACT:
+    if plain is None or plain.error < EXACT:
         return None
-    trial = trial.until(min(trial.finite_steps, policy.horizon))
+    late, policy = latest(task), own.policy
+    trial = trial.until(min(trial.finite_steps, task.horizon, policy.horizon))
     most = ALL if plain.alike else LEAVES
     best, found = min(most * _left(plain), CLOSE), None
     for name in names:

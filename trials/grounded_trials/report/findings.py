@@ -27,7 +27,12 @@ from grounded_trials.report.forecast import SECONDS
 from grounded_trials.wording import figure, rendered, shown
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.next_step import Since
-from grounded_trials.workspace.off_target import reaches, tracking_error, weighed_groups
+from grounded_trials.workspace.off_target import (
+    rates_among,
+    reaches,
+    tracking_error,
+    weighed_groups,
+)
 
 if TYPE_CHECKING:
     from grounded_trials.report.settled import Settled
@@ -240,10 +245,8 @@ def improvements_in(findings: Findings) -> list[Improved]:
     arrives = reaches(task)
     worse = "; here the best trial is worse than the first, but better in other terms of the reward"
     groups = weighed_groups(task)
-    rates = {f"{task.model.states[names[0]]}/s" for names, _ in groups}
-    for names, what in groups:
+    for (names, what), rate in zip(groups, rates_among(task, groups), strict=True):
         states = [task.model.state_names.index(name) for name in names]
-        rate = task.model.states[names[0]] in rates
         errors = [[e[:, states] for e in off_target(findings, r)] for _, r in runs]
         unit = shown(task.model.states[names[0]])
         far = "distance from the desired position" if len(names) > 1 else f"{what}, off its target"

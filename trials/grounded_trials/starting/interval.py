@@ -24,6 +24,7 @@ RATES = (1000, 500, 400, 250, 200, 125, 120, 100, 60, 50, 40, 30, 25, 20, 15, 10
 STEPS = tuple(float(f"{1 / rate:.6g}") for rate in RATES)  # [s], rounded as written to files
 GUESSED = 0.05  # [s], if nothing is known
 LONGEST = 0.1  # [s]; slower changes may be the steps of a test signal
+SLOW = 0.95  # [s] from which an interval is rounded to whole seconds
 ENOUGH = 20  # smallest number of times between changes
 NEARLY_ALL = 0.95  # share of them that must be multiples of the interval
 ONCE = 0.25  # share of them that must equal the interval
@@ -77,7 +78,7 @@ def round_interval(rows: float) -> float:
     if abs(usual / rows - 1) < NEAR or not STEPS[0] < rows:
         return usual
     whole = [1e-3 * max(round(1e3 * rows), 1), 1 / max(round(1 / rows), 1)]
-    if rows > NEARLY_ALL:
+    if rows > SLOW:
         whole = [float(round(rows))]
     nearest = min(whole, key=lambda step: abs(step - rows))
     return float(f"{nearest if abs(nearest / rows - 1) < NEAR else rows:.6g}")

@@ -72,7 +72,7 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
     errors = [tracking_error(task, trial.until(max(trial.finite_steps, 0))) for trial in whole]
     ended = any(len(e) <= task.horizon for e in errors)
     groups, arrives = weighed_groups(task), reaches(task)
-    units = [task.model.states[names[0]] for names, _ in groups]
+    units, rates = [task.model.states[names[0]] for names, _ in groups], rates_among(task, groups)
     ranked: list[tuple[bool, float, int]] = []
     found: dict[int, OffTarget] = {}
     for k, (names, what) in enumerate(groups):
@@ -90,12 +90,18 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
             values |= {"most": float(worst.max()), "at_s": task.dt * int(np.argmax(worst))}
         if (terminal.any() or arrives) and not ended:
             values["end"] = float(np.sqrt(np.mean([e[-1] @ e[-1] for e in each])))
-        ranked.append((any(units[k] == f"{unit}/s" for unit in units), -cost, k))
+        ranked.append((rates[k], -cost, k))
         found[k] = OffTarget(what.removeprefix("the "), units[k], **values)
     told = sorted(k for *_, k in sorted(ranked)[:FEW])
     dear = MOST * sum(cost for _, cost, _ in ranked)
     told += [k for _, cost, k in ranked if cost < dear and k not in told]
     return tuple(found[k] for k in told)
+
+
+def rates_among(task: Task, groups: Sequence[tuple[Sequence[str], str]]) -> list[bool]:
+    """Return which of the groups are rates of others: they come after these."""
+    units = [task.model.states[names[0]] for names, _ in groups]
+    return [any(unit == f"{other}/s" for other in units) for unit in units]
 
 
 def reaches(task: Task) -> bool:

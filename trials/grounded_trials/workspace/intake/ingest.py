@@ -215,10 +215,9 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         logged = [name for name in task.model.state_names if name not in _guessed(log)]
         tried = [(names, f) for names, f in units_tried(task.model) if {*names} <= {*logged}]
         units, by = odd_columns(task.model, own, whole, tried)
-    off = log and not why and not units and zero_in(log, task, own, whole)
-    if off and candidate is None:
-        raise GroundedError(f"{path} ran {ran}, but {off}")
     if not why and not units:
+        if candidate is None and log and (off := zero_in(log, task, own, whole, seen.ran)):
+            raise GroundedError(f"{path} ran {ran}, but {off}")
         told = _like(read, ran, seen.ran)
         if fell:
             read = cut_short(read, fell.steps, fell.told)

@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import listed
 from grounded.search.returned.who_drove import LEAST, follows
 from grounded.task import Task
+from grounded.trial import Trial
 from grounded_trials.wording import count, with_unit
 from grounded_trials.workspace.intake.acted_on import acted_on
 
@@ -61,11 +63,15 @@ def _left(log: Recording, policy: Policy, first: float, missed: int) -> float:
     T = 0 if trial is None else min(trial.finite_steps, policy.horizon)
     if trial is None or T - missed < LEAST:
         return np.inf
-    sent = np.clip(trial.inputs[:T], policy.low, policy.high)
-    asked = policy.commands(trial.states[None, :T], log.past, sent[None])[0]
+    return float(np.median(_apart(policy, trial.until(T), log.past)[missed:]))
+
+
+def _apart(policy: Policy, trial: Trial, past: Array) -> Array:
+    """Return the rms difference of each step's commands from the policy's, in units of size."""
+    sent = np.clip(trial.inputs, policy.low, policy.high)
+    asked = policy.commands(trial.states[None, : len(sent)], past, sent[None])[0]
     size = np.maximum(np.abs(policy.feedforward).max(axis=0), np.abs(sent).max(axis=0)) + 1e-12
-    off = np.sqrt((((asked - sent) / size) ** 2).mean(axis=1))
-    return float(np.median(off[missed:]))
+    return np.asarray(np.sqrt((((asked - sent) / size) ** 2).mean(axis=1)))
 
 
 def begins_late(log: Recording, policy: Policy) -> float:
@@ -88,10 +94,7 @@ def begins_late(log: Recording, policy: Policy) -> float:
         T = min(most, policy.horizon - k)
         if T < LEAST:
             return np.inf
-        sent = np.clip(trial.inputs[:T], policy.low, policy.high)
-        asked = policy.after(k).commands(trial.states[None, :T], past, sent[None])[0]
-        size = np.abs(policy.feedforward).max(axis=0) + 1e-12
-        return float(np.median(np.sqrt((((asked - sent) / size) ** 2).mean(axis=1))))
+        return float(np.median(_apart(policy.after(k), trial.until(T), past)))
 
     stride = max(1, policy.horizon // COARSE)
     best = min(range(0, policy.horizon, stride), key=left)

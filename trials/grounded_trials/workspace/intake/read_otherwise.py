@@ -24,7 +24,7 @@ from grounded.search.returned.other_scale import (
     unit_named,
     units_tried,
 )
-from grounded.search.returned.who_drove import FINE, follows
+from grounded.search.returned.who_drove import FINE, Following, follows, latest
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.logs.signals import Series
@@ -108,7 +108,9 @@ def misled(log: Recording | None, task: Task, own: Candidate) -> str:
     return _off_zero(task, offset_in(log, task, own))
 
 
-def zero_in(log: Recording, task: Task, own: Candidate, trial: Trial) -> str:
+def zero_in(
+    log: Recording, task: Task, own: Candidate, trial: Trial, plain: Following | None
+) -> str:
     """Return how a run's log is off from what its program measured, and how to correct it; or "".
 
     Args:
@@ -116,9 +118,10 @@ def zero_in(log: Recording, task: Task, own: Candidate, trial: Trial) -> str:
         task: the task.
         own: the candidate, whose run it is, as far as its commands tell.
         trial: the run.
+        plain: the comparison of its commands.
     """
     logged = [name for name in task.model.state_names if name in log.logged]
-    return _off_zero(task, any_offset(task, own, trial, logged))
+    return _off_zero(task, any_offset(task, own, trial, logged, plain))
 
 
 def _off_zero(task: Task, off: tuple[str, float] | None) -> str:
@@ -198,7 +201,8 @@ def offset_in(log: Recording, task: Task, own: Candidate) -> tuple[str, float] |
     for begins in (log.first, *log.openings[:TRIED]):
         if trial := log.trial_from(begins):
             names = [name for name in task.model.state_names if name in log.logged]
-            if found := any_offset(task, own, trial, names):
+            plain = follows(own.policy, trial.until(task.horizon), latest(task))
+            if found := any_offset(task, own, trial, names, plain):
                 return found
     return None
 
