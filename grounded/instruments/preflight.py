@@ -334,8 +334,9 @@ class _Bench:
         return a_mean(w, q, over)
 
     def derived(self, relation: Integral, lag: Lag) -> Derived | None:
-        """Return how a late velocity follows from its position through a filter, if it does."""
-        if not relation.exact or lag.sign < 0 or lag.delay < self.dt:
+        """Return how a late velocity, no plain mean, follows from its position, if it does."""
+        mean = lag.mean >= SMOOTH * self.dt
+        if mean or not relation.exact or lag.sign < 0 or lag.delay < self.dt:
             return None
         return derived(self.model, relation, self.trials, SMOOTH * self.dt)
 
