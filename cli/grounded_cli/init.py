@@ -40,8 +40,8 @@ FEW = 8  # alternative signals listed for an unsure state or input
 @click.option("--blank", is_flag=True, help="No log yet: a workspace of --model, to fill in.")
 @click.option(
     "--kind",
-    help="Kind of model skeleton: car, rover, differential, balance, drone, arm, pendulum, crane, "
-    "generic.",
+    help="Kind of model skeleton: car, rover, differential, boat, balance, drone, arm, pendulum, "
+    "crane, generic.",
 )
 @click.option("--inputs", metavar="A,B,...", help="Columns that are inputs (kind generic).")
 @click.option(

@@ -86,13 +86,17 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
 
 
 def _predicted(proposed: Proposed) -> str:
-    """Return the predicted utility, and that expected in its log if sensor noise costs much."""
+    """Return the predicted utility, and errors in units.
+
+    If sensor noise costs much, the utility to be expected in the log is added.
+    """
     assert proposed.candidate is not None
     promised, cost = proposed.candidate.predicted_utility, proposed.noise_cost
     text = f"utility {number(promised)}"
-    if not cost > NOISY * abs(promised):
-        return text
-    return f"{text}; about {number(promised - cost)} in its log, including sensor noise"
+    if cost > NOISY * abs(promised):
+        text += f", about {number(promised - cost)} in its log, including sensor noise"
+    errors = "; ".join(one.summary() for one in proposed.off_target)
+    return f"{text}; off target: {errors}" if errors else text
 
 
 def _otherwise(candidate: Candidate, best: Tried) -> bool:

@@ -24,7 +24,7 @@ from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, hinges, path_target, swing_up
 from grounded_trials.workspace.exporting import void_exports
 from grounded_trials.workspace.task_file import equal_weights, read_target, without_range
-from ros_bags import arm_bag, car_bag, commanded_arm_bag, rover_bag
+from ros_bags import arm_bag, boat_bag, car_bag, commanded_arm_bag, rover_bag
 from shared_data import data
 
 
@@ -220,7 +220,7 @@ def test_nothing_is_overwritten_and_nothing_half_made_is_left(tmp_path, mine):
     with pytest.raises(GroundedError, match=r"mine\.py"):
         begin(tmp_path / "new", log, model=mine)
     assert not (tmp_path / "new").exists()
-    for words in (["--kind", "boat"], ["--model", "nowhere.py"]):
+    for words in (["--kind", "submarine"], ["--model", "nowhere.py"]):
         done = grounded("init", tmp_path / "new", "--from", log, *words)
         assert done.code == 1 and words[1] in done.err
     assert not (tmp_path / "new").exists()
@@ -381,6 +381,27 @@ def test_a_robot_whose_wheels_have_a_command_each_gets_its_equations(wheels, tmp
     x = model.system.step(np.zeros((1, 5)), u, model.values, 0.01)[0]
     moved = dict(zip(model.states, x, strict=True))
     assert moved["v"] > 0 > moved["omega"] and {"gain", "track", "tau"} == set(model.params)
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        ("/thruster/left", "/thruster/right"),
+        ("/wamv/thrusters/left/thrust", "/wamv/thrusters/right/thrust"),
+        ("/thruster_left", "/thruster_right"),
+    ],
+)
+def test_a_boat_with_two_thrusters_is_no_drone(tmp_path, left, right):
+    """The word thrust in a topic's name made it a drone, with z, roll and pitch."""
+    found = begin(tmp_path / "w", boat_bag(tmp_path / "bag", left, right))
+    assert found.kind == "boat" and not found.unsure
+    paths = {guess.name: guess.path for guess in found.states}
+    assert paths["u"].endswith("linear.x") and paths["v"].endswith("linear.y")
+    assert [guess.path for guess in found.inputs] == [f"{left}.data", f"{right}.data"]
+    model = Workspace(tmp_path / "w").base_model
+    x = model.system.step(np.zeros((1, 6)), np.array([[0.0, 1.0]]), model.values, 0.01)[0]
+    moved = dict(zip(model.states, x, strict=True))
+    assert moved["u"] > 0 and moved["r"] > 0  # the right thruster alone turns it to the left
 
 
 @pytest.mark.parametrize(

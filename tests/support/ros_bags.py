@@ -131,6 +131,27 @@ def rover_bag(folder):
     return bag(folder, topics, messages)
 
 
+def boat_bag(folder, left, right):
+    """Write a bag of a boat with two thrusters, whose commands are numbers on two topics."""
+    topics = {"/odom": "nav_msgs/msg/Odometry"}
+    topics |= dict.fromkeys((left, right), "std_msgs/msg/Float32")
+    messages, psi, x, y = [], 0.0, 0.0, 0.0
+    number = T["std_msgs/msg/Float32"]
+    for k in range(300):
+        t, rate = START + k * 50_000_000, 0.3 * np.sin(0.02 * k)
+        u, v = 0.8 + 0.2 * np.sin(0.05 * k), -0.3 * rate
+        moving = odometry(t, x, y, psi, u, rate)
+        moving.twist.twist.linear.y = v
+        messages.append(("/odom", t, moving))
+        for topic, way in ((left, -1), (right, 1)):
+            sent = 0.5 + 0.2 * np.sin(0.05 * k + 0.6) + way * 0.2 * np.sin(0.02 * k + 0.3)
+            messages.append((topic, t, number(data=np.float32(sent))))
+        psi += 0.05 * rate
+        x += 0.05 * (u * np.cos(psi) - v * np.sin(psi))
+        y += 0.05 * (u * np.sin(psi) + v * np.cos(psi))
+    return bag(folder, topics, messages)
+
+
 def turned(roll, pitch, yaw):
     """Return the quaternion (x, y, z, w) of Rz(yaw) Ry(pitch) Rx(roll), and that matrix."""
     angles = np.array([roll, pitch, yaw])

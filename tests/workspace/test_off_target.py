@@ -189,3 +189,19 @@ def test_status_and_ingest_say_the_number_of_the_page(cart, tmp_path):
     assert again.to_json()["off_target"][0]["unit"] == told.unit
     out = grounded("-C", folder, "ingest", best.stored.path).out
     assert again.off_target[0].summary() in " ".join(out.split())
+
+
+def test_propose_says_how_far_the_predicted_run_is_off(cart, tmp_path):
+    """It gave a predicted utility alone, beside which nobody could set ingest's centimetres."""
+    folder = copied(cart, tmp_path / "cart")
+    w = Workspace(folder)
+    way = np.linspace(0, 1, w.task.horizon + 1)
+    w.target({"x": 0.3 * way**2 * (3 - 2 * way)})
+    proposed = w.propose()
+    target = w.task.target[:, 0]
+    error = np.abs(proposed.candidate.predicted_states[:, 0] - target)
+    told = next(one for one in proposed.off_target if one.what == "x")
+    assert told.rms == pytest.approx(np.sqrt(np.mean(error**2))) and told.most == error.max() > 0
+    out = " ".join(grounded("-C", folder, "propose").out.split())
+    assert f"off target: {told.summary()}" in out
+    assert proposed.to_json()["off_target"][0]["what"] == "x"

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -234,24 +235,22 @@ def _several_cancel(predictor: Predictor, h: Hypothesis, size: Array) -> bool:
     known = [p for p in h.pairs if isinstance(p[0].family, kinds)]
     names = [effect.name for effect, _ in known if not getattr(effect.family, "parts", 0)]
 
-    def step(of: Hypothesis) -> Array:
-        return predictor.next(of, x)
-
-    def without(of: Hypothesis, taken: Sequence[str]) -> Hypothesis:
+    @cache
+    def step(taken: frozenset[str]) -> Array:
+        of = h
         for name in taken:
             of = of.minus(name)
-        return of
+        return predictor.next(of, x)
 
     for count in range(3, len(names) + 1):
-        for some in combinations(names, count):
-            bare = step(without(h, some))
+        for some in map(frozenset, combinations(names, count)):
+            bare = step(some)
 
-            def change(of: Hypothesis, bare: Array = bare) -> float:
-                moved = data.model.difference(step(of), bare) / size
+            def change(taken: frozenset[str], bare: Array = bare) -> float:
+                moved = data.model.difference(step(taken), bare) / size
                 return float(np.sqrt(np.sum(moved**2 * data.valid.T[..., None])))
 
-            alone = [change(without(h, [n for n in some if n != name])) for name in some]
-            if change(h) < LEFT * min(alone):
+            if change(frozenset()) < LEFT * min(change(some - {name}) for name in some):
                 return True
     return False
 

@@ -231,6 +231,9 @@ def _score(
     plain = bare_command if is_input else without_unit
     bare = plain(field.path)[len(topic.topic) :].lower().strip('".')
     best = max(_fit(called, one, topic.topic.lower()) for one in {inside, bare})
+    folders = topic.topic.lower().split("/")[:-1]  # /thrusters/left/command is the input `left`
+    if is_input and inside in ("data", "value") and set(called) & set(folders):
+        best = max(best, 3.0)
     if best <= 0:
         return 0.0
     words = set(_WORD.findall(path))

@@ -18,6 +18,7 @@ from grounded_trials.logs.joint_names import from_base, slides
 from grounded_trials.logs.stated_units import factor_between, unit_in_name
 from grounded_trials.starting.skeletons import (
     BALANCE,
+    BOAT,
     CAR,
     CRANE,
     DIFFERENTIAL,
@@ -45,9 +46,11 @@ HEADING = re.compile(r"(^|[/._])(yaw|psi|heading|theta|th|orientation)([/._\d]|$
 SENSED = re.compile(
     "encoder|tick|position|current|effort|bumper|cliff|range|sonar|feedback|measured"
 )
+OTHER = {"left": "right", "Left": "Right", "LEFT": "RIGHT"}
 PITCHES, ROLLS_ON = {"pitch", "tilt", "lean"}, {"x", "v", "position", "speed", "velocity", "wheel"}
 FLIES = {"roll", "yaw", "z", "thrust", "altitude", "elevator", "rudder", "steering", "psi"}
 SWINGS = re.compile(r"angle|swing|sway|pendulum|pole|theta|tilt")  # angle of a load on a trolley
+AFLOAT = re.compile(r"thruster|propeller|(^|[/._])(usv|wamv|boat|vessel)([/._\d]|$)")
 FLYING = re.compile(
     r"(^|[/_])(cf\d*|crazyflie|quad(rotor|copter)?|drone|uav|mavros|copter)([/_]|$)"
 )
@@ -144,7 +147,10 @@ def _word(path: str) -> str:
     return name if name.isidentifier() else f"s_{name}"
 
 
-KINDS = ("car", "rover", "differential", "balance", "drone", "arm", "pendulum", "crane", "generic")
+KINDS = (
+    *("car", "rover", "differential", "boat", "balance"),
+    *("drone", "arm", "pendulum", "crane", "generic"),
+)
 
 
 def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
@@ -161,16 +167,25 @@ def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
     flying = next((t.topic for t in log.topics if FLYING.search(t.topic.lower())), None)
     if flying is not None:
         return "drone", f"{flying} is named like a drone"
+    both = _both_sides(log)
+    afloat = next((t.topic for t in log.topics if AFLOAT.search(t.topic.lower())), None)
+    if both and afloat is not None:
+        named = f"{afloat} is named like a boat's"
+        return "boat", f"{named}, and there are the commands {' and '.join(both)}, and a heading"
     for wanted, kind, what in (
         (("steer",), "car", "has a steering signal"),
-        (("thrust", "attitude_setpoint", "actuator_outputs"), "drone", "has a drone's commands"),
+        (
+            ("thrust(?!er)", "attitude_setpoint", "actuator_outputs"),
+            "drone",
+            "has a drone's commands",
+        ),
         (("cmd_vel",), "rover", "holds velocity commands"),
     ):
         for topic in log.topics:
             if _says(topic, wanted):
                 return kind, f"{topic.topic} {what}"
     words = {_word(one.path).lower() for topic in log.topics for one in topic.fields}
-    if both := _both_sides(log):
+    if both:
         return "differential", f"it has the commands {' and '.join(both)}, and a heading"
     if command := _balancing(log):
         return "balance", f"it has a pitch, a position or speed, and one command, {command}"
@@ -227,14 +242,15 @@ def _crane(log: LogReport, units: Units) -> Skeleton:
 
 def _both_sides(log: LogReport) -> tuple[str, ...]:
     """Return the names of a left and a right command; () without both, or without a heading."""
-    found = moving(log)
-    if not any(HEADING.search(one.path.lower()) for one in found.values()):
+    paths = {f.path for t in log.topics for f in t.fields if f.low != f.high}
+    if not any(HEADING.search(path.lower()) for path in paths):
         return ()
-    for name in found:
-        other = name.lower().replace("left", "right")
-        pair = next((n for n in found if n.lower() == other != name.lower()), None)
-        if pair and not any(SENSED.search(found[n].path.lower()) for n in (name, pair)):
-            return name, pair
+    for left in sorted(paths):
+        right = re.sub("left|Left|LEFT", lambda m: OTHER[m[0]], left)
+        if right == left or right not in paths or SENSED.search(left.lower()):
+            continue
+        names = _word(left), _word(right)
+        return names if names[0] != names[1] else ("left", "right")
     return ()
 
 
@@ -269,7 +285,7 @@ def _drone(log: LogReport) -> Skeleton:
     commands = [t for t in log.topics if COMMANDED.search(t.topic.lower())]
     own = next((f for t, f in yaws if t not in commands), None)
     sent = any(t in commands and f.low != f.high for t, f in yaws)
-    rates = any(_says(t, ("angular.z",)) for t in commands)
+    rates = any(_says(t, (r"angular\.z",)) for t in commands)
     command = "yaw_command" if sent else "yaw_rate" if rates else ""
     low, high = (own.low or 0.0, own.high or 0.0) if own else (0.0, 0.0)
     return drone(low, high, command)
@@ -285,7 +301,7 @@ def _in_the_plane(topic: TopicReport) -> bool:
 
 def _says(topic: TopicReport, words: Sequence[str]) -> bool:
     everything = " ".join([topic.topic, *(one.path for one in topic.fields)]).lower()
-    return any(word in everything for word in words)
+    return any(re.search(word, everything) for word in words)
 
 
 def _car(log: LogReport) -> Skeleton:
@@ -316,18 +332,18 @@ def skeleton(
     ackermann = any("Ackermann" in topic.type for topic in log.topics)
     if kind == "car" and not ackermann:
         return _car(log)
-    if kind == "differential" and (both := _both_sides(log)):
-        named = dict(zip(DIFFERENTIAL.inputs, both, strict=True))
+    fixed = {one.kind: one for one in (CAR, ROVER, DIFFERENTIAL, BOAT, BALANCE, PENDULUM)}
+    if kind in ("differential", "boat") and (both := _both_sides(log)):
+        plain = fixed[kind]
+        named = dict(zip(plain.inputs, both, strict=True))
         lines = [
-            re.sub(r"a\.(left|right)", lambda m: f"a.{named[m[1]]}", line)
-            for line in DIFFERENTIAL.lines
+            re.sub(r"a\.(left|right)", lambda m: f"a.{named[m[1]]}", line) for line in plain.lines
         ]
-        return replace(DIFFERENTIAL, inputs=dict.fromkeys(both, "1"), lines=lines)
+        return replace(plain, inputs=dict.fromkeys(both, "1"), lines=lines)
     if kind == "crane":
         return _crane(log, units or {})
     if kind == "balance" and (command := _balancing(log)):
         return _driven_by(command, _in_volts(command, moving(log)[command].path, units or {}))
     if kind == "drone":
         return _drone(log)
-    fixed = {one.kind: one for one in (CAR, ROVER, DIFFERENTIAL, BALANCE, PENDULUM)}
     return fixed[kind] if kind in fixed else generic(log, inputs, units)

@@ -126,6 +126,29 @@ DIFFERENTIAL = Skeleton(
     ROVER.angles,
     ROVER.roles,
 )
+BOAT = Skeleton(
+    "boat",
+    "A boat with a thruster on each side: u forwards, v to the left, r the turn rate, over ground",
+    {"u": "m/s", "v": "m/s", "r": "rad/s", "x": "m", "y": "m", "psi": "rad"},
+    {"left": "1", "right": "1"},
+    {
+        "push": '1.0, "m/s^2", 0.01, 50.0',
+        "turn": '1.0, "rad/s^2", 0.01, 50.0',
+        "drag_u": '0.5, "1/s", 0.0, 10.0',
+        "drag_v": '1.0, "1/s", 0.0, 20.0',
+        "drag_r": '1.0, "1/s", 0.0, 20.0',
+    },
+    (
+        '"u": p.push * (a.right + a.left) / 2 - p.drag_u * s.u + s.v * s.r',
+        '"v": -p.drag_v * s.v - s.u * s.r',
+        '"r": p.turn * (a.right - a.left) / 2 - p.drag_r * s.r',
+        '"x": s.u * np.cos(s.psi) - s.v * np.sin(s.psi)',
+        '"y": s.u * np.sin(s.psi) + s.v * np.cos(s.psi)',
+        '"psi": s.r',
+    ),
+    ("psi",),
+    {"position": ("x", "y"), "heading": "psi", "speed": "u", "heading_rate": "r"},
+)
 DRONE = Skeleton(
     "drone",
     "A hovering drone: attitude follows its commands with a lag, thrust acts along its axis",

@@ -36,6 +36,7 @@ class Proposed(Result):
     file: Path | None  # the candidate's file; None if the search has ended
     then: NextCommand
     noise_cost: float = 0.0  # expected cost of sensor noise in its log, beyond what is predicted
+    off_target: tuple[OffTarget, ...] = ()  # errors of the predicted run, in units
 
     @property
     def candidate(self) -> Candidate | None:
@@ -54,7 +55,8 @@ class Proposed(Result):
     def to_json(self) -> dict[str, Any]:
         """Return the document of `propose --json`; candidate is null if the search has ended."""
         found = self.proposal.to_json() | {"file": str(self.file) if self.file else None}
-        return found | {"noise_cost": self.noise_cost}
+        errors = [one.to_json() for one in self.off_target]
+        return found | {"noise_cost": self.noise_cost, "off_target": errors}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -142,7 +144,8 @@ def propose_in(workspace: Folder) -> Proposed:
     if not candidate.grounded:  # else the model replays a log, and its noise is included
         noise = sensor_noise(workspace.task_trials(), workspace.base_model.n)
         cost = noise_cost(workspace.task, candidate.policy, noise)
-    return Proposed(proposal, path, then, cost)
+    off_target = off_target_of(workspace.task, [candidate.predicted_run])
+    return Proposed(proposal, path, then, cost, off_target)
 
 
 def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
