@@ -326,6 +326,10 @@ def test_a_plan_whose_inputs_cost_nearly_all_says_so_and_a_target_tells_its_weig
     assert not [n for n in blank.propose().proposal.notes if "of the plan's cost" in n]
     s = np.linspace(0, 1, 201)
     blank.target({"x": 10 * s**3 * (10 - 15 * s + 6 * s**2)})
-    text = file.read_text().replace("state = {x = 0.01}", "state = {x = 1000.0}")
-    file.write_text(text.replace("input = { }", "input = { force = 0.1 }"))
-    assert [n for n in blank.propose().proposal.notes if "of the plan's cost" in n]
+    text, told = file.read_text(), []
+    for x, force in ((1.0, 1.0), (1000.0, 0.1)):  # 3 % and 0.03 % of the way off
+        weighed = text.replace("state = {x = 0.01}", f"state = {{x = {x}}}")
+        file.write_text(weighed.replace("input = { }", f"input = {{ force = {force} }}"))
+        notes = Workspace(blank.folder).propose().proposal.notes
+        told.append(any("of the plan's cost" in note for note in notes))
+    assert told == [True, False]

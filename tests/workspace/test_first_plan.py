@@ -357,3 +357,43 @@ def test_a_plan_that_throws_an_input_from_end_to_end_says_so_and_what_calms_it(t
         return [note for note in notes if "turn jumps over" in note]
 
     assert len(told(1e-9)) == 1 and not told(1.0)
+
+
+DRIVEN = """
+from grounded import Model
+import numpy as np
+
+def rate(s, a, p):
+    return {"x": s.v * np.cos(s.psi), "y": s.v * np.sin(s.psi) + 0.05, "psi": a.turn, "v": a.push}
+
+model = Model(states={"x": "m", "y": "m", "psi": "rad", "v": "m/s"}, angles=("psi",),
+              inputs={"turn": "rad/s", "push": "m/s^2"}, derivative=rate,
+              roles={"position": ("x", "y"), "heading": "psi", "speed": "v"})
+"""
+
+
+@pytest.mark.parametrize("heading", [1.0, 0.0])
+def test_a_plan_off_its_path_says_which_weights_would_bring_it_closer(tmp_path, heading):
+    """A current of 5 cm/s: along the path the boat has to point beside it."""
+    (tmp_path / "driven.py").write_text(DRIVEN)
+    w = Workspace.create(tmp_path / "w", model=tmp_path / "driven.py")
+    t = 0.1 * np.arange(101)
+    w.target({"x": 0.5 * t, "y": 0 * t, "psi": 0 * t, "v": 0.5 + 0 * t})
+    file = w.folder / "grounded.toml"
+    text = file.read_text().replace("[limits]", "[limits]\nturn = [-2, 2]\npush = [-2, 2]")
+    text = re.sub(r"(?m)^start = .*$", "start = { v = 0.5 }", text)
+
+    def told(place: float) -> tuple[list[str], float]:
+        weights = f"state = {{ x = {place:g}, y = {place:g}, psi = {heading}, v = {heading} }}"
+        file.write_text(re.sub(r"(?m)^state = .*$", weights, text))
+        proposed = Workspace(w.folder).propose()
+        return proposed.proposal.notes, proposed.off_target[0].rms
+
+    notes, off = told(1.0)
+    _, closer = told(10.0)
+    found = [note for note in notes if "psi" in note and "x = 10, y = 10" in note]
+    assert len(found) == (heading > 0)
+    if heading:
+        assert (
+            off > 0.05 and f"{100 * off:.2g} cm" in found[0] and f"{100 * closer:.2g}" in found[0]
+        )

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.errors import NextCommand
+from grounded.frozen import Array
 from grounded.result import listed, measured, measured_alike, percent
 from grounded.search.scatter import sensor_noise
 from grounded.task import Task
@@ -38,6 +39,8 @@ HELD = 0.8  # share of the steps at a limit above which an input counts as limit
 SHORT = 0.25  # share of the target's extent by which a plan may end away from the target's end
 MISSED = 0.1  # share of the target's extent above which an error is reported
 SHAKEN = 0.05  # share of an input's [limits] (else of its range in the plan) moved by noise
+ASIDE = 0.01  # share of the target's extent by which a plan may be off, as an rms
+CLOSER, ENOUGH = 10.0, 0.6  # factor tried on the position's weights; share of the error then left
 PIECES = 10  # pieces of the plan in which the effect of noise is computed
 OFTEN = 4  # jumps over half the range of an input; a quick manoeuvre has two or three
 SOMEWHERE = 1.5  # ratio of the noise in one piece to the whole above which its time is reported
@@ -76,14 +79,17 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
         error, aim = np.zeros((len(sent) + 1, len(none))), task.input_target
         assert aim is not None
         share = step_rewards(reward, error, sent, aim, task.past).sum() / first.predicted_utility
-        if share > MOSTLY:
+        off, extent = _off_first_group(task, first.predicted_states)
+        if share > MOSTLY and off > ASIDE * extent:
             found.append(
                 f"{percent(share)} of the plan's cost is [reward] input and input_change: with "
                 "less weight there, errors would count for more"
             )
     found += _of_other_limits(workspace)
     if first is not None:
-        found += _held_back(task, first) or _falls_short(task, first)
+        found += (
+            _held_back(task, first) or _falls_short(task, first) or _outweighed(workspace, first)
+        )
         found += _thrown(task, first) or _shaken(workspace, first)
     found += held
     loose = _not_held(workspace, proposal.refused) if proposal.refused is not None else []
@@ -215,6 +221,50 @@ def _falls_short(task: Task, first: Candidate) -> list[str]:
         "get there in time. Weigh inputs and their changes less, draw a slower target, or check "
         "model.py"
     ]
+
+
+def _outweighed(workspace: Folder, first: Candidate) -> list[str]:
+    """Return a note if a plan leaves the path because [reward] weighs other states as much.
+
+    That is tried: the note gives the error of a plan with larger weights on the position.
+    """
+    from grounded.search.first_policy import finished
+
+    task, aim = workspace.task, workspace.planner.aim
+    groups = weighed_groups(task)
+    if len(groups) < 2 or aim.model.system.how != "compiled":
+        return []
+    names, what = groups[0]
+    states, unit = [task.model.state_names.index(n) for n in names], task.model.states[names[0]]
+    off, extent = _off_first_group(task, first.predicted_states)
+    if len(names) < 2 or not off > ASIDE * extent > 0 or not task.reward.state[states].all():
+        return []
+    state, terminal = aim.reward.state.copy(), aim.reward.terminal.copy()
+    state[states], terminal[states] = CLOSER * state[states], CLOSER * terminal[states]
+    reward = replace(aim.reward, state=state, terminal=terminal)
+    closer = finished(replace(aim, reward=reward).problem(), first.predicted_inputs)
+    left, _ = _off_first_group(task, closer.z[:, : task.model.n])
+    if not left < ENOUGH * off:
+        return []
+    was, now = measured_alike([off, left], unit)
+    weights = ", ".join(f"{names[k]} = {state[i]:.4g}" for k, i in enumerate(states))
+    return [
+        f"the plan is off {what} by {was} rms, because [reward] state weighs "
+        f"{listed([name for others, _ in groups[1:] for name in others])} as well: with "
+        f"{CLOSER:g} times the weight on it ({weights}) a plan is off by {now}"
+    ]
+
+
+def _off_first_group(task: Task, run: Array) -> tuple[float, float]:
+    """Return the rms error of a run (H + 1, n) in the first weighed group, and its extent."""
+    groups = weighed_groups(task)
+    if not groups:
+        return 0.0, 0.0
+    states = [task.model.state_names.index(name) for name in groups[0][0]]
+    error = np.nan_to_num(task.model.difference(run, task.target)[:, states])  # NaN: free
+    way = np.vstack([task.start, task.target])[:, states]
+    extent = np.nanmax(way, axis=0) - np.nanmin(way, axis=0)
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1)))), float(np.linalg.norm(extent))
 
 
 def _thrown(task: Task, first: Candidate) -> list[str]:

@@ -23,6 +23,7 @@ from grounded_trials.workspace.folder import Folder
 FEW = 2  # groups of states reported: positions and angles before their rates, then by cost
 MOST = 0.5  # a group with more than this share of the tracking cost is reported in any case
 WRITTEN = 1e-3  # tolerance for target.csv, relative to its range, due to the digits in the file
+EXACT = 1e-3  # share of the largest error below which a plan's end is on target
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
 
 
@@ -50,7 +51,8 @@ class OffTarget(Document):
     def summary(self) -> str:
         """Return a text such as `position 2.1 mm rms, 7.3 mm at most (at 7.95 s)`."""
         told = []
-        rms, most, end = measured_alike([self.rms, self.most, self.end], self.unit)
+        at_end = 0.0 if self.end < EXACT * self.most else self.end  # of a plan
+        rms, most, end = measured_alike([self.rms, self.most, at_end], self.unit)
         if np.isfinite(self.rms):
             told += [f"{rms} rms", f"{most} at most (at {self.at_s:.4g} s)"]
         if np.isfinite(self.end):
