@@ -209,6 +209,24 @@ def test_what_reads_the_same_before_and_after_is_not_told_first(car):
     assert not told_same[0] and any(told_same)
 
 
+def test_the_position_is_told_even_if_it_did_not_improve(car):
+    """A boat's page gave three speeds and angles, and not that it stayed 31 cm off its path."""
+    findings = gather(Folder(car))
+    first, best = findings.first, findings.best
+    assert first is not None and best is not None
+    names = findings.task.model.state_names
+    x, y = names.index("x"), names.index("y")
+    states = best.trial.states.copy()
+    states[:, [x, y]] = first.trial.states[:, [x, y]]
+    runs = tuple(
+        replace(r, trial=replace(r.trial, states=states)) if r.candidate is best.candidate else r
+        for r in findings.runs
+    )
+    found = improvements_in(replace(findings, runs=runs))
+    (told,) = [one for one in found if one.what.startswith("distance from the desired position")]
+    assert told.is_same and not found[0].is_same and len(found) <= 4
+
+
 def test_a_calibrated_model_is_not_called_crude(car):
     findings = gather(Folder(car))
     assert findings.plain == "crude model" and not findings.effects

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.result import listed
 from grounded_trials.formats.budget import keep
 from grounded_trials.formats.cdr import cdr_messages, ros1_messages
 from grounded_trials.formats.mcap_records import Channel, Messages, Schema
@@ -37,6 +38,7 @@ from grounded_trials.formats.schemas import struct_of
 from grounded_trials.logs.log_files import log_records, reading
 
 Clock = Literal["header", "log", "publish"]
+FEW = 8  # topics of a log that are all named where one is missing
 SAMPLE_BYTES = 48  # memory for a sample until it is on the grid
 JSON_PIECE = 2**20  # [bytes] of JSON parsed at once, at least one message
 
@@ -265,9 +267,13 @@ class _Collector:
 
     def series(self) -> Series:
         if not self.type:
+            known = sorted(self.topics)
+            said = nearest(self.path.topic, known)
+            if 0 < len(known) <= FEW:  # the nearest name may be another signal's: /left for /port
+                said = f"it has {listed(known)}"
             raise GroundedError(
                 f"'{self.name}' is read from '{self.path.text}', but the log has no topic "
-                f"'{self.path.topic}': {nearest(self.path.topic, sorted(self.topics))}"
+                f"'{self.path.topic}': {said}"
             )
         columns = [np.concatenate(part) for part in zip(*self.parts, strict=True)]
         if not columns or not len(columns[0]):

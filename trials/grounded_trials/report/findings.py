@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 One = TypeVar("One")
 SHOWN = 4  # largest number of rows of improvements
+FAR = "distance from the desired position"
 AT_END = "at the end: "  # label of errors of the last state
 MOVED = 0.02  # share of the change in cost below which a row is left out
 WORSE = 1.05  # ratio to the first trial's error above which a row is reported as worse
@@ -249,7 +250,7 @@ def improvements_in(findings: Findings) -> list[Improved]:
         states = [task.model.state_names.index(name) for name in names]
         errors = [[e[:, states] for e in off_target(findings, r)] for _, r in runs]
         unit = shown(task.model.states[names[0]])
-        far = "distance from the desired position" if len(names) > 1 else f"{what}, off its target"
+        far = FAR if len(names) > 1 else f"{what}, off its target"
         running, terminal = task.reward.state[states], task.reward.terminal[states]
         views = [(errors, running, f"{far}, rms")] * bool(running.any() or not terminal.any())
         if (terminal.any() or arrives) and not short:
@@ -263,12 +264,15 @@ def improvements_in(findings: Findings) -> list[Improved]:
             paid = worse * (missed[-1] > WORSE * missed[0])
             one = Improved(words + note + paid, unit, before, missed[-1])
             found.append((one.is_same, rate, -moved, one))
-    reached = next((one for *_, one in found if arrives and one.what.startswith(AT_END)), None)
     found.sort(key=lambda each: each[:3])
     least = MOVED * sum(abs(moved) for _, _, moved, _ in found)
     large = [one for k, (*_, moved, one) in enumerate(found) if not k or -moved >= least]
-    told = large[:SHOWN]
-    return told if reached is None or reached in told else [*told[: SHOWN - 1], reached]
+    firsts = (
+        next((one for *_, one in found if one.what.startswith(words)), None)
+        for words in (FAR, *(AT_END,) * arrives)
+    )
+    asked = [one for one in firsts if one is not None and one not in large[:SHOWN]]
+    return [*large[: SHOWN - len(asked)], *asked]  # what was asked for, if it changed or not
 
 
 def utility_terms(findings: Findings) -> tuple[list[tuple[str, ...]], tuple[str, ...]]:
