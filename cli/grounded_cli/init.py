@@ -126,13 +126,15 @@ def _ask(guess: Guess) -> str:
 
 
 def _tell(begun: Begun) -> None:
+    from grounded.result import listed
+
     what = f"skeleton of kind '{begun.kind}': {begun.why}" if begun.kind else begun.why
     sentence(f"{begun.workspace} is a workspace for {begun.log}")
     show(field("model", what, "  "))
     show(field("grid", f"{begun.dt:g} s, {begun.horizon} steps", "  "))
     show(field("target", begun.target, "  "))
     show("")
-    both = (*begun.states, *begun.inputs)
+    both, known = (*begun.states, *begun.inputs), [g.name for g in begun.states if g.path]
     aligned = partial(field, indent="  ", width=max(LABEL, *(len(guess.name) for guess in both)))
     for guess in both:
         mark = "" if guess.sure else "UNSURE "
@@ -144,6 +146,8 @@ def _tell(begun: Begun) -> None:
             or_ = "or" if guess.path else "perhaps"
             more = f" or {len(guess.others) - FEW} more" * (len(guess.others) > FEW)
             show(aligned("", f"{or_} {', '.join(guess.others[:FEW])}{more}"))
+        if known and guess in begun.states and not guess.path:
+            show(aligned("", f"the smoother estimates it from {listed(known)} ([estimate])"))
     for note in begun.notes:
         remark("note", note)
     look = "; look at what is UNSURE in its [log]" if begun.unsure else ""

@@ -383,6 +383,33 @@ def test_a_robot_whose_wheels_have_a_command_each_gets_its_equations(wheels, tmp
     assert moved["v"] > 0 > moved["omega"] and {"gain", "track", "tau"} == set(model.params)
 
 
+WHEEL = """
+from grounded import Model
+
+def f(s, a, p):
+    return {"angle": s.angle_rate, "angle_rate": -s.angle - a.pwm, "wheel_speed": 100 * a.pwm}
+
+model = Model(states={"angle": "rad", "angle_rate": "rad/s", "wheel_speed": "rad/s"},
+              inputs={"pwm": "1"}, angles=("angle",), derivative=f)
+"""
+
+
+def test_a_speed_in_rpm_is_the_state_its_name_begins_with(tmp_path):
+    """wheel_rpm was not found for wheel_speed, and offered for angle_rate instead."""
+    t, log = 0.01 * np.arange(600), tmp_path / "log.csv"
+    rows = np.column_stack([t, 10 * np.sin(t), 300 * np.cos(2 * t), np.sin(3 * t)])
+    np.savetxt(log, rows, "%.5f", ",", header="t,angle_deg,wheel_rpm,pwm", comments="")
+    (tmp_path / "wheel.py").write_text(WHEEL)
+    done = grounded("init", tmp_path / "w", "--from", log, "--model", tmp_path / "wheel.py")
+    text = (tmp_path / "w/grounded.toml").read_text()
+    table = tomllib.loads(text)["log"]["state"]
+    assert table["wheel_speed"]["path"] == "/csv.wheel_rpm"
+    assert table["wheel_speed"]["scale"] == pytest.approx(np.pi / 30)
+    assert "angle_rate" not in table
+    said = " ".join(done.out.split())
+    assert holds(said.partition("angle_rate")[2], "estimate", "angle and wheel_speed")
+
+
 @pytest.mark.parametrize(
     ("left", "right"),
     [

@@ -26,7 +26,11 @@ ULOG, ZIP = b"ULog\x01\x12\x35", b"PK\x03\x04"  # how the files begin
 VALUES = 200_000_000  # largest number of values in one file
 ROWS = 50_000  # rows in a batch
 STAMPS = ("t", "time", "timestamp", "stamp", "times", "timestamps")
-TIMES = (*STAMPS, "seconds", "secs", "clock", "clk", "elapsed")
+TICKS = {  # an Arduino's functions
+    **{"millis": "ms", "milliseconds": "ms", "micros": "us", "microseconds": "us"},
+    "nanoseconds": "ns",
+}
+TIMES = (*STAMPS, "seconds", "secs", "clock", "clk", "elapsed", *TICKS)
 ABROAD = (  # the same in other languages, used if no column has an English name
     *("zeit", "zeitstempel", "uhrzeit", "temps", "horodatage", "heure", "tiempo", "hora"),
     *("tempo", "ora", "tijd", "tid", "czas", "aika", "время", "时间", "時間", "时间戳"),
@@ -200,7 +204,8 @@ def _times(columns: Columns, path: Path) -> tuple[str, Any]:
         if values.dtype.kind == "i":  # [ns], from texts
             return name, values
     name = _time_of(list(columns), path)
-    unit = next((u for u in ("ns", "us", "ms") if name.lower().endswith("_" + u)), "")
+    word = name.lower().rpartition("_")[2]
+    unit = TICKS.get(word) or ("_" in name and word in UNITS and word) or ""
     values = columns[name]
     finite = values[np.isfinite(values)]
     top = float(np.abs(finite).max(initial=0.0))
@@ -236,7 +241,7 @@ def time_among(names: Sequence[str]) -> str:
 
 def is_time(name: str, words: Sequence[str] = (*TIMES, *ABROAD)) -> bool:
     """Check whether a column's name is that of a time, perhaps with a unit at the end."""
-    stem = re.sub(r"_?(in_)?(s|ns|us|ms|sec)$", "", name.lower()) or name.lower()
+    stem = re.sub(rf"_?(in_)?(s|ns|us|ms|sec|{'|'.join(TICKS)})$", "", name.lower()) or name.lower()
     return name.lower() in words or stem in words
 
 

@@ -19,7 +19,9 @@ from grounded_trials.formats.message_path import AXES, WORLD
 from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
 from grounded_trials.logs.stated_units import (
     bare_command,
+    factor_between,
     may_be,
+    unit_in_name,
     unit_of,
     without_role,
     without_unit,
@@ -127,6 +129,9 @@ def guess_mapping(
     meant = {name: _meanings(log, name, states) for name in states}
     scored = {name: _candidates(log, name, meant[name], is_input=False) for name in states}
     scored = {name: _of_unit(log, some, units.get(name, "")) for name, some in scored.items()}
+    for name, some in scored.items():
+        if not any(c.score >= LEAST for c in some):
+            scored[name] = _of_stem(log, name, units.get(name, "")) or some
     homes = _homes(scored)
     found = tuple(_choose(log, name, scored[name], homes) for name in states)
     taken = {guess.path for guess in found}
@@ -169,6 +174,23 @@ def _of_unit(log: LogReport, candidates: list[_Candidate], unit: str) -> list[_C
         if field.low != field.high and unit_of(field.path) == unit
     ]
     return moving or candidates
+
+
+def _of_stem(log: LogReport, name: str, unit: str) -> list[_Candidate]:
+    """Return the number that a state's name begins with in the state's kind of unit.
+
+    So `wheel_rpm` is the state wheel_speed [rad/s]. Empty if it is none or several.
+    """
+    stem = re.sub(r"_(rate|speed|velocity|vel|omega|dot)$", "", name.lower())
+    found = [
+        _Candidate(LEAST + 1.0, topic, field)
+        for topic in log.topics
+        for field in topic.fields
+        if field.low != field.high
+        and re.split(r"[/.]", without_unit(field.path).lower())[-1].strip('"') == stem
+        and factor_between(unit_in_name(field.path), unit) is not None
+    ]
+    return found if len(found) == 1 and stem != name.lower() else []
 
 
 def _may_be(path: str, unit: str) -> bool:
