@@ -431,6 +431,12 @@ def test_a_boat_with_two_thrusters_is_no_drone(tmp_path, left, right):
     assert moved["u"] > 0 and moved["r"] > 0  # the right thruster alone turns it to the left
 
 
+def test_speeds_measured_on_both_sides_are_no_commands(tmp_path):
+    left, right = "/wheel/left/speed", "/wheel/right/speed"
+    found = begin(tmp_path / "w", boat_bag(tmp_path / "bag", left, right))
+    assert found.kind not in ("differential", "boat")
+
+
 @pytest.mark.parametrize(
     ("names", "kind"),
     [

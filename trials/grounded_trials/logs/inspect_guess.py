@@ -190,7 +190,8 @@ def _of_stem(log: LogReport, name: str, unit: str) -> list[_Candidate]:
         and re.split(r"[/.]", without_unit(field.path).lower())[-1].strip('"') == stem
         and factor_between(unit_in_name(field.path), unit) is not None
     ]
-    return found if len(found) == 1 and stem != name.lower() else []
+    plain = unit in ("", "1") or stem == name.lower()  # motor_pct may be a command
+    return found if len(found) == 1 and not plain else []
 
 
 def _may_be(path: str, unit: str) -> bool:

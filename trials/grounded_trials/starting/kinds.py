@@ -250,7 +250,10 @@ def _both_sides(log: LogReport) -> tuple[str, ...]:
         if right == left or right not in paths or SENSED.search(left.lower()):
             continue
         names = _word(left), _word(right)
-        return names if names[0] != names[1] else ("left", "right")
+        if names[0] != names[1]:
+            return names
+        if COMMANDED.search(left.lower()) or EFFORT.search(left.lower()):  # /left/thrust
+            return "left", "right"
     return ()
 
 
