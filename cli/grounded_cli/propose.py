@@ -261,7 +261,7 @@ def _trust(candidate: Candidate, standing: Standing, workspace: Workspace) -> st
         return f"{since}: {measured}; no run has tested its plans yet"
     logs = len(workspace.trials()) - sum(len(tried.trials) for tried in standing.history)
     if measured:
-        return f"{measured}, by its diagnosis; it was never tested on this manoeuvre"
+        return f"{measured}, by its diagnosis; no run of this task has tested it yet"
     if not logs:
         return "unknown: the crude model was never compared with the real system"
     config = workspace.config.model
@@ -269,7 +269,7 @@ def _trust(candidate: Candidate, standing: Standing, workspace: Workspace) -> st
     by = f"was {done} with" if done else "can be checked against"
     return (
         f"the model {by} {count(logs, 'log')} of data (`grounded diagnose` shows how well it "
-        "predicts), but it was never tested on this manoeuvre"
+        "predicts), but no run of this task has tested it yet"
     )
 
 

@@ -431,6 +431,13 @@ def test_a_boat_with_two_thrusters_is_no_drone(tmp_path, left, right):
     assert moved["u"] > 0 and moved["r"] > 0  # the right thruster alone turns it to the left
 
 
+def test_a_measured_rate_is_no_input(tmp_path):
+    """A boat's log taken for a drone's gave its odometry's turn rate as the command of the yaw."""
+    log = boat_bag(tmp_path / "bag", "/thruster/left", "/thruster/right")
+    found = begin(tmp_path / "w", log, kind="rover")
+    assert [guess.name for guess in found.inputs if not guess.path] == ["speed", "turn"]
+
+
 def test_speeds_measured_on_both_sides_are_no_commands(tmp_path):
     left, right = "/wheel/left/speed", "/wheel/right/speed"
     found = begin(tmp_path / "w", boat_bag(tmp_path / "bag", left, right))

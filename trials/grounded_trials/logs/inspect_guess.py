@@ -31,6 +31,7 @@ FEW = 8  # alternatives listed in [log]
 SURE = 1.5  # lead in score over the next candidate, to be sure
 AS_OFTEN = 0.5  # of the wheel odometry's rate: a pose at this rate is preferred to the odometry's
 LEAST = 2.0  # below this score nothing is proposed
+MEASURED = ("/Odometry", "/Imu")  # messages that hold no commands
 SIMULATED_S = 1.0  # header stamps further from the log's clock are simulation time
 
 _YAW = ("@rpy.yaw", "yaw", "heading", "theta", "psi")
@@ -262,6 +263,7 @@ def _score(
     words = set(_WORD.findall(path))
     commanded = any(word in words for word in _COMMANDED)
     best += (0.5 if is_input else -2.0) * commanded
+    best -= 3.0 if is_input and topic.type.endswith(MEASURED) else 0.0
     best -= 3.0 if field.low is None else 0.0
     best -= 1.0 if field.low == field.high else 0.0
     best -= 1.0 if topic.messages < 3 else 0.0
