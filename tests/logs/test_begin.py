@@ -434,8 +434,9 @@ def test_a_boat_with_two_thrusters_is_no_drone(tmp_path, left, right):
 def test_a_measured_rate_is_no_input(tmp_path):
     """A boat's log taken for a drone's gave its odometry's turn rate as the command of the yaw."""
     log = boat_bag(tmp_path / "bag", "/thruster/left", "/thruster/right")
-    found = begin(tmp_path / "w", log, kind="rover")
-    assert [guess.name for guess in found.inputs if not guess.path] == ["speed", "turn"]
+    found = begin(tmp_path / "w", log, kind="drone")
+    (rate,) = [guess for guess in found.inputs if guess.name == "yaw_rate"]
+    assert not rate.path and not rate.sure
 
 
 def test_speeds_measured_on_both_sides_are_no_commands(tmp_path):
