@@ -258,12 +258,11 @@ def _score(
     folders = topic.topic.lower().split("/")[:-1]  # /thrusters/left/command is the input `left`
     if is_input and inside in ("data", "value") and set(called) & set(folders):
         best = max(best, 3.0)
-    if best <= 0:
+    if best <= 0 or (is_input and topic.type.endswith(MEASURED)):
         return 0.0
     words = set(_WORD.findall(path))
     commanded = any(word in words for word in _COMMANDED)
     best += (0.5 if is_input else -2.0) * commanded
-    best -= 3.0 if is_input and topic.type.endswith(MEASURED) else 0.0
     best -= 3.0 if field.low is None else 0.0
     best -= 1.0 if field.low == field.high else 0.0
     best -= 1.0 if topic.messages < 3 else 0.0
