@@ -127,6 +127,7 @@ def _ask(guess: Guess) -> str:
 
 def _tell(begun: Begun) -> None:
     from grounded.result import listed
+    from grounded_trials.logs.guessed_table import estimating
 
     what = f"skeleton of kind '{begun.kind}': {begun.why}" if begun.kind else begun.why
     sentence(f"{begun.workspace} is a workspace for {begun.log}")
@@ -134,7 +135,7 @@ def _tell(begun: Begun) -> None:
     show(field("grid", f"{begun.dt:g} s, {begun.horizon} steps", "  "))
     show(field("target", begun.target, "  "))
     show("")
-    both, known = (*begun.states, *begun.inputs), [g.name for g in begun.states if g.path]
+    both, known = (*begun.states, *begun.inputs), estimating(begun.states)
     aligned = partial(field, indent="  ", width=max(LABEL, *(len(guess.name) for guess in both)))
     for guess in both:
         mark = "" if guess.sure else "UNSURE "
@@ -147,7 +148,8 @@ def _tell(begun: Begun) -> None:
             more = f" or {len(guess.others) - FEW} more" * (len(guess.others) > FEW)
             show(aligned("", f"{or_} {', '.join(guess.others[:FEW])}{more}"))
         if known and guess in begun.states and not guess.path:
-            show(aligned("", f"the smoother estimates it from {listed(known)} ([estimate])"))
+            names = listed(one.name for one in known)
+            show(aligned("", f"the smoother estimates it from {names} ([estimate])"))
     for note in begun.notes:
         remark("note", note)
     look = "; look at what is UNSURE in its [log]" if begun.unsure else ""

@@ -47,6 +47,14 @@ def test_an_arduino_s_times_are_known_by_their_name(tmp_path, column, unit):
     assert one.trial.steps * one.trial.dt == pytest.approx(20, abs=2.1)
 
 
+def test_times_in_ms_since_1970_are_known_by_their_size_under_any_name(tmp_path):
+    table(tmp_path / "a.csv", "time_s")
+    rows = np.loadtxt(tmp_path / "a.csv", delimiter=",", skiprows=1)
+    rows[:, 0] += 1.764e12
+    np.savetxt(tmp_path / "b.csv", rows, "%.1f", ",", header="time_s,v,force", comments="")
+    assert begin(tmp_path / "w", tmp_path / "b.csv", kind="generic", inputs=["force"]).dt < 2
+
+
 def test_the_first_row_at_0_of_a_slow_log_is_kept(tmp_path):
     log = table(tmp_path / "a.csv")
     specs = SignalSpec("/csv.v"), SignalSpec("/csv.force")

@@ -26,8 +26,11 @@ ULOG, ZIP = b"ULog\x01\x12\x35", b"PK\x03\x04"  # how the files begin
 VALUES = 200_000_000  # largest number of values in one file
 ROWS = 50_000  # rows in a batch
 STAMPS = ("t", "time", "timestamp", "stamp", "times", "timestamps")
-TICKS = {  # an Arduino's functions
-    **{"millis": "ms", "milliseconds": "ms", "micros": "us", "microseconds": "us"},
+TICKS = {  # an Arduino's functions, and their units in full
+    "millis": "ms",
+    "milliseconds": "ms",
+    "micros": "us",
+    "microseconds": "us",
     "nanoseconds": "ns",
 }
 TIMES = (*STAMPS, "seconds", "secs", "clock", "clk", "elapsed", *TICKS)
@@ -205,7 +208,7 @@ def _times(columns: Columns, path: Path) -> tuple[str, Any]:
             return name, values
     name = _time_of(list(columns), path)
     word = name.lower().rpartition("_")[2]
-    unit = TICKS.get(word) or ("_" in name and word in UNITS and word) or ""
+    unit = TICKS.get(word, word if word in ("ns", "us", "ms") else "")
     values = columns[name]
     finite = values[np.isfinite(values)]
     top = float(np.abs(finite).max(initial=0.0))

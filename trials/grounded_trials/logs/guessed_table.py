@@ -51,8 +51,7 @@ def _table(kind: str, guess: Guess, clock: str) -> list[str]:
 
 def _estimate(states: Sequence[Guess]) -> list[str]:
     """Return an [estimate] table for the states that the log does not contain."""
-    missing = [guess.name for guess in states if not guess.path]
-    known = [guess for guess in states if guess.path and guess.field is not None]
+    missing, known = [guess.name for guess in states if not guess.path], estimating(states)
     if not missing or not known:
         return []
     deviations = ", ".join(
@@ -64,6 +63,11 @@ def _estimate(states: Sequence[Guess]) -> list[str]:
         f"measured = {{ {deviations} }}  # standard deviations, in the model's units; check them",
         f"# add {' or '.join(missing)} if the log contains it after all",
     ]
+
+
+def estimating(states: Sequence[Guess]) -> list[Guess]:
+    """Return the states of the log from which [estimate] gets those that it does not contain."""
+    return [guess for guess in states if guess.path and guess.field is not None]
 
 
 def _deviation(guess: Guess) -> float:

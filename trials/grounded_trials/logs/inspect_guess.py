@@ -183,6 +183,8 @@ def _of_stem(log: LogReport, name: str, unit: str) -> list[_Candidate]:
     So `wheel_rpm` is the state wheel_speed [rad/s]. Empty if it is none or several.
     """
     stem = re.sub(r"_(rate|speed|velocity|vel|omega|dot)$", "", name.lower())
+    if stem == name.lower() or unit in ("", "1"):  # motor_pct may be a command
+        return []
     found = [
         _Candidate(LEAST + 1.0, topic, field)
         for topic in log.topics
@@ -191,8 +193,7 @@ def _of_stem(log: LogReport, name: str, unit: str) -> list[_Candidate]:
         and re.split(r"[/.]", without_unit(field.path).lower())[-1].strip('"') == stem
         and factor_between(unit_in_name(field.path), unit) is not None
     ]
-    plain = unit in ("", "1") or stem == name.lower()  # motor_pct may be a command
-    return found if len(found) == 1 and not plain else []
+    return found if len(found) == 1 else []
 
 
 def _may_be(path: str, unit: str) -> bool:

@@ -268,9 +268,8 @@ class _Collector:
     def series(self) -> Series:
         if not self.type:
             known = sorted(self.topics)
-            said = nearest(self.path.topic, known)
-            if 0 < len(known) <= FEW:  # the nearest name may be another signal's: /left for /port
-                said = f"it has {listed(known)}"
+            few = 0 < len(known) <= FEW  # the nearest name may be another's: /left for /port
+            said = f"it has {listed(known)}" if few else nearest(self.path.topic, known)
             raise GroundedError(
                 f"'{self.name}' is read from '{self.path.text}', but the log has no topic "
                 f"'{self.path.topic}': {said}"

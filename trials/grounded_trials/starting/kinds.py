@@ -148,8 +148,16 @@ def _word(path: str) -> str:
 
 
 KINDS = (
-    *("car", "rover", "differential", "boat", "balance"),
-    *("drone", "arm", "pendulum", "crane", "generic"),
+    "car",
+    "rover",
+    "differential",
+    "boat",
+    "balance",
+    "drone",
+    "arm",
+    "pendulum",
+    "crane",
+    "generic",
 )
 
 

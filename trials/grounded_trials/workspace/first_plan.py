@@ -56,6 +56,8 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
         held: the result of `at_rest.held_before`.
     """
     task, first, found = workspace.task, proposal.candidate, list[str]()
+    off, extent = (0.0, 0.0) if first is None else _off_path(task, first.predicted_states)
+    astray = off > ASIDE * extent
     free = [
         name
         for name, *both in zip(task.model.input_names, task.low, task.high, strict=True)
@@ -79,17 +81,17 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
         error, aim = np.zeros((len(sent) + 1, len(none))), task.input_target
         assert aim is not None
         share = step_rewards(reward, error, sent, aim, task.past).sum() / first.predicted_utility
-        off, extent = _off_first_group(task, first.predicted_states)
-        if share > MOSTLY and off > ASIDE * extent:
+        if share > MOSTLY and astray:
             found.append(
                 f"{percent(share)} of the plan's cost is [reward] input and input_change: with "
                 "less weight there, errors would count for more"
             )
     found += _of_other_limits(workspace)
     if first is not None:
-        found += (
-            _held_back(task, first) or _falls_short(task, first) or _outweighed(workspace, first)
-        )
+        short = _held_back(task, first) or _falls_short(task, first)
+        if not short and astray and extent:
+            short = _outweighed(workspace, first, off)
+        found += short
         found += _thrown(task, first) or _shaken(workspace, first)
     found += held
     loose = _not_held(workspace, proposal.refused) if proposal.refused is not None else []
@@ -194,8 +196,7 @@ def _held_back(task: Task, first: Candidate) -> list[str]:
             if np.isfinite(end) and share > HELD and not np.allclose(aim[:, j], end):
                 limit = with_unit(f"{end:.4g}", task.model.inputs[name])
                 held.append(f"{name} is at its limit of {limit} for {percent(share)} of the plan")
-    plan = Trial(first.predicted_states, sent, task.dt, task.model.state_names, names)
-    if not held or not (missed := _most_missed(task, plan)):
+    if not held or not (missed := _most_missed(task, first.predicted_run)):
         return []
     return [
         f"{' and '.join(held)}, and still {missed}: the target seems to require more "
@@ -209,9 +210,8 @@ def _falls_short(task: Task, first: Candidate) -> list[str]:
         return []
     names, what = groups[0]
     states, unit = [task.model.state_names.index(n) for n in names], task.model.states[names[0]]
-    way = np.vstack([task.start, task.target])[:, states]
     left = task.model.difference(first.predicted_states[-1], task.target[-1])[states]
-    off, far = float(np.linalg.norm(left)), float(np.linalg.norm(np.ptp(way, axis=0)))
+    off, far = float(np.linalg.norm(left)), _extent(task, states)
     if not off > SHORT * far > 0:
         return []
     short, way_told = measured_alike([off, far], unit)
@@ -223,10 +223,11 @@ def _falls_short(task: Task, first: Candidate) -> list[str]:
     ]
 
 
-def _outweighed(workspace: Folder, first: Candidate) -> list[str]:
+def _outweighed(workspace: Folder, first: Candidate, off: float) -> list[str]:
     """Return a note if a plan leaves the path because [reward] weighs other states as much.
 
-    That is tried: the note gives the error of a plan with larger weights on the position.
+    That is tried: the note gives the error of a plan with larger weights on the position, beside
+    that of the first plan, `off`.
     """
     from grounded.search.first_policy import finished
 
@@ -236,14 +237,13 @@ def _outweighed(workspace: Folder, first: Candidate) -> list[str]:
         return []
     names, what = groups[0]
     states, unit = [task.model.state_names.index(n) for n in names], task.model.states[names[0]]
-    off, extent = _off_first_group(task, first.predicted_states)
-    if len(names) < 2 or not off > ASIDE * extent > 0 or not task.reward.state[states].all():
+    if len(names) < 2 or not task.reward.state[states].all():
         return []
     state, terminal = aim.reward.state.copy(), aim.reward.terminal.copy()
     state[states], terminal[states] = CLOSER * state[states], CLOSER * terminal[states]
     reward = replace(aim.reward, state=state, terminal=terminal)
     closer = finished(replace(aim, reward=reward).problem(), first.predicted_inputs)
-    left, _ = _off_first_group(task, closer.z[:, : task.model.n])
+    left, _ = _off_path(task, closer.z[:, : task.model.n])
     if not left < ENOUGH * off:
         return []
     was, now = measured_alike([off, left], unit)
@@ -255,16 +255,20 @@ def _outweighed(workspace: Folder, first: Candidate) -> list[str]:
     ]
 
 
-def _off_first_group(task: Task, run: Array) -> tuple[float, float]:
+def _off_path(task: Task, run: Array) -> tuple[float, float]:
     """Return the rms error of a run (H + 1, n) in the first weighed group, and its extent."""
     groups = weighed_groups(task)
     if not groups:
         return 0.0, 0.0
     states = [task.model.state_names.index(name) for name in groups[0][0]]
-    error = np.nan_to_num(task.model.difference(run, task.target)[:, states])  # NaN: free
+    error = task.model.difference(run, task.target)[:, states]
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1)))), _extent(task, states)
+
+
+def _extent(task: Task, states: Sequence[int]) -> float:
+    """Return the diagonal of the box that the start and the target of some states span."""
     way = np.vstack([task.start, task.target])[:, states]
-    extent = np.nanmax(way, axis=0) - np.nanmin(way, axis=0)
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1)))), float(np.linalg.norm(extent))
+    return float(np.linalg.norm(np.ptp(way, axis=0)))
 
 
 def _thrown(task: Task, first: Candidate) -> list[str]:
@@ -311,11 +315,11 @@ def _shaken(workspace: Folder, first: Candidate) -> list[str]:
 
 def _most_missed(task: Task, plan: Trial) -> str:
     """Return the largest error of a plan relative to the target's extent; "" if it is small."""
-    error, way, found = tracking_error(task, plan), np.vstack([task.start, task.target]), []
+    error, found = tracking_error(task, plan), []
     for names, what in weighed_groups(task):
         states = [task.model.state_names.index(name) for name in names]
         far = np.linalg.norm(error[:, states], axis=1)
-        k, asked = int(np.argmax(far)), float(np.linalg.norm(np.ptp(way[:, states], axis=0)))
+        k, asked = int(np.argmax(far)), _extent(task, states)
         text = (
             f"{what} misses its target by {measured(far[k], task.model.states[names[0]])} at "
             f"{k * task.dt:.4g} s"

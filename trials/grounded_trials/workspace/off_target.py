@@ -23,7 +23,7 @@ from grounded_trials.workspace.folder import Folder
 FEW = 2  # groups of states reported: positions and angles before their rates, then by cost
 MOST = 0.5  # a group with more than this share of the tracking cost is reported in any case
 WRITTEN = 1e-3  # tolerance for target.csv, relative to its range, due to the digits in the file
-EXACT = 1e-3  # share of the largest error below which a plan's end is on target
+EXACT = 1e-4  # share of the largest error below which a plan's end is on target
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
 
 
