@@ -28,14 +28,18 @@ BIASED = (
     "the robot is steered by its sensor of {state}, which reads {by}: [task] start and the target "
     "are off by that unless this sensor measured them. Do one of two things: keep the effect and "
     "add {bias:.3g} to them; or correct the readings ([log.state.{state}] offset {off:+.3g}, and "
-    "the same in the robot's program), remove sensor_bias:{state} from [model] effects and ingest "
-    "the logs again"
+    "the same in the robot's program), remove sensor_bias:{state} from [model] effects, `discard` "
+    "the trials and ingest their logs again"
 )
 SCALED = (
     "the target, [task] start and the reported distance of {state} from the target are in readings "
     "of its sensor, which shows {by:.3g} % {more} than the true value. For true values correct "
     "[log.state.{state}] scale and the scale in the robot's program, remove sensor_scale:{state} "
-    "from [model] effects and ingest the logs again"
+    "from [model] effects, `discard` the trials and ingest their logs again"
+)
+OLD = (
+    "the target and the reported distance of {state} from it are in readings of its sensor, which "
+    "are {by:.3g} s old: when they are on the target, {state} itself is ahead of it by that time"
 )
 DRAW = "draw the manoeuvre first (`grounded target --help`), or propose anyway to repeat that drive"
 REMEASURE = (
@@ -83,6 +87,8 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
         if family == "sensor_scale" and effect["name"] in effects:
             more, by = "more" if effect["k"] > 0 else "less", 100 * abs(effect["k"])
             remark("note", SCALED.format(state=state, by=by, more=more))
+        if family == "sensor_delay" and effect["name"] in effects:
+            remark("note", OLD.format(state=state, by=effect["d"]))
     if not done.claimed:
         remark("note", f"{effects[0]} {UNCLAIMED}")
     if done.beside:

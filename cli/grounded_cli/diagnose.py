@@ -137,8 +137,10 @@ def _show(found: Diagnosis, nominal: dict[str, float], *, details: bool) -> None
             show(field("caveats", text))
     if not found.no_cause:
         if found.prediction_error:
-            show("\n" + table(*error_table(found, whole_trials=details)))
-            _note(f"open loop, {_held_out(found)}")
+            rows, header = error_table(found, whole_trials=details)
+            show("\n" + table(rows, header))
+            adopted = "model.py: without what was adopted; now: with it; " * ("now" in header)
+            _note(f"{adopted}open loop, {_held_out(found)}")
         _effects(found, details=details)
     _places(found, details=details)
     if details:

@@ -129,6 +129,6 @@ def _errors(found: Fit, model: Model) -> str:
                 shown(model.states.get(name, "")),
             )
         )
-    ahead = f"{found.before.horizon_s:g} s"
+    ahead = f"{found.before.horizon_s:.3g} s"
     header = ("held-out error", "1 step before", "after", f"{ahead} before", "after", "unit")
     return table(rows, header)

@@ -16,7 +16,7 @@ from grounded_cli.terminal import LABEL, field, number, progress, remark, show, 
 from grounded_trials.wording import count, percent, with_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
     from grounded.search.candidate import Candidate, Tried
     from grounded.search.standing import Standing
@@ -78,7 +78,11 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
     show(field("what", _what(candidate, standing, workspace.task), "  "))
     show(field("predicted", _predicted(proposed), "  "))
     if standing.incumbent is not None:
-        show(field("so far", _so_far(candidate, standing.incumbent, workspace.task), "  "))
+        from grounded_trials.workspace.identity import estimated_in
+
+        guessed = estimated_in(workspace.trials())
+        text = _so_far(candidate, standing.incumbent, workspace.task, guessed)
+        show(field("so far", text, "  "))
     show(field("trust", _trust(candidate, standing, workspace), "  "))
     show_extent(candidate, workspace.task)
     if last:
@@ -107,7 +111,7 @@ def _otherwise(candidate: Candidate, best: Tried) -> bool:
     return candidate.base == best.candidate.id and candidate.unlike(best.utility)
 
 
-def _so_far(candidate: Candidate, best: Tried, task: Task) -> str:
+def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection[str] = ()) -> str:
     """Return the best one's utility and, if it differs clearly, what the model gives it and why.
 
     The difference is split into two parts: the start (the model's own run starts at s_0, the real
@@ -120,25 +124,25 @@ def _so_far(candidate: Candidate, best: Tried, task: Task) -> str:
     if not _otherwise(candidate, best):
         return text
     same, told = candidate.expected_of_base, UNLIKE * abs(candidate.predicted_gain)
+    own = f"{text}. For {best.candidate.id} itself the model predicts {number(same)}"
     if same < ASTRAY * best.utility:
-        return f"{text}, which the same model does not reproduce: it predicts {number(same)}"
-    text = f"{text}, for which the same model predicts {number(same)}"
+        return f"{own}, so it does not reproduce those runs"
     if not math.isfinite(candidate.base_as_run):
-        return text
-    elsewhere, why = began_elsewhere(task, best.trials), []
+        return own
+    elsewhere, why = began_elsewhere(task, best.trials, estimated), []
     start = same - candidate.base_as_run if elsewhere else 0.0
     if abs(start) > told:
         where = f"away from [task] start in {listed(elsewhere)}"
-        why.append(f"{_dearer(start)} because the real runs began {where}")
+        why.append(f"{_apart(start)} than its runs, because they began {where}")
     else:
         start = 0.0
     rest, known = same - start - best.utility, math.isfinite(best.standard_error)
     if abs(rest) > told and (known or why):
         within = abs(rest) <= LUCKY * best.standard_error
-        lucky = "within the scatter of the runs" if within else "more than the runs scatter"
-        unknown = "and how far the runs scatter is not known"
-        why.append(f"{_dearer(rest)} without explanation, {lucky if known else unknown}")
-    return f"{text}: the model's run costs {', and '.join(why)}" if why else text
+        scatter = "which is within their scatter" if within else "which their scatter can't explain"
+        than = "" if why else " than its runs"
+        why.append(f"{_apart(rest)}{than}, {scatter if known else 'for a reason not known yet'}")
+    return f"{own}: {', and '.join(why)}" if why else own
 
 
 def noise_share(best: Tried) -> str:
@@ -148,13 +152,13 @@ def noise_share(best: Tried) -> str:
     return f", about {number(min(best.noise_cost, -best.utility))} of it sensor noise"
 
 
-def _dearer(gain: float) -> str:
-    return f"{number(abs(gain))} {'less' if gain > 0 else 'more'}"
+def _apart(gain: float) -> str:
+    return f"{'better' if gain > 0 else 'worse'} by {number(abs(gain))}"
 
 
 def _what(candidate: Candidate, standing: Standing, task: Task) -> str:
     """Describe how a candidate was made."""
-    seconds = f"{task.horizon * task.dt:g} s"
+    seconds = f"{task.horizon * task.dt:.4g} s"
     if candidate.way == "own plan":
         return f"the changed model's own plan, instead of a step from {candidate.base}, {seconds}"
     if candidate.way == "gentler gains":
@@ -283,19 +287,19 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     if len(missed) == 1:
         promised, real = number(promises[-1]), number(last[-1].utility)
         said = number(last[-1].candidate.predicted_utility)
-        noise = f" ({promised} in its log, with sensor noise)" * (said != promised)
+        noise = f", or {promised} with the sensor noise seen since" * (said != promised)
         text = f"the last prediction was {said}{noise}, the real run gave {real}"
         if failed:
             text = f"the last run failed, where {said} was predicted"
     elif not failed:
         noisy = any(one.promised != one.candidate.predicted_utility for one in last)
         counted = ", with sensor noise," * noisy
-        text = f"the last {len(whole)} predictions{counted} missed by {listed(whole)}"
+        text = f"the last {len(whole)} predictions{counted} missed the utility by {listed(whole)}"
     elif not whole:
         text = f"the last {failed} runs failed"
     else:
         text = f"of the last {len(missed)} runs {failed} failed; for the others, predictions "
-        text += f"missed by {listed(whole)}"
+        text += f"missed the utility by {listed(whole)}"
     best, tried = standing.incumbent, {one.candidate.id for one in standing.history}
     if best is None or candidate.id in tried or not math.isfinite(missed[-1]):
         return text

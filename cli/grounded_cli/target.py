@@ -20,13 +20,18 @@ if TYPE_CHECKING:
 
 SECONDS = 5.0  # default duration of a step or a swing-up
 REACHED = 0.95  # of --speed: a path that stays below it brings a note
+STRAIGHT = 1e3  # times --size: larger turning radii are those of a straight line
+SLOW = 0.5  # of the highest speed: below it a path's radius is not computed from its samples
 TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
 
 
 @click.command("target")
 @click.argument("shape", metavar="SHAPE|FILE")
 @click.option(
-    "--size", type=float, default=2.0, help="Length, or radius of a circle or loop [m] (2)."
+    "--size",
+    type=float,
+    default=2.0,
+    help="Length of a line, radius of a circle, half the width of a figure-8's loops [m] (2).",
 )
 @click.option("--speed", type=float, help="Maximum speed [m/s] (1).")
 @click.option("--accel", type=float, help="Maximum acceleration along the path [m/s^2] (1).")
@@ -119,8 +124,9 @@ def command(
         found = {"target": str(path), "horizon": rows - 1, "columns": ranges, "free": free}
         show_json(found)
         return
-    fastest = _fastest(model, columns, dt) if shape in PATHS and not ends else math.nan
-    if speed is not None and fastest < REACHED * speed:
+    planar = shape in PATHS and has_plane(model)
+    fastest, tightest = _driven(model, columns, dt) if planar else (math.nan, math.inf)
+    if speed is not None and not ends and fastest < REACHED * speed:
         by = f"--accel {drive.accel:g} and --lateral {lateral:g} m/s^2"
         remark(
             "note", f"it reaches {fastest:.3g} m/s at most, not --speed {speed:g}: {by} limit it"
@@ -132,7 +138,9 @@ def command(
                 f"{name} = {value:g} rad is {abs(value) / (2 * math.pi):.2g} turns: if you meant "
                 f"degrees, use `--to {name}={math.radians(value):.4g}`",
             )
-    show(f"{path}: {shape}, {(rows - 1) * dt:g} s, {rows - 1} steps")
+    show(f"{path}: {shape}, {(rows - 1) * dt:.4g} s, {rows - 1} steps")
+    if tightest < STRAIGHT * size:
+        show(field("driven", f"at up to {fastest:.3g} m/s, turning radius {tightest:.3g} m", "  "))
     for name, (low, high) in ranges.items():
         span = f"{number(low)} to {number(high)}" if low < high else f"stays at {number(low)}"
         text = with_unit(span, model.states[name])
@@ -140,7 +148,7 @@ def command(
     if free:
         show(field("free", _free(free, reward, _rest_of(model, free) * (shape == "line")), "  "))
     for kind, by in (
-        ("state", "1 / (range in the target)^2, of a position the smaller of its ranges"),
+        ("state", "1 / (range in the target)^2, a tenth of that for velocities of positions"),
         ("input_change", "0.04 / (range of [limits])^2"),
     ):
         if (weights := reward.get(kind, {})) != before.get(kind, {}):
@@ -165,12 +173,20 @@ def command(
     show(f"\n{next_line(NextCommand('propose'))}")
 
 
-def _fastest(model: Model, columns: dict[str, Array], dt: float) -> float:
-    """Return the highest speed along a path in a plane; NaN if the target has none."""
-    place = [columns[name] for name in model.roles.get("position", ()) if name in columns]
-    if len(place) < 2:
-        return math.nan
-    return max(map(math.hypot, *((one[1:] - one[:-1]) / dt for one in place)))
+def _driven(model: Model, columns: dict[str, Array], dt: float) -> tuple[float, float]:
+    """Return the highest speed [m/s] and the smallest turning radius [m] of a path in a plane."""
+    import numpy as np
+
+    x, y = (columns[name] for name in model.roles["position"][:2])
+    v = np.diff(np.stack([x, y]), axis=1) / dt
+    speed = np.hypot(*v)
+    turn = v[0, :-1] * v[1, 1:] - v[1, :-1] * v[0, 1:]  # speed^2 times the sine of the turn
+    both, mean = speed[:-1] * speed[1:], (speed[:-1] + speed[1:]) / 2
+    fast = np.minimum(speed[:-1], speed[1:]) > SLOW * speed.max()
+    rate = np.arcsin(np.clip(turn[fast] / both[fast], -1, 1)) / dt
+    with np.errstate(divide="ignore"):
+        radius = mean[fast] / np.abs(rate)
+    return float(speed.max()), float(radius.min(initial=math.inf))
 
 
 def _rest_of(model: Model, free: list[str]) -> str:

@@ -8,7 +8,7 @@ import os
 import re
 import sys
 import textwrap
-import time
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TextIO
@@ -118,23 +118,29 @@ def names_in(text: str | None) -> list[str]:
 def stages() -> Iterator[Callable[[str], None]]:
     """Yield a function that shows the current stage of a long command ("" clears it).
 
-    On a terminal the line is updated in place; elsewhere (in a log file, for example) a line is
-    written every `EVERY` seconds at most.
+    On a terminal the line is updated in place; elsewhere (in a log file, for example) the current
+    stage is written every `EVERY` seconds.
     """
-    live, told = is_live(sys.stderr), time.monotonic()
+    live, now, ended = is_live(sys.stderr), "", threading.Event()
 
     def tell(stage: str) -> None:
-        nonlocal told
+        nonlocal now
+        now = stage
         if live:
             sys.stderr.write("\r\033[K")
             _write(f"{stage and stage + ' ...'}", sys.stderr, end="")
-        elif stage and time.monotonic() - told > EVERY:
-            told = time.monotonic()
-            _write(f"{stage} ...", sys.stderr)
 
+    def remind() -> None:
+        while not ended.wait(EVERY):
+            if now:
+                _write(f"{now} ...", sys.stderr)
+
+    if not live:
+        threading.Thread(target=remind, daemon=True).start()
     try:
         yield tell
     finally:
+        ended.set()
         tell("")
 
 

@@ -31,8 +31,9 @@ def give_or_take(estimate: Estimate) -> str:
         return quantity(estimate)
     places = math.floor(math.log10(max(abs(value), std))) - math.floor(math.log10(std)) + 2
     digits = min(max(places, 3), MOST_DIGITS)
-    scatter = spread(std) if 1e-6 <= std < 1e-4 else f"{std:.2g}"
-    return with_unit(f"{value:.{digits}g} +- {scatter}", estimate.unit)
+    scatter = spread(std) if 1e-6 <= std < 1e-4 else f"{std:#.2g}".rstrip(".")
+    shown = f"{value:#.{digits}g}".rstrip(".")  # with zeros at its end, which count
+    return with_unit(f"{shown} +- {scatter}", estimate.unit)
 
 
 GREEK = (
@@ -144,13 +145,19 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     return re.sub(r"\{(\w+)(%)?(?:([^{}|]+)\|([^{}|]+))?\}", filled, text)
 
 
+def acts_reversed(params: Mapping[str, Estimate]) -> bool:
+    """Return whether the values of an effect are a gain that reverses the sign."""
+    return "g" in params and params["g"].value < -1
+
+
 def _turned(effect: Effect, params: Mapping[str, Estimate]) -> str:
     """Return the sentence for a gain of the opposite sign; "" if the sign is right."""
     from grounded.effects import InputFamily
 
-    text, size = effect.family.turned, -1 - params["g"].value if "g" in params else 0.0
-    if not text or size <= 0:
+    text = effect.family.turned
+    if not (text and acts_reversed(params)):
         return ""
+    size = -1 - params["g"].value
     if abs(size - 1) < AS_STRONG:
         return text + TURNED * isinstance(effect.family, InputFamily)
     return f"{text} (with {number(100 * size)} % of the modelled strength)"

@@ -40,6 +40,7 @@ from grounded.diagnosis.validation.limits import (
     held,
     knowable,
     limits,
+    with_measured_filters,
 )
 from grounded.diagnosis.validation.motions import without_others
 from grounded.diagnosis.validation.ruler import Ruler
@@ -153,7 +154,7 @@ def diagnose(
     exact = bool(copies) and not (scattered(trials) or scattered(compare))
     first = sum(trial.known_steps >= 2 for trial in trials)
     looked = sound_trials(subject, [*trials, *compare], options.hidden)
-    trials = looked.trials
+    trials, model = looked.trials, with_measured_filters(model, looked.findings)
     data = prepare(model, trials, latency, past, options.hidden)
     filters = {model.state_names.index(name): tau for name, tau in looked.filters.items()}
     moved = [f for f in looked.findings if f.corrected and f.kind == "delay"]

@@ -317,8 +317,8 @@ class Remainder(Document):
         if not self.above and math.isfinite(self.size):
             [off, _] = beside_noise(errors, self.floor, unit, at_most=self.floor_at_most)
             return (
-                f"the rate of {name} lacks {number(self.size)} {self.unit} rms{where}; it lasts, "
-                f"although the {off} that {name} is off {ahead} may be noise alone"
+                f"the rate of {name} lacks {number(self.size)} {self.unit} rms{where}: small but "
+                f"lasting, while {ahead} {name} is off by {off}, which may be noise alone"
             )
         [off, noise] = beside_noise(errors, self.floor, unit, at_most=self.floor_at_most)
         return f"{name} is still off by {off} {ahead}{noise}{where}"

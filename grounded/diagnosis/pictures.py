@@ -21,7 +21,7 @@ CREDIT_S = 1.0  # horizon at which an effect's worth is measured [s]
 MODELS = {  # keys of a prediction error: role, name
     "outset": ("limit", "model.py"),
     "crude": ("model", "model"),
-    "calibrated": ("step2", "calibrated"),
+    "calibrated": ("step1", "calibrated"),
     "with_effects": ("best", "as diagnosed"),
     "noise_floor": ("other", "noise alone"),
 }
@@ -120,7 +120,7 @@ def _by_channel(error: RulerRow) -> list[Panel | Bars]:
             if math.isfinite(value):
                 bars.append((name, value, role))
         if bars:
-            when = WHOLE if error.whole_trial else f"{error.horizon_s:g} s ahead"
+            when = WHOLE if error.whole_trial else f"{error.horizon_s:.3g} s ahead"
             panels.append(Bars(f"{channel}, {when}", _in_unit(bars, unit)))
     return panels
 
@@ -222,7 +222,7 @@ def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars
     if not bars:  # the state was never measured
         return []
     title = what.removeprefix("the ").capitalize() if len(names) > 1 else what
-    return [Bars(f"{title}: error {error.horizon_s:g} s ahead", bars)]
+    return [Bars(f"{title}: error {error.horizon_s:.3g} s ahead", bars)]
 
 
 def _second_ahead(diagnosis: Diagnosis) -> RulerRow | None:
@@ -249,7 +249,7 @@ def where_figure(diagnosis: Diagnosis) -> Figure | None:
         for c in where.channels
         if math.isfinite(c.share)
     ]
-    by_time = [(f"{t.start:g} to {t.end:g} s", t.share, "") for t in where.times]
+    by_time = [(f"{t.start:.4g} to {t.end:.4g} s", t.share, "") for t in where.times]
     by_region = [(r.told, r.share, f", {percent(r.occupancy)} of the time") for r in where.regions]
     panels = [
         Bars(f"Share of the gap by {word}", _shares(shares, role))
@@ -300,7 +300,7 @@ def _ranking(diagnosis: Diagnosis) -> tuple[Bar, ...]:
 
 def _shrinkage(diagnosis: Diagnosis) -> Bars:
     gap = diagnosis.gap
-    ahead = f" {gap.horizon_s:g} s ahead" if math.isfinite(gap.horizon_s) else ""
+    ahead = f" {gap.horizon_s:.3g} s ahead" if math.isfinite(gap.horizon_s) else ""
     rows = (
         ("model", gap.before, "model"),
         ("as diagnosed", gap.after, "best"),

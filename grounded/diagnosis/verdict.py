@@ -258,7 +258,8 @@ def _others(claims: Claims, identified: Sequence[Identifiable]) -> str:
         most = max(abs(known[name].value / value - 1) for name, value in old.items())
         by = f" by {'' if one else 'at most '}{percent(most)}"
     others = f"{len(old)} others" if len(old) > NAMED else listed(old)
-    return f"; {others}, changed with {'it' if len(off) == 1 else 'them'}{by}, may be right"
+    it = "it" if len(off) == 1 else "them"
+    return f"; {others} {'is' if one else 'are'} adjusted with {it}{by}, but need not be wrong"
 
 
 def sentence(clauses: Iterable[str]) -> str:

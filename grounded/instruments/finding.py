@@ -10,6 +10,7 @@ from grounded.trial import Trial
 
 DEGREES = 57.29577951308232  # in a radian
 RPM = 9.549296585513721  # revolutions per minute in one radian per second
+LEFT_OUT = "left out of the diagnosis: it adds nothing to"  # the log of its position
 ALIKE = 0.02  # relative tolerance within which a factor counts as that of a unit
 
 
@@ -84,15 +85,14 @@ def late_effects(findings: Iterable[Finding]) -> dict[str, dict[str, float]]:
 
 def a_mean(name: str, position: str, over: float) -> Finding:
     """Return the finding of a velocity that is a difference of its position over a time [s]."""
-    text = f"is a mean over {over:.2g} s, as from differences of {position}; not used here: "
-    return Finding(name, f"{text}it adds nothing to {position}", "smoothed", corrected=True)
+    text = f"is a mean over {over:.2g} s, as from differences of {position}; {LEFT_OUT} {position}"
+    return Finding(name, text, "smoothed", corrected=True)
 
 
 def derived_from(position: str, age: float) -> str:
     """Return what is said of a velocity that a filter computes from its position."""
     return (
-        f"is a filtered derivative of {position}, {age:.2g} s old on average; not used here: it "
-        f"adds nothing to {position}"
+        f"is a filtered derivative of {position}, {age:.2g} s old on average; {LEFT_OUT} {position}"
     )
 
 

@@ -110,6 +110,8 @@ class Candidate(Result):
         """Return a sentence that says why a `doubtful` candidate may lose."""
         gain = self.predicted_gain if best is None else self.promised_over(best)
         over = self.base if best is None else best.candidate.id
+        if best is not None and self.promised_over(best) != self.predicted_utility - best.utility:
+            over = f"the {self.expected_of_base:.4g} that the model predicts for {over} itself"
         cost = self.predicted_gain - self.predicted_utility  # of its base
         off = f"{self.likely_off:.3g}"  # beyond the base's whole cost the size means nothing
         off = f"more than the whole cost of {self.base}" if self.likely_off > cost > 0 else off

@@ -236,7 +236,7 @@ def _ended(
         phase, then, ending = "converged", None, "no step improved"
         sentence = (
             f"{lost} step{'s' * (lost > 1)} from {own} did not improve, and the model promises "
-            f"less than {100 * tolerance:g} % from smaller steps: {own} is the result (step 7)"
+            f"less than {100 * tolerance:g} % from smaller steps: {own} is the result"
         )
     else:
         phase, then, ending = "converged", None, "nothing promised"

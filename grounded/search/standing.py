@@ -241,7 +241,7 @@ def standing(
     if step is None:
         sentence = (
             f"no step improved on {own} down to alpha = {2.0**-options.max_halvings:g}: "
-            f"{own} is the result (step 7)"
+            f"{own} is the result"
         )
         return replace(now, phase="converged", sentence=sentence, ending="no step improved")
     if options.damps and (hardly := _hardly(history, options.tolerance, model)):

@@ -1,5 +1,6 @@
 """Words on a terminal: columns, labels and remarks within 80 columns."""
 
+import time
 from dataclasses import replace
 
 import pytest
@@ -117,11 +118,13 @@ def _row(horizon_s, **more):
 
 def test_a_long_command_says_its_stage_in_a_log_too_now_and_then(capsys, monkeypatch):
     """Eighteen minutes of nothing: a first user believed that it hung."""
+    monkeypatch.setattr(terminal, "EVERY", 0.5)
     with terminal.stages() as tell:
         tell("fitting")
-        monkeypatch.setattr(terminal, "EVERY", -1.0)
         tell("comparing effects, 40 %")
+        time.sleep(0.8)  # also while nothing is told: `next` was silent for four minutes
         tell("")
+        time.sleep(0.6)
     assert capsys.readouterr().err == "comparing effects, 40 % ...\n"
 
 

@@ -98,7 +98,7 @@ def test_the_verdict_of_a_comparison_begins_with_what_changed():
     found = compared((Changed("parameter:r", "r", *values, 190.0),))
     first = found.verdict.lines[0]
     assert first == found.verdict.comparison and found.sentence.startswith(first)
-    assert holds(first, "r changed", "0.0496 +- 0.0002 m", "0.0459 +- 0.0002 m")
+    assert holds(first, "r changed", "0.04960 +- 0.00020 m", "0.04590 +- 0.00020 m")
     causes, others = verdict_lines(found)
     assert causes == [first, "One", "Two"]
     assert others == [] and found.verdict.lines[1].startswith(BOTH)

@@ -298,7 +298,8 @@ def test_the_cause_that_makes_most_is_named_first(effect_first):
     credit = credit if effect_first else [Credit("calibration", 0.9), Credit(effect.name, 0.1)]
     table = errors(0.5, with_effects={"omega": 0.1}, noise_floor={"omega": 0.09})
     found = verdict(claims, (row,), (), (), (table,), tuple(credit))
-    damped, moved = found.sentence.find("damped"), found.sentence.find("m should be 1.2 +- 0.01 kg")
+    damped = found.sentence.find("damped")
+    moved = found.sentence.find("m should be 1.200 +- 0.010 kg")
     assert found.kind == "effect" and min(damped, moved) >= 0
     assert (damped < moved) is effect_first
     assert "omega by 0.10 rad/s instead of 0.50 rad/s (noise: 0.090 rad/s)" in found.sentence

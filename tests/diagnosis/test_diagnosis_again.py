@@ -172,7 +172,7 @@ def test_an_adopted_delay_is_made_longer_or_shorter(adopted):
     (best,) = search.of_size(1)
     assert best.hypothesis.values[0]["d"] == pytest.approx(change, abs=5e-4)
     said = meaning(effect, {"d": Estimate(change, 1e-4, unit="s")})
-    assert f"{'less' if change < 0 else 'more'} than adopted" in said and "0.1 " in said
+    assert f"{'less' if change < 0 else 'more'} than adopted" in said and "0.1" in said
 
 
 def test_adopting_a_change_of_a_delay_replaces_it():

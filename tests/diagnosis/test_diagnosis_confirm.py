@@ -182,6 +182,27 @@ def test_once_a_calibration_is_dropped_the_likelier_effect_is_named(wavy):
     assert _likelier(search, likelier, alone) is None
 
 
+def test_of_stand_ins_that_predict_alike_the_likelier_is_named(wavy):
+    """Understeer was named, 79 nats, though 5 ms more of an adopted delay had 350."""
+    search = copy(wavy[0])
+    search.fits = dict(search.fits)
+    (first, other) = (
+        replace(f, hypothesis=replace(f.hypothesis, spread=0.1, shift=np.zeros(1)))
+        for f in search.of_size(1)[:2]
+    )
+    other = replace(other, evidence=first.evidence + 100.0)
+    for f in (first, other):
+        key = f.noise.structure, 0.1, tuple(sorted(f.hypothesis.names))
+        search.fits = {k: v for k, v in search.fits.items() if k[2] != key[2]} | {key: f}
+    alike, worse = (
+        Said(lambda c: 1.0),
+        Said(lambda c: 0.5 if {*c} >= {*first.hypothesis.names} else 1.0),
+    )
+    assert _likelier(search, first, alike) is other
+    assert _likelier(search, first, worse) is None
+    assert _likelier(search, other, alike) is None
+
+
 def test_noise_can_not_hide_what_predicts_far_better(wavy):
     """The likeliest claims nothing; under another noise there is one that predicts."""
     search, _ = wavy

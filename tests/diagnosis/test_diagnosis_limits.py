@@ -16,8 +16,10 @@ from grounded.diagnosis.validation.limits import (
     limits,
     still_states,
     switches,
+    with_measured_filters,
 )
 from grounded.effects import Library
+from grounded.instruments.finding import Finding
 from grounded.models.pendulum import model as pendulum
 
 
@@ -141,3 +143,18 @@ def test_friction_of_a_joint_without_an_input_is_suspected_behind_two_effects(cl
     found = joints_without_input(CART_POLE, claimed)
     assert bool(found) == said
     assert all(name in one for one in found for name in claimed if "input" not in name)
+
+
+def test_a_filter_that_sensors_show_alone_is_held():
+    """A speed's filter of 0.050 s, seen beside its position, was calibrated to 0.035 s."""
+    tau = Param(0.05, "s", 0.0, 0.6, 0.025)
+    model = Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"u": "m/s^2"},
+        params={"sensor_lag_v_tau": tau, "k": Param(1.0, "1", 0.5, 2.0)},
+        derivative=lambda s, a, p: {"x": s.v, "v": p.k * a.u},
+    )
+    seen = with_measured_filters(model, [Finding("v", "is filtered", "lag", 0.05)])
+    assert seen.params["sensor_lag_v_tau"].spread == 0 < tau.spread
+    assert seen.params["sensor_lag_v_tau"].value == 0.05 and seen.params["k"].spread > 0
+    assert with_measured_filters(model, [Finding("x", "is filtered", "lag", 0.05)]) is model

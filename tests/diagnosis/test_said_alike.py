@@ -168,7 +168,7 @@ def test_the_verdict_counts_the_parameters_that_adopt_writes():
     row = Ranked(effect.name, {"k": Estimate(1.0, 0.1)}, {}, 50.0, claimed=True)
     credit = (Credit("calibration", 0.9), Credit(effect.name, 0.1))
     said = verdict(claims, (row,), (), (), (), credit, identified=(lost,))
-    assert holds(said.causes[0], "and 1 more", "e and f, changed", "at most 1.0 %")
+    assert holds(said.causes[0], "and 1 more", "e and f are", "at most 1.0 %")
     found = Diagnosis(said, parameters=known, identifiable=(lost,), ranking=(row,))
     written = found.known_parameters
     assert len(written) == 4 + 2

@@ -94,7 +94,7 @@ def test_the_ros_node_of_the_page_sends_what_the_policy_says(car, monkeypatch):
     monkeypatch.chdir(car)
     monkeypatch.syspath_prepend(str(car))
     (car / "node.py").write_text(block("python", "class Drive(Node)"))
-    node = runpy.run_path(str(car / "node.py"))["Drive"]()
+    node = runpy.run_path(str(car / "node.py"))["Drive"]("c0001.npz")
     ((period, tick),) = node.timers
     tick()
     assert period == 0.05 and node.sent == []  # it waits for a state

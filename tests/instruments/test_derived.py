@@ -74,12 +74,12 @@ def test_a_slow_sensor_of_its_own_is_still_used(noise):
 
 
 def test_a_signal_that_is_not_used_has_one_line():
-    """One line said "corrected here", the next "not used here"."""
+    """One line said "corrected here", the next the opposite."""
     for kind, keep in (("filtered", 0.5), ("filtered", 0.8)):
         found = preflight(SWING, swung(kind, keep=keep)).findings
         assert {"smoothed"} < {f.kind for f in found if f.signal == "w"}
         (line,) = (one for one in instrument_lines(found) if one.startswith("w:"))
-        assert "not used here" in line and "corrected here" not in line
+        assert "left out" in line and "corrected here" not in line
     late = put_right("w", "0.02 s later than the derivative of q", "delay", "delay_s = 0.02")
     (line,) = instrument_lines([late, a_mean("w", "q", 0.04)])
     assert "0.02 s later" in line and "mean over 0.04 s" in line and "delay_s = 0.02" in line

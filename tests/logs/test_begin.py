@@ -23,6 +23,7 @@ from grounded_trials.starting.begin import begin
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, hinges, path_target, swing_up
 from grounded_trials.workspace.exporting import void_exports
+from grounded_trials.workspace.off_target import rates_beside
 from grounded_trials.workspace.task_file import equal_weights, read_target, without_range
 from ros_bags import arm_bag, boat_bag, car_bag, commanded_arm_bag, rover_bag
 from shared_data import data
@@ -490,7 +491,8 @@ def test_what_is_left_out_is_said_and_inputs_can_be_named(wheels, tmp_path):
     assert any("--inputs" in note for note in found.notes)
     assert grounded("-C", tmp_path / "w", found.then.verb, *found.then.arguments).code == 0
     done = grounded("init", tmp_path / "v", "--from", log, "--inputs", "aa,bb", "--json").json
-    assert [one["name"] for one in done["signals"]][-2:] == ["aa", "bb"] and not done["notes"]
+    assert [one["name"] for one in done["signals"]][-2:] == ["aa", "bb"]
+    assert len(done["notes"]) == 1 and "model.py" in done["notes"][0]  # its equations are missing
     wrong = grounded("init", tmp_path / "u", "--from", log, "--inputs", "aa,cc")
     assert wrong.code == 1 and "cc" in wrong.err and not (tmp_path / "u").exists()
 
@@ -610,7 +612,12 @@ def test_weights_belong_to_the_target_until_somebody_chooses_them(wheels, tmp_pa
     w.forget()
     names, values = read_target(tmp_path / "w/target.csv")
     by = dict(zip(names, values.T, strict=True))
-    new = [max(np.ptp(by[name]), 0.1) ** -2 for name in w.base_model.state_names]
+    rates = rates_beside(w.base_model, by)
+    assert {"v", "omega"} & rates == {"v", "omega"} & {*by}
+    new = [
+        max(np.ptp(by[name]), 0.1) ** -2 * (0.1 if name in rates else 1.0)
+        for name in w.base_model.state_names
+    ]
     now = w.task.reward.state
     assert now[1:] == pytest.approx((before if chosen else new)[1:], rel=1e-3)
     assert before[1:] != pytest.approx(new[1:], rel=0.1)
@@ -626,6 +633,8 @@ def test_a_column_that_stays_has_the_range_of_its_unit():
     columns = {"x": 2 * t, "y": 0 * t, "psi": 0 * t, "v": 0.01 * t}
     weights = equal_weights(columns, units)
     assert weights == pytest.approx({"x": 0.25, "y": 0.25, "psi": 1.0, "v": 100.0})
+    less = equal_weights(columns, units, ("x", "y"), ("v",))  # a velocity beside its position
+    assert less["v"] == pytest.approx(10.0)
     for y, as_much in ((3 * t, 3.0), (0.5 * t, 1.8), (0 * t, 9.0)):  # axes of one position
         both = equal_weights({"x": 9 * t, "y": y, "v": t}, units, ("x", "y"))
         assert both["x"] == both["y"] == pytest.approx(as_much**-2)

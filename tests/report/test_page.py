@@ -7,6 +7,7 @@ import re
 import time
 from dataclasses import replace
 from html.parser import HTMLParser
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from grounded.errors import NextCommand
 from grounded.model import Param
 from grounded_trials.report.findings import Improved, improvements_in, utility_terms
 from grounded_trials.report.gathering import gather
+from grounded_trials.report.page.diagnosed import _doubts
 from grounded_trials.report.page.page import page
 from grounded_trials.report.page.tables import UNKNOWN, parameter_table
 from grounded_trials.report.report_text import report_text
@@ -159,7 +161,7 @@ def test_nothing_is_said_to_improve_that_did_not(car):
     now, runs = findings.standing, findings.runs
     assert heading(findings) == "What improved"
     first = now.history[0]
-    assert "Nothing" in heading(replace(findings, standing=replace(now, incumbent=first)))
+    assert "still the best" in heading(replace(findings, standing=replace(now, incumbent=first)))
     none = replace(now, incumbent=first, history=(first,))
     assert heading(replace(findings, standing=none)) == "Results"
     best = findings.best
@@ -398,3 +400,9 @@ def test_a_value_without_an_interval_is_said_to_be_undetermined(cart, interval):
     text = page(replace(findings, diagnosis=Diagnosis.from_json(DIAGNOSIS | {"ranking": [entry]})))
     assert f"k = {UNKNOWN}<" in text
     assert "0.280 to 0.320" not in text
+
+
+def test_noise_that_is_zero_everywhere_breaks_no_page():
+    """A diagnosis without a cause, of exact trials: the page died by the minimum of nothing."""
+    exact = SimpleNamespace(whole=SimpleNamespace(irreducible=0.0), irreducible_unsure=0.5)
+    assert float(_doubts({"x": exact})) > 1

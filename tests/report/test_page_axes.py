@@ -42,6 +42,13 @@ from reported import car, cart, copied, many_flights
 __all__ = ["car", "cart"]
 
 
+def test_a_target_that_stays_sets_no_range():
+    """The only run of a load that was to hang still: an axis from -1p to 1p, the run cut off."""
+    t = np.linspace(0, 1, 11)
+    panel = _timed("th", "rad", [Curve(t, 0 * t, "desired"), Curve(t, 0.1 * t - 0.05, "model")])
+    assert panel.y_range[0] <= -0.05 and panel.y_range[1] >= 0.05 and not panel.note
+
+
 def test_a_run_is_not_cut_off_for_little():
     """A first run 1.4 times too large for the axis was cut off."""
     t = np.linspace(0.0, 0.07, 20)

@@ -67,7 +67,7 @@ def late_boom():
         low=np.array([-1.0]),
         high=np.array([1.0]),
     )
-    noise = Noise(measurement={"th": 3e-4, "w": 3e-3})
+    noise = Noise(measurement={"th": 3e-4, "w": 1e-2})
     plant = Plant(true, latency={"u": 0.06}, noise=noise, substeps=20)
     found = task.with_model(crude.with_values({"K": 0.41, "tau": 0.1}))
     effects = [{"name": "rate_limit:u", "r": 7.5}, {"name": "delay:u", "d": 0.12}]

@@ -101,7 +101,7 @@ def test_trials_that_do_not_improve_shorten_the_step_then_end_the_search(options
     assert last.candidate is None and last.standing.phase == "converged"
     assert last.standing.incumbent is not None
     assert last.standing.incumbent.candidate.id == "c0001"
-    assert holds(last.standing.sentence, "c0001", f"alpha = {steps[-1][1]:g}", "step 7")
+    assert holds(last.standing.sentence, "c0001", f"alpha = {steps[-1][1]:g}")
 
 
 def test_trials_that_do_not_improve_raise_the_damping_until_nothing_is_promised():

@@ -397,3 +397,46 @@ def test_a_plan_off_its_path_says_which_weights_would_bring_it_closer(tmp_path, 
         assert (
             off > 0.05 and f"{100 * off:.2g} cm" in found[0] and f"{100 * closer:.2g}" in found[0]
         )
+
+
+BALL = """
+from grounded import Model
+import numpy as np
+
+def rate(s, a, p):
+    return {"x": s.v, "v": 7 * np.sin(s.beam), "beam": (0.0015 * a.servo - s.beam) / 0.12}
+
+model = Model(states={"x": "m", "v": "m/s", "beam": "rad"}, inputs={"servo": "deg"},
+              derivative=rate)
+"""
+
+
+def test_a_plan_that_stops_short_says_that_its_speed_weighs_as_much(tmp_path):
+    """Of 20 cm a plan lacked 6.5 mm, and 0.1 mm with less weight on the speed."""
+    (tmp_path / "ball.py").write_text(BALL)
+    w = Workspace.create(tmp_path / "w", model=tmp_path / "ball.py", dt=0.04)
+    file = w.folder / "grounded.toml"
+    text = file.read_text().replace("[limits]", "[limits]\nservo = [-45, 45]")
+    file.write_text(re.sub(r"(?m)^start = .*$", "start = { x = -0.1 }", text))
+    grounded("-C", w.folder, "target", "line", "--to", "x=0.1", "--seconds", "2.5", "--hold", "1")
+    written = file.read_text()
+    short = {}
+    for speed in (0.1, 10.0, 1000.0):
+        file.write_text(re.sub(r"(?m)^state = .*$", f"state = {{ x = 25, v = {speed} }}", written))
+        proposed = Workspace(w.folder).propose()
+        told = [note for note in proposed.proposal.notes if "x = 250" in note]
+        short[speed] = proposed.off_target[0].end, told
+    assert short[0.1][0] < short[10.0][0] < short[1000.0][0]
+    assert not short[0.1][1] and holds(short[1000.0][1][0], "at its end", "v")
+
+
+def test_an_input_that_moves_nothing_is_named(tmp_path):
+    """Gains of 0 in a skeleton: the candidate sent nothing, and nobody said why."""
+    idle = BALL.replace("0.0015 * a.servo", "0 * a.servo")
+    (tmp_path / "ball.py").write_text(idle)
+    w = Workspace.create(tmp_path / "w", model=tmp_path / "ball.py", dt=0.04)
+    w.target({"x": np.linspace(0, 0.1, 51)})
+    notes = w.propose().proposal.notes
+    assert any(holds(note, "servo", "model.py") and "no state" in note for note in notes)
+    (w.folder / "model.py").write_text(BALL)
+    assert not any("no state" in note for note in Workspace(w.folder).propose().proposal.notes)

@@ -58,3 +58,22 @@ def test_the_old_target_is_kept(w):
     path = w.target({"theta": list(LINE)})
     assert (w.folder / "target.csv.bak").read_bytes() == old != path.read_bytes()
     assert w.config.task.horizon == 20
+
+
+CART = """
+from grounded import Model
+
+model = Model(states={"x": "mm", "v": "mm/s"}, inputs={"u": "mm/s^2"},
+              derivative=lambda s, a, p: {"x": s.v, "v": a.u})
+"""
+
+
+@pytest.mark.parametrize("size", [180.0, 1800.0])
+def test_weights_of_large_ranges_are_not_taken_for_chosen_ones(tmp_path, size):
+    """In mm: 1/180^2 was written as 3.1e-05 and never changed again, 1/1800^2 as 0."""
+    (tmp_path / "cart.py").write_text(CART)
+    w = Workspace.create(tmp_path / "w", model=tmp_path / "cart.py")
+    for far in (size, 1.0):
+        w.target({"x": far * LINE})
+        w.forget()
+        assert w.task.reward.state[0] == pytest.approx(far**-2, rel=1e-4)

@@ -92,6 +92,15 @@ def test_an_effect_that_was_fitted_in_place_of_what_is_adopted_now_is_named(cart
     assert "delay:force" in done.err and "warning" in done.err
 
 
+def test_what_is_adopted_is_not_called_unknown(cart, tmp_path):
+    """It named another effect ("did you mean"), as a newer diagnosis no longer lists it."""
+    folder = copied(cart, tmp_path / "w")
+    grounded("-C", folder, "adopt", "viscous_friction:v")
+    diagnosed(folder, ranking=DIAGNOSIS["ranking"][1:])
+    done = grounded("-C", folder, "adopt", "viscous_friction:v")
+    assert done.code == 1 and "adopted already" in done.err
+
+
 def test_nothing_is_adopted_where_one_name_is_wrong(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     before = (folder / "grounded.toml").read_text()
@@ -129,6 +138,19 @@ def test_what_is_calibrated_to_its_bound_is_not_to_be_adopted(cart, tmp_path, pa
     mass = {"value": part * high, "std": 0.02, "interval": [part * high] * 2, "unit": "kg"}
     verdict = {**DIAGNOSIS["verdict"], "parameters": ["mass"]}
     diagnosed(folder, verdict=verdict, parameters={"mass": mass})
+    assert last(grounded("-C", folder, "status")) == f"grounded {then}"
+
+
+@pytest.mark.parametrize(("gain", "then"), [(-0.1, "adopt input_gain:force"), (-1.9, "diagnose")])
+def test_a_command_of_the_wrong_sign_is_not_adopted_as_a_gain(cart, tmp_path, gain, then):
+    """The verdict said to flip its sign in model.py, `next:` to adopt a gain of -1.89."""
+    folder = copied(cart, tmp_path / "w")
+    row = DIAGNOSIS["ranking"][0] | {
+        "effect": "input_gain:force",
+        "params": {"g": {"value": gain, "std": 0.01, "unit": "1"}},
+    }
+    verdict = {"kind": "effect", "effects": ["input_gain:force"], "sentence": "One."}
+    diagnosed(folder, verdict=verdict, ranking=[row])
     assert last(grounded("-C", folder, "status")) == f"grounded {then}"
 
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,12 @@ from grounded_trials import Workspace
 from grounded_trials.report.findings import AT_END, improvements_in
 from grounded_trials.report.gathering import gather
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.off_target import off_target_of, position_axes, reaches
+from grounded_trials.workspace.off_target import (
+    off_target_of,
+    position_axes,
+    reaches,
+    traded,
+)
 from reported import cart, copied
 
 __all__ = ["cart"]
@@ -205,3 +211,21 @@ def test_propose_says_how_far_the_predicted_run_is_off(cart, tmp_path):
     out = " ".join(grounded("-C", folder, "propose").out.split())
     assert f"off target: {told.summary()}" in out
     assert proposed.to_json()["off_target"][0]["what"] == "x"
+
+
+def test_a_better_candidate_that_is_farther_off_says_what_it_gained_by():
+    """The path went from 0.5 to 0.85 cm, and the candidate was the best so far: no word why."""
+    here = task(state=np.array([1.0, 1.0, 0.0, 0.0]))
+    rough = np.tile([[1.0, 0.0], [0.0, 1.0]], (H // 2, 1))
+
+    def tried(name, off, inputs):
+        states = np.zeros((H + 1, 4))
+        states[:, 0] = off
+        trial = Trial(states, inputs, DT, ROVER.state_names, ROVER.input_names)
+        utility = here.utility(trial)
+        return SimpleNamespace(candidate=SimpleNamespace(id=name), trials=(trial,), utility=utility)
+
+    before, best = tried("c0001", 0.01, rough), tried("c0002", 0.02, 0 * rough)
+    assert best.utility > before.utility
+    assert holds(traded(here, best, before), "c0002", "c0001", "inputs cost less", "2.0 cm")
+    assert traded(here, tried("c0003", 0.01, 0 * rough), before) == ""

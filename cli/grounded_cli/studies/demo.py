@@ -13,7 +13,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded_cli.learn import narrated
 from grounded_cli.options import as_json, located, next_line
 from grounded_cli.status import summary
-from grounded_cli.terminal import field, number, progress, remark, say, show, show_json
+from grounded_cli.terminal import field, number, progress, remark, say, show, show_json, stages
 from grounded_trials.wording import count, rendered
 
 if TYPE_CHECKING:
@@ -52,8 +52,10 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     with progress("finding the optimum with the true model"):
         best = optimum(workspace)
     save_optimum(workspace, best)
-    with progress("diagnosing the gap"):
-        diagnosed = workspace.diagnose(_few(workspace, status), engine=Engine(os.cpu_count() or 1))
+    with stages() as tell:
+        tell("diagnosing the gap")
+        some, engine = _few(workspace, status), Engine(os.cpu_count() or 1)
+        diagnosed = workspace.diagnose(some, engine=engine, progress=tell)
     with progress("writing the report"):
         html, rrd = (find_spec(name) is not None for name in ("jinja2", "rerun"))
         report = workspace.report(html=html, rrd=rrd)

@@ -34,7 +34,7 @@ from grounded.diagnosis.hypotheses.plainest import plainer
 from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
-from grounded.diagnosis.validation.gain import BETTER
+from grounded.diagnosis.validation.gain import BETTER, Gain
 from grounded.diagnosis.validation.motions import of_no_size, repeats
 from grounded.diagnosis.validation.own_numbers import SURE, equations, own_numbers
 from grounded.diagnosis.validation.ruler import Ruler, folds
@@ -136,21 +136,37 @@ def _plainest(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool) 
 
 
 def _likelier(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted | None:
-    """After calibration was dropped, find a likelier hypothesis that differs in one effect.
+    """After a cause was dropped, find a likelier hypothesis that differs in one effect.
 
     The effects were selected while the parameters were free, so with exact parameters others may be
-    likelier.
+    likelier. And of two effects that stand in for each other, the one that predictions needed less
+    was dropped, by no more than their scatter, even if it is far likelier alone than the other. A
+    changed value of an adopted effect need not predict as well as a new effect: that an adopted
+    value is slightly off is known, and an effect that imitates it may fit the rest of the gap too.
     """
     h, names = fit.hypothesis, set(fit.hypothesis.names)
     near = [f for f in search.of_size(len(names)) if len(names - {*f.hypothesis.names}) == 1]
-    if h.spread > 0 or not near:
-        return None
-    starts = [(replace(f.hypothesis, shift=None, spread=0.0), fit.noise, f.track) for f in near]
-    others = [
-        f for f in search.refined(starts[:RIVALS], REFIT) if search.score(f) > search.score(fit)
-    ]
-    others = [f for f in others if not ruler.gain(f, fit).beyond(*BETTER)]
+    if h.spread > 0:
+        others = [f for f in near if f.hypothesis.spread == h.spread]
+    else:
+        starts = [(replace(f.hypothesis, shift=None, spread=0.0), fit.noise, f.track) for f in near]
+        others = search.refined(starts[:RIVALS], REFIT) if starts else []
+    others = [f for f in others if search.score(f) > search.score(fit) + TIE * (h.spread > 0)]
+    others = [f for f in others if not _outdone(ruler.gain(f, fit), _adopted(f, names))]
     return max(others, key=search.score, default=None)
+
+
+def _outdone(gain: Gain, adopted: bool) -> bool:
+    """Check whether predictions refuse a likelier rival.
+
+    If it only changes adopted effects, only a large gain refuses it.
+    """
+    return gain.beyond(*BETTER) and (gain.mean > BETTER[1] or not adopted)
+
+
+def _adopted(rival: Fitted, names: set[str]) -> bool:
+    """Check whether all that a rival has beside `names` are changes of adopted effects."""
+    return all(effect.known for effect in rival.hypothesis.effects if effect.name not in names)
 
 
 def _likely(search: HypothesisSearch, fit: Fitted) -> bool:

@@ -492,8 +492,9 @@ def test_one_log_is_one_trial(w, tmp_path):
     w.discard(first.trial)
     kept = w.ingest(path, data=True)
     assert kept.candidate == ""
-    with pytest.raises(GroundedError, match=f"stored already, as {kept.trial}, data"):
+    with pytest.raises(GroundedError, match=f"stored already, as {kept.trial}, data") as refused:
         w.ingest(path)  # "ran c0001, which was made for an earlier task"
+    assert refused.value.then is None  # `next` with the log of a drive: it advised to discard it
 
 
 def recorded_in_motion(path, change=0.3, begun=0.13):

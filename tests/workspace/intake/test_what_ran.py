@@ -306,7 +306,7 @@ def test_the_candidate_after_a_false_crash_is_not_handed_out_once_that_is_discar
 def test_it_is_said_whose_commands_they_are_only_where_they_match(learnt):
     """A third policy's run, nearer to one candidate than to the other, is neither's."""
     (own, _, candidates), _, (_, theirs, _) = runs(learnt)
-    inputs = theirs.inputs + 0.2 * np.sin(np.arange(theirs.steps) / 8)[:, None]
+    inputs = theirs.inputs + 0.25 * np.sin(np.arange(theirs.steps) / 8)[:, None]
     seen = suspicion(learnt.task, replace(theirs, inputs=inputs), own, candidates)
     why, name = seen.why, seen.other
     assert "nearer" in why and name == ""

@@ -127,7 +127,7 @@ def gap_sentence(gap: Gap) -> str:
     low = "; below 1, so errors are smaller than that" * (gap.after < gap.floor)
     return (
         f"{figure(gap.before, 3)} before, {figure(gap.after, 3)} after, {held}, in units of the "
-        f"error that the estimated noise alone causes {gap.horizon_s:g} s ahead{low}; not "
+        f"error that the estimated noise alone causes {gap.horizon_s:.3g} s ahead{low}; not "
         "comparable between two diagnoses"
     )
 

@@ -44,6 +44,7 @@ from grounded_trials.workspace.model_file import load_module, model_in
 NONE: Mapping[str, Array] = {}  # no input was read
 SLOWEST = 0.5  # [Hz] smallest plausible row rate; below it, times may be in another unit
 NAMED = 5  # most columns named in an error
+TO_COMPLETE = "no input changes a state yet: write your robot's equations into model.py"
 HORIZON = 200  # largest number of steps of a target taken from a recorded run
 Ask = Callable[[Guess], str]
 
@@ -203,7 +204,7 @@ def _begin(
         states, inputs = (
             tuple(_only_named(g, of) for g in s) for s, of in ((states, "state"), (inputs, "input"))
         )
-        notes = (*notes, *_left_out(report, found))
+        notes = (*notes, *_left_out(report, found), TO_COMPLETE)
     units = {**found.states, **found.inputs}
     both = from_the_rest((*states, *inputs), units, report, joint_units(joints))
     states, inputs = both[: found.n], both[found.n :]
@@ -364,4 +365,4 @@ def _recorded(
     columns = dict(zip(measured, found.states.T, strict=True))
     horizon = len(found.states) - 1
     write(columns, horizon, dict(zip(mapping.inputs, found.inputs.T, strict=True)))
-    return f"the run in the log, its first {horizon * dt:g} s", horizon, found.warnings
+    return f"the run in the log, its first {horizon * dt:.3g} s", horizon, found.warnings

@@ -13,8 +13,8 @@ from grounded.model import Model
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import key
 from grounded_trials.workspace.config import FILE, OFFERED
-from grounded_trials.workspace.off_target import position_names
-from grounded_trials.workspace.task_file import change_weight, equal_weights, write_target
+from grounded_trials.workspace.off_target import usual_weights
+from grounded_trials.workspace.task_file import change_weight, write_target
 
 STOOD = 0.5  # [s] at the start of a log in which the robot may stand still
 STILL = 0.05  # fraction of a state's range (or a rate's maximum) that counts as standing still
@@ -49,7 +49,7 @@ def write_first(
     """
     dt, whose = grid
     write_target(folder / "target.csv", dt, dict(columns))
-    weights = equal_weights(columns, model.states, position_names(model))
+    weights = usual_weights(model, columns)
     changes = {name: change_weight(ranges[name], model.inputs[name]) for name in model.input_names}
     stated = getattr(model.step, "limits", {})  # limits in an MJCF or URDF file
     limits = [
@@ -71,17 +71,18 @@ def write_first(
         f"start = {_inline(held) if held else '{ }'}"
         + "  # where it stood in the log's first rows, and the inputs that held it" * bool(held),
         "feedback = true               # false: open loop",
-        "latency = { }                 # [s] transport delay of inputs: `fit --latency` finds it",
+        "latency = { }                 # [s] transport delay of inputs, unless `diagnose` finds it",
         "",
-        "[reward]                      # quadratic weights: 1 / (range in the target)^2; a",
-        "                              # constant column uses the largest range of its unit, else",
-        "                              # 1. `target` updates them until you change one",
+        "[reward]                      # quadratic weights: 1 / (range in the target, at least",
+        "                              # 0.1)^2, a tenth of it for a velocity beside its position;",
+        "                              # a constant column uses the largest range of its unit,",
+        "                              # else 1. `target` updates them until you change one",
         f"state = {_inline(weights)}",
         "# terminal: weights of the last step only. If the run must END at rest on its target",
         "# (docking, parking) but overshoots, use 10 to 100 times `state`, also for the speeds",
         f"# terminal = {_inline({name: OFFERED * weight for name, weight in weights.items()})}",
-        "# weights of (a_t - a_{t-1})^2: 0.04 / (range of [limits])^2, so 0.01 for -1 to 1.",
-        "# `target` updates them from [limits] until you change one; from the ranges in the log:",
+        "# input_change: weights of (a_t - a_{t-1})^2, 0.04 / (range in [limits])^2. While they",
+        "# are as in the next line, which `init` wrote, `target` adapts them to your [limits]",
         f"# input_change = {_inline(changes)}",
         f"input_change = {_inline(changes)}",
         "",

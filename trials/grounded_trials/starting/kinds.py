@@ -105,6 +105,10 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
         inputs = (called or held or driven or efforts)[:INPUTS] or ["u"]
     states = [name for name in reversed(found) if name not in inputs][:MOST] or ["x"]
     rates = _rates(log, {name: found[name].path for name in states if name in found})
+    for position, rate in rates.items():  # v is logged without a unit, x in m: v is in m/s
+        known_as = rate.removeprefix("s.")
+        if unit.get(known_as) == "1" != unit[position]:
+            unit[known_as] = f"{unit[position]}/s"
     per = {i: f"/({u})" * (u != "1") for i in inputs if (u := unit.get(i, "1"))}
     gains = {
         f"gain_{s}_{i}": f'0.0, "{unit.get(s, "1")}{per[i]}", -100.0, 100.0'

@@ -66,7 +66,10 @@ def _sampled(
     dt, states = workspace.config.task.dt, workspace.base_model.states
     known = [name for name in names if name in states]
     if not known:
-        raise GroundedError(f"{file} has no column named after a state: {', '.join(names)}")
+        raise GroundedError(
+            f"{file} has no column named after a state ({', '.join(states)}): it has t and "
+            + ", ".join(names)
+        )
     rows = in_steps(times[-1], dt, np.floor((times[-1] + 1e-9) / dt)) + 1
     t = dt * np.arange(rows)
     return {name: np.interp(t, times, values[:, names.index(name)]) for name in known}

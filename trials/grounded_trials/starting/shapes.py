@@ -33,7 +33,7 @@ BRIEF, SLIGHT = 1e-4, 1e-3  # [s] of the step there; [rad/s^2] smallest pull of 
 class Drive:
     """Size, speed limits and timing of a path, in SI units."""
 
-    size: float = 2.0  # [m] length of a line, radius of a circle and of an 8's loops
+    size: float = 2.0  # [m] length of a line, radius of a circle, half the width of an 8's loops
     speed: float = 1.0  # [m/s] limit
     accel: float = 1.0  # [m/s^2] along the path
     lateral: float = 4.0  # [m/s^2] across it
@@ -49,7 +49,7 @@ def path_target(
     to: Mapping[str, float] = MappingProxyType({}),
     start: Mapping[str, float] = MappingProxyType({}),
 ) -> dict[str, Array]:
-    """Return the columns of a target that follows a path in the plane from rest.
+    """Return the columns of a target, (H + 1,) each, that follows a path in the plane from rest.
 
     Args:
         shape: line, circle or figure-8.
@@ -58,9 +58,6 @@ def path_target(
         dt: control interval [s].
         to: further states, each with the value that it keeps along the path: a drone's height.
         start: [task] start: where the path begins, and the height unless `to` gives one.
-
-    Returns:
-        The desired values of each state, (H + 1,).
 
     Raises:
         GroundedError: if the model has no position, a number is not positive, `to` names a state of
@@ -79,19 +76,38 @@ def path_target(
     limit = np.minimum(drive.speed, np.sqrt(drive.lateral / np.maximum(curvature, 1e-9)))
     limit[-1] *= not drive.hold
     speed = _reachable(along, limit, drive.accel)
-    middle = 0.5 * (speed[1:] + speed[:-1])
-    when = np.concatenate([[0.0], np.cumsum(np.diff(along) / np.maximum(middle, 1e-6))])
-    t = _grid(when[-1] + drive.hold, dt)
+    t, far, pace = _driven(along, speed, drive.hold, dt)
     columns = {
-        name: start.get(name, 0.0) + np.interp(t, when, way)
+        name: start.get(name, 0.0) + np.interp(far, along, way)
         for name, way in zip(position, (x, y), strict=False)
     }
-    rate = np.gradient(heading, along) * speed
-    for role, values in {"heading": heading, "speed": speed, "heading_rate": rate}.items():
+    bend = np.interp(far, along, np.gradient(heading, along))
+    turned = np.interp(far, along, heading)
+    for role, values in {"heading": turned, "speed": pace, "heading_rate": bend * pace}.items():
         played = model.roles.get(role)
         if isinstance(played, str) and played in model.states:
-            columns[played] = np.interp(t, when, values)
+            columns[played] = values
     return columns | _kept(shape, model, to, start, columns, len(t))
+
+
+def _driven(
+    along: Array, speed: Array, hold: float, dt: float, seconds: float | None = None
+) -> tuple[Array, Array, Array]:
+    """Return times on the grid (H + 1,), and the way covered and the speed there.
+
+    The speed is linear in time between the points of a path, at which `along` and `speed` are
+    given. A path that ends in motion is driven a little more slowly, by less than a step in all, so
+    that it ends with a whole step. `seconds`: its duration without `hold`; None: by these speeds.
+    """
+    lasts = 2 * np.diff(along) / np.maximum(speed[1:] + speed[:-1], 1e-6)
+    when = np.concatenate([[0.0], np.cumsum(lasts)])
+    t = _grid((seconds or when[-1]) + hold, dt)
+    slower = (seconds or (t[-1] if speed[-1] > 0 else when[-1])) / when[-1]
+    when, speed, lasts = when * slower, speed / slower, lasts * slower
+    i = np.clip(np.searchsorted(when, t, side="right") - 1, 0, len(lasts) - 1)
+    part = np.minimum((t - when[i]) / lasts[i], 1.0)
+    pace = speed[i] + part * (speed[i + 1] - speed[i])
+    return t, along[i] + part * lasts[i] * (speed[i] + pace) / 2, pace
 
 
 def _kept(
@@ -153,7 +169,7 @@ def line_target(
     seconds: float | None = None,
     kept: str = "",
 ) -> dict[str, Array]:
-    """Return the columns of a straight line in the states, from rest to rest, with their rates.
+    """Return the columns, (H + 1,) each, of a straight line from rest to rest, with their rates.
 
     If one coordinate of a position is named, the others stay at their start values.
 
@@ -167,9 +183,6 @@ def line_target(
         kept: with `seconds`, which of "speed" and "accel" of `drive` is kept, while the other is
             computed; "": both are computed.
 
-    Returns:
-        The desired values of each state, (H + 1,).
-
     Raises:
         GroundedError: for an unknown state, a line of zero length, an ambiguous axis, or a
             duration that is not possible with the speed or acceleration kept.
@@ -180,7 +193,8 @@ def line_target(
     way = {name: value - start.get(name, 0.0) for name, value in to.items()}
     length = max(map(abs, way.values()))
     if not 0 < length < np.inf:
-        raise GroundedError(f"the line ends where it starts, at {_told(to)}: change --to")
+        there = ", ".join(f"{name} = {value:g}" for name, value in to.items())
+        raise GroundedError(f"the line ends where it starts, at {there}: change --to")
     if seconds is not None:
         drive = _in_time(drive, length, seconds, kept)
         _grid(seconds + drive.hold, dt)
@@ -188,11 +202,8 @@ def line_target(
     limit = np.full(FINE, drive.speed)
     limit[-1] = 0.0
     speed = _reachable(along, limit, drive.accel)
-    when = np.concatenate([[0.0], np.cumsum(2 * np.diff(along) / (speed[1:] + speed[:-1]))])
-    if seconds is not None:
-        when *= seconds / when[-1]  # correct the discretisation error
-    t = _grid(when[-1] + drive.hold, dt)
-    share, rate = np.interp(t, when, along) / length, np.interp(t, when, speed) / length
+    t, share, rate = _driven(along, speed, drive.hold, dt, seconds)
+    share, rate = share / length, rate / length
     columns = {name: start.get(name, 0.0) + share * far for name, far in way.items()}
     rates, place = velocities(model), position_names(model)
     way |= dict.fromkeys([q for q in place if q not in way and not {*place}.isdisjoint(way)], 0.0)
@@ -239,10 +250,6 @@ def _axis(model: Model) -> str:
         f"model '{model.name}' has {'several axes' if moved else 'no axis'} for a line: name a "
         f"state and its end, such as --to {next(iter(moved or model.states))}=1.0"
     )
-
-
-def _told(values: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} = {value:g}" for name, value in values.items())
 
 
 def _path(shape: str, drive: Drive) -> tuple[Array, Array, Array, Array]:

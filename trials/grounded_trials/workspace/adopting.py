@@ -319,10 +319,11 @@ def _check(
             newer_alone(found),
         )
     known = [row.effect for row in found.ranking] + _curves(found) + [*found.late_sensors]
-    adopted = [e["name"] for e in workspace.config.model.effects if e["name"] not in before]
+    effects = [str(effect["name"]) for effect in workspace.config.model.effects]
+    adopted = [name for name in effects if name not in before or name not in known]
     in_log = in_time_now(workspace, found.preflight)
     for name in names:
-        if name not in known:
+        if name not in known and name not in adopted:
             _check_alike(name, found)
             family = [one for one in known if one.startswith(f"{name}:")]
             there = f"did you mean '{family[0]}'?" if family else nearest(name, known)

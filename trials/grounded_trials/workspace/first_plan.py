@@ -18,11 +18,12 @@ from grounded.result import listed, measured, measured_alike, percent
 from grounded.search.scatter import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded.utility import step_rewards
 from grounded_trials.wording import rendered, with_unit
 from grounded_trials.workspace.config import made_changes
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import (
+    cost_of_inputs,
+    reaches,
     still_logged,
     tracked,
     tracking_error,
@@ -69,22 +70,25 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
         )
     if free:
         found.append(f"[limits] has none for {', '.join(free)}: plans may send values of any size")
+    if first is not None and (idle := _without_effect(task, first)):
+        found.append(
+            f"{listed(idle)} change{'s' * (len(idle) == 1)} no state in the model: complete the "
+            f"equations and values in {workspace.config.model.file or 'the model'}"
+        )
     if log := seen_in(workspace.config):
         found.append(
             f"[limits] are only the range used in {log}: enter the robot's real limits"
-            + ", and draw the manoeuvre (`target`): target.csv is the run in that log"
+            + ", then delete seen_in there"
+            + "; and draw the manoeuvre (`target`): target.csv is the run in that log"
             * still_logged(workspace)
         )
     if first is not None and first.predicted_utility < 0:
-        none = np.zeros(task.model.n)
-        reward, sent = replace(task.reward, state=none, terminal=none), first.predicted_inputs
-        error, aim = np.zeros((len(sent) + 1, len(none))), task.input_target
-        assert aim is not None
-        share = step_rewards(reward, error, sent, aim, task.past).sum() / first.predicted_utility
-        if share > MOSTLY and astray:
+        share = cost_of_inputs(task, first.predicted_run) / -first.predicted_utility
+        if share > MOSTLY and (astray or not _chosen(workspace)):
             found.append(
-                f"{percent(share)} of the plan's cost is [reward] input and input_change: with "
-                "less weight there, errors would count for more"
+                f"{percent(share)} of the plan's cost is [reward] input and input_change, so the "
+                "search gains most by smoother inputs: with less weight there (a tenth, say), "
+                "errors would count for more"
             )
     found += _of_other_limits(workspace)
     if first is not None:
@@ -108,6 +112,35 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
             f"{name} has {rows} rows, but [task] horizon = {task.horizon} uses only the first "
             f"{task.horizon + 1}: the plan ends after {task.horizon * task.dt:g} s"
         )
+    return found
+
+
+def _chosen(workspace: Folder) -> bool:
+    """Return whether the weights on input changes are not those that `init` or `target` wrote."""
+    made = made_changes(workspace.config.file.read_text(encoding="utf-8"))
+    names, weights = workspace.base_model.input_names, workspace.task.reward.input_change
+    return not made or any(made.get(n) != w for n, w in zip(names, weights, strict=True))
+
+
+def _without_effect(task: Task, plan: Candidate) -> list[str]:
+    """Return the inputs that change no step of the model along a plan, at either of their limits.
+
+    An example is a gain that is still 0 in a model skeleton.
+    """
+    model, sent, found = task.model, plan.predicted_inputs, list[str]()
+    x = plan.predicted_states[: len(sent)]
+    for j, name in enumerate(model.input_names):
+        ends = [
+            end if np.isfinite(end) else other
+            for end, other in ((task.low[j], sent[:, j] - 1), (task.high[j], sent[:, j] + 1))
+        ]
+        after = []
+        for end in ends:
+            u = sent.copy()
+            u[:, j] = end
+            after.append(model.system.step(x, u, model.values, task.dt))
+        if task.low[j] < task.high[j] and np.array_equal(after[0], after[1]):
+            found.append(name)
     return found
 
 
@@ -237,7 +270,8 @@ def _outweighed(workspace: Folder, first: Candidate, off: float) -> list[str]:
         return []
     names, what = groups[0]
     states, unit = [task.model.state_names.index(n) for n in names], task.model.states[names[0]]
-    if len(names) < 2 or not task.reward.state[states].all():
+    ends = reaches(task)
+    if not (ends or len(names) > 1) or not task.reward.state[states].all():
         return []
     state, terminal = aim.reward.state.copy(), aim.reward.terminal.copy()
     state[states], terminal[states] = CLOSER * state[states], CLOSER * terminal[states]
@@ -247,22 +281,27 @@ def _outweighed(workspace: Folder, first: Candidate, off: float) -> list[str]:
     if not left < ENOUGH * off:
         return []
     was, now = measured_alike([off, left], unit)
+    how = "at its end" if ends else "rms"
     weights = ", ".join(f"{names[k]} = {state[i]:.4g}" for k, i in enumerate(states))
     return [
-        f"the plan is off {what} by {was} rms, because [reward] state weighs "
+        f"the plan is off {what} by {was} {how}, because [reward] state weighs "
         f"{listed([name for others, _ in groups[1:] for name in others])} as well: with "
         f"{CLOSER:g} times the weight on it ({weights}) a plan is off by {now}"
     ]
 
 
 def _off_path(task: Task, run: Array) -> tuple[float, float]:
-    """Return the rms error of a run (H + 1, n) in the first weighed group, and its extent."""
+    """Return the error of a run (H + 1, n) in the first weighed group, and the group's extent.
+
+    It is the error at the end if the task is to reach a point, else the rms error.
+    """
     groups = weighed_groups(task)
     if not groups:
         return 0.0, 0.0
     states = [task.model.state_names.index(name) for name in groups[0][0]]
     error = task.model.difference(run, task.target)[:, states]
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1)))), _extent(task, states)
+    off = np.linalg.norm(error[-1:] if reaches(task) else error, axis=1)
+    return float(np.sqrt(np.mean(off**2))), _extent(task, states)
 
 
 def _extent(task: Task, states: Sequence[int]) -> float:

@@ -21,6 +21,7 @@ from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.store.store import made_folder
 from grounded_trials.workspace.config import set_in_model, set_latency
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import estimated_in
 from grounded_trials.workspace.unknown_id import named_trials
 
 if TYPE_CHECKING:
@@ -110,7 +111,7 @@ def _worse(found: Fit) -> str:
     if not known.any():
         return text
     i = int(np.argmax(np.where(known, now / np.where(known, was, 1.0), -np.inf)))
-    name, when = before.names[i], f"{before.horizon_s:g} s ahead" if far else "one step ahead"
+    name, when = before.names[i], f"{before.horizon_s:.3g} s ahead" if far else "one step ahead"
     unit = found.model.states.get(name, "")
     off, then = measured_alike([now[i], was[i]], unit)
     return (
@@ -187,7 +188,7 @@ def fit_trials(
     from grounded_trials.workspace.intake.where_to_mend import where_to_mend
 
     planner = workspace.planner
-    guessed = {n for t in workspace.trials() for n in t.meta.get("estimated", "").split(",")}
+    guessed = estimated_in(workspace.trials())
     model, n = planner.plan.model, planner.task.model.n
     shown = [i for i, name in enumerate(model.state_names[:n]) if name not in guessed]
     hidden = [name for i, name in enumerate(model.state_names) if i not in shown]

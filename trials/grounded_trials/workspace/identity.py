@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -79,6 +79,11 @@ class StoredTrial:
     def policy(self) -> bytes | None:
         """The contents of the candidate file that it ran."""
         return self.policy_of() if self.ran else None
+
+
+def estimated_in(trials: Iterable[StoredTrial]) -> set[str]:
+    """Return the states that no sensor measured in some trial, so that a smoother found them."""
+    return {n for one in trials for n in one.meta.get("estimated", "").split(",") if n}
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,6 @@ from grounded.task import MAX_HORIZON
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import Config, set_target
 from grounded_trials.workspace.task_file import (
-    equal_weights,
     limited_changes,
     read_target,
     write_target,
@@ -30,11 +29,11 @@ def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -
         GroundedError: if the columns are no target of the model, see `checked`; or a file can't be
             written. The files are then as before.
     """
-    from grounded_trials.workspace.off_target import position_names
+    from grounded_trials.workspace.off_target import usual_weights
 
     columns = checked(columns, model)
-    units, place = model.states, position_names(model)
-    weights = {name: round(w, 6) for name, w in equal_weights(columns, units, place).items()}
+    each = usual_weights(model, columns)
+    weights = {name: float(f"{w:.6g}") for name, w in each.items()}  # a range may be 1800 mm
     rows = len(next(iter(columns.values())))
     name = config.task.target or "target.csv"
     path = config.file.parent / name
@@ -48,7 +47,7 @@ def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -
         with suppress(GroundedError, ValueError):  # an unreadable target is replaced
             names, values = read_target(path)
             given = dict(zip(names[1:], values.T[1:], strict=True))
-            before = equal_weights(given, units, place)
+            before = usual_weights(model, given)
         write_atomically(path.with_name(path.name + ".bak"), old)
     write_target(path, config.task.dt, columns)
     try:

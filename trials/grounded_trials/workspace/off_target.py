@@ -7,8 +7,9 @@ at the end.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,11 +20,17 @@ from grounded.search.scatter import beyond_noise
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.task_file import equal_weights
+
+if TYPE_CHECKING:
+    from grounded.search.candidate import Tried
 
 FEW = 2  # groups of states reported: positions and angles before their rates, then by cost
 MOST = 0.5  # a group with more than this share of the tracking cost is reported in any case
 WRITTEN = 1e-3  # tolerance for target.csv, relative to its range, due to the digits in the file
 EXACT = 1e-4  # share of the largest error below which a plan's end is on target
+FARTHER = 1.1  # of the error before: a better candidate's larger error is explained
+RATES = ("speed", "heading_rate", "rates")  # roles of velocities
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
 
 
@@ -146,6 +153,21 @@ def position_names(model: Model) -> list[str]:
     return [model.state_names[i] for i in position_axes(model)]
 
 
+def rates_beside(model: Model, names: Collection[str]) -> set[str]:
+    """Return which of some states are the velocities of others, or of a position among them."""
+    from grounded_trials.logs.inspect_pairs import velocities
+
+    known = {model.state_names[i] for role in RATES for i in roles_of(model).get(role, ())}
+    moved = {rate for place, rate in velocities(model).items() if place in names}
+    return {*names} & (moved | (known if {*position_names(model)} & {*names} else set()))
+
+
+def usual_weights(model: Model, columns: Mapping[str, Array]) -> dict[str, float]:
+    """Return the weights on the states of a target that nobody chose, see `equal_weights`."""
+    rates = rates_beside(model, columns)
+    return equal_weights(columns, model.states, position_names(model), rates)
+
+
 def roles_of(model: Model) -> dict[str, list[int]]:
     """Return the indices of the states in each role of the model."""
     index = {name: i for i, name in enumerate(model.state_names)}
@@ -165,14 +187,48 @@ def tracking_error(task: Task, trial: Trial) -> Array:
     return task.model.difference(trial.states, task.target[: trial.steps + 1])
 
 
-def began_elsewhere(task: Task, trials: Sequence[Trial]) -> tuple[str, ...]:
+def traded(task: Task, best: Tried, before: Tried) -> str:
+    """Return why a better candidate is farther from its target than the one before; else "".
+
+    Utility also counts inputs and other states. On a path that is followed to a centimetre they may
+    be all that is left to gain.
+    """
+    pair = [off_target_of(task, tried.trials)[:1] for tried in (before, best)]
+    if not all(pair) or pair[0][0].what != pair[1][0].what:
+        return ""
+    was, now = pair[0][0], pair[1][0]
+    if not now.rms > FARTHER * was.rms:
+        return ""
+    pairs = ([cost_of_inputs(task, run) for run in one.trials] for one in (before, best))
+    costs = [float(np.mean(own)) for own in pairs]
+    smoother = costs[0] - costs[1] > 0.5 * (best.utility - before.utility)
+    why = "its inputs cost less" if smoother else "other states are nearer to theirs"
+    a, b = measured_alike([was.rms, now.rms], was.unit)
+    return (
+        f"{best.candidate.id} is better than {before.candidate.id} because {why}: {was.what} is "
+        f"off by {b} rms instead of {a}. If that matters more, weigh it more in [reward] state, or "
+        "stop here"
+    )
+
+
+def cost_of_inputs(task: Task, run: Trial) -> float:
+    """Return what the inputs of a run cost by [reward] input and input_change."""
+    terms = task.terms(run)
+    return -(terms.get("input", 0.0) + terms.get("input_change", 0.0))
+
+
+def began_elsewhere(
+    task: Task, trials: Sequence[Trial], estimated: Collection[str] = ()
+) -> tuple[str, ...]:
     """Return the names of the states in which runs of one candidate began away from [task] start.
 
-    Differences within the sensors' noise do not count.
+    Differences within the sensors' noise do not count, nor do `estimated` states, whose error no
+    sensor's noise bounds.
     """
     off = np.array([task.model.difference(t.states[0], task.start) for t in trials])
     names = np.array(task.model.state_names)
-    return tuple(names[beyond_noise(trials, off, task.start)].tolist())
+    told = names[beyond_noise(trials, off, task.start)].tolist()
+    return tuple(name for name in told if name not in estimated)
 
 
 def logged_target(workspace: Folder) -> str:

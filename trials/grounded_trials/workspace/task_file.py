@@ -123,6 +123,7 @@ LEAST = 0.1  # smallest range of a target column used for its weight
 # a column counts as constant if its range is below STILL of its size (of LEAST if that is less), or
 # below HARDLY in its unit
 STILL, HARDLY = 0.01, 1e-4
+RATE = 0.1  # weight of a velocity beside its position, relative to that of other states
 NARROW = 0.2  # smallest range used for a position's axis, as a fraction of the largest one
 UNKNOWN = 1.0  # range assumed for a constant column if no column of its unit moves
 FULL = {"%": (-100.0, 100.0)}  # range assumed for an input without limits, by unit
@@ -295,9 +296,15 @@ def limited_changes(config: Config, model: Model) -> dict[str, tuple[float, floa
 
 
 def equal_weights(
-    columns: Mapping[str, Array], units: Mapping[str, str], together: Collection[str] = ()
+    columns: Mapping[str, Array],
+    units: Mapping[str, str],
+    together: Collection[str] = (),
+    rates: Collection[str] = (),
 ) -> dict[str, float]:
     """Return weights by which an error as large as a column's range (at least LEAST) costs 1.
+
+    That of a velocity beside its position costs RATE: its noise is a larger part of its range, and
+    a plan would leave the path for the sake of the speed.
 
     A constant column has no range of its own. It gets the largest range or size among the columns
     of its unit (a y that is constant while x moves; a step to a constant 5 m), or UNKNOWN if no
@@ -308,6 +315,7 @@ def equal_weights(
         units: the units of the model's states.
         together: the axes of one position, which share a weight: that of the smallest range, but
             of at least NARROW of the largest.
+        rates: the velocities of positions in the target (`off_target.rates_beside`).
     """
     ranges = {name: range_of(values) for name, values in columns.items()}
     if axes := [own for name, own in ranges.items() if name in together and own > 0]:
@@ -322,7 +330,7 @@ def equal_weights(
         name: max(own or (UNKNOWN if name in rest else size[units.get(name, "")]), LEAST)
         for name, own in ranges.items()
     }
-    return {name: width**-2 for name, width in widths.items()}
+    return {name: (RATE if name in rates else 1.0) * w**-2 for name, w in widths.items()}
 
 
 def range_of(values: Array) -> float:

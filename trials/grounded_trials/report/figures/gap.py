@@ -89,7 +89,7 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
         caption += f" The last diagnosis, {made_from(diagnosis)}, {saw}."
     if trial.steps < steps:
         end = begin + trial.steps * trial.dt
-        caption += f" Only its worst part, from {begin:g} to {end:g} s, is drawn."
+        caption += f" Only its worst part, from {begin:.4g} to {end:.4g} s, is drawn."
     return Figure(name, title, caption, tuple(panels), legend(panels))
 
 

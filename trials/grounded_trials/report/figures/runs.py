@@ -149,7 +149,7 @@ def bias_figure(findings: Findings) -> Figure | None:
             panel = replace(panel, note="; ".join(filter(None, (panel.note, note))))
         panels.append(panel)
     caption = (
-        f"What must be added to the rate of change of the {findings.plain} for it to replay the "
+        f"The rate of change that the {findings.plain} lacks, step by step, to replay the "
         "trial. A curve with the same shape in all iterations is a property of the system, not of "
         "a run."
     )
@@ -198,7 +198,9 @@ def _timed(
     """
     calm = [c.y for c in curves if c.role != "model"] + [np.array(limits)]
     wild = [c.y for c in curves if c.role == "model"]
-    values = without_astray(calm, wild, spare) if any(len(v) for v in calm) else wild
+    finite = [v[np.isfinite(v)] for v in calm]
+    moves = any(len(v) and v.max() > v.min() for v in finite)  # else: a constant target
+    values = without_astray(calm, wild, spare) if moves else [*calm, *wild]
     low, high = fitted(values)
     all_low, all_high = fitted([*calm, *wild])
     if all_high - all_low <= CUT * (high - low):

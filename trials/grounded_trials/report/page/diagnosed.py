@@ -170,7 +170,7 @@ def _shares(split: Split, parts: Parts | ChannelParts) -> tuple[str, str, str]:
 
 def _doubts(splits: Mapping[str, Split]) -> str:
     """Up to how many times the noise errors may be noise: 1.3, more where repeats are few."""
-    known = [one for one in splits.values() if one.whole.irreducible > 0]
+    known = [one for one in splits.values() if one.whole.irreducible > 0] or [*splits.values()]
     factors = [doubt_of(one.irreducible_unsure) for one in known]
     ends = dict.fromkeys(f"{factor:.2g}" for factor in (min(factors), max(factors)))
     return " to ".join(ends)

@@ -208,7 +208,7 @@ def _heading(findings: Findings) -> str:
     runs, tried = compared(findings), [one for one in findings.history if one.trials]
     if len(runs) < 2:
         alone = len(tried) < 2 or findings.first is None
-        return "Results" if alone else "Nothing improved on the first run"
+        return "Results" if alone else "The first run is still the best"
     rows = improvements_in(findings)
     worse = any(one.after > one.before and not one.is_same for one in rows)
     return "What the runs changed" if worse else "What improved"

@@ -28,6 +28,8 @@ from grounded.model import Model
 from grounded.places import probe
 from grounded.task import Task
 from grounded_trials.formats.messages import Ints
+from grounded_trials.logs.command_steps import stands_still
+from grounded_trials.logs.inspect_pairs import velocities
 from grounded_trials.logs.resample import stamped_otherwise
 from grounded_trials.logs.samples import Samples, check_overlap, tidy
 from grounded_trials.logs.signals import Series, SignalSpec
@@ -110,13 +112,29 @@ def with_estimates(
         return dict(series)
     times, states = _smoothed(records, table, task, _sizes(samples, task))
     t, first = clock.stamps(times), series[next(iter(table.measured))]
-    found = dict(series)
+    found, rests = dict(series), _at_rest(samples, sent, model)
     for name in guessed:
         values = states[:, model.state_names.index(name)]
+        if name in rests:
+            values = np.where(t <= rests[name], 0.0, values)
         spec = SignalSpec(f"/estimate.{name}", first.spec.clock)
         logged = t - round(float(np.median(first.t - first.log_times)))
         found[name] = replace(first, spec=spec, t=t, values=values, log_times=logged)
     return found
+
+
+def _at_rest(samples: Sequence[Samples], sent: Sequence[Samples], model: Model) -> dict[str, int]:
+    """Return until when the rates of measured states are zero [ns]: no robot moves on its own.
+
+    That is until a command first changes, if all measured states stand still before it for a while.
+    A smoother spreads the first jerk, where its model is off, back over the rest before it.
+    """
+    moved = [s.t[1:][np.diff(s.y) != 0] for s in sent]
+    until = min((int(t[0]) for t in moved if len(t)), default=0)
+    if not stands_still(samples, (), until):
+        return {}
+    own = {s.name for s in samples}
+    return {rate: until for place, rate in velocities(model).items() if place in own}
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ from grounded_trials.workspace.intake.stored_before import (
 )
 from grounded_trials.workspace.intake.trial_check import afterwards, warnings_about
 from grounded_trials.workspace.next_step import after_log
-from grounded_trials.workspace.off_target import off_target_of
+from grounded_trials.workspace.off_target import off_target_of, traded
 from grounded_trials.workspace.proposing import candidate_named, latest_candidates, standing_in
 from grounded_trials.workspace.unknown_id import refuse_ids
 
@@ -127,7 +127,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     scaled = [name for one in faults for name in one.inputs]
     checked = warnings_about(workspace, trial, read.last_s, read.fell, scaled)
     warnings = (*read.warnings, *odd, *checked)
-    if whole := _whole(read, workspace.task):
+    if trial.candidate and (whole := _whole(read, workspace.task)):
         warnings = (*warnings, *afterwards(workspace.task, whole))
     if before:
         warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
@@ -140,6 +140,10 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     if ahead and verdict == "run again":
         now = standing_in(workspace, ahead=True)
     judged = [interpolate_gaps(trial).trial] if trial.candidate else []
+    rest = [one for one in history if one is not tried and one.accepted]
+    outdone = max(rest, key=lambda one: one.utility, default=None)
+    best = tried is not None and now is not None and now.incumbent is tried
+    told = traded(workspace.task, tried, outdone) if best and tried and outdone else ""
     return Ingested(
         trial=added.id,
         sha256=added.sha256,
@@ -152,7 +156,11 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         signals=read.signals,
         verdict=verdict,
         crashed=tried.failed if tried and verdict == "crashed" else (),
-        notes=(*read.notes, *(odd_run(workspace, now, added.id) if now and read.doubted else ())),
+        notes=(
+            *read.notes,
+            *filter(None, [told]),
+            *(odd_run(workspace, now, added.id) if now and read.doubted else ()),
+        ),
         off_target=off_target_of(workspace.task, judged),
         then=NextCommand("discard", (added.id,))
         if odd and not aside

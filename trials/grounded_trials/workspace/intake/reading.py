@@ -30,6 +30,7 @@ from grounded_trials.workspace.intake.foreign import ForeignLog, begun, mapping_
 from grounded_trials.workspace.intake.log_faults import no_angles
 from grounded_trials.workspace.intake.stored_before import (
     refuse_as_another,
+    refuse_known_data,
     same_recording,
     set_aside_of,
 )
@@ -173,6 +174,8 @@ def read_log_file(workspace: Folder, path: Path, candidate: str | None, data: bo
     log = read_foreign(workspace, path, mapping_of(workspace, path))
     ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
     refuse_as_another(path, log.stored, "" if data else candidate)
+    if not (data or ran):
+        refuse_known_data(path, log.stored)
     before = None if data or ran else set_aside_of(workspace, log.source["source_sha256"])
     if before and before.candidate in workspace.candidate_ids():
         ran = before.candidate

@@ -50,6 +50,20 @@ def refuse_as_another(path: Path, stored: Sequence[StoredTrial], wanted: str | N
     )
 
 
+def refuse_known_data(path: Path, stored: Sequence[StoredTrial]) -> None:
+    """Refuse a log that is stored as data and was passed as the log of a run, probably by mistake.
+
+    Raises:
+        GroundedError: if it is stored as data.
+    """
+    if stored and not stored[-1].trial.candidate:
+        identity = stored[-1].stored.id
+        raise GroundedError(
+            f"{path} is stored already, as {identity}, data: pass the log of the candidate's run. "
+            f"If this is one, discard {identity} and name the candidate with --candidate ID"
+        )
+
+
 def _what(candidate: str | None) -> str:
     return f"a run of {candidate}" if candidate else "data"
 
