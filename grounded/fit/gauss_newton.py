@@ -9,8 +9,9 @@ as it does in one-step least squares (errors in variables).
 
 Gauss-Newton neglects that the filter's gains depend on theta too. If the model gets stiffer with
 theta, its steps may then decrease the likelihood, and theta would stay at its start. So when no
-step increases the likelihood, the search continues with the exact gradient (`exact`) until that
-gives no increase either.
+step increases the likelihood, the search continues with the gradient through the gains (`exact`)
+until that gives no increase either, and, if that still promises some, with differences of the
+likelihood (`differenced`).
 
 A step is accepted if the log-likelihood increases; else lambda grows. Unknowns at a bound that the
 step would leave are held; directions without information in the data are not moved.
@@ -25,10 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.estimate import NoiseStd
-from grounded.fit.point import FitData, Linear, Point, exact, linear, point
+from grounded.fit.point import FitData, Linear, Point, differenced, exact, linear, point
 from grounded.frozen import Array
 
 ENOUGH = 0.002  # [nats] predicted gain below which the search ends; 1/16 of a standard deviation
+DOUBTED = 1.0  # [nats] promised gain that does not come, above which a gradient is doubted
 WHOLE = 1e-9  # rounding tolerance, as a fraction of a step
 NOTHING = 1e-9  # eigenvalue, relative to the largest (scaled), treated as no information
 
@@ -61,13 +63,15 @@ def climb(
     """
     at, damping, last = start, 1e-3, max_steps
     slopes_at: Callable[[FitData, Point], Linear] = linear
-    slopes = linear(data, at)
+    slopes, better = linear(data, at), [exact, differenced]
     for step in range(max_steps):
         at, slopes, damping, status = _step(data, noise, at, slopes, free, damping, slopes_at)
-        if status != "rising" and slopes_at is exact:
-            return Climb(at, slopes, step, status)
         if status != "rising":
-            damping, slopes_at, slopes = 1e-3, exact, exact(data, at)
+            promise = marquardt_step(data, at.theta, slopes, free, 1e-3)[1]
+            if not better or (slopes_at is exact and promise < DOUBTED):
+                return Climb(at, slopes, step, status)
+            damping, slopes_at = 1e-3, better.pop(0)
+            slopes = slopes_at(data, at)
             last = min(last, step + 1 + max_steps // 2)
         if step + 1 == last:
             break

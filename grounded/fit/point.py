@@ -36,6 +36,7 @@ from grounded.frozen import Array
 
 PART = 8  # records in a part: the lanes of the widest vector registers
 SMALL = 8_000  # total steps up to which records are not divided
+APART = 1e-4  # half the span of a difference, relative to an unknown's value or scale
 BLOCKS = 60  # approximate number of time blocks whose gradients are kept for intervals
 Wanted = Literal["value", "slopes", "exact"]
 
@@ -156,6 +157,23 @@ def exact(data: FitData, at: Point) -> Linear:
     """Return the derivatives including the dependence of the filter's gains on the parameters."""
     passes = point(data, at.noise, at.theta, at, "exact").passes
     return _sum([one.slopes for one in passes if one.slopes is not None])
+
+
+def differenced(data: FitData, at: Point) -> Linear:
+    """Return the derivatives with a gradient by differences of the log-likelihood itself.
+
+    `exact` differentiates A = f_x at the track's points, but the filter takes the slope over its
+    uncertainty. For a state that no sensor measures, in a model that bends, they differ by much.
+    """
+    slopes, unknowns = linear(data, at), data.unknowns
+    gradient = np.zeros(unknowns.k)
+    for i in range(unknowns.k):
+        size = APART * min(unknowns.scale[i], max(abs(at.theta[i]), 1e-3))
+        low, high = np.clip(
+            at.theta[i] + np.array([-size, size]), unknowns.low[i], unknowns.high[i]
+        )
+        gradient[i] = (fall(data, at, i, low) - fall(data, at, i, high)) / (high - low)
+    return replace(slopes, g=gradient)
 
 
 def fall(data: FitData, at: Point, i: int, value: float) -> float:

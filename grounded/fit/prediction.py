@@ -71,7 +71,7 @@ def prediction_error(
     x = smooth(filtered).x if np.isfinite(filtered.loglik) else filtered.x
     steps = max(1, round(horizon_s / noise.dt))
     one, ahead, windows = _windows(model, batch, measurement, x, steps)
-    return PredictionError(measurement.names, one, ahead, horizon_s, windows)
+    return PredictionError(measurement.names, one, ahead, steps * noise.dt, windows)
 
 
 def _windows(

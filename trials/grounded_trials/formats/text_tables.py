@@ -32,6 +32,7 @@ LOOK = 65536  # characters read of a line
 BEFORE = 20  # rows before the last one that show how many digits its last cell should have
 DATES = ("date", "datetime", "date_time", "datum", "datum_zeit", "fecha")
 DAY = re.compile(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})")  # as in Germany
+SECONDS = re.compile(r"(^|[\W_])s(ec|ecs|econds)?[\])]?$")  # at the end of a column's name
 CLOCK = re.compile(r"^(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d*)?)$")
 
 
@@ -84,6 +85,21 @@ def column_units(path: Path) -> dict[str, str]:
         for name, cell in zip(head.names, head.cells, strict=True)
     }
     return {f"/csv.{name}": unit[1] for name, unit in said.items() if unit and '"' not in unit[1]}
+
+
+def states_time_unit(path: Path) -> bool:
+    """Return whether a text table leaves no doubt about its times.
+
+    Its column of times says that they are in seconds (`time_s`, `time [s]`), or holds times of day.
+    """
+    if path.suffix.lower() not in (".csv", ".tsv", ".txt"):
+        return False
+    with _opened(path) as stream:
+        lines = [stream.readline(LOOK) for _ in range(PREAMBLE + 2)]
+    head = _head(lines, path)
+    at = head.names.index(_times_among(head, lines, path))
+    row = next((_cells(row, head.mark) for row in lines[head.rows :] if row.strip()), [])
+    return bool(SECONDS.search(head.cells[at].lower())) or ":" in "".join(row[at : at + 1])
 
 
 def cut_off(path: Path) -> str:

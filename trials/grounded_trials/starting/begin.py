@@ -19,7 +19,7 @@ from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Result, listed
-from grounded_trials.formats.text_tables import column_units
+from grounded_trials.formats.text_tables import column_units, states_time_unit
 from grounded_trials.logs.guessed_table import mapping_toml
 from grounded_trials.logs.inspect_evidence import as_stated, weigh
 from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated
@@ -214,7 +214,7 @@ def _begin(
             tuple(_asked(g, ask, partial(as_stated, said, units[g.name])) for g in some)
             for some in (states, inputs)
         )
-    slow = _in_seconds(report)
+    slow = () if states_time_unit(files[0]) else _in_seconds(report)
     notes = (*notes, *slow, *wide_joints(states, units, joints, report))
     step, whose, note = (dt, "", "") if dt else interval_of(report, inputs, states)
     ranges = {g.name: _range(report, g) for g in (*states, *inputs)}

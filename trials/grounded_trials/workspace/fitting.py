@@ -195,13 +195,14 @@ def fit_trials(
     looked = sound_trials(planner.plan, [planner.lift(trial) for trial in used], hidden)
     records = []
     for trial in looked.trials:
-        known = np.r_[np.ones(n), 0.1 * np.ptp(trial.states[:, n:], axis=0) + 1e-6]
+        width = np.ptp(trial.states, axis=0)
+        known = np.where(np.arange(model.n) < n, np.maximum(width, 1.0), 0.1 * width + 1e-6)
         record = record_of(model, trial)
         records.append(
             replace(
                 record,
                 measured=record.measured[:, shown],
-                start=np.where(np.arange(model.n) < n, 0.0, trial.states),
+                start=trial.states,
                 start_std=known,
             )
         )

@@ -36,8 +36,8 @@ from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.toml_table import Table
 
 FINEST = 8  # largest number of smoother rows in a control step
-PIECE_S = 5.0  # length of the pieces of a log, which are smoothed in parallel [s]
-OVERLAP_S = 1.5  # overlap of the pieces on each side [s]
+PIECE_S, PIECE = 5.0, 100  # least length of the pieces that are smoothed in parallel [s], rows
+OVERLAP_S, OVERLAP = 1.5, 30  # least overlap of the pieces on each side [s], rows
 LEAST = 3  # smallest number of rows that can be smoothed
 MARGIN_S = 0.5  # time after the last change of a command that still counts as motion [s]
 WIDE = 10.0  # std of an initial state, relative to the state's size
@@ -263,7 +263,8 @@ def _overlapping(record: Record) -> Iterator[tuple[Record, slice]]:
     from grounded.estimate.record import part
 
     h = float(record.times[1] - record.times[0])
-    each, more, rows = max(1, round(PIECE_S / h)), round(OVERLAP_S / h), len(record.times)
+    each, more = max(PIECE, round(PIECE_S / h)), max(OVERLAP, round(OVERLAP_S / h))
+    rows = len(record.times)
     for first in range(0, rows, each):
         a, b = max(0, first - more), min(rows, first + each + more)
         piece = part(record, a, b - 1)
@@ -277,11 +278,13 @@ def _moving(records: Sequence[Record]) -> list[Record]:
 
     sent = records[0]
     changed = sent.command_times[1:][(np.diff(sent.commands, axis=0) != 0).any(axis=1)]
-    first, last = (changed[0], changed[-1] + MARGIN_S) if len(changed) else (-np.inf, np.inf)
+    h = float(records[0].times[1] - records[0].times[0])
+    margin, span = max(MARGIN_S, h), max(PIECE_S, PIECE * h)
+    first, last = (changed[0], changed[-1] + margin) if len(changed) else (-np.inf, np.inf)
     found = []
     for record in records:
         rows = np.flatnonzero((record.times >= first) & (record.times <= last))
         if len(rows) >= LEAST:
             found.append(part(record, int(rows[0]), int(rows[-1])))
-    pieces = [piece for record in found or records for piece in cut(record, PIECE_S)]
+    pieces = [piece for record in found or records for piece in cut(record, span)]
     return [piece for piece in pieces if np.isfinite(piece.measured).any(axis=0).all()]
