@@ -227,6 +227,9 @@ def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars
 
 def _second_ahead(diagnosis: Diagnosis) -> RulerRow | None:
     errors = diagnosis.prediction_error
+    horizons = [e for e in errors if not e.whole_trial]
+    if horizons and horizons[0].horizon_s > CREDIT_S / 2:  # a slow process
+        return furthest(horizons)
     ahead = (e for e in errors if math.isclose(e.horizon_s, CREDIT_S, rel_tol=0.1))
     return next((e for e in ahead if not e.drowned), None)
 

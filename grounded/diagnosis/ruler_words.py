@@ -24,16 +24,25 @@ def improvement(rows: Sequence[RulerRow]) -> str:
 
     Whole trials are used if predictions 1 s ahead gain nothing, or whole trials gain much more.
     """
-    first = telling(rows)
-    shown = [row for row in rows if row is first or row.whole_trial]
-    for row in sorted(shown, key=lambda row: row is not first):
-        gains = _gains(row)
-        best = sorted((n for n in gains if gains[n] > SHOWS), key=lambda n: -gains[n])
-        told = [(name, *_told(row, name, "with_effects", "crude")) for name in best[: NAMED - 1]]
-        parts = [f"{name} by {now} instead of {then}{noise}" for name, now, then, noise in told]
-        if parts:
-            return f"{_ahead(row)} miss {listed(parts)}."
-    return f"{_ahead(first)} hardly change." if first else ""
+    row = told_row(rows)
+    if row is None:
+        first = telling(rows)
+        return f"{_ahead(first)} hardly change." if first else ""
+    told = [(name, *_told(row, name, "with_effects", "crude")) for name in _best(row)]
+    parts = [f"{name} by {now} instead of {then}{noise}" for name, now, then, noise in told]
+    return f"{_ahead(row)} miss {listed(parts)}."
+
+
+def told_row(rows: Sequence[RulerRow]) -> RulerRow | None:
+    """Return the row of which `improvement` gives numbers; None if predictions hardly change."""
+    whole = (row for row in rows if row.whole_trial)
+    return next((row for row in (telling(rows), *whole) if row and _best(row)), None)
+
+
+def _best(row: RulerRow) -> list[str]:
+    """Return the channels that improve most, best first, of those that improve enough to name."""
+    gains = _gains(row)
+    return sorted((n for n in gains if gains[n] > SHOWS), key=lambda n: -gains[n])[: NAMED - 1]
 
 
 def telling(rows: Sequence[RulerRow]) -> RulerRow | None:

@@ -8,6 +8,7 @@ from html import escape
 from typing import TYPE_CHECKING
 
 from grounded.diagnosis.error_report import RulerRow, furthest
+from grounded.diagnosis.ruler_words import told_row
 from grounded.result import figure, html_table, percent, shown, spread, with_unit
 
 if TYPE_CHECKING:
@@ -26,8 +27,11 @@ def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[lis
 
     Args:
         diagnosis: the result.
-        whole_trials: whether to add the errors over whole trials to those a horizon ahead.
+        whole_trials: whether to add the errors over whole trials to those a horizon ahead. They
+            are added in any case if the sentence gives them.
     """
+    told = told_row(diagnosis.prediction_error)
+    whole_trials = whole_trials or (told is not None and told.whole_trial)
     ahead = [row for row in [furthest(diagnosis.prediction_error)] if row]
     whole = [row for row in diagnosis.prediction_error if row.whole_trial]
     columns = {

@@ -145,6 +145,9 @@ def test_a_slow_plant_is_spoken_of_by_whole_trials():
     assert holds(improvement((second, whole)), "0.30 m", "5.0 m")
     quick = row({"x": 0.2}, {"x": 0.08})
     assert telling((quick, whole)) is quick and "8.0 cm" in improvement((quick, whole))
+    for rows, told in (((second, whole), True), ((quick, whole), False)):  # as in the sentence
+        table, _ = error_table(SimpleNamespace(prediction_error=rows), whole_trials=False)
+        assert any("whole trial" in cells[0] for cells in table) is told
     assert telling((whole,)) is None and telling(()) is None
 
 

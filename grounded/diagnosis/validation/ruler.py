@@ -1,10 +1,11 @@
 """The ruler: rms errors of held-out open-loop predictions, in the unit of each channel.
 
 From many moments of the log, and from the start of each trial, a hypothesis is simulated with the
-recorded commands and without further measurements. Its errors are taken 0.1, 0.5 and 1 s later and
-over whole trials. Its values come from the other trials, or from the other pieces of one long log.
-The errors do not depend on the noise that a diagnosis estimates, so they can be compared between
-hypotheses, models and diagnoses. Two hypotheses are compared by `gain`.
+recorded commands and without further measurements. Its errors are taken 0.1, 0.5 and 1 s later (of
+a slow process 1, 5 and 10 steps later) and over whole trials. Its values come from the other
+trials, or from the other pieces of one long log. The errors do not depend on the noise that a
+diagnosis estimates, so they can be compared between hypotheses, models and diagnoses. Two
+hypotheses are compared by `gain`.
 
 No model predicts better than the noise floor. If a manoeuvre was repeated (same candidate or same
 commands), predictions of the repeats share the model's error and differ in noise, so the scatter
@@ -33,6 +34,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 SECONDS = (0.1, 0.5, 1.0)
+SLOW, STEPS = 0.5, (1, 5, 10)  # [s] control step from which a process counts as slow; its horizons
 MOST_STARTS, FEWER_STARTS = 400, 75  # the second applies to a simulator, whose steps are slow
 MOST_WHOLE = 8  # most trials that are predicted from start to end
 WHOLE_STEPS = 4000  # most steps of these together, unless that leaves fewer than LEAST_WHOLE
@@ -69,7 +71,8 @@ class Ruler:
         self.folds = folds(data)
         self.held_out = len(np.unique(self.folds)) > 1
         longest = int(data.lengths.max())
-        steps = (1, *(max(1, round(s / data.dt)) for s in SECONDS))
+        fast = data.dt < SLOW
+        steps = (1, *(max(1, round(s / data.dt)) for s in SECONDS)) if fast else STEPS
         self.steps = tuple(dict.fromkeys(k for k in steps if k < longest))  # and the whole trial
         self.names = [n for i, n in enumerate(data.model.state_names) if i not in data.hidden]
         self.shown = [data.model.state_names.index(n) for n in self.names]

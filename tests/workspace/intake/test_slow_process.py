@@ -93,3 +93,13 @@ def test_a_fit_moves_though_the_hidden_state_bends_the_gradient(tanks):
         TRUE["k4"] * TRUE["k2"] / TRUE["k1"], rel=0.05
     )
     assert found.before.horizon_s == DT  # it was called 1 s
+
+
+@pytest.mark.slow
+def test_a_slow_process_is_predicted_ten_steps_ahead(tanks):
+    """One step of 4 s was the only horizon: too short to show what the model lacks."""
+    _, workspace, _ = tanks
+    found = workspace.diagnose()
+    assert [row.horizon_s for row in found.prediction_error[:-1]] == [DT, 5 * DT, 10 * DT]
+    whole = found.prediction_error[-1]
+    assert whole.whole_trial and whole.with_effects["lower"] < 0.2 * whole.crude["lower"]
