@@ -128,6 +128,23 @@ def pairs(model: Model) -> list[str]:
     return [f"{t}<-{s}" for t in but_position(model) for s in names if s != t]
 
 
+def crossed(model: Model) -> list[str]:
+    """Return `target<-input` for every state that some input drives at once, and every other input.
+
+    An input that acts on a state through others in between (a servo) does not drive it at once.
+    """
+    dt, (x, u) = probe(model, SHORT), samples(model, 8)
+    size = np.abs(model.system.linearise(x, u, model.values, dt)[1]).max(axis=0)
+    acts = dict(zip(model.state_names, size > 1e-3 * dt, strict=True))
+    driven = [name for name in dynamic(model) if acts[name].any()]
+    return [
+        f"{name}<-{a}"
+        for name in driven
+        for a, own in zip(model.input_names, acts[name], strict=True)
+        if not own
+    ]
+
+
 def samples(model: Model, count: int = 3) -> tuple[Array, Array]:
     """Return random states (count, n) and inputs (count, m), the same ones every time."""
     rng = np.random.default_rng(0)

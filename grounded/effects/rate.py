@@ -123,6 +123,18 @@ coupling = RateFamily(
     rate=_coupling_rate,
 )
 
+crosstalk = RateFamily(
+    name="crosstalk",
+    loose=True,
+    equation="s' = model + k u   (s<-u)",
+    sentence="{source} also act{s} on {driven}, by {k}",
+    targets=places.crossed,
+    quantities=_coupling,
+    lookalikes=("coupling", "input_gain", "periodic", "cornering_drag"),
+    vague=0.7,
+    rate=lambda s, a, own, t, c, site: {coupled(site)[0]: c["k"] * a[coupled(site)[1]]},
+)
+
 periodic = RateFamily(
     name="periodic",
     loose=True,
@@ -148,5 +160,11 @@ slew_limit = RateFamily(
     parts=4,
 )
 
-FAMILIES = (offset, rate_gain, trend, coupling, periodic, slew_limit)
-ADDED = (offset, trend, coupling, periodic)  # not for a state whose rate is another state
+FAMILIES = (offset, rate_gain, trend, coupling, crosstalk, periodic, slew_limit)
+ADDED = (
+    offset,
+    trend,
+    coupling,
+    crosstalk,
+    periodic,
+)  # not for a state whose rate is another state

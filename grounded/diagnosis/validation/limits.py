@@ -210,7 +210,7 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
         family = effect.family
         if targets & memory:
             continue
-        if isinstance(family, InputFamily | MemoryFamily) and targets & still:
+        if isinstance(family, InputFamily | MemoryFamily | RateFamily) and targets & still:
             continue
         if targets & on_off and (isinstance(family, InputFamily) or family is backlash):
             continue
