@@ -55,6 +55,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 NOTHING = 0.1  # nats below which no trial can separate two effects
+HIDDEN = 0.1  # part of the expected evidence found in the trials, below which something hides it
 REPLAYED = 4  # most recent trials whose commands are used to calibrate the expected evidence
 ADAPTED = 12  # iterations in which a rival is fitted to a run
 TWICE = 0.8  # two runs are asked for if they leave less than this part of what one leaves of `+-`
@@ -128,32 +129,35 @@ def probe(
     group = ties[0]
     task, first, second = _rivals(task, diagnosis, trials, library or Library(), group[:2])
     noise = _Noise.of(task.model, diagnosis)
-    again = [run for t in trials[-REPLAYED:] if (run := _run(task, first, policy, t)) is not None]
-    if again:
-        second = _adapted(task, again, second, noise)
-    told = sum(_evidence(task, run, first, second, noise) for run in again)
-    told *= len(trials) / max(len(again), 1)
+    second = _adapted(task, list(trials[-REPLAYED:]), second, noise)
+    again = [_replayed(task, h, policy, trials) for h in (first, second)]
+    ways = [_Way(task, noise, first, second, again[0]), _Way(task, noise, second, first, again[1])]
+    told = ways[0].known * len(trials) / max(len(again[0]), 1)
     rows = [diagnosis.ranked(name) for name in group[:2]]
     apart = [row.evidence for row in rows if row is not None]
     trust = min(1.0, max(TIE, float(np.ptp(apart))) / max(told, 1e-12))
     best: tuple[float, Policy, str] | None = None
     for words, candidate in probes(policy, task.model, _inputs_of(task.model, group[:2])):
         runs = [_run(task, h, candidate) for h in (first, second)]
-        if any(run is None or not _safe(task, run) for run in runs):
+        safe = [run for run in runs if run is not None and _safe(task, run)]
+        if len(safe) < len(runs):
             continue
-        assert runs[0] is not None and runs[1] is not None
-        expected = trust * min(
-            _evidence(task, runs[0], first, second, noise),
-            _evidence(task, runs[1], second, first, noise),
-        )
+        expected = min(way.adds(run) for way, run in zip(ways, safe, strict=True))
         if best is None or expected > best[0]:
             best = (expected, candidate, words)
     if best is None:
         return None
-    expected, chosen, words = best
-    if expected < NOTHING:
+    most, chosen, words = best
+    expected = trust * most
+    if most < NOTHING:
         same = f"No probe can distinguish {group[0]} from {group[1]}: with the other values"
         text = f"{same} refitted they are equivalent"
+        return Probe(chosen, expected, (group[0], group[1]), text, little=True)
+    if expected < TIE <= most and trust < HIDDEN:
+        text = (
+            f"No probe is sure to distinguish {group[0]} from {group[1]}: by the model, the trials "
+            "so far should have done so, but the rest that it lacks hides the difference"
+        )
         return Probe(chosen, expected, (group[0], group[1]), text, little=True)
     gain = f"{expected:,.{int(expected < 100)}f} nats"
     tells = f"{words}: expected to distinguish {group[0]} from {group[1]} by {gain}"
@@ -357,6 +361,12 @@ def _run(task: Task, h: Hypothesis, policy: Policy, like: Trial | None = None) -
     return Trial(np.array(states), inputs, task.dt, *names, start_inputs=held)
 
 
+def _replayed(task: Task, h: Hypothesis, policy: Policy, trials: Sequence[Trial]) -> list[Trial]:
+    """Return runs in the model with a hypothesis, with the commands of the latest trials."""
+    runs = (_run(task, h, policy, trial) for trial in trials[-REPLAYED:])
+    return [run for run in runs if run is not None]
+
+
 def _wrapped(task: Task, h: Hypothesis) -> Model:
     """Return the model with a hypothesis' shifts and effects."""
     model = task.model
@@ -379,13 +389,41 @@ def _safe(task: Task, run: Trial | None) -> bool:
     return bool(inside.all())
 
 
-def _evidence(task: Task, run: Trial, true: Hypothesis, rival: Hypothesis, noise: _Noise) -> float:
-    """Return what the rival, its values fitted, can't explain of a run [nats]."""
-    data = noise.data(task, [run])
-    predictor = Predictor(data)
-    rss = []
-    for h in (true, rival):
-        start = [(h, noise.model, data.y.copy())]
-        fits = refine(predictor, start, iterations=ADAPTED, fixed_noise=True)
-        rss.append(float(fits[0].rss.sum()) if fits else np.inf)
-    return max(0.5 * (rss[1] - rss[0]), 0.0)
+class _Way:
+    """One of two rivals is true: what would a further run add to the evidence against the other?
+
+    Args:
+        task: with the calibrated model.
+        noise: that of the diagnosis.
+        true: the hypothesis by which runs are simulated.
+        rival: the other one.
+        trials: runs with the commands of the trials so far, as `true` has them.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        noise: _Noise,
+        true: Hypothesis,
+        rival: Hypothesis,
+        trials: Sequence[Trial],
+    ) -> None:
+        self.task, self.noise, self.both, self.trials = task, noise, (true, rival), list(trials)
+        self.known = self._apart(self.trials) if self.trials else 0.0
+
+    def adds(self, run: Trial) -> float:
+        """Return what a run adds [nats], with all values fitted to it and the trials together.
+
+        Fitted to the run alone, the values of a rival would forget what the trials so far say of
+        them, and most rivals would pass for equivalent.
+        """
+        return max(self._apart([*self.trials, run]) - self.known, 0.0)
+
+    def _apart(self, runs: Sequence[Trial]) -> float:
+        data, rss = self.noise.data(self.task, runs), []
+        predictor = Predictor(data)
+        for h in self.both:
+            start = [(h, self.noise.model, data.y.copy())]
+            fits = refine(predictor, start, iterations=ADAPTED, fixed_noise=True)
+            rss.append(float(fits[0].rss.sum()) if fits else np.inf)
+        return max(0.5 * (rss[1] - rss[0]), 0.0)

@@ -167,6 +167,8 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
         about = About(make, incumbent, options, way)
         stepping = keeping_promises(about)
         found = stepping.step_from(step, promised)
+        if stepping is not about and found and found.candidate and about.ruined_by(found.candidate):
+            stepping, found = about, about.step_from(step, promised)
         if stepping.corrected and found and found.candidate:
             found = _surer(stepping, step, found)
         least = options.tolerance * abs(stepping.already)
