@@ -1,4 +1,4 @@
-"""The original model makes no step that is a ruin in the adopted one, which replays the best run."""
+"""The original model takes no step that would ruin the run in the adopted one."""
 
 from dataclasses import replace
 
