@@ -148,7 +148,7 @@ def believed(
     if not nearest:
         return Believed(grounded)
     others = [o for o, _ in nearest]
-    refuting = [o for o, t in nearest[ASKED:] if t.candidate.of_corrected and t.accepted is False]
+    refuting = [o for o, t in nearest[ASKED:] if t.candidate.of_corrected and t.lost]
 
     crude, corrected = [], []
     for other in others[:ASKED] + refuting[:ASKED]:
