@@ -30,7 +30,9 @@ from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
+from grounded_trials.workspace.intake.begun import begun_elsewhere
 from grounded_trials.workspace.intake.earlier_task import OfEarlierTask, of_earlier_task
+from grounded_trials.workspace.intake.gone_wrong import gone_wrong
 from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.intake.log_faults import dead_sensors, log_faults, mistaken_in
 from grounded_trials.workspace.intake.look import Look
@@ -125,10 +127,9 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     faults = log_faults(workspace, interpolate_gaps(trial).trial)
     odd = tuple(one.told(trial, own=read.own) for one in faults)
     scaled = [name for one in faults for name in one.inputs]
+    elsewhere = begun_elsewhere(workspace, trial)
     checked = warnings_about(workspace, trial, read.last_s, read.fell, scaled)
-    warnings = (*read.warnings, *odd, *checked)
-    if trial.candidate and (whole := _whole(read, workspace.task)):
-        warnings = (*warnings, *afterwards(workspace.task, whole))
+    warnings = (*read.warnings, *odd, *(one.told for one in elsewhere), *checked)
     if before:
         warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
     if aside := added.id in workspace.discarded():
@@ -137,6 +138,12 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     history = now.history if now else ()
     tried = next((t for t in history if t.candidate.id == trial.candidate), None)
     verdict = ASIDE if aside else _verdict(trial, tried, workspace.config.search.repeats)
+    wrong = any(one.again for one in elsewhere)
+    if not (odd or wrong or aside):
+        asked = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
+        warnings, wrong = (*filter(None, [asked]), *warnings), bool(asked)
+    if trial.candidate and not wrong and (whole := _whole(read, workspace.task)):
+        warnings = (*warnings, *afterwards(workspace.task, whole))
     if ahead and verdict == "run again":
         now = standing_in(workspace, ahead=True)
     judged = [interpolate_gaps(trial).trial] if trial.candidate else []
@@ -163,7 +170,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         ),
         off_target=off_target_of(workspace.task, judged),
         then=NextCommand("discard", (added.id,))
-        if odd and not aside
+        if (odd or wrong) and not aside
         else after_log(workspace, verdict, now),
     )
 

@@ -10,24 +10,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from grounded.frozen import Array
 from grounded.result import measured_alike
 from grounded.search.candidate import Candidate
-from grounded.search.returned.who_drove import UNLIKE, follows, latest, second_differences
+from grounded.search.returned.who_drove import UNLIKE, follows, latest
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
-from grounded_trials.wording import count, in_digits_apart, with_unit
+from grounded_trials.wording import count, with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import reaches, weighed_groups
 
-# share of the mean cost of a step above which a start away from s_0 brings a warning; for a state
-# without weight along the way, share of its range in the run
-FAR = 0.1
-SURE = 3.0  # the start must also be off by this many std of sensor noise and of earlier starts
-MUCH = 1.0  # share of a mean step's cost above which the start changes the utility too much
-FEWEST = 2  # smallest number of earlier runs from which the scatter of starts is estimated
 LATEST = 3  # largest number of steps by which late inputs are reported
-WHITE = 0.6745 * 6**0.5  # median of absolute second differences of white noise of std 1
 AWAY = 0.02  # drift after a run, relative to the target's extent, above which it is reported
 WIDEN = "no plan will use that; widen them if the robot can take it"
 
@@ -81,7 +73,6 @@ def warnings_about(
             f"{task.horizon}: they are not judged"
         )
     whole = whole.until(task.horizon)
-    found += _start(task, whole, _starts_before(workspace, trial.id))
     found += _inputs(task, whole)
     candidate, _ = workspace.candidate(trial.candidate)
     found += _still(whole) if np.ptp(candidate.predicted_states, axis=0).any() else []
@@ -132,57 +123,6 @@ def _lacking(task: Task, last_s: float) -> str:
     if not missing > 0:  # only its commands end early, or its rows are the control steps
         return ""
     return f", with its last state {1e3 * missing:.3g} ms before the plan's last"
-
-
-def _starts_before(workspace: Folder, identity: str) -> Array:
-    """Return how far from s_0 the other runs of this task started, (N, n)."""
-    task = workspace.task
-    runs = [one for one in workspace.task_trials() if one.candidate and one.id != identity]
-    off = [task.model.difference(one.states[0], task.start) for one in runs]
-    return np.array(off).reshape(len(off), task.model.n)
-
-
-def _start(task: Task, trial: Trial, before: Array) -> list[str]:
-    """Return warnings for states in which a run did not start at s_0, beyond their sensor noise.
-
-    A state that [reward] weighs along the way is judged by the cost of its offset relative to a
-    mean step of the run, the most costly first; another state relative to its range in the run.
-    Offsets within the scatter of earlier starts `before`, (N, n), are unavoidable and tolerated.
-    """
-    if trial.finite_steps < 0:
-        return []
-    off = task.model.difference(trial.states[0], task.start)
-    states = trial.states[: trial.finite_steps + 1]
-    usual = np.ptp(states, axis=0)
-    jumps = np.abs(second_differences(states, task.model.angle_mask))
-    noise = np.median(jumps, axis=0) / WHITE if len(jumps) else np.zeros(len(usual))
-    known = -task.rewards(trial)[: len(states)]
-    known = known[np.isfinite(known)]
-    usually = known.sum() / max(len(known), 1)
-    weight = task.reward.state
-    with np.errstate(all="ignore"):
-        share = np.where(weight > 0, weight * off**2 / usually, np.abs(off) / usual)
-    told = (share > FAR) & (np.abs(off) > np.maximum(SURE * noise, 1e-9))
-    if len(before) >= FEWEST:
-        told &= (np.abs(off) > SURE * before.std(axis=0, ddof=1)) | (share > MUCH)
-    found = []
-    for i in sorted(np.flatnonzero(told), key=lambda i: (weight[i] == 0, -share[i])):
-        name, unit = list(task.model.states.items())[i]
-        began, start = in_digits_apart(float(trial.states[0, i]), float(task.start[i]))
-        turned = f" ({np.rad2deg(off[i]):+.2g} degrees)" if unit == "rad" else ""
-        does = (
-            "this changes its utility. Place the robot nearer to the start, `discard "
-            f"{trial.id}` and run it again"
-            if share[i] > MUCH
-            else "the run counts, no need to repeat it. Place the robot nearer to the start next "
-            "time"
-        )
-        found.append(
-            f"the run started with {name} = {with_unit(began, unit)}, the task's start is {start}: "
-            f"{with_unit(f'{off[i]:+.2g}', unit)}{turned} off, more than the noise in the log. "
-            f"{does[0].upper()}{does[1:]}"
-        )
-    return found
 
 
 def _unsafe(task: Task, trial: Trial, ran: Candidate) -> list[str]:
