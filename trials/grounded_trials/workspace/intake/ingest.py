@@ -30,6 +30,7 @@ from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
+from grounded_trials.workspace.intake.after_run import afterwards
 from grounded_trials.workspace.intake.begun import begun_elsewhere
 from grounded_trials.workspace.intake.earlier_task import OfEarlierTask, of_earlier_task
 from grounded_trials.workspace.intake.gone_wrong import gone_wrong
@@ -66,7 +67,7 @@ from grounded_trials.workspace.intake.stored_before import (
     repeated,
     what_repeats,
 )
-from grounded_trials.workspace.intake.trial_check import afterwards, warnings_about
+from grounded_trials.workspace.intake.trial_check import warnings_about
 from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of, traded
 from grounded_trials.workspace.proposing import candidate_named, latest_candidates, standing_in
@@ -143,7 +144,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         asked = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
         warnings, wrong = (*filter(None, [asked]), *warnings), bool(asked)
     if trial.candidate and not wrong and (whole := _whole(read, workspace.task)):
-        warnings = (*warnings, *afterwards(workspace.task, whole))
+        warnings = (*warnings, *afterwards(workspace.planner, whole))
     if ahead and verdict == "run again":
         now = standing_in(workspace, ahead=True)
     judged = [interpolate_gaps(trial).trial] if trial.candidate else []

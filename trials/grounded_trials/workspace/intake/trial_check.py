@@ -10,17 +10,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from grounded.result import measured_alike
 from grounded.search.candidate import Candidate
 from grounded.search.returned.who_drove import UNLIKE, follows, latest
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
 from grounded_trials.wording import count, with_unit
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.off_target import reaches, weighed_groups
 
 LATEST = 3  # largest number of steps by which late inputs are reported
-AWAY = 0.02  # drift after a run, relative to the target's extent, above which it is reported
 WIDEN = "no plan will use that; widen them if the robot can take it"
 
 
@@ -143,67 +140,6 @@ def _unsafe(task: Task, trial: Trial, ran: Candidate) -> list[str]:
                 f"{predicted} was predicted"
             )
     return found
-
-
-def afterwards(task: Task, whole: Trial) -> list[str]:
-    """Return warnings on what the robot did after the run: it left [safety], or moved on."""
-    return _left_afterwards(task, whole) or _moved_on(task, whole)
-
-
-def _moved_on(task: Task, whole: Trial) -> list[str]:
-    """Return a warning if a robot that was to reach a point drifts away from it after the run.
-
-    Only if the inputs are constant after the run, so that nobody drove it.
-    """
-    end, last = task.horizon, whole.finite_steps
-    groups = weighed_groups(task) if reaches(task) else []
-    held = whole.inputs[end:last]
-    if not groups or last <= end + 1 or np.ptp(held[1:], axis=0).any():
-        return []
-    names, what = groups[0]
-    states = [task.model.state_names.index(name) for name in names]
-    off = task.model.difference(whole.states[: last + 1], task.target[-1])[:, states]
-    far = np.linalg.norm(off, axis=1)
-    way = np.linalg.norm(np.ptp(np.vstack([task.start, task.target])[:, states], axis=0))
-    worst = end + int(np.argmax(far[end:]))
-    if not far[worst] > max(AWAY * way, 2 * far[end]):
-        return []
-    later, then = measured_alike([far[worst], far[end]], task.model.states[names[0]])
-    return [
-        f"{(worst - end) * task.dt:.2g} s after the run {what} was {later} from its target, at its "
-        f"end {then}: [reward] only judges the run. To make the robot stay there, "
-        f"{_to_stay(task, states)}"
-    ]
-
-
-def _to_stay(task: Task, states: Sequence[int]) -> str:
-    """Return what would make a robot stay at the end of its target that the task lacks."""
-    from grounded.places import integrals
-
-    end = task.target[-max(2, len(task.target) // 20) :, states]
-    rates = [one.j for one in integrals(task.model) if one.exact and one.i in states]
-    ways = ["let the target rest at its end (target --hold)"] * bool(np.ptp(end, axis=0).any())
-    if not rates or not (task.reward.terminal[rates] > 0).all():
-        ways.append("weigh the rates at the end ([reward] terminal)")
-    return ", or ".join(ways) or "let the target rest for longer (target --hold)"
-
-
-def _left_afterwards(task: Task, whole: Trial) -> list[str]:
-    """Return a warning if the robot left [safety] after a run that stayed inside."""
-    assert task.safety_low is not None and task.safety_high is not None
-    states = whole.states[: whole.finite_steps + 1]
-    out = np.maximum(task.safety_low - states, states - task.safety_high)
-    if (out[: task.horizon + 1] > 0).any() or not (out > 0).any():
-        return []
-    t, i = np.unravel_index(int(np.argmax(out)), out.shape)
-    first = int(np.argmax((out > 0).any(axis=1))) - task.horizon
-    name, unit = list(task.model.states.items())[int(i)]
-    low, high = task.safety_low[i], task.safety_high[i]
-    return [
-        f"{first * whole.dt:.2g} s after its end the robot left [safety] {name} = [{low:g}, "
-        f"{high:g}]: {name} was {with_unit(f'{states[t, i]:.3g}', unit)}. Stop it in time, or let "
-        "the target end at rest inside"
-    ]
 
 
 def _inputs(task: Task, trial: Trial) -> list[str]:
