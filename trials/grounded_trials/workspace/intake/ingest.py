@@ -40,6 +40,7 @@ from grounded_trials.workspace.intake.look import Look
 from grounded_trials.workspace.intake.odd_run import odd_run
 from grounded_trials.workspace.intake.read_otherwise import (
     misled,
+    misused_in,
     pace_of,
     rather_exchanged,
     unit_of,
@@ -277,6 +278,13 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             f"{path} ran {left}, which was made for an earlier task (other target, reward, limits, "
             "start or horizon): its utility can't be compared. Ingest it with --data for fitting "
             "and diagnosis, and run a candidate of this task",
+            NextCommand("ingest", (str(path), "--data")),
+        )
+    if log and not other and whole.inputs.any() and (misused := misused_in(log, task, own)):
+        raise GroundedError(
+            f"{path} did not run {ran} as it should: its commands are not what {ran} sends on the "
+            f"logged states and times; {misused}, and run {ran} again. Ingest it with --data for "
+            "fitting and diagnosis",
             NextCommand("ingest", (str(path), "--data")),
         )
     known = replace(read.trial, id="").until(read.trial.known_steps)
