@@ -19,10 +19,11 @@ from grounded.result import listed, with_unit
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import multiplied
 from grounded.search.returned.other_scale import NEARLY, UNITS, units_tried
-from grounded.search.returned.who_drove import DECISIVE, Following, evidence, follows, latest
+from grounded.search.returned.who_drove import DECISIVE, FINE, Following, evidence, follows, latest
 from grounded.task import Task
 from grounded.trial import Trial
 
+SAME = 2.0  # ratio of the differences left by two misuses that explain a log equally well
 LEAVES = 0.25  # largest share of the original difference that a misuse may leave
 TIMES = {"ms": 1e3, "us": 1e6, "minutes": 1 / 60}  # units of a time that should be in seconds
 
@@ -39,14 +40,16 @@ def misused(task: Task, own: Candidate, trial: Trial, plain: Following) -> str:
     Returns:
         The end of a sentence about its commands; "" if nothing reproduces them.
     """
-    late, best, told = latest(task), LEAVES * plain.error, ""
+    late, most, found = latest(task), min(LEAVES * plain.error, NEARLY), []
     for policy, passed, said in _ways(task.model, own, trial):
-        found = follows(policy, passed, late)
-        if found is None or not found.alike or not found.error < min(best, NEARLY):
-            continue
-        if evidence(plain, found) > DECISIVE:
-            best, told = found.error, said
-    return told
+        fit = follows(policy, passed, late)
+        if fit is not None and fit.alike and fit.error < most and evidence(plain, fit) > DECISIVE:
+            changed = int((passed.states != trial.states).any(axis=0).sum())
+            found.append((fit.error, -changed, said))
+    least = min((error for error, _, _ in found), default=0.0)
+    # at the limits one state may explain as much as all, but a program passes all in one unit
+    near = [one for one in found if one[0] <= SAME * least + FINE]
+    return min(near, key=lambda one: (one[1], one[0]))[2] if near else ""
 
 
 def _ways(model: Model, own: Candidate, trial: Trial) -> Iterator[tuple[Policy, Trial, str]]:
