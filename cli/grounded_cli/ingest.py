@@ -86,6 +86,10 @@ def following(log: str, candidate: str | None, json_: bool) -> None:
     if json_:
         show_json(done.to_json())
         return
+    if done.proposed is None:
+        _tell(log, done.taken, None, workspace.base_model)
+        show(f"\nnothing is proposed from this log\n{next_line(done.taken.then)}")
+        return
     _tell(log, done.taken, done.proposed.standing.incumbent, workspace.base_model)
     show("")
     tell_proposed(workspace, done.proposed, last=done.exported is None)
@@ -120,6 +124,8 @@ def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
         passed = best is not None and best.candidate.id != one.candidate
         passed = passed and (one.verdict == AGAIN or (one.known and one.verdict in BEST))
         meaning = VERDICTS.get(one.verdict, "")
+        if one.then.verb == "discard":  # "it may be bad luck" would contradict the warning
+            meaning = "; discard it, as the warning says"
         if passed and one.verdict in BEST:
             meaning = " than those before it"
         text = f"utility {number(one.utility)}, {one.verdict}{_earlier(one) or meaning}"

@@ -58,6 +58,7 @@ class Ahead:
         starts: largest number of samples to predict from.
         delays: command delays tried [s].
         linear: also remove errors that are linear in the initial states.
+        constant: remove a constant rate of each state.
     """
 
     def __init__(
@@ -69,6 +70,7 @@ class Ahead:
         delays: Sequence[float] = DELAYS,
         *,
         linear: bool = False,
+        constant: bool = True,
     ) -> None:
         self.model, self.shown, self.sent, self.dt = model, list(shown), trial.inputs, trial.dt
         self.steps = max(1, round(AHEAD / trial.dt))
@@ -81,6 +83,7 @@ class Ahead:
         self.at = at[:: -(-len(at) // starts)] if len(at) else at
         self.first, self.last = logged[self.at], logged[self.at + self.steps]
         self.left_out = _basis(self.first[:, self.shown] if linear else self.first[:, :0])
+        self.left_out = self.left_out if constant else self.left_out[:, :0]
         moves = np.nanstd(logged[:, self.shown], axis=0) if good.any() else np.zeros(len(shown))
         self.least = LITTLE * moves + TINY
         params = list(model.params.values())
@@ -183,7 +186,7 @@ class Ahead:
         return self._fit(size, found)
 
     def _off(self, gains: Array, values: Array, late: int | Steps) -> Array:
-        """Return the errors (K, N, shown) minus the removed parts, at least their means.
+        """Return the errors (K, N, shown) minus the removed parts, usually at least their means.
 
         For K gains (K, m), parameters (K, k) and delays (K,); a single one is broadcast.
         """

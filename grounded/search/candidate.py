@@ -56,6 +56,7 @@ class Candidate(Result):
     slopes: Slopes = ""  # derivatives of the model that it was planned in
     base_as_run: float = float("nan")  # model's utility of the base from where its trials began
     likely_off: float = 0.0  # likely error of predicted_gain, from held-out trials; 0: unknown
+    seen: tuple[str, ...] = ()  # ids of the search's trials that were known when it was made
     units: Mapping[str, str] = field(default_factory=dict)  # of states and inputs, for figures
 
     @property
@@ -169,6 +170,7 @@ class Tried(Result):
     noise_cost: float = 0.0  # cost of sensor noise in its logs; of the best, and for `promised`
     deviation: float = float("nan")  # standard deviation of a single run, from repeats (`scatter`)
     probability: float = float("nan")  # that it beats the best before it; NaN: nothing is repeated
+    gone: tuple[str, ...] = ()  # trials that it was made from and that were discarded since
 
     @cached_property
     def utility(self) -> float:
@@ -187,6 +189,20 @@ class Tried(Result):
         if not self.utilities or not np.isfinite(self.utilities).all():
             return float("nan")
         return float(self.deviation / np.sqrt(len(self.utilities)))
+
+    @property
+    def void(self) -> bool:
+        """Whether it was not run, and was made from a trial that was discarded since."""
+        return bool(self.gone) and not self.trials
+
+    @property
+    def lost(self) -> bool:
+        """Whether it counts as a step that did not improve.
+
+        A step by derivatives that were learnt from trials discarded since says nothing about those
+        of the trials that are left.
+        """
+        return self.accepted is False and not (self.gone and self.candidate.slopes)
 
     @property
     def failed(self) -> tuple[str, ...]:

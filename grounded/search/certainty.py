@@ -43,6 +43,7 @@ def judged(
     iteration = losses = 0  # accepted improvements; steps from the incumbent that did not improve
     exact = False  # whether the system has repeated itself to the last bit
     ids = {c.id for c in candidates}
+    known = {trial.id for trial in trials}
     spent = sum(t.candidate in ids for t in trials) >= options.max_trials
     by_name: dict[str, list[Trial]] = {}
     for trial in trials:
@@ -51,16 +52,17 @@ def judged(
     for candidate in candidates:
         own = tuple(by_name.get(candidate.id, ()))
         utilities = tuple(task.utility(t) for t in own)
+        gone = tuple(one for one in candidate.seen if one not in known)
         failed = any(u == -np.inf for u in utilities)
         exact = exact or (agree and repeated_exactly(own))
         enough = min(options.repeats, len(own)) if exact and own else options.repeats
         if len(own) < enough and not failed:
-            history.append(Tried(candidate, own, utilities, None))
+            history.append(Tried(candidate, own, utilities, None, gone=gone))
             continue
         better = incumbent is None or float(np.mean(utilities)) > incumbent.utility
         accepted = better and not failed
         pieces = by_pieces(task, own) if len(own) > 1 and np.isfinite(utilities).all() else None
-        tried = Tried(candidate, own, utilities, accepted, pieces=pieces)
+        tried = Tried(candidate, own, utilities, accepted, pieces=pieces, gone=gone)
         if accepted:
             iteration += incumbent is not None
             incumbent, losses = tried, 0

@@ -330,6 +330,7 @@ class Maker:
             predicted_utility=already,
             caution=caution,
             way=way,
+            seen=tuple(one.id for tried in self.now.history for one in tried.trials if one.id),
             units={**self.planner.task.model.states, **self.planner.task.model.inputs},
         )
         return self.foretold(made, policy, problem, already)

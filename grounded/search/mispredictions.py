@@ -29,6 +29,10 @@ laws that such a trial refutes still predict trials nearby. After two such losse
 by more than the likely error, the crude derivatives are used (`making.REFUTED`).
 With a single other trial nothing can be left out: the value is then at least the share of the
 mispredictions that law 1 leaves in the held-out parts of the run.
+
+Laws of first order hold in a neighbourhood. So runs that strayed from it (`strayed`) correct
+nothing: one run with a motor wired the wrong way round gave derivatives whose step lost six times
+the best cost. And corrected derivatives must still replay the incumbent from s_0.
 """
 
 from __future__ import annotations
@@ -56,6 +60,8 @@ ASKED = 3  # nearest trials that are left out in turn
 LATEST = 100  # latest trials that these are chosen from
 DEAD = 1e-4  # regularisation, relative to the mean square effect of the inputs
 WORST = 1e12  # cost of a run that diverges
+STRAYED = 100.0  # factor on the costs promised and best so far: a run that misses by more strayed
+ASTRAY = 3.0  # a model that gives the incumbent more than this times its cost does not replay it
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,13 +141,14 @@ def believed(
     if own is None:
         return Believed(grounded)
     told = [t for t in history[-LATEST:] if t is not incumbent and np.isfinite(t.utility)]
+    told = [t for t in told if not strayed(t, incumbent)]
     ran = [(o, t) for t in told if (o := seen(planner, t, grounded)) is not None]
     moved = [apart(grounded, o.run, own.run) for o, _ in ran]
     nearest = [ran[j] for j in np.argsort(moved, kind="stable") if moved[j] > 0]
     if not nearest:
         return Believed(grounded)
     others = [o for o, _ in nearest]
-    refuting = [o for o, t in nearest[ASKED:] if t.candidate.of_corrected and t.accepted is False]
+    refuting = [o for o, t in nearest[ASKED:] if t.candidate.of_corrected and t.lost]
 
     crude, corrected = [], []
     for other in others[:ASKED] + refuting[:ASKED]:
@@ -159,13 +166,31 @@ def believed(
         )
     misses = float(np.mean(crude)), float(np.mean(corrected))
     share = misses[1] / (sum(misses) + 1e-300)
+    if not (replays := _replays(made.problem, incumbent, grounded)):
+        share = 1.0
     both = (
         Alternative(share, grounded, off),
         Alternative(1.0 - share, made.problem, unexplained),
     )
-    plain = misses[0] <= misses[1] or not trusted
+    plain = misses[0] <= misses[1] or not (trusted and replays)
     model, missed = (Believed(grounded), misses[0]) if plain else (made, misses[1])
     return replace(model, missed=missed, alternatives=both)
+
+
+def strayed(tried: Tried, best: Tried) -> bool:
+    """Return whether runs left the neighbourhood in which mispredictions correct derivatives.
+
+    They did if they missed their promise by far more than the cost promised and the best one's.
+    """
+    cost = max(abs(tried.promised), abs(best.utility), 1e-9)
+    return tried.promised - tried.utility > STRAYED * cost
+
+
+def _replays(problem: Problem, incumbent: Tried, grounded: Problem) -> bool:
+    """Return whether corrected derivatives give the incumbent's policy about its cost from s_0."""
+    policy = incumbent.candidate.policy
+    cost = max(-incumbent.utility, -predicted(grounded, policy).utility)
+    return -predicted(problem, policy).utility <= ASTRAY * cost
 
 
 def _with(law: Array | None, own: Seen, grounded: Problem) -> Believed:

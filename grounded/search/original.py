@@ -7,18 +7,30 @@ original model has kept more, the original model makes the next step. This is de
 proposal, so the adopted effects are used again if the original model does worse. No trial is spent
 on the choice. A gain within its own likely error is no promise: after one such gain had failed, a
 self-balancing robot whose adopted effects were right nearly fell by a step of the original model.
-The original model must also give the incumbent's own run about the utility that it had.
+Nor is a promise broken by a loss that the scatter of repeats may explain, or by a run that ended
+early on its path, because somebody stopped it: the promises count as kept as far as two standard
+errors allow. The original model must also give the incumbent's own run about the utility that it
+had.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from grounded.search.candidate import LITTLE, Tried
+from grounded.search.certainty import error_between
 from grounded.search.making import FORETOLD, About
 from grounded.search.planner import Planner
 from grounded.search.step_size import BROKEN
+from grounded.task import Task
+from grounded.trial import Trial
+
+LUCK = 2.0  # standard errors that a loss must exceed to break a promise
+ON_PATH = 2.0  # a run that ended early was on its path if it cost at most this times the best one
 
 
 @dataclass(frozen=True)
@@ -27,11 +39,23 @@ class Promises:
 
     promised: float = 0.0
     real: float = 0.0  # of each step at most the promised gain, and at least its negative
+    doubt: float = 0.0  # by how much more it may be: `LUCK` standard errors, within those bounds
 
     @property
     def share(self) -> float:
         """Return the kept share; 1 for a model without steps."""
         return self.real / self.promised if self.promised > 0 else 1.0
+
+    @property
+    def broken(self) -> bool:
+        """Whether less than the share `BROKEN` was kept, beyond doubt."""
+        return self.real + self.doubt < BROKEN * self.promised
+
+    def and_of(self, promised: float, real: float, error: float) -> Promises:
+        """Return them with those of one more step, given the standard error of its gain."""
+        gained, may = np.clip([real, real + LUCK * error], -promised, promised).tolist()
+        doubt = math.hypot(self.doubt, may - gained)
+        return Promises(self.promised + promised, self.real + gained, doubt)
 
 
 def keeping_promises(about: About) -> About:
@@ -43,9 +67,11 @@ def keeping_promises(about: About) -> About:
     make, planner = about.make, about.make.planner
     if planner.plan is planner.task:
         return about
-    adopted, original = promises(make.now.history, make.fingerprint)
+    history = make.now.history
+    stopped = [t.candidate.id for t in history if stopped_on_path(planner.task, t, history)]
+    adopted, original = promises(history, make.fingerprint, stopped)
     much = adopted.promised >= LITTLE * -about.incumbent.utility
-    if not (much and adopted.share < min(BROKEN, original.share)):
+    if not (much and adopted.broken and adopted.share < original.share):
         return about
     crude = replace(make, planner=Planner(planner.task, planner.task))
     original_one = About(crude, about.incumbent, about.options, about.way, original=True)
@@ -53,23 +79,48 @@ def keeping_promises(about: About) -> About:
     return original_one if off < FORETOLD * -about.incumbent.utility else about
 
 
-def promises(history: Sequence[Tried], model: str) -> tuple[Promises, Promises]:
+def stopped_on_path(task: Task, tried: Tried, history: Sequence[Tried]) -> bool:
+    """Return whether a candidate only failed by runs that ended early, though on their path.
+
+    They are compared with the runs of the candidate that it was made from, up to the same step.
+    """
+    base = next((t for t in history if t.candidate.id == tried.candidate.base), None)
+    failed = [t for t, u in zip(tried.trials, tried.utilities, strict=True) if u == -np.inf]
+    if not failed or base is None or not math.isfinite(base.utility):
+        return False
+    costs = -np.mean([task.rewards(trial) for trial in base.trials], axis=0)
+
+    def on_path(run: Trial) -> bool:
+        T = run.steps
+        early = run.finite_steps == T < task.horizon
+        return early and -task.rewards(run)[:T].sum() <= ON_PATH * costs[:T].sum()
+
+    return all(map(on_path, failed))
+
+
+def promises(
+    history: Sequence[Tried], model: str, without: Sequence[str] = ()
+) -> tuple[Promises, Promises]:
     """Return the promises of the steps of the adopted model, and of all other steps.
 
     Args:
         history: all candidates with their trials.
         model: fingerprint of the model with the adopted effects.
+        without: ids of candidates whose runs neither kept nor broke a promise.
     """
-    utility = {t.candidate.id: t.utility for t in history if t.accepted is not None}
+    judged = {t.candidate.id: t for t in history if t.accepted or t.lost}
+    judged = {name: tried for name, tried in judged.items() if name not in without}
     adopted, original = Promises(), Promises()
     for tried in history:
         made = tried.candidate
         promised = 0.0 if made.doubtful else made.predicted_gain
-        if made.base not in utility or made.id not in utility or not promised > 0:
+        if made.base not in judged or made.id not in judged or not promised > 0:
             continue
-        gained = max(-promised, min(utility[made.id] - utility[made.base], promised))
+        base = judged[made.base]
+        error, known = error_between(base, tried, history)
+        gained = promised, tried.utility - base.utility, error if known else 0.0
         if made.model == model and not made.of_original:
-            adopted = Promises(adopted.promised + promised, adopted.real + gained)
+            adopted = adopted.and_of(*gained)
         else:
-            original = Promises(original.promised + promised, original.real + gained)
+            original = original.and_of(*gained)
     return adopted, original

@@ -263,6 +263,7 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
     Too little is less than the tolerance each on average, or in total less than the standard error
     of that gain, if repeats show it. Else a search under noise would follow lucky runs.
     """
+    history = tuple(t for t in history if t.accepted is not False or t.lost)
     before = [t for t in history[:-PATIENCE] if t.accepted]
     last = history[-PATIENCE:]
     if not before or any(t.candidate.model != model for t in last):
@@ -289,7 +290,9 @@ def _suspicion(history: tuple[Tried, ...], incumbent: Tried, model: str) -> str:
         return ""  # the model has changed since: the next trial shows the effect
     lost = 0
     for tried in history:
-        lost = 0 if tried is incumbent or tried.accepted is None else lost + 1
+        if tried is incumbent or tried.accepted is not False:
+            lost = 0
+        lost += tried.lost
     if lost >= LOST:
         return f"{lost} steps in a row did not improve: a diagnosis may show what the model lacks"
     if wild(incumbent):
@@ -329,13 +332,16 @@ def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | No
 def _waiting(now: Standing, model: str) -> Tried | None:
     """Return the latest candidate without its trials that is still valid, or None.
 
-    It is invalid if the trial that it was made from was discarded since: the crash for which a
-    first policy was made gentler, or the run that a step starts from.
+    It is invalid if a trial that it was made from was discarded since: the crash for which a first
+    policy was made gentler, the run that a step starts from, or any other that the search knew. The
+    one that was waiting before that trial then waits again.
     """
     undecided = {t.candidate.id for t in now.history if t.accepted is None}
     failed = sum(t.accepted is False for t in now.history)
     for tried in reversed(now.history):
         made = tried.candidate
+        if tried.void or (tried.gone and tried.accepted is False and made.base):
+            continue
         if tried.accepted is not None or made.model != model:
             return None
         if made.base not in undecided and (made.base or made.caution <= failed):

@@ -217,5 +217,5 @@ def losers_of(
         way: only candidates made in this way; None for all.
     """
     tried = [t for t in history if t.candidate.base == base and t.candidate.model == model]
-    lost = [t.candidate for t in tried if t.accepted is False]
+    lost = [t.candidate for t in tried if t.lost]
     return [c for c in lost if way is None or c.way == way]

@@ -8,6 +8,7 @@ import pytest
 
 from grounded.plant import Plant
 from grounded.rollout import simulate
+from grounded.search import mispredictions
 from grounded.search.ask_tell import Search
 from grounded.search.making import About, Maker
 from grounded.search.margin import AGES, worse_costs
@@ -204,3 +205,50 @@ def test_old_samples_are_asked_of_corrected_slopes_too(found):
     costs = worse_costs([about.real], found.best.candidate.policy)
     assert costs.shape == (1, len(AGES)) and np.isfinite(costs).all()
     assert costs[0, -1] > -predicted(about.real, found.best.candidate.policy).utility
+
+
+def wired_wrongly(task, candidate):
+    """Return the trial of a candidate on a robot whose motors turn the other way."""
+    own = task.model
+
+    def derivative(s, a, p):
+        turned = SimpleNamespace(**{name: -getattr(a, name) for name in own.input_names})
+        return own.derivative(s, turned, p)
+
+    return drive(task, Plant(replace(own, derivative=derivative)), candidate)
+
+
+def test_a_run_with_a_motor_wired_wrongly_corrects_no_derivatives():
+    """Its law gave a helicopter a step that lost six times the best cost."""
+    task = cart_task()
+    found = searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 1)
+    made = found.search.ask()
+    search = Search(task, candidates=found.search.candidates, trials=found.search.trials)
+    search.tell(wired_wrongly(task, made))
+    history = search.standing.history
+    assert history[-1].utility < 1000 * history[0].utility
+    told = believed(Planner(task, task), search.best, history, found.problem)
+    assert told.corrected is None and not told.alternatives
+
+
+def test_corrected_derivatives_must_replay_the_best_run(monkeypatch):
+    """With the wild run of a motor they gave -2,014 for a best run of -1.553."""
+    task = cart_task()
+    found = searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 2)
+    planner, history = Planner(task, task), found.search.standing.history
+    moved = replace(found.problem, start=found.problem.start + 0.01)  # noise of the first sample
+
+    def flattered(problem, own, other):
+        return 1.0 if problem is moved else 0.0
+
+    def unstable(own, others, grounded):
+        law = np.zeros((len(own.x), 2, 6))
+        law[:, :, :2] = 1.5 * np.eye(2)  # each step more than doubles what is off
+        return law, 0.0
+
+    monkeypatch.setattr(mispredictions, "unforetold", flattered)
+    assert believed(planner, found.best, history, moved).corrected is not None
+    monkeypatch.setattr(mispredictions, "laws", unstable)
+    made = believed(planner, found.best, history, moved)
+    assert made.corrected is None
+    assert [one.weight for one in made.alternatives] == [1.0, 0.0]

@@ -3,12 +3,14 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from grounded.plant import Plant
 from grounded.search.improve import propose
 from grounded.search.original import Promises, promises
 from grounded.search.planner import Planner, planner_with
+from grounded.search.scatter import PIECES
 from grounded.search.step_size import SearchOptions
 from small_tasks import cart_task, drive, other, rover_task
 
@@ -52,10 +54,26 @@ def test_an_effect_that_keeps_its_promises_makes_all_steps():
     assert not any(c.of_original for c in candidates)
 
 
-def step(name, base, model, promised, utility, of_original=False, accepted=True, doubtful=False):
+def step(
+    name,
+    base,
+    model,
+    promised,
+    utility,
+    of_original=False,
+    accepted=True,
+    doubtful=False,
+    runs=None,
+    lost=True,
+):
     fields = {"id": name, "base": base, "model": model, "predicted_gain": promised}
     made = SimpleNamespace(**fields, of_original=of_original, doubtful=doubtful)
-    return SimpleNamespace(candidate=made, utility=utility, accepted=accepted)
+    utilities = (utility,) if runs is None else runs
+    pieces = None if runs is None else np.outer(runs, np.ones(PIECES) / PIECES)
+    fields = {"utility": float(np.mean(utilities)), "utilities": utilities, "pieces": pieces}
+    return SimpleNamespace(
+        candidate=made, accepted=accepted, lost=accepted is False and lost, **fields
+    )
 
 
 def test_promises_are_counted_for_each_model():
@@ -72,3 +90,42 @@ def test_promises_are_counted_for_each_model():
     assert adopted == Promises(3.0, -1.0)
     assert original == Promises(6.0, 4.0)
     assert Promises().share == 1.0
+    assert adopted.broken and not original.broken and not Promises().broken
+
+
+def test_a_loss_that_scatter_may_explain_breaks_no_promise():
+    """Right effects of a helicopter were given up after one loss that was called bad luck."""
+    best = step("c1", "", "better", float("nan"), 0.0, runs=(-0.86, -0.72))
+    lost = step("c2", "c1", "better", 0.21, -0.87, accepted=False)
+    adopted, _ = promises((best, lost), "better")
+    assert adopted.share < 0 and not adopted.broken
+    sure = step("c1", "", "better", float("nan"), 0.0, runs=(-0.7901, -0.7899))
+    assert promises((sure, lost), "better")[0].broken
+    again = [step(f"c{k}", "c1", "better", 0.21, -0.95, accepted=False) for k in range(2, 7)]
+    assert promises((best, *again), "better")[0].broken  # five such losses are no bad luck
+
+
+def test_a_step_made_from_a_discarded_trial_broke_no_promise():
+    best = step("c1", "", "better", float("nan"), -1.6)
+    wild = step("c2", "c1", "better", 1.2, -9.6, accepted=False)
+    assert promises((best, wild), "better")[0].broken
+    disowned = step("c2", "c1", "better", 1.2, -9.6, accepted=False, lost=False)
+    assert promises((best, disowned), "better")[0] == Promises()
+
+
+def test_a_run_that_was_stopped_on_its_path_broke_no_promise():
+    """It was stopped by hand after 59 of 90 steps: the adopted effects were given up for it."""
+    task, target = CASES["cart"]
+    plant, options = Plant(other(task.model, 1.3)), SearchOptions()
+    candidates = [propose(task, [], [], options).candidate]
+    trials = [drive(task, plant, candidates[0])]
+    planner = replace(planner_with(task, [(target, {"g": -1.6})]), task=task)
+    candidates.append(propose(task, candidates, trials, options, planner=planner).candidate)
+    assert candidates[1].predicted_gain > 0.1 * -task.utility(trials[0])
+    run = replace(trials[0].until(27), candidate="c0002", id="t2")
+    fell = np.array(run.states)
+    fell[15:, 0] -= np.linspace(0.0, 5.0, len(fell) - 15)
+    for stopped, original in ((run, False), (replace(run, states=fell), True)):
+        made = propose(task, candidates, [*trials, stopped], options, planner=planner)
+        assert made.standing.history[1].verdict() == "crashed"
+        assert made.candidate.of_original is original

@@ -14,7 +14,7 @@ from grounded.search.ask_tell import learn
 from grounded.search.improve import propose
 from grounded.search.planner import model_fingerprint
 from grounded.search.standing import MAX_CAUTION, standing
-from grounded.search.step_size import OTHER_WAY, SearchOptions, Step
+from grounded.search.step_size import OTHER_WAY, SearchOptions, Step, losers_of
 from grounded.trial import Trial, mean_trial
 from grounded.utility import Reward
 from small_tasks import cart_task, drive, other, rover_task
@@ -310,6 +310,38 @@ def test_a_step_is_not_run_from_a_run_that_was_set_aside():
     story = Story().add().add()
     assert story.propose().candidate.base == "c0002"
     del story.trials[1]
+    assert story.propose().candidate is story.candidates[1]
+
+
+def test_a_candidate_made_from_a_discarded_loss_gives_way_to_the_one_that_lost():
+    """c0007 was proposed still, after the run of c0006 that was its reason had been set aside."""
+    story = Story().add().add(cut)
+    made = story.propose().candidate
+    assert made.seen == tuple(trial.id for trial in story.trials) and len(made.seen) == 2
+    story.candidates += [made] * (made not in story.candidates)
+    wrong = story.trials.pop()
+    again = story.propose()
+    assert not again.is_new and again.candidate is story.candidates[1]
+    assert again.standing.history[-1].void and again.standing.history[-1].gone == (wrong.id,)
+    story.trials.append(wrong)
+    assert story.propose().candidate is made  # restored
+
+
+@pytest.mark.parametrize("slopes", ["", "corrected", "original"])
+def test_a_step_learnt_from_a_discarded_trial_counts_as_no_loss(slopes):
+    """After `discard` of a wild run the step that it had led to still counted: -9.604."""
+    story = Story().add().add(cut)
+    made = replace(story.propose().candidate, slopes=slopes)
+    story.candidates[2:] = [made]
+    worse = replace(
+        story.trials[0], states=story.trials[0].states + 9.0, id="t9", candidate=made.id
+    )
+    story.trials.append(worse)
+    assert losers_of(story.now.history, made.base, made.model)[-1] is made
+    del story.trials[1]
+    lost = losers_of(story.now.history, made.base, made.model)
+    assert lost == ([] if slopes else [made])
+    assert story.now.history[-1].verdict() == "no better"  # which it was
     assert story.propose().candidate is story.candidates[1]
 
 

@@ -32,6 +32,7 @@ FINE = 1e-4  # resolution of logged commands at best, relative to an input's siz
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # ages of the states acted on that are tried, in steps
 AGES = 1.0  # steps by which that age varies in a run (lost packets, clock drift and jitter)
 OTHERS = 20  # number of latest candidates to compare with
+OR_UNITS = ", or `runner.action` got states in other units or order, or a time that is not in s"
 
 
 @dataclass(frozen=True)
@@ -174,18 +175,21 @@ def suspicion(task: Task, trial: Trial, own: Candidate, others: Sequence[Candida
         name = name if same else ""
     elif found.alike:
         return Suspicion(found)
+    elif done := _misused(task, own, trial, found):
+        looks = done
     elif still := _at_zero(trial, own):
         looks = (
             f"{listed(still)} {'is' if len(still) == 1 else 'are'} 0 from the first step to the "
         )
-        looks += "last: were the commands recorded?"
+        looks += "last: were the commands recorded, and did `runner.action` get the seconds since "
+        looks += "the start of the run?"
     elif found.until_s >= LEAST * trial.dt:
         looks = (
             f"up to {found.until_s:.1f} s they are alike: then somebody, or something, took over, "
-            "or no new states reached the policy"
+            f"or no new states reached the policy{OR_UNITS}"
         )
     else:
-        looks = "somebody, or another controller, drove"
+        looks = f"somebody, or another controller, drove{OR_UNITS}"
     name = name if nats > DECISIVE else ""
     if found.beyond:
         j = trial.input_names.index(found.beyond)
@@ -198,6 +202,13 @@ def suspicion(task: Task, trial: Trial, own: Candidate, others: Sequence[Candida
         differs = f"{found.input} differs by {rms} (rms)"
     why = f"its commands are not what {own.id} sends on the logged states: {differs}; {looks}"
     return Suspicion(found, why, name, () if name else tuple(_at_zero(trial, own)))
+
+
+def _misused(task: Task, own: Candidate, trial: Trial, found: Following) -> str:
+    from grounded.search.returned.misused import misused
+
+    known = trial.inputs.any() and not found.beyond  # else nothing was recorded, or another unit
+    return misused(task, own, trial, found) if known else ""
 
 
 def _at_zero(trial: Trial, own: Candidate) -> list[str]:

@@ -12,10 +12,10 @@ from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.trial_check import _to_stay
+from grounded_trials.workspace.intake.after_run import _to_stay
 from grounded_trials.workspace.intake.where_to_mend import where_to_mend
-from recorded import record, waiting
-from workspaces import CONFIG, make
+from recorded import LOGGED, record, waiting
+from workspaces import CONFIG, MODEL, make
 
 NARROW = CONFIG.replace("force = [-5.0, 5.0]", "force = [0.0, 1.17]")
 T = np.arange(200) * 0.05
@@ -145,6 +145,27 @@ def test_a_robot_that_moves_on_after_its_run_did_not_come_to_rest(tmp_path, roll
     told = [one for one in Workspace(w.folder).ingest(file).warnings if "after the run" in one]
     assert len(told) == (rolls > 0)
     assert not told or holds(told[0], "60 cm from its target", "--hold")
+
+
+@pytest.mark.parametrize("knows", [True, False])
+def test_a_robot_that_its_held_input_lets_go_is_told_so(tmp_path, knows):
+    """A helicopter fell under 0 V after every run: terminal weights and --hold were advised."""
+    model = MODEL.replace("a.force - p", "a.force - 1.5 * s.x - p") if knows else MODEL
+    made = Workspace(make(tmp_path / "w", config=LOGGED, model=model).folder)
+    record(made, tmp_path / "first.csv", made.propose().candidate.policy, 0.0, seed=9)
+    made.ingest(tmp_path / "first.csv")
+    made.propose()
+    file, table, beyond = driven_on(made, tmp_path)
+    if not knows:  # what pulls is not in the model, but in the log
+        late = beyond > 0
+        table[late, 1] = table[beyond <= 0, 1][-1] - 0.3 * beyond[late] ** 2
+        np.savetxt(file, table, "%.5f", ",", header="t,x,v,force", comments="")
+    (told,) = (
+        one for one in Workspace(made.folder).ingest(file).warnings if "after the run" in one
+    )
+    assert holds(told, "force = 0 N", "runner.done(t)", "[task] start")
+    assert ("force = 1.5 N would" in told) is knows
+    assert "terminal" not in told and "--hold" not in told
 
 
 @pytest.mark.parametrize("rolls", [0.0, 0.4])

@@ -1,5 +1,7 @@
 """A run that its log hides: each was told as `somebody, or another controller, drove`."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -163,3 +165,13 @@ def test_a_candidate_of_an_earlier_task_is_found(w, tmp_path, waits):
     assert done.code == 0, done.err
     fresh = record(w, tmp_path / "b.csv", own.policy, 0.5, seed=5)
     assert w.ingest(fresh, candidate=own.id).candidate == own.id
+
+
+def test_a_program_that_passed_its_candidate_another_unit_is_told_so(w, tmp_path):
+    """`Somebody, or something, took over`, it said of a controller called with degrees."""
+    policy = w.candidate("c0002")[0].policy
+    unit = np.array([1e3, 1e3, *np.ones(policy.gain.shape[2] - 2)])
+    called_in_mm = replace(policy, gain=policy.gain * unit, reference=policy.reference / unit)
+    said = str(refused(w, record(w, tmp_path / "a.csv", called_in_mm, 0.5)))
+    assert holds(said, "c0002", "x and v", "`runner.action`", "in mm", "pass m and m/s")
+    assert "somebody" not in said and "[log" not in said

@@ -303,6 +303,26 @@ def test_the_candidate_after_a_false_crash_is_not_handed_out_once_that_is_discar
     assert any("c0002" in note and "set aside" in note for note in new.proposal.notes)
 
 
+def test_the_candidate_after_a_run_that_was_stopped_gives_way_once_that_is_discarded(tmp_path):
+    """Only deleting candidates/c0007.mcap brought back the candidate that had been stopped."""
+    w = Workspace(make(tmp_path / "w").folder)
+    w.ingest(w.run(w.propose().candidate.id).trial_file)
+    ran, _, _ = read_trial(w.run(w.propose().candidate.id).trial_file)
+    write_trial(tmp_path / "short.mcap", ran.until(20), {"kind": "trial", "task": w.task.hash})
+    short = w.ingest(tmp_path / "short.mcap", candidate="c0002").trial
+    after = w.propose().candidate
+    assert (after.id, after.seen) == ("c0003", ("t0001", short))
+    w.discard(short)
+    again = w.propose()
+    assert (again.candidate.id, again.proposal.is_new) == ("c0002", False)
+    for notes in (again.proposal.notes, w.status().notes):
+        assert any(holds(note, "c0003", short, "void", "--candidate c0003") for note in notes)
+    assert w.propose().candidate.id == "c0002"
+    assert any(short in note for note in w.export("c0003", tmp_path / "c.npz").notes)
+    w.restore(short)
+    assert w.propose().candidate.id == "c0003"
+
+
 def test_it_is_said_whose_commands_they_are_only_where_they_match(learnt):
     """A third policy's run, nearer to one candidate than to the other, is neither's."""
     (own, _, candidates), _, (_, theirs, _) = runs(learnt)

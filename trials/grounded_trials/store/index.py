@@ -24,7 +24,7 @@ from grounded_trials.store.known import KnownTrial, Worth
 from grounded_trials.store.store import Stored
 
 KEPT = 2**20  # [bytes] arrays of larger trials are not kept in the index
-_VERSION = 3  # of the tables and of the result of `_about`
+_VERSION = 4  # of the tables and of the result of `_about`
 _TABLES = """
 CREATE TABLE files (name TEXT PRIMARY KEY, stamp TEXT, about TEXT, proof BLOB);
 CREATE TABLE numbers (name TEXT PRIMARY KEY, states BLOB, inputs BLOB, proof BLOB);

@@ -30,7 +30,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.store.store import Stored
 from grounded_trials.store.trial_file import read_trial
-from grounded_trials.wording import with_unit
+from grounded_trials.wording import ranges, with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial, candidate_of, sha256
 
@@ -261,9 +261,15 @@ class Check:
             yield coasts
 
     def _became(self) -> Iterator[str]:
-        """Yield that it lost, or that its trials were set aside."""
+        """Yield that it lost, that its trials were set aside, or those that it was made from."""
         name, best = self.candidate.id, self.standing.incumbent
         tried = next((t for t in self.standing.history if t.candidate.id == name), None)
+        if tried is not None and tried.void:
+            yield (
+                f"{name} was made from {ranges(tried.gone)}, which "
+                f"{'is' if len(tried.gone) == 1 else 'are'} set aside: `propose` says what to run "
+                "instead"
+            )
         if tried is not None and tried.accepted is False and best is not None:
             lost = "crashed" if tried.utility == -np.inf else f"lost with {tried.utility:.4g}"
             yield f"{name} {lost}; the best so far is {best.candidate.id}, {best.utility:.4g}"

@@ -52,6 +52,7 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "slopes": str,
     "base_as_run": float,
     "likely_off": float,
+    "seen": lambda text: tuple(filter(None, text.split(","))),
 }
 _ABSENT = {
     "predicted_gain": "nan",
@@ -61,6 +62,7 @@ _ABSENT = {
     "slopes": "",
     "base_as_run": "nan",
     "likely_off": "0.0",
+    "seen": "",
 }
 
 
@@ -105,7 +107,8 @@ class StoredCandidate:
         """Restore a candidate from `about`; `load` reads the arrays when they are needed."""
         from grounded_trials.store.known import KnownCandidate
 
-        fields = KnownCandidate.of(load, about["candidate"])
+        own = about["candidate"]
+        fields = KnownCandidate.of(load, own | {"seen": tuple(own["seen"])})
         return cls(fields, about["kind"], about["task"], about["sha256"])
 
 
@@ -238,7 +241,7 @@ def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
     """Encode a candidate as the bytes of its file; `kind` is "search" or "probe"."""
     values = vars(candidate) | {"task": task.hash}
     meta = {"kind": kind} | {
-        name: repr(values[name]) if of is float else str(values[name])
+        name: repr(values[name]) if of is float else _text(values[name])
         for name, of in _FIELDS.items()
     }
     return candidate_bytes(
@@ -249,6 +252,10 @@ def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
         state_units=dict(task.model.states),
         input_units=dict(task.model.inputs),
     )
+
+
+def _text(value: object) -> str:
+    return ",".join(value) if isinstance(value, tuple) else str(value)
 
 
 def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:

@@ -35,12 +35,14 @@ class NextRun(Result):
     """The result of `next`: the ingested log, what to run next, and the file for the robot."""
 
     taken: Ingested
-    proposed: Proposed
+    proposed: Proposed | None  # None if the log should be discarded first
     exported: Exported | None  # None if the search has ended
     removed: tuple[Path, ...] = ()  # deleted exports of candidates that are void now
 
     def summary(self) -> str:
         """Return what was stored, and what comes next."""
+        if self.proposed is None:
+            return f"{self.taken.trial} is stored; it should be discarded first"
         name = None if self.proposed.candidate is None else self.proposed.candidate.id
         return f"{self.taken.trial} is stored; next: {name or 'nothing, the search has ended'}"
 
@@ -48,7 +50,7 @@ class NextRun(Result):
         """Return the document of `next --json`: those of ingest, propose and export."""
         return {
             "trials": [self.taken.to_json()],
-            "propose": self.proposed.to_json(),
+            "propose": None if self.proposed is None else self.proposed.to_json(),
             "export": None if self.exported is None else self.exported.to_json(),
             "removed": [str(path) for path in self.removed],
         }
@@ -96,9 +98,14 @@ def _odd_before(workspace: Folder) -> bool:
 
 
 def next_in(workspace: Folder, log: Path, candidate: str | None, *, runner: bool) -> NextRun:
-    """Ingest a log, propose, and export for the robot, see `Workspace.next`."""
+    """Ingest a log, propose, and export for the robot, see `Workspace.next`.
+
+    Nothing is proposed from a log that should be discarded.
+    """
     taken = ingest_log(workspace, log, candidate)
     workspace.forget()
+    if taken.then.verb == "discard":
+        return NextRun(taken, None, None)
     proposed, exported = propose_in(workspace), None
     if proposed.candidate is not None:
         name, form = proposed.candidate.id, "npz" if runner else "json"

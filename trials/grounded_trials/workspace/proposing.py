@@ -116,8 +116,11 @@ def propose_in(workspace: Folder) -> Proposed:
     candidate = proposal.candidate
     notes = [f"{name} was not run and is void: {why}" for name, why in void.items()]
     if candidate is not None and proposal.is_new:
-        notes = notes or _void(workspace, before)
+        notes = notes or _disowned(proposal.standing) or _void(workspace, before)
         notes = [f"{note}; run {candidate.id} instead" for note in notes]
+    elif candidate is not None:
+        left = _disowned(proposal.standing)
+        notes += [f"{note}; run {candidate.id} instead" for note in left]
     held: list[str] = []
     if not proposal.standing.trials and (candidate is None or proposal.is_new):
         from grounded_trials.workspace.at_rest import held_before
@@ -228,6 +231,22 @@ def _not_run(workspace: Folder, before: Sequence[str]) -> tuple[Candidate, dict[
     return None
 
 
+def _disowned(now: Standing) -> list[str]:
+    """Explain which latest candidates, never run, are void since a trial was discarded."""
+    found = []
+    for tried in reversed(now.history):
+        if not tried.gone or tried.accepted:
+            break
+        if tried.void:
+            name = tried.candidate.id
+            found.append(
+                f"{name} was not run and is void: {ranges(tried.gone)}, which it was made from, "
+                f"{'is' if len(tried.gone) == 1 else 'are'} set aside. If the robot has run it "
+                f"meanwhile, ingest that log with --candidate {name}: it counts"
+            )
+    return found
+
+
 def _other_model(workspace: Folder, before: Sequence[str]) -> bool:
     """Return whether the search's last candidate was planned with another model, and never run."""
     last = _not_run(workspace, before)
@@ -306,6 +325,7 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
         since.sentence if since else "",
         (
             *notes,
+            *(_disowned(standing) if standing.phase != "propose" else ()),
             *_namesakes(workspace),
             *not_counted(uncounted(workspace, workspace.trials(), standing)),
         ),

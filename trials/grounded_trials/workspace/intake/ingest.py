@@ -30,13 +30,17 @@ from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
+from grounded_trials.workspace.intake.after_run import afterwards
+from grounded_trials.workspace.intake.begun import begun_elsewhere
 from grounded_trials.workspace.intake.earlier_task import OfEarlierTask, of_earlier_task
+from grounded_trials.workspace.intake.gone_wrong import gone_wrong
 from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.intake.log_faults import dead_sensors, log_faults, mistaken_in
 from grounded_trials.workspace.intake.look import Look
 from grounded_trials.workspace.intake.odd_run import odd_run
 from grounded_trials.workspace.intake.read_otherwise import (
     misled,
+    misused_in,
     pace_of,
     rather_exchanged,
     unit_of,
@@ -64,7 +68,7 @@ from grounded_trials.workspace.intake.stored_before import (
     repeated,
     what_repeats,
 )
-from grounded_trials.workspace.intake.trial_check import afterwards, warnings_about
+from grounded_trials.workspace.intake.trial_check import warnings_about
 from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of, traded
 from grounded_trials.workspace.proposing import candidate_named, latest_candidates, standing_in
@@ -125,10 +129,9 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     faults = log_faults(workspace, interpolate_gaps(trial).trial)
     odd = tuple(one.told(trial, own=read.own) for one in faults)
     scaled = [name for one in faults for name in one.inputs]
+    elsewhere = begun_elsewhere(workspace, trial)
     checked = warnings_about(workspace, trial, read.last_s, read.fell, scaled)
-    warnings = (*read.warnings, *odd, *checked)
-    if trial.candidate and (whole := _whole(read, workspace.task)):
-        warnings = (*warnings, *afterwards(workspace.task, whole))
+    warnings = (*read.warnings, *odd, *(one.told for one in elsewhere), *checked)
     if before:
         warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
     if aside := added.id in workspace.discarded():
@@ -137,6 +140,12 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     history = now.history if now else ()
     tried = next((t for t in history if t.candidate.id == trial.candidate), None)
     verdict = ASIDE if aside else _verdict(trial, tried, workspace.config.search.repeats)
+    wrong = any(one.again for one in elsewhere)
+    if not (odd or wrong or aside):
+        asked = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
+        warnings, wrong = (*filter(None, [asked]), *warnings), bool(asked)
+    if trial.candidate and not wrong and (whole := _whole(read, workspace.task)):
+        warnings = (*warnings, *afterwards(workspace.planner, whole))
     if ahead and verdict == "run again":
         now = standing_in(workspace, ahead=True)
     judged = [interpolate_gaps(trial).trial] if trial.candidate else []
@@ -163,7 +172,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         ),
         off_target=off_target_of(workspace.task, judged),
         then=NextCommand("discard", (added.id,))
-        if odd and not aside
+        if (odd or wrong) and not aside
         else after_log(workspace, verdict, now),
     )
 
@@ -269,6 +278,13 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             f"{path} ran {left}, which was made for an earlier task (other target, reward, limits, "
             "start or horizon): its utility can't be compared. Ingest it with --data for fitting "
             "and diagnosis, and run a candidate of this task",
+            NextCommand("ingest", (str(path), "--data")),
+        )
+    if log and not other and whole.inputs.any() and (misused := misused_in(log, task, own)):
+        raise GroundedError(
+            f"{path} did not run {ran} as it should: its commands are not what {ran} sends on the "
+            f"logged states and times; {misused}, and run {ran} again. Ingest it with --data for "
+            "fitting and diagnosis",
             NextCommand("ingest", (str(path), "--data")),
         )
     known = replace(read.trial, id="").until(read.trial.known_steps)

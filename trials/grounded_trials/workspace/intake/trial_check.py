@@ -10,25 +10,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from grounded.frozen import Array
-from grounded.result import measured_alike
 from grounded.search.candidate import Candidate
-from grounded.search.returned.who_drove import UNLIKE, follows, latest, second_differences
+from grounded.search.returned.who_drove import UNLIKE, follows, latest
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
-from grounded_trials.wording import count, in_digits_apart, with_unit
+from grounded_trials.wording import count, with_unit
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.off_target import reaches, weighed_groups
 
-# share of the mean cost of a step above which a start away from s_0 brings a warning; for a state
-# without weight along the way, share of its range in the run
-FAR = 0.1
-SURE = 3.0  # the start must also be off by this many std of sensor noise and of earlier starts
-MUCH = 1.0  # share of a mean step's cost above which the start changes the utility too much
-FEWEST = 2  # smallest number of earlier runs from which the scatter of starts is estimated
 LATEST = 3  # largest number of steps by which late inputs are reported
-WHITE = 0.6745 * 6**0.5  # median of absolute second differences of white noise of std 1
-AWAY = 0.02  # drift after a run, relative to the target's extent, above which it is reported
 WIDEN = "no plan will use that; widen them if the robot can take it"
 
 
@@ -81,7 +70,6 @@ def warnings_about(
             f"{task.horizon}: they are not judged"
         )
     whole = whole.until(task.horizon)
-    found += _start(task, whole, _starts_before(workspace, trial.id))
     found += _inputs(task, whole)
     candidate, _ = workspace.candidate(trial.candidate)
     found += _still(whole) if np.ptp(candidate.predicted_states, axis=0).any() else []
@@ -134,57 +122,6 @@ def _lacking(task: Task, last_s: float) -> str:
     return f", with its last state {1e3 * missing:.3g} ms before the plan's last"
 
 
-def _starts_before(workspace: Folder, identity: str) -> Array:
-    """Return how far from s_0 the other runs of this task started, (N, n)."""
-    task = workspace.task
-    runs = [one for one in workspace.task_trials() if one.candidate and one.id != identity]
-    off = [task.model.difference(one.states[0], task.start) for one in runs]
-    return np.array(off).reshape(len(off), task.model.n)
-
-
-def _start(task: Task, trial: Trial, before: Array) -> list[str]:
-    """Return warnings for states in which a run did not start at s_0, beyond their sensor noise.
-
-    A state that [reward] weighs along the way is judged by the cost of its offset relative to a
-    mean step of the run, the most costly first; another state relative to its range in the run.
-    Offsets within the scatter of earlier starts `before`, (N, n), are unavoidable and tolerated.
-    """
-    if trial.finite_steps < 0:
-        return []
-    off = task.model.difference(trial.states[0], task.start)
-    states = trial.states[: trial.finite_steps + 1]
-    usual = np.ptp(states, axis=0)
-    jumps = np.abs(second_differences(states, task.model.angle_mask))
-    noise = np.median(jumps, axis=0) / WHITE if len(jumps) else np.zeros(len(usual))
-    known = -task.rewards(trial)[: len(states)]
-    known = known[np.isfinite(known)]
-    usually = known.sum() / max(len(known), 1)
-    weight = task.reward.state
-    with np.errstate(all="ignore"):
-        share = np.where(weight > 0, weight * off**2 / usually, np.abs(off) / usual)
-    told = (share > FAR) & (np.abs(off) > np.maximum(SURE * noise, 1e-9))
-    if len(before) >= FEWEST:
-        told &= (np.abs(off) > SURE * before.std(axis=0, ddof=1)) | (share > MUCH)
-    found = []
-    for i in sorted(np.flatnonzero(told), key=lambda i: (weight[i] == 0, -share[i])):
-        name, unit = list(task.model.states.items())[i]
-        began, start = in_digits_apart(float(trial.states[0, i]), float(task.start[i]))
-        turned = f" ({np.rad2deg(off[i]):+.2g} degrees)" if unit == "rad" else ""
-        does = (
-            "this changes its utility. Place the robot nearer to the start, `discard "
-            f"{trial.id}` and run it again"
-            if share[i] > MUCH
-            else "the run counts, no need to repeat it. Place the robot nearer to the start next "
-            "time"
-        )
-        found.append(
-            f"the run started with {name} = {with_unit(began, unit)}, the task's start is {start}: "
-            f"{with_unit(f'{off[i]:+.2g}', unit)}{turned} off, more than the noise in the log. "
-            f"{does[0].upper()}{does[1:]}"
-        )
-    return found
-
-
 def _unsafe(task: Task, trial: Trial, ran: Candidate) -> list[str]:
     """Return warnings for states that left [safety], with the predicted value."""
     assert task.safety_low is not None and task.safety_high is not None
@@ -203,67 +140,6 @@ def _unsafe(task: Task, trial: Trial, ran: Candidate) -> list[str]:
                 f"{predicted} was predicted"
             )
     return found
-
-
-def afterwards(task: Task, whole: Trial) -> list[str]:
-    """Return warnings on what the robot did after the run: it left [safety], or moved on."""
-    return _left_afterwards(task, whole) or _moved_on(task, whole)
-
-
-def _moved_on(task: Task, whole: Trial) -> list[str]:
-    """Return a warning if a robot that was to reach a point drifts away from it after the run.
-
-    Only if the inputs are constant after the run, so that nobody drove it.
-    """
-    end, last = task.horizon, whole.finite_steps
-    groups = weighed_groups(task) if reaches(task) else []
-    held = whole.inputs[end:last]
-    if not groups or last <= end + 1 or np.ptp(held[1:], axis=0).any():
-        return []
-    names, what = groups[0]
-    states = [task.model.state_names.index(name) for name in names]
-    off = task.model.difference(whole.states[: last + 1], task.target[-1])[:, states]
-    far = np.linalg.norm(off, axis=1)
-    way = np.linalg.norm(np.ptp(np.vstack([task.start, task.target])[:, states], axis=0))
-    worst = end + int(np.argmax(far[end:]))
-    if not far[worst] > max(AWAY * way, 2 * far[end]):
-        return []
-    later, then = measured_alike([far[worst], far[end]], task.model.states[names[0]])
-    return [
-        f"{(worst - end) * task.dt:.2g} s after the run {what} was {later} from its target, at its "
-        f"end {then}: [reward] only judges the run. To make the robot stay there, "
-        f"{_to_stay(task, states)}"
-    ]
-
-
-def _to_stay(task: Task, states: Sequence[int]) -> str:
-    """Return what would make a robot stay at the end of its target that the task lacks."""
-    from grounded.places import integrals
-
-    end = task.target[-max(2, len(task.target) // 20) :, states]
-    rates = [one.j for one in integrals(task.model) if one.exact and one.i in states]
-    ways = ["let the target rest at its end (target --hold)"] * bool(np.ptp(end, axis=0).any())
-    if not rates or not (task.reward.terminal[rates] > 0).all():
-        ways.append("weigh the rates at the end ([reward] terminal)")
-    return ", or ".join(ways) or "let the target rest for longer (target --hold)"
-
-
-def _left_afterwards(task: Task, whole: Trial) -> list[str]:
-    """Return a warning if the robot left [safety] after a run that stayed inside."""
-    assert task.safety_low is not None and task.safety_high is not None
-    states = whole.states[: whole.finite_steps + 1]
-    out = np.maximum(task.safety_low - states, states - task.safety_high)
-    if (out[: task.horizon + 1] > 0).any() or not (out > 0).any():
-        return []
-    t, i = np.unravel_index(int(np.argmax(out)), out.shape)
-    first = int(np.argmax((out > 0).any(axis=1))) - task.horizon
-    name, unit = list(task.model.states.items())[int(i)]
-    low, high = task.safety_low[i], task.safety_high[i]
-    return [
-        f"{first * whole.dt:.2g} s after its end the robot left [safety] {name} = [{low:g}, "
-        f"{high:g}]: {name} was {with_unit(f'{states[t, i]:.3g}', unit)}. Stop it in time, or let "
-        "the target end at rest inside"
-    ]
 
 
 def _inputs(task: Task, trial: Trial) -> list[str]:

@@ -1,0 +1,67 @@
+"""Commands that a candidate's file sends if a program passes it the wrong things."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from facts import holds
+from grounded.onboard import Runner
+from grounded.search.ask_tell import Search
+from grounded.search.returned.misused import misused
+from grounded.search.returned.who_drove import follows, suspicion
+from grounded.trial import Trial
+from small_tasks import rover_task
+
+
+@pytest.fixture(scope="module")
+def waiting():
+    task = rover_task()
+    return task, Search(task).ask()
+
+
+def driven(task, made, states=lambda x: x, times=lambda t: t, seed=0):
+    """Run a candidate in its model, by a program that passes changed states and times."""
+    runner, rng = Runner(made.policy), np.random.default_rng(seed)
+    x, rows, sent = task.start.copy(), [], []
+    for k in range(task.horizon):
+        seen = x + rng.normal(0, 0.002, len(x))
+        rows.append(seen)
+        u = runner.action(times(k * task.dt), states(seen))
+        sent.append(u)
+        x = task.model.system.step(x[None], 0.9 * u[None], task.model.values, task.dt)[0]
+    names = task.model.state_names, task.model.input_names
+    return Trial(np.array([*rows, x]), np.array(sent), task.dt, *names, candidate=made.id)
+
+
+WAYS = {
+    "degrees": ({"states": lambda x: x * [1, 1, 180 / np.pi]}, ("psi", "degrees", "pass rad")),
+    "mm": ({"states": lambda x: x * [1e3, 1e3, 1]}, ("x", "y", "mm", "pass m")),
+    "order": ({"states": lambda x: x[[1, 0, 2]]}, ("x and y", "order")),
+    "ms": ({"times": lambda t: 1e3 * t}, ("in ms", "seconds")),
+    "minutes": ({"times": lambda t: t / 60}, ("in minutes", "seconds")),
+    "clock": ({"times": lambda t: 1.7e9 + t}, ("speed = 0.5 m/s", "a clock")),
+    "zero": ({"times": lambda t: 0 * t}, ("stays at 0", "seconds")),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_what_the_program_passed_is_named(waiting, way):
+    """`Somebody, or another controller, drove` was said of states in degrees."""
+    task, made = waiting
+    wrong, named = WAYS[way]
+    trial = driven(task, made, **wrong)
+    found = suspicion(task, trial, made, [made])
+    assert holds(found.why, *named, "runner.action")
+
+
+def test_other_commands_are_no_misuse(waiting):
+    task, made = waiting
+    assert suspicion(task, driven(task, made), made, [made]).why == ""
+    for seed in range(4):
+        noise = np.random.default_rng(seed).normal(size=(task.horizon + 9, 2))
+        smooth = np.array([np.convolve(column, np.ones(10) / 4, "valid") for column in noise.T]).T
+        trial = replace(driven(task, made), inputs=np.clip(smooth, task.low, task.high))
+        plain = follows(made.policy, trial)
+        assert not plain.alike and misused(task, made, trial, plain) == ""
+        assert holds(suspicion(task, trial, made, [made]).why, "other units", "not in s")

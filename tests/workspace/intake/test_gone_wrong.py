@@ -1,0 +1,93 @@
+"""A run that should not count: a motor wired wrongly, a push, a start in another place."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from facts import holds
+from grounded.plant import Plant
+from grounded_trials import Workspace
+from grounded_trials.store.trial_file import read_trial, write_trial
+from workspaces import REAL, make
+
+TURNED = (
+    REAL.replace("import model as crude", "import model as plain")
+    + """
+from dataclasses import replace
+from types import SimpleNamespace
+
+
+def turned(s, a, p):
+    return crude.derivative(s, SimpleNamespace(force=FORCE), p)
+
+
+model = replace(model, derivative=turned)
+"""
+)
+TURNED = TURNED.replace("latency =", "crude = model\nlatency =").replace(
+    "model = crude.with", "model = plain.with"
+)
+
+
+@pytest.fixture
+def w(tmp_path):
+    """A workspace with one good run, and a second candidate."""
+    w = Workspace(make(tmp_path / "w").folder)
+    w.ingest(w.run(w.propose().candidate.id).trial_file)
+    assert w.propose().candidate.id == "c0002"
+    return w
+
+
+def run(w, force):
+    (w.folder / "real.py").write_text(TURNED.replace("FORCE", force))
+    return w.run("c0002").trial_file
+
+
+@pytest.mark.parametrize("steps", [40, 25])
+def test_a_motor_wired_wrongly_is_told_before_the_next_plan(w, tmp_path, steps):
+    """The plan after it was `no better`, without a word, and lost six times the best cost."""
+    trial, *_ = read_trial(run(w, "-a.force"))
+    assert w.task.utility(trial) < -100
+    write_trial(tmp_path / "t.mcap", trial.until(steps), {"kind": "trial", "task": w.task.hash})
+    done = w.next(tmp_path / "t.mcap")
+    assert (done.proposed, done.exported, done.to_json()["propose"]) == (None, None, None)
+    assert (done.taken.then.verb, done.taken.then.arguments) == ("discard", ("t0002",))
+    told = done.taken.warnings[0]
+    assert holds(told, "force", "the other way round", "`discard t0002`", "c0002", "`propose`")
+    w.discard("t0002")
+    assert w.propose().candidate.id == "c0002"
+
+
+def test_a_run_that_missed_by_hundreds_of_times_what_runs_miss_is_asked_about(w):
+    file = run(w, "a.force + 80.0")
+    out = grounded("-C", w.folder, "next", file).out
+    done = w.ingest(file)
+    assert any(holds(one, "did it run as it should", "`discard t0002`") for one in done.warnings)
+    assert not any("other way round" in one for one in done.warnings)
+    assert done.then.verb == "discard"
+    assert out.split()[-2:] == ["\\", "t0002"] and "Run c0" not in out
+
+
+@pytest.mark.parametrize("force", ["a.force", "0.6 * a.force", "a.force + 0.5"])
+def test_a_run_of_a_robot_that_the_model_knows_little_of_is_not(w, force):
+    found = w.ingest(run(w, force))
+    assert found.then.verb == "propose"
+    assert not any("discard" in one for one in found.warnings)
+
+
+@pytest.mark.parametrize(("off", "again"), [(0.6, True), (0.02, False)])
+def test_a_run_that_started_elsewhere_is_discarded_or_counts(w, off, again):
+    """One output asked to discard it, called it bad luck, and exported the next candidate."""
+    robot, policy = Plant(w.base_model.with_values({"mass": 1.4})), w.candidate("c0002")[0].policy
+    trial = robot.run(policy, {"x": off, "v": 0.0}, np.random.default_rng(0))
+    file = w.folder / "t.mcap"
+    write_trial(file, replace(trial, candidate="c0002"), {"kind": "trial", "task": w.task.hash})
+    out = grounded("-C", w.folder, "next", file).out
+    found = w.ingest(file)
+    told = [one for one in found.warnings if f"started with x = {off}" in one]
+    assert len(told) == 1 and ("`discard t0002`" in told[0]) is again
+    assert ("the run counts" in told[0].lower()) is not again
+    assert (found.then.verb == "discard") is again
+    assert ("bad luck" in out or "Run c0" in out) is not again

@@ -1,0 +1,126 @@
+"""Tell of a run that started away from [task] start, and whether that spoils its utility.
+
+By how much a start changes the utility, the model says: it runs the candidate from there and from
+s_0. A run whose utility it changes much says nothing about its candidate, and must be run again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.search.planner import predicted
+from grounded.search.returned.who_drove import second_differences
+from grounded.trial import Trial, interpolate_gaps
+from grounded_trials.wording import in_digits_apart, with_unit
+from grounded_trials.workspace.folder import Folder
+
+# share of the mean cost of a step above which a start away from s_0 brings a warning; for a state
+# without weight along the way, share of its range in the run
+FAR = 0.1
+SURE = 3.0  # the start must also be off by this many std of sensor noise and of earlier starts
+MUCH = 1.0  # share of a mean step's cost from which earlier starts that scatter are no excuse
+SPOILT = 0.2  # share of the run's cost by which the start changes it too much
+FEWEST = 2  # smallest number of earlier runs from which the scatter of starts is estimated
+WHITE = 0.6745 * 6**0.5  # median of absolute second differences of white noise of std 1
+
+
+@dataclass(frozen=True)
+class Begun:
+    """A state in which a run started elsewhere.
+
+    Args:
+        told: the warning.
+        again: whether the run must be discarded and run again.
+    """
+
+    told: str
+    again: bool
+
+
+def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
+    """Return the states in which a run did not start at s_0, beyond their sensor noise.
+
+    A state that [reward] weighs along the way is judged by the cost of its offset relative to a
+    mean step of the run, the most costly first; another state relative to its range in the run.
+    Offsets within the scatter of earlier starts are unavoidable and tolerated.
+
+    Args:
+        workspace: the workspace with the task, the model and the earlier runs.
+        trial: the trial as stored.
+    """
+    task = workspace.task
+    before, trial = _starts_before(workspace, trial.id), interpolate_gaps(trial).trial
+    trial = trial.until(task.horizon)
+    if not trial.candidate or trial.finite_steps < 0:
+        return []
+    off = task.model.difference(trial.states[0], task.start)
+    states = trial.states[: trial.finite_steps + 1]
+    usual = np.ptp(states, axis=0)
+    jumps = np.abs(second_differences(states, task.model.angle_mask))
+    noise = np.median(jumps, axis=0) / WHITE if len(jumps) else np.zeros(len(usual))
+    known = -task.rewards(trial)[: len(states)]
+    known = known[np.isfinite(known)]
+    usually = known.sum() / max(len(known), 1)
+    weight = task.reward.state
+    with np.errstate(all="ignore"):
+        share = np.where(weight > 0, weight * off**2 / usually, np.abs(off) / usual)
+    told = (share > FAR) & (np.abs(off) > np.maximum(SURE * noise, 1e-9))
+    if len(before) >= FEWEST:
+        told &= (np.abs(off) > SURE * before.std(axis=0, ddof=1)) | (share > MUCH)
+    found = []
+    for i in sorted(np.flatnonzero(told), key=lambda i: (weight[i] == 0, -share[i])):
+        name, unit = list(task.model.states.items())[i]
+        began, start = in_digits_apart(float(trial.states[0, i]), float(task.start[i]))
+        turned = f" ({np.rad2deg(off[i]):+.2g} degrees)" if unit == "rad" else ""
+        changes = _changes(workspace, trial, off * (np.arange(len(off)) == i))
+        real = abs(task.utility(trial))
+        again = abs(changes) > SPOILT * (
+            real if np.isfinite(real) else -_promised(workspace, trial)
+        )
+        does = (
+            f"by the model this changes its utility by {changes:+.3g}: `discard {trial.id}`, place "
+            f"the robot nearer to the start and run {trial.candidate} again. If it always starts "
+            "there, set it in [task] start"
+            if again
+            else "the run counts, no need to repeat it. Place the robot nearer to the start next "
+            "time"
+        )
+        found.append(
+            Begun(
+                f"the run started with {name} = {with_unit(began, unit)}, the task's start is "
+                f"{start}: {with_unit(f'{off[i]:+.2g}', unit)}{turned} off, more than the noise in "
+                f"the log. {does[0].upper()}{does[1:]}",
+                bool(again),
+            )
+        )
+    return found
+
+
+def _starts_before(workspace: Folder, identity: str) -> Array:
+    """Return how far from s_0 the other runs of this task started, (N, n)."""
+    task = workspace.task
+    runs = [one for one in workspace.task_trials() if one.candidate and one.id != identity]
+    off = [task.model.difference(one.states[0], task.start) for one in runs]
+    return np.array(off).reshape(len(off), task.model.n)
+
+
+def _changes(workspace: Folder, trial: Trial, off: Array) -> float:
+    """Return by how much a start that is off by `off` (n,) changes the utility in the model."""
+    planner = workspace.planner
+    policy = workspace.candidate(trial.candidate)[0].policy
+    problem = planner.plan.problem(exact=True)
+    moved = problem.start.copy()
+    moved[: len(off)] += off
+    with np.errstate(all="ignore"):
+        from_there, from_s_0 = (
+            predicted(replace(problem, start=start), policy).utility
+            for start in (moved, problem.start)
+        )
+    return float(np.nan_to_num(from_there - from_s_0, nan=-np.inf))
+
+
+def _promised(workspace: Folder, trial: Trial) -> float:
+    return workspace.candidate(trial.candidate)[0].predicted_utility
