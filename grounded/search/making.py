@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 GENTLER = 1e3  # factor on the input weights for each unit of caution
 HALF, FINE = 0.5, 12  # share of the mean gain to fall below; parts of a unit of caution
 NEAR = 0.2  # relative distance to a run that lost within which a step counts as the same
+WITNESS = 3.0  # factor on a model's largest miss, below which its prediction of a ruin says nothing
 REFUTED = 2  # bad losses of steps with corrected derivatives before those are given up
 FORETOLD = 0.2  # largest error of the plain model at the incumbent, as a fraction of its cost
 
@@ -212,13 +213,18 @@ class About:
         return made.expected_gain < -max(self._disturbed, -self.incumbent.utility)
 
     def ruined_by(self, made: Candidate) -> bool:
-        """Return whether this model gives a step of another one more than twice the best cost.
+        """Return whether this model gives a step of another one far more than the best cost.
 
         This model replays the best trial, too. A step of an excavator's original model, planned
-        without the adopted delay of 60 ms, made it swing: -12 where the best was -0.2.
+        without the adopted delay of 60 ms, made it swing: -12 where the best was -0.2. A model that
+        missed its own steps by about as much is no witness.
         """
+        history = self.make.now.history
+        own = losers_of(history, self.incumbent.candidate.id, self.make.fingerprint)
+        ids = {candidate.id for candidate in own if not candidate.of_original}
+        missed = [t.promised - t.utility for t in history if t.candidate.id in ids]
         lost = self.already - predicted(self.real, made.policy).utility
-        return not lost <= -self.incumbent.utility
+        return not lost <= max([-self.incumbent.utility, *(WITNESS * miss for miss in missed)])
 
     @cached_property
     def _disturbed(self) -> float:
