@@ -12,6 +12,8 @@ time constant or a wheelbase. Such rate effects are dropped (`aliases`):
 
     offset:s, rate_gain:s   dropped if   d rate / d p  or  d rate / d u   is k times its own rate
 
+    rate_gain:q             dropped if   q' = c w, and nothing depends on q: sensor_scale:q
+
 at many random states and inputs, and at other values of the parameters, too.
 """
 
@@ -133,6 +135,8 @@ class Library:
         integrals = places.integrated(model)
         geometric = set(integrals) - set(places.velocities(model))
         same = aliases(model, idle | outright) | joint.renamed(model) | medium.renamed(model)
+        scaled = set(sensor.sensor_scale.targets(model)) & {*places.only_read(model)}
+        same |= {f"rate_gain:{name}": f"sensor_scale:{name}" for name in scaled}
         for family in self.families:
             moves = isinstance(family, LossFamily | MediumFamily | RateFamily)
             where = model if moves else whole
