@@ -10,6 +10,7 @@ from facts import holds
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.error_report import Credit, Remainder
+from grounded.diagnosis.hypotheses.lookalike import related
 from grounded.diagnosis.report import Estimate, Ranked
 from grounded.diagnosis.validation.blame import Blame
 from grounded.diagnosis.verdict import verdict
@@ -38,6 +39,8 @@ def test_the_scale_of_a_sensor_is_offered_and_no_gain_that_equals_it():
     assert "sensor_scale:stick" in names(STICK) and "rate_gain:stick" not in names(STICK)
     assert "rate_gain:stick" in names(STICK, "sensor_scale")
     assert "rate_gain:theta" in names(pendulum)  # gravity feels the true angle
+    gyro, encoder = (Library().effect(f"sensor_scale:{n}", STICK) for n in ("stick_rate", "stick"))
+    assert related(gyro, encoder)  # a gyro that reads too much is compared with it
 
 
 def short(scale=0.94, trials=3, steps=200, dt=0.02):
