@@ -189,6 +189,21 @@ def integrated(model: Model) -> dict[str, tuple[str, float]]:
     return found
 
 
+def only_read(model: Model) -> dict[str, str]:
+    """Return states that only integrate another one, on which nothing depends: {stick: its rate}.
+
+    Such a state changes slower than modelled if its sensor reads too little, or if a gear between
+    the two is another one. No trial tells which.
+    """
+    pairs = integrated(model)
+    if not pairs:
+        return {}
+    f_x, _ = model.system.linearise(*samples(model, 8), model.values, probe(model, 1e-2))
+    felt = np.abs(f_x - np.eye(model.n)).max(axis=0).max(axis=0)  # by any state, itself included
+    free = {name for name, size in zip(model.state_names, felt, strict=True) if size < 1e-9}
+    return {name: rate for name, (rate, _) in pairs.items() if name in free}
+
+
 @dataclass(frozen=True)
 class Integral:
     """The rate of state i is c times state j; `exact` if the model says so, not only its roles."""

@@ -21,6 +21,7 @@ MOST_DIGITS = 6  # significant digits of a value
 DISAGREE = "but the trials disagree"
 KNOWN = 2.0  # standard deviations from zero that a value needs to be worded
 FEW = 3  # up to so many causes get a clause each
+LATE = ("delay", "sensor_delay", "first_order_lag", "sensor_lag")  # they decide if a loop is stable
 TOLD = 4  # clauses otherwise: one per kind of effect, the smallest causes only counted
 
 
@@ -172,7 +173,8 @@ def clauses(
 ) -> tuple[str, ...]:
     """Return the clauses of the verdict's first sentence, each with its share, largest first.
 
-    More than FEW causes are grouped by kind: the friction of every joint in one clause.
+    More than FEW causes are grouped by kind: the friction of every joint in one clause. Delays and
+    lags are never only counted.
 
     Args:
         names: names of the causes, largest first.
@@ -193,15 +195,21 @@ def clauses(
         key = (own.family.name, *_told(values[name])) if own is not None and alike else (name,)
         kinds.setdefault(key, []).append(i)
     groups = sorted(kinds.values(), key=lambda group: -sum(shares[i] for i in group))
-    told = groups if len(groups) <= TOLD + 1 else groups[:TOLD]
+    told = [group for group in groups if group in groups[:TOLD] or is_late(names[group[0]])]
+    told = groups if len(groups) <= len(told) + 1 else told
     found = []
     for first, *others in told:
         same = [f", {_beside(effects[names[i]], values[names[i]])}" for i in others]
         together = sum(shares[i] for i in (first, *others))
         found.append(with_share(f"{causes[first]}{''.join(same)}", together))
-    if rest := [i for group in groups[len(told) :] for i in group]:
+    if rest := [i for group in groups if group not in told for i in group]:
         found.append(with_share(f"{len(rest)} smaller causes", sum(shares[i] for i in rest)))
     return tuple(found)
+
+
+def is_late(cause: str) -> bool:
+    """Check whether a cause is a delay or a lag, which is named however small its share is."""
+    return cause.partition(":")[0] in LATE
 
 
 def with_share(clause: str, share: float) -> str:

@@ -47,7 +47,7 @@ from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.verdict import MOST_EFFECTS, with_faults
 from grounded.diagnosis.writer import Writer
 from grounded.effects import Effect, Library
-from grounded.effects.actuator import delay_again
+from grounded.effects.actuator import delay, delay_again
 from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError, type_of
 from grounded.frozen import positive, whole_number
@@ -171,14 +171,18 @@ def diagnose(
             data = replace(data, model=held(uncertain, null[0]))
             model = without_others(Predictor(data), null[0].track, options.but, options.library)
             data = replace(data, model=model)
-    offered = [
-        _again(effect, options.delays[effect.name], data)
-        if effect.name in options.delays
-        else effect
-        for effect in options.library.candidates(data.model, data.scales)
-    ]
-    settled = {*options.but, *looked.settled}
-    candidates = knowable(data, [e for e in offered if e.name not in settled])
+    settled, late = {*options.but, *looked.settled}, options.delays
+    offered = list(options.library.candidates(data.model, data.scales))
+    names = {effect.name for effect in offered}
+    if delay in options.library.families:  # those of the inputs that moved in earlier trials
+        more = [name for name in late if name not in names]
+        offered += [options.library.effect(name, data.model, data.scales) for name in more]
+    shown = knowable(data, [e for e in offered if e.name not in settled], (*late,))
+    candidates = tuple(
+        _again(effect, late[effect.name], data) if effect.name in late else effect
+        for effect in shown
+        if effect.name not in settled
+    )
     joints = options.library.joints(data.model, data.scales)
     joints = knowable(data, [e for e in joints if e.name not in settled])
     with running(engine):

@@ -54,6 +54,8 @@ def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[lis
         for name, unit in row.unit_by_channel.items():
             if math.isnan(row.crude.get(name, math.nan)):
                 continue  # the state has no sensor
+            if not any(getattr(row, key).get(name) for key in columns):
+                continue  # it never moved
             figures = (_cell(row, key, name) for key in columns)
             rows.append((f"{name}, {when}", *figures, shown(unit)))
     return rows, ("error (rms)", *columns.values(), "unit")

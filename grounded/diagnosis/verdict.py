@@ -34,6 +34,7 @@ from grounded.diagnosis.report import (
 )
 from grounded.diagnosis.ruler_words import explained, floor, improvement, rest, worsened
 from grounded.instruments.finding import Finding, in_the_log
+from grounded.model import Model
 from grounded.result import listed, percent
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
@@ -107,7 +108,8 @@ def verdict(
             text = explained(rows)
         return _said("none", text, *once, first=first)
     apart = _apart(per_trial, agreement)
-    causes = _causes(claims, ranking, credit, identified, apart)
+    open_gap = any(one.above for one in remainder)
+    causes = _causes(claims, ranking, credit, identified, apart, open_gap)
     told = clauses(
         [one.of for one in credit],
         causes,
@@ -120,6 +122,7 @@ def verdict(
     words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed])
     words += [f"{told_apart(group, same)}." for group in groups]
     words += [one.sentence() for one in claims.one_clock[:1]]
+    words += _geared(claims.data.model, [row.effect for row in claimed])[:1]
     more = 0
     if remainder and len(claims.names) == most:
         more = min(most + FURTHER, MOST_EFFECTS) * any(one.above for one in remainder)
@@ -177,8 +180,9 @@ def _causes(
     credit: Sequence[Credit],
     identified: Sequence[Identifiable],
     apart: Mapping[str, str],
+    open_gap: bool = False,
 ) -> tuple[str, ...]:
-    """Return one clause per cause, the largest first."""
+    """Return one clause per cause, the largest first; `open_gap`: a gap remains beside them."""
     from grounded.diagnosis.validation.claims import has_size
     from grounded.diagnosis.validation.motions import KNOWN
 
@@ -191,10 +195,11 @@ def _causes(
     for one in credit:
         if one.of in effects:
             text = meaning(effects[one.of], values[one.of])
+            text += OPEN * (open_gap and one.of.startswith("parameter:"))
             text += UNSURE * (not has_size(effects[one.of], values[one.of], KNOWN))
             text += f", {apart[one.of]}" if one.of in apart else ""
         else:
-            text = f"the model's own parameters are off: {_moved(claims)}"
+            text = f"the model's own parameters are off: {_moved(claims)}{OPEN * open_gap}"
             text += _others(claims, identified)
             named = parameters_off(claims)[:NAMED]
             held = dict.fromkeys(other for n in named for other in given.get(n, ()))
@@ -206,6 +211,19 @@ def _causes(
             text += f" ({listed(joined)} {are} known only with the others)" * bool(joined)
         found.append(text)
     return tuple(found)
+
+
+def _geared(model: Model, claimed: Sequence[str]) -> list[str]:
+    """Return a sentence for each claimed scale of a sensor that a gear or linkage equals."""
+    from grounded import places
+
+    pairs = places.only_read(model) if any(n.startswith("sensor_scale:") for n in claimed) else {}
+    return [
+        f"A gear or linkage between {rate} and {name} that differs from the model would look the "
+        f"same in any log: measure how far {name} really moves."
+        for name, rate in pairs.items()
+        if f"sensor_scale:{name}" in claimed
+    ]
 
 
 def _apart(per_trial: Sequence[TrialValue], agreement: Sequence[Agreement]) -> dict[str, str]:
@@ -239,6 +257,7 @@ def _moved(claims: Claims) -> str:
     return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
 
 
+OPEN = ", unless the gap that remains is the reason"  # a value that a parameter should have
 UNSURE = ", but its size is uncertain: within 2 standard deviations of zero"
 
 

@@ -326,7 +326,7 @@ rate_limit = MemoryFamily(
     name="rate_limit",
     equation="|u_eff'| <= r",
     sentence="{target} can't move faster than {r}",
-    targets=places.inputs,
+    targets=_one_or_alike,
     quantities=lambda site: speed_limit(site, f"{site.unit(site.target)}/s"),
     lookalikes=("slew_limit", "first_order_lag", "delay", "saturation"),
     advance=_advance_rate,

@@ -160,9 +160,9 @@ def two_axes(unit: str) -> tuple[Quantity, ...]:
 
 def speed_limit(site: Site, unit: str) -> tuple[Quantity, ...]:
     """Return a speed limit r, scanned downwards from half the fastest that a step could show."""
-    spread = site.scales.spread(site.target)
-    fastest = spread / site.scales.dt
-    grid = tuple(float(v) for v in np.geomspace(0.5 * fastest, 0.1 * spread, 12))
+    spreads = [site.scales.spread(name) for name in site.targets]
+    fastest = max(spreads) / site.scales.dt
+    grid = tuple(float(v) for v in np.geomspace(0.5 * fastest, 0.1 * min(spreads), 12))
     return (Quantity("r", unit, grid, 0.0, np.inf, start=2 * fastest, places=6),)
 
 

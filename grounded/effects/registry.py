@@ -12,6 +12,8 @@ time constant or a wheelbase. Such rate effects are dropped (`aliases`):
 
     offset:s, rate_gain:s   dropped if   d rate / d p  or  d rate / d u   is k times its own rate
 
+    rate_gain:q             dropped if   q' = c w, and nothing depends on q: sensor_scale:q
+
 at many random states and inputs, and at other values of the parameters, too.
 """
 
@@ -28,8 +30,10 @@ from grounded.effects.correction import correction
 from grounded.effects.family import (
     Effect,
     Family,
+    InputFamily,
     LossFamily,
     MediumFamily,
+    MemoryFamily,
     ParamFamily,
     Quantity,
     RateFamily,
@@ -108,7 +112,7 @@ class Library:
         raise GroundedError(f"there is no effect family '{name}': {nearest(name, known)}")
 
     def effect(self, name: str, model: Model, scales: Scales | None = None) -> Effect:
-        """Return the effect `family:target` at a model.
+        """Return the effect `family:target` at a model; of joint inputs, any several will do.
 
         Raises:
             GroundedError: if the family is unknown or does not apply there.
@@ -116,7 +120,7 @@ class Library:
         family_name, _, target = name.partition(":")
         family = self.family(family_name)
         known = list(family.targets(model))
-        if target not in known:
+        if target not in known and not _part_of(family, target, known):
             raise GroundedError(
                 f"effect '{name}' does not apply to model '{model.name}': "
                 + nearest(name, [f"{family_name}:{t}" for t in known])
@@ -131,6 +135,8 @@ class Library:
         integrals = places.integrated(model)
         geometric = set(integrals) - set(places.velocities(model))
         same = aliases(model, idle | outright) | joint.renamed(model) | medium.renamed(model)
+        scaled = set(sensor.sensor_scale.targets(model)) & {*places.only_read(model)}
+        same |= {f"rate_gain:{name}": f"sensor_scale:{name}" for name in scaled}
         for family in self.families:
             moves = isinstance(family, LossFamily | MediumFamily | RateFamily)
             where = model if moves else whole
@@ -157,6 +163,15 @@ class Library:
         model = moved_model(model)
         targets = family.targets(model)
         return tuple(_build(family, target, model, scales or Scales()) for target in targets)
+
+
+def _part_of(family: Family, target: str, known: Iterable[str]) -> bool:
+    """Check whether a target is several of the inputs, in their order, that a known one joins."""
+    if not isinstance(family, InputFamily | MemoryFamily):
+        return False
+    parts = target.split("+")
+    joint = ([name for name in one.split("+") if name in parts] for one in known)
+    return len(parts) > 1 and parts in list(joint)
 
 
 def _build(family: Family, target: str, model: Model, scales: Scales) -> Effect:

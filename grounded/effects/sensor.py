@@ -79,7 +79,7 @@ sensor_scale = SensorFamily(
     sentence="the log of {target} is {k%too large|too small}",
     targets=lambda model: [n for n in places.but_position(model) if n not in model.angles],
     quantities=lambda site: (Quantity("k", "1", low=-0.8, high=4.0, absurd=1.0),),
-    lookalikes=("odometry_scale", "rate_gain", "input_gain", "parameter"),
+    lookalikes=("sensor_scale", "odometry_scale", "rate_gain", "input_gain", "parameter"),
     measure=lambda value, c: (1 + c["k"]) * value,
     recover=lambda value, c: value / (1 + c["k"]),
 )

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import pytest
+
 from facts import holds
 from grounded.diagnosis.cause_words import (
     DISAGREE,
@@ -59,6 +61,17 @@ def test_the_smallest_of_many_are_counted():
     found = told(names, [0.5, 0.2, 0.15, 0.1, 0.03, 0.02])
     assert len(found) == 5
     assert found[-1] == "2 smaller causes (5.0 % of the improvement)"
+
+
+@pytest.mark.parametrize("late", ["delay:t1+t2", "first_order_lag:t2"])
+def test_a_delay_is_named_however_small_its_share(late):
+    """A delay that made the machine oscillate was one of `2 smaller causes`."""
+    names = [INERTIA, ONE, "calibration", GAIN, BIAS, late, "input_bias:t2"]
+    VALUES["input_bias:t2"] = {"b": Estimate(0.03, 0.001, unit="N m")}
+    VALUES[late] = {n: Estimate(0.06, 0.001, unit="s") for n in ("d", "tau")}
+    found = told(names, [0.4, 0.2, 0.15, 0.1, 0.08, 0.05, 0.02])
+    assert len(found) == 6 and "0.06 s" in found[4]
+    assert found[-1] == "2 smaller causes (10 % of the improvement)"
 
 
 def test_a_joint_with_dry_friction_is_not_told_beside_one_with_viscous_friction():

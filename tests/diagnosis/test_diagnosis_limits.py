@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from test_diagnosis_unmeasured import swings
 
+from facts import holds
 from grounded import GroundedError, Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.tables import error_table
 from grounded.diagnosis.validation.limits import (
     joints_without_input,
     knowable,
@@ -36,8 +38,7 @@ def test_states_that_never_moved_give_no_cause():
     found = diagnose(pendulum, list(stuck(swings(), 0, 1)))
     assert found.kind == "unknown" and not found.effects
     assert [s for s in found.unknowable if "never moved" in s] == [
-        f"state {name} never moved, so effects on it can't be identified"
-        for name in ("theta", "omega")
+        "states theta and omega never moved, so effects on them can't be identified"
     ]
 
 
@@ -90,6 +91,68 @@ def test_how_much_a_switch_is_on_is_not_doubted():
     assert switches(data) == {"torque"} and "delay:torque" in offered
     assert not {f"{name}:torque" for name in ("saturation", "input_gain", "backlash")} & offered
     assert not switches(prepare(pendulum, swings()))
+
+
+ARM = Model(
+    name="arm",
+    states={
+        **dict.fromkeys(("q1", "q2", "q3"), "rad"),
+        **dict.fromkeys(("w1", "w2", "w3"), "rad/s"),
+    },
+    inputs={"u1": "N m", "u2": "N m", "u3": "N m"},
+    derivative=lambda s, a, p: {
+        **{f"q{k}": s[f"w{k}"] for k in (1, 2, 3)},
+        **{f"w{k}": 4 * a[f"u{k}"] - 2 * s[f"w{k}"] for k in (1, 2, 3)},
+    },
+)
+
+
+def two_of_three(late=3, trials=2, steps=120):
+    """An arm of which the first joint stands still; the others' commands arrive some steps late."""
+    rng, found = np.random.default_rng(4), []
+    for _ in range(trials):
+        u = np.repeat(rng.uniform(-1, 1, (steps // 8, 3)), 8, axis=0) * [0.0, 1.0, 1.0]
+        states = [np.zeros(6)]
+        for k in range(steps):
+            sent = u[max(k - late, 0)][None] * (k >= late)
+            states.append(ARM.system.step(states[-1][None], sent, ARM.values, 0.02)[0])
+        noise = np.array([0, 1e-4, 1e-4, 0, 1e-3, 1e-3]) * rng.standard_normal((steps + 1, 6))
+        found.append(Trial(np.array(states) + noise, u, 0.02, ARM.state_names, ARM.input_names))
+    return found
+
+
+def test_a_joint_effect_is_offered_of_the_inputs_that_move():
+    """A delay of both joints that moved was called a lag, since two others stood still."""
+    data = prepare(ARM, two_of_three())
+    all_of_them = Library().candidates(ARM, data.scales)
+    names = [e.name for e in knowable(data, all_of_them)]
+    families = ("delay", "first_order_lag", "input_gain", "dead_zone", "rate_limit")
+    assert {f"{family}:u2+u3" for family in families} <= {*names}
+    assert len(names) == len({*names}) and not any("u1" in name for name in names)
+    (late,) = (e for e in all_of_them if e.name == "delay:u1+u2+u3")
+    assert Library().effect("delay:u2+u3", ARM, data.scales).site.targets == ("u2", "u3")
+    assert [e.name for e in knowable(data, [late], [late.name])] == [late.name]  # it is adopted
+    with pytest.raises(GroundedError, match="does not apply"):
+        Library().effect("delay:u3+u2", ARM)
+    with pytest.raises(GroundedError, match="does not apply"):
+        Library().effect("delay:u2+u4", ARM)
+
+
+def test_all_that_stands_still_takes_one_sentence():
+    """There were six lines on two joints."""
+    (said,) = limits(prepare(ARM, two_of_three())).sentences
+    assert holds(said, "input u1 never changed", "states q1 and w1 never moved")
+    (said,) = limits(prepare(pendulum, list(stuck(swings(), 0, 1)))).sentences
+    assert holds(said, "states theta and omega never moved")
+
+
+@pytest.mark.slow
+def test_joints_that_stand_still_do_not_hide_a_delay_of_the_others():
+    found = diagnose(ARM, two_of_three())
+    assert found.effects == ("delay:u2+u3",)
+    assert found.ranking[0].values["d"] == pytest.approx(0.06, abs=0.002)
+    rows, _ = error_table(found)
+    assert rows and not any(row[0].startswith(("q1", "w1")) for row in rows)
 
 
 def test_a_model_that_is_no_number_at_a_measured_state_says_where():

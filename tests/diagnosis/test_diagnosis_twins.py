@@ -1,5 +1,6 @@
 """Effects that are one thing once a parameter may move: fitted to the end, named together."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -67,6 +68,24 @@ def test_two_effects_are_one_thing_beside_a_parameter_that_moves(one, other, kno
     blamed = [Library().effect("parameter:tau", model)] if known else []
     assert moving(data, Hypothesis(tuple(blamed), ({"d": 0.02},) * len(blamed))) == free
     assert moving(data, Hypothesis((a,), ({},))) == []
+
+
+def test_what_a_parameter_does_alone_makes_no_two_effects_one_thing():
+    """A wrong sign was "equivalent" to a friction: each was also another value of a parameter."""
+    model = Model(
+        name="fan",
+        states={"psi": "rad", "w": "rad/s"},
+        inputs={"u": "V"},
+        params={"K": Param(2.0, "1", 0.5, 8.0), "D": Param(1.0, "1/s", 0.2, 5.0)},
+        derivative=lambda s, a, p: {"psi": s.w, "w": p.K * a.u - p.D * s.w},
+    )
+    made = [replace(t, state_names=("psi", "w"), input_names=("u",)) for t in trials(2, 60)]
+    data = prepare(model, made)
+    names = ("input_gain:u", "viscous_friction:w", "rate_gain:w")
+    effects = [Library().effect(name, model, data.scales) for name in names]
+    free = moving(data, Hypothesis(spread=0.3))
+    for one, other in itertools.permutations(effects, 2):
+        assert not twins(Predictor(data), one, other, free)
 
 
 @pytest.fixture(scope="module")

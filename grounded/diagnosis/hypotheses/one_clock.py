@@ -7,7 +7,7 @@ can distinguish the two, unless the same clock stamps a command and its response
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,7 +49,7 @@ class OneClock:
 
 
 def one_clock(
-    model: Model, effects: Sequence[Effect], shown: Sequence[str]
+    model: Model, effects: Sequence[Effect], shown: Sequence[str], still: Collection[str] = ()
 ) -> tuple[OneClock, ...]:
     """Find delays that cover all inputs, or all sensors, of an independent part of a model.
 
@@ -57,19 +57,21 @@ def one_clock(
         model: its structure defines the parts.
         effects: the claimed effects.
         shown: names of states that have a sensor.
+        still: inputs that never changed, whose delay makes no difference.
     """
+    moving = [name for name in model.input_names if name not in still]
     some = [e for e in effects if e.family.name in FAMILIES]
     parts = _parts(model) if some else []
     found = []
     for effect in some:
         targets = set(effect.site.targets)
         touched = [part for part in parts if targets & part]
-        inputs = tuple(n for n in model.input_names if any(n in part for part in touched))
+        inputs = tuple(n for n in moving if any(n in part for part in touched))
         states = tuple(n for n in shown if any(n in part for part in touched))
         side, other = (inputs, states) if effect.family.name == "delay" else (states, inputs)
         if targets == set(side) and other:
             like = f"{FAMILIES[effect.family.name]}:{'+'.join(other)}"
-            whole = len(inputs) == model.m and len(states) == len(shown)
+            whole = len(inputs) == len(moving) and len(states) == len(shown)
             found.append(OneClock(effect.name, like, inputs, states, whole))
     return tuple(found)
 

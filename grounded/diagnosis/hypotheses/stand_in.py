@@ -80,6 +80,9 @@ def twins(predictor: Predictor, one: Effect, other: Effect, free: Sequence[int])
     Tested at random points, every state and input drawn independently: the rate that the one adds
     must be a linear combination of the other's and of the parameters' slopes. Only for effects with
     one value and no memory, and not for simulators, whose instantaneous rates are not known.
+
+    What the parameters can do alone says nothing of the other effect: if one parameter scales each
+    input and another one is each friction, any two of these effects would be one thing.
     """
     data, h = predictor.data, Hypothesis()
     if simulated(data.model) or not (_at_once(one) and _at_once(other)):
@@ -105,10 +108,20 @@ def twins(predictor: Predictor, one: Effect, other: Effect, free: Sequence[int])
         moved = np.zeros(len(scale))
         moved[index] = SIDE * scale[index]
         columns.append(slope(replace(h, shift=moved), replace(h, shift=-moved)))
-    own, others = columns[0], np.stack(columns[1:], axis=-1)
-    others = others / np.maximum(np.linalg.norm(others, axis=0), 1e-300)
-    left = own - others @ np.linalg.lstsq(others, own, rcond=1e-9)[0]
-    return bool(own.any()) and float(left @ left) < IDENTICAL * float(own @ own)
+    first, second, *shifts = columns
+    if any(_is_sum(effect, shifts) for effect in (first, second)):
+        return False
+    return bool(first.any()) and _is_sum(first, [second, *shifts])
+
+
+def _is_sum(own: Array, others: Sequence[Array]) -> bool:
+    """Check whether a slope is a linear combination of others."""
+    if not others:
+        return not own.any()
+    columns = np.stack(others, axis=-1)
+    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    left = own - columns @ np.linalg.lstsq(columns, own, rcond=1e-9)[0]
+    return float(left @ left) <= IDENTICAL * float(own @ own)
 
 
 SAMPLES = 500  # random points at which two effects are compared

@@ -22,7 +22,7 @@ from grounded.diagnosis.validation.credit import ordered
 from grounded.diagnosis.validation.decide import Decision
 from grounded.diagnosis.validation.gain import BETTER
 from grounded.diagnosis.validation.held_out import gaps_of, held_out_errors
-from grounded.diagnosis.validation.limits import Limits
+from grounded.diagnosis.validation.limits import Limits, constant_inputs
 from grounded.diagnosis.validation.prediction_error import normalised
 from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.effects import Effect
@@ -64,7 +64,7 @@ class Claims:
         candidates = search.candidates
         self.alike = () if known.no_cause else lookalikes(self.predictor, best, candidates)
         late = [e for e, values in best.hypothesis.pairs if values.get("d", 0.0) >= 0]
-        self.one_clock = one_clock(self.data.model, late, ruler.names)
+        self.one_clock = one_clock(self.data.model, late, ruler.names, constant_inputs(self.data))
         swap(search, best, self.alike)  # ties are decided between converged fits
         self.like_parameters = (
             of_parameters(self.predictor, self.null, off, candidates) if off else ()

@@ -73,14 +73,11 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
             f"{FEW_STEPS} or more"
         )
         no_cause = True
-    still = constant_inputs(data)
-    for name in still:
-        found.append(f"input {name} never changed, so effects of its actuator can't be identified")
+    still, unmoved = constant_inputs(data), still_states(data)
+    if still or unmoved:
+        found.append(_stood_still(still, unmoved))
     if len(still) == data.model.m and not released(data):
         no_cause = True
-    unmoved = still_states(data)
-    for name in unmoved:
-        found.append(f"state {name} never moved, so effects on it can't be identified")
     if data.skipped:
         slow = simulated(data.model)
         why = "simulator steps are slow" if slow else "to limit memory"
@@ -94,6 +91,20 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
     if {*unmoved, *empty, *(names[i] for i in data.hidden)} == {*names}:
         no_cause = True
     return Limits(tuple(found), no_cause)
+
+
+def _stood_still(inputs: Sequence[str], states: Sequence[str]) -> str:
+    """Return one sentence on all inputs that never changed and all states that never moved."""
+    told = [
+        f"{kind}{'s' * (len(names) > 1)} {listed(names)} never {moved}"
+        for kind, names, moved in (("input", inputs, "changed"), ("state", states, "moved"))
+        if names
+    ]
+    if not states:
+        own = "its actuator" if len(inputs) == 1 else "their actuators"
+        return f"{told[0]}, so effects of {own} can't be identified"
+    one = len(inputs) + len(states) == 1
+    return f"{', and '.join(told)}, so effects on {'it' if one else 'them'} can't be identified"
 
 
 def joints_without_input(model: Model, claimed: Collection[str]) -> list[str]:
@@ -199,8 +210,20 @@ def still_states(data: Data) -> list[str]:
     return found
 
 
-def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
-    """Return the effects that these data could show."""
+def knowable(
+    data: Data, effects: Sequence[Effect], whole: Collection[str] = ()
+) -> tuple[Effect, ...]:
+    """Return the effects that these data could show.
+
+    An effect of several inputs is that of those which move: a delay of all commands shows in two of
+    four joints while the others stand still.
+
+    Args:
+        data: the trials.
+        effects: all candidates.
+        whole: names of effects that the model has already, which stay as they are.
+    """
+    effects = _of_moving(data, effects, whole)
     still, unmoved, on_off = set(constant_inputs(data)), set(still_states(data)), switches(data)
     dead = {n for i, n in enumerate(data.model.state_names) if not data.seen[..., i].any()}
     memory = {data.model.state_names[i] for i in data.hidden}
@@ -210,7 +233,8 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
         family = effect.family
         if targets & memory:
             continue
-        if isinstance(family, InputFamily | MemoryFamily | RateFamily) and targets & still:
+        lost = still - targets if effect.name in whole and not targets <= still else still
+        if isinstance(family, InputFamily | MemoryFamily | RateFamily) and targets & lost:
             continue
         if targets & on_off and (isinstance(family, InputFamily) or family is backlash):
             continue
@@ -224,6 +248,24 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
             continue
         kept.append(effect)
     return tuple(kept)
+
+
+def _of_moving(data: Data, effects: Sequence[Effect], whole: Collection[str]) -> list[Effect]:
+    """Replace effects of several inputs by those of the inputs that move, if these are several."""
+    still, on_off = set(constant_inputs(data)), switches(data)
+    named, found = {effect.name for effect in effects}, []
+    for effect in effects:
+        site, family = effect.site, effect.family
+        lost = still | on_off if isinstance(family, InputFamily) else still
+        shown = tuple(name for name in site.targets if name not in lost)
+        inputs = isinstance(family, InputFamily | MemoryFamily)
+        if inputs and 1 < len(shown) < len(site.targets) and effect.name not in whole:
+            effect = family.at(replace(site, targets=shown))
+            if effect.name in named:
+                continue
+            named.add(effect.name)
+        found.append(effect)
+    return found
 
 
 def identifiable(

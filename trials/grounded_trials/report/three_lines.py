@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from grounded.diagnosis.cause_words import is_late
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.ruler_words import in_doubt, open_noise, rest, telling, worsened
 from grounded.diagnosis.verdict import told_apart
@@ -38,11 +39,15 @@ def three_lines(diagnosis: Diagnosis, task: Task) -> list[str]:
 
 
 def _wrong(diagnosis: Diagnosis) -> str:
-    """The largest causes without their shares, which the bars show; the others are counted."""
+    """The largest causes without their shares, which the bars show; the others are counted.
+
+    Delays and lags are named in any case, as they decide whether a loop is stable.
+    """
     told: list[str] = []
     small = 0
     for clause, credit in zip(diagnosis.verdict.causes, diagnosis.credit, strict=True):
-        if told and (len(told) == CAUSES or credit.share < SMALL):
+        many = len(told) >= CAUSES or credit.share < SMALL
+        if told and many and not is_late(credit.of):
             small += 1
         else:
             told.append(clause)

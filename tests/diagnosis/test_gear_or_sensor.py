@@ -1,0 +1,92 @@
+"""A state that only integrates another one: its sensor's scale and a gear are one thing."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from facts import holds
+from grounded import Model, Param, Trial
+from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.error_report import Credit, Remainder
+from grounded.diagnosis.hypotheses.lookalike import related
+from grounded.diagnosis.report import Estimate, Ranked
+from grounded.diagnosis.validation.blame import Blame
+from grounded.diagnosis.verdict import verdict
+from grounded.effects import Library
+from grounded.models.pendulum import model as pendulum
+from grounded.places import only_read
+
+STICK = Model(
+    name="stick",
+    states={"stick": "rad", "stick_rate": "rad/s"},
+    inputs={"valve": "1"},
+    params={"k": Param(0.8, "rad/s", 0.4, 1.6)},
+    derivative=lambda s, a, p: {
+        "stick": s.stick_rate,
+        "stick_rate": (p.k * a.valve - s.stick_rate) / 0.15,
+    },
+)
+
+
+def names(model, *without):
+    return {effect.name for effect in Library().without(without).candidates(model)}
+
+
+def test_the_scale_of_a_sensor_is_offered_and_no_gain_that_equals_it():
+    assert only_read(STICK) == {"stick": "stick_rate"} and not only_read(pendulum)
+    assert "sensor_scale:stick" in names(STICK) and "rate_gain:stick" not in names(STICK)
+    assert "rate_gain:stick" in names(STICK, "sensor_scale")
+    assert "rate_gain:theta" in names(pendulum)  # gravity feels the true angle
+    gyro, encoder = (Library().effect(f"sensor_scale:{n}", STICK) for n in ("stick_rate", "stick"))
+    assert related(gyro, encoder)  # a gyro that reads too much is compared with it
+
+
+def short(scale=0.94, trials=3, steps=200, dt=0.02):
+    """An encoder that reads 6 % short beside a gyro that is right."""
+    rng, found = np.random.default_rng(7), []
+    for _ in range(trials):
+        u, states = np.repeat(rng.uniform(-1, 1, steps // 10), 10), [np.zeros(2)]
+        for sent in u:
+            x, a = states[-1][None], np.array([[sent]])
+            states.append(STICK.system.step(x, a, STICK.values, dt)[0])
+        y = np.array(states) * [scale, 1.0] + rng.normal(size=(steps + 1, 2)) * [5e-4, 4e-3]
+        found.append(Trial(y, u[:, None], dt, STICK.state_names, STICK.input_names))
+    return found
+
+
+@pytest.mark.slow
+def test_an_encoder_that_reads_short_is_named_and_a_gear_as_its_second_reading():
+    """It was a state that "changes slower", to be told apart by a trial that could not."""
+    found = diagnose(STICK, short())
+    assert found.effects == ("sensor_scale:stick",)
+    assert found.ranking[0].values["k"] == pytest.approx(-0.06, abs=0.005)
+    assert holds(
+        found.sentence, "log of the stick is", "too small", "gear or linkage", "stick_rate"
+    )
+    assert "slowly and fast" not in found.next_trial
+
+
+@pytest.mark.parametrize("error", [0.011, 0.0050])
+def test_a_value_is_no_fact_while_a_gap_remains(error):
+    """k_boom "should be 0.5402", while a quarter of the boom's speed was lost to the stick."""
+    model, data = STICK, SimpleNamespace(model=STICK)
+    known = {"k": Estimate(0.72, 0.004, unit="rad/s")}
+    claims = SimpleNamespace(
+        known=SimpleNamespace(no_cause=False, sentences=()),
+        best=SimpleNamespace(hypothesis=SimpleNamespace(effects=())),
+        data=data,
+        moved=[Blame(model.param_names.index("k"), 90.0)],
+        parameters=lambda: known,
+        one_clock=(),
+        names=(),
+    )
+    left = Remainder("stick", error=error, floor=0.0049, horizon_s=1.0, error_unit="rad")
+    row = Ranked("parameter:k", {"d": Estimate(-0.08, 0.004, unit="rad/s")}, {}, 90.0, claimed=True)
+    credit = (Credit("calibration", 1.0),)
+    said = verdict(claims, (row,), (), (left,), (), credit, most=3)
+    assert holds(said.causes[0], "k should be 0.7200")
+    assert ("the gap that remains" in said.causes[0]) == left.above == (error > 0.01)
+    assert "gap that remains" not in verdict(claims, (row,), (), (), (), credit).causes[0]
+    assert replace(left, error=0.0).above is False
