@@ -26,15 +26,16 @@ COMMANDS = "/valve_controller/commands"
 NAMES = ["boom_joint", "stick_joint"]
 
 
-def excavator(folder, topic="/joint_states", commands=True):
-    """An arm of two joints for 6 s; the topic of its commands may stay empty."""
+def excavator(folder, topic="/joint_states", commands=True, still=0):
+    """An arm of two joints for 6 s, at first `still` for some rows; its commands may be missing."""
     topics = {topic: "sensor_msgs/msg/JointState", COMMANDS: "std_msgs/msg/Float64MultiArray"}
     layout = T["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
 
     def messages():
         q, w = np.array([0.3, -1.2]), np.zeros(2)
         for k in range(600):
-            t, u = START + k * 10**7, 0.5 * np.sin(np.array([0.02, 0.031]) * k)
+            t = START + k * 10**7
+            u = 0.5 * np.sin(np.array([0.02, 0.031]) * max(k - still, 0))
             yield topic, t, joints(t, NAMES, q, w, np.zeros(2))
             if commands and k % 2 == 0:
                 yield COMMANDS, t, T[topics[COMMANDS]](layout=layout, data=u)
@@ -77,3 +78,12 @@ def test_a_renamed_topic_names_all_that_is_read_from_it(tmp_path, model):
     assert "boom, stick, boom_rate and stick_rate are read from /joint_states" in told
     assert "renamed to /arm/joint_states, edit their paths in [log]" in told
     assert refused.value.then.verb == "inspect"
+
+
+def test_a_robot_that_stood_away_from_zero_starts_there(tmp_path, model):
+    """`target line --to` began at 0, 0, where the arm never was."""
+    begin(tmp_path / "w", excavator(tmp_path / "bag", still=100), model=model)
+    assert Workspace(tmp_path / "w").config.task.start == {"boom": 0.3, "stick": -1.2}
+    moving = tmp_path / "moving"
+    begin(moving, excavator(tmp_path / "bag2"), model=model)
+    assert Workspace(moving).config.task.start == {}
