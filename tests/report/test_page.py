@@ -189,6 +189,7 @@ def test_a_gain_that_scatter_may_explain_is_headed_perhaps(car):
     text = page(found)
     assert re.search(r"<h2>What perhaps improved \(probability 0\.[67]\d\)</h2>", text)
     assert "which the scatter of repeats may explain" in text
+    assert "bias in 1 s, c0" in text and "bias per s" not in text  # its column is in rad, not rad/s
 
 
 def test_a_diagnosis_that_is_not_the_last_word_says_no_next_trial(cart):
