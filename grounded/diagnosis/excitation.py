@@ -233,9 +233,9 @@ def _teaching(
     elif shrunk > 1 - TEACHES:
         ends = f"+- {then:.2g}{unit}", f"+- {now:.2g}{unit}"
         same = "as now" if ends[0] == ends[1] else f"now {ends[1]}"
-        best = f"{words}{', run twice' * again}"
+        way = f"{words}{', run twice' * again}"
         sentence = (
-            f"no candidate inside the limits teaches much: after the best, {best}, {name} would be "
+            f"no candidate inside the limits teaches much: after the best, {way}, {name} would be "
             f"known to {ends[0]} ({same})"
         )
         little = True
