@@ -151,6 +151,8 @@ def load(
 ) -> Runner:
     """Load a runner from an exported candidate; nothing in the file is executed.
 
+    Its `policy` has the fields of a `Policy`, `horizon` (the number of steps) included.
+
     Args:
         path: the .npz file.
         states: the robot's state names in the order in which it passes them; None for no check.
@@ -160,7 +162,8 @@ def load(
     Raises:
         ValueError: if the file is not an exported candidate, or is for another robot or task.
     """
-    return Runner(SimpleNamespace(**read(path, states, inputs, task)))
+    found = read(path, states, inputs, task)
+    return Runner(SimpleNamespace(horizon=len(found["feedforward"]), **found))
 
 
 def read(path: Any, states: Names, inputs: Names, task: Optional[str]) -> dict[str, Any]:
@@ -250,7 +253,7 @@ if __name__ == "__main__":  # check a file and print its contents
         shown = load(sys.argv[1]).policy
     except ValueError as problem:
         sys.exit(f"error: {problem}")
-    print(f"{len(shown.feedforward)} steps of {shown.dt:g} s")
+    print(f"{shown.horizon} steps of {shown.dt:g} s")
     print("states ", ", ".join(shown.state_names))
     for name, low, high in zip(shown.input_names, shown.low, shown.high):
         print(f"input   {name}, limits {low:g} to {high:g}")

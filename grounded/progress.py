@@ -33,7 +33,7 @@ class Stages:
     """Reports each stage with the share done and the time left, from the usual number of calls.
 
     The number of calls varies by a factor of two either way, and later ones take longer (`LATER`).
-    Close to the usual number, the end is unknown: the time taken so far is shown instead.
+    So the time left is told as if there were twice as many calls: "at most".
 
     Args:
         tell: shows a line; None for no output.
@@ -52,17 +52,19 @@ class Stages:
         self.count += 1
         if self.tell is None:
             return
-        share, taken = (self.count / self.usual) ** LATER, time.monotonic() - self.began
-        if share > NEARLY:
+        taken = time.monotonic() - self.began
+        least, share = ((self.count / (by * self.usual)) ** LATER for by in (2.0, 1.0))
+        if least > NEARLY:
             return self.tell(f"{stage}, {_told(taken)} so far, longer than usual")
-        left = taken * (1 - share) / share
+        done = f"about {100 * share:.0f} % done" if share < NEARLY else f"{_told(taken)} so far"
+        left = taken * (1 - least) / least
         shrinks, self.left = left < self.left, left  # no estimate is shown if the end recedes
-        about = f", {_told(left)} left" if self.count > 10 and shrinks else ""
-        self.tell(f"{stage}, about {100 * share:.0f} % done{about}")
+        about = f", at most {_told(left)} left" if self.count > 10 and shrinks else ""
+        self.tell(f"{stage}, {done}{about}")
 
 
 LATER = 1.3  # exponent of the share of calls that gives the share of time (three diagnoses)
-NEARLY = 0.9  # share of the usual number of calls from which on no estimate is shown
+NEARLY = 0.9  # share from which on its number says nothing: there may be twice as many calls
 
 
 def _told(seconds: float) -> str:

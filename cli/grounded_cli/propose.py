@@ -83,7 +83,8 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
         guessed = estimated_in(workspace.trials())
         text = _so_far(candidate, standing.incumbent, workspace.task, guessed)
         show(field("so far", text, "  "))
-    show(field("trust", _trust(candidate, standing, workspace), "  "))
+    lacks = "; this model lacks what the last diagnosis found" * bool(proposed.lacks)
+    show(field("trust", _trust(candidate, standing, workspace) + lacks, "  "))
     show_extent(candidate, workspace.task)
     if last:
         show(f"\n{next_line(proposed.then)}")

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from grounded_cli.options import as_json, typed
+from grounded_cli.options import as_json, open_workspace, typed
 from grounded_cli.terminal import field, progress, say, show, show_json
 from grounded_trials.wording import count
 
 if TYPE_CHECKING:
+    from grounded.errors import NextCommand
     from grounded_trials.logs.recover import Recovery
 
 
@@ -89,6 +90,29 @@ def _steps(found: Recovery) -> str:
     return f"{found.steps}{planned} steps of a trial {ran}{', with a hole' * found.hole}"
 
 
+def _of_foreign(found: Recovery, target: str) -> NextCommand:
+    """Return `ingest` for a log that [log] of this workspace can read, else `inspect`.
+
+    It is data, unless a candidate waits for its trial, which this log may be.
+    """
+    from grounded.errors import GroundedError, NextCommand
+    from grounded_trials.formats.message_path import parse_path
+    from grounded_trials.logs.log_table import log_mapping
+    from grounded_trials.workspace.proposing import standing_in
+
+    try:
+        workspace = open_workspace()
+        model = workspace.base_model
+        mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
+        specs = (*mapping.states.values(), *mapping.inputs.values()) if mapping else ()
+        if not specs or any(parse_path(one.path).topic not in found.messages for one in specs):
+            return NextCommand("inspect", (target,))
+        waits = workspace.candidate_ids() and standing_in(workspace).outstanding
+    except GroundedError:  # no workspace here, or one that can't be read
+        return NextCommand("inspect", (target,))
+    return NextCommand("ingest", (target,) if waits else ("--data", target))
+
+
 def _next(found: Recovery) -> str:
     """Return the lines that say what to do with the file."""
     from grounded.errors import NextCommand
@@ -101,7 +125,7 @@ def _next(found: Recovery) -> str:
             f"next: {typed(NextCommand('propose'))}   writes the outstanding candidate again"
         )
     if not _is_trial(found):
-        return f"next: {typed(NextCommand('inspect', (target,)))}"
+        return f"next: {typed(_of_foreign(found, target))}"
     if found.hole:
         why = "a trial with a hole can't be used: run it again"
         again = NextCommand("run", (found.candidate,))

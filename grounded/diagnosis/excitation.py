@@ -160,12 +160,14 @@ def probe(
         )
         return Probe(chosen, expected, (group[0], group[1]), text, little=True)
     gain = f"{expected:,.{int(expected < 100)}f} nats"
-    tells = f"{words}: expected to distinguish {group[0]} from {group[1]} by {gain}"
+    tells = f"expected to distinguish {group[0]} from {group[1]} by {gain}"
     if little := expected < TIE:
         tells = (
-            f"no candidate inside the limits is informative enough, not even {tells} "
+            f"no candidate inside the limits is informative enough: the best, {words}, is {tells} "
             f"({TIE:g} needed); record larger inputs or another manoeuvre"
         )
+    else:
+        tells = f"{words}: {tells}"
     return Probe(chosen, expected, (group[0], group[1]), tells, little)
 
 
@@ -233,7 +235,13 @@ def _teaching(
     if diagnosis.motions == 1 < len(trials) and words != BASE:
         sentence = f"{words}: would show whether {name}, so far from one motion, holds in another"
     elif shrunk > 1 - TEACHES:
-        sentence = f"no candidate inside the limits teaches much, not even {sentence}"
+        ends = f"+- {then:.2g}{unit}", f"+- {now:.2g}{unit}"
+        same = "as now" if ends[0] == ends[1] else f"now {ends[1]}"
+        way = f"{words}{', run twice' * again}"
+        sentence = (
+            f"no candidate inside the limits teaches much: after the best, {way}, {name} would be "
+            f"known to {ends[0]} ({same})"
+        )
         little = True
     return Probe(chosen, gain, (name,), sentence, little, then, 1 + again)
 

@@ -270,7 +270,7 @@ def where_figure(diagnosis: Diagnosis) -> Figure | None:
     caption = (
         "Evidence is the gain in log-likelihood less a price for parameters. Blue: the loss "
         "without a claimed effect, 3 nats or more. Grey: the gain of another effect alone, in "
-        "place of the claimed ones."
+        "place of the claimed ones; below 0, it is not worth its parameters."
     )
     if by_channel:
         more = f"Beside a channel's share: the model's prediction error{_ahead(diagnosis)}."

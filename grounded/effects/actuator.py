@@ -178,8 +178,8 @@ def _fade(site: Site) -> tuple[Quantity, ...]:
 input_fade = InputFamily(
     name="input_fade",
     equation="u_eff = (1 - k t) u",
-    sentence="the gain of {target} gets {k%lower every second (a battery that sags)|higher every "
-    "second}",
+    sentence="the gain of {target} gets {k%lower every second (for example a battery that sags)|"
+    "higher every second}",
     targets=places.inputs,
     quantities=_fade,
     lookalikes=("input_gain", "trend", "input_bias"),

@@ -16,6 +16,7 @@ from grounded.search.scatter import (
     Repeats,
     beyond_noise,
     by_pieces,
+    by_states,
     noise_cost,
     sensor_noise,
     with_errors,
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from grounded.search.step_size import SearchOptions
 
 PART = 0.3  # share of a gain due to different start states from which on it is reported
+ANOTHER = 99.0  # ratio of a state's costs in two runs that is no scatter, see `another_kind`
 FEW = 4.0  # degrees of freedom below which the sentence mentions the few repeats
 
 
@@ -74,7 +76,7 @@ def judged(
             if (
                 options.rerun_incumbent
                 and not (spent or exact)
-                and in_doubt(incumbent, tried, history, losses + options.repeats)
+                and in_doubt(task, incumbent, tried, history, losses + options.repeats)
             ):
                 tried = replace(tried, accepted=None, in_doubt=True)
         history.append(tried)
@@ -99,13 +101,16 @@ def repeated_exactly(trials: Sequence[Trial]) -> bool:
     return any(a.repeats(b) for a, b in pairwise(trials))
 
 
-def in_doubt(incumbent: Tried, loser: Tried, history: Sequence[Tried], most: int) -> bool:
+def in_doubt(
+    task: Task, incumbent: Tried, loser: Tried, history: Sequence[Tried], most: int
+) -> bool:
     """Return whether a loss may be due to a lucky trial of the incumbent.
 
     A lucky incumbent would block every further step. So after a loss within two standard errors the
     incumbent is run again, until it has `most` trials: one for each loss. Without repeats at a
     similar utility, the standard deviation is taken as half of the utility, as for chi-squared with
-    eight degrees of freedom; a loss of more than 1.4 times the best cost is then accepted at once.
+    eight degrees of freedom; a loss of more than 1.4 times the best cost is then accepted at once,
+    and one of more than 0.7 times if it is of another kind (`another_kind`).
     On a deterministic system this costs one trial per incumbent.
     """
     if not np.isfinite(loser.utility) or len(incumbent.trials) >= most:
@@ -113,7 +118,21 @@ def in_doubt(incumbent: Tried, loser: Tried, history: Sequence[Tried], most: int
     scatter = Repeats((*history, loser)).near(incumbent.utility)
     each = math.sqrt(scatter.variance) if scatter.known else 0.5 * abs(incumbent.utility)
     error = each * np.sqrt(1 / len(incumbent.trials) + 1 / len(loser.trials))
-    return not incumbent.utility - loser.utility > 2 * error
+    loss = incumbent.utility - loser.utility
+    if not scatter.known and loss > error and another_kind(task, incumbent, loser):
+        return False
+    return not loss > 2 * error
+
+
+def another_kind(task: Task, incumbent: Tried, loser: Tried) -> bool:
+    """Return whether the error of one state explains a loss, and is no scatter of the incumbent's.
+
+    Even if a state's cost has only two degrees of freedom, as a single slow swing has, the ratio of
+    two such costs exceeds 99 by chance in 1 of 100 cases, F(2, 2): a tenfold error.
+    """
+    before, after = by_states(task, incumbent.trials), by_states(task, loser.trials)
+    rise, loss = after - before, incumbent.utility - loser.utility
+    return bool(((rise >= loss) & (after > ANOTHER * before)).any())
 
 
 def with_chances(history: Sequence[Tried]) -> tuple[Tried, ...]:

@@ -156,6 +156,7 @@ class Proposal(Result):
             predicted_utility=made and made.predicted_utility,
             phase="await-trial" if made else now.phase,
             sentence=now.sentence,
+            ending=None if made else now.ending or None,
             notes=self.notes,
         )
         best = document(best_utility=now.incumbent and now.incumbent.utility, new=self.is_new)

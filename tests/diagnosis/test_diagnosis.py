@@ -251,7 +251,7 @@ def test_sentences_are_english():
         "The gain of the throttle gets 5 % higher every second."
     )
     assert said("input_fade:throttle", k=0.05) == (
-        "The gain of the throttle gets 5 % lower every second (a battery that sags)."
+        "The gain of the throttle gets 5 % lower every second (for example a battery that sags)."
     )
     assert said("parameter:k", d=0.1) == "The parameter k should be 1.1 1/s instead of 1."
     bent = "40 % lower at 1, its largest command in the log, than near zero"

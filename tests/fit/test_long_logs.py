@@ -75,6 +75,23 @@ def test_stages_tell_share_and_time_and_what_was_taken_where_the_end_is_not_know
     assert any("s left" in line for line in told)
 
 
+@pytest.mark.parametrize("calls", [20, 39])  # as usual, and nearly twice as many
+def test_no_estimate_of_the_time_left_is_exceeded(monkeypatch, calls):
+    """A diagnosis had 45 s left, and 3 minutes later it took longer than usual."""
+    clock, told = [0.0], []
+    monkeypatch.setattr("grounded.progress.time.monotonic", lambda: clock[0])
+    stages = Stages(told.append, usual=20, began=0.0)
+    for k in range(1, calls + 1):
+        clock[0] = 90 * k**1.3 / 20**1.3
+        stages("refine")
+    left = [90 * (calls**1.3 - k**1.3) / 20**1.3 for k in range(1, calls + 1)]
+    found = [re.search(r"at most (\d+) (s|min) left", text) for text in told]
+    most = [int(one[1]) * {"s": 1, "min": 60}[one[2]] if one else None for one in found]
+    pairs = [(m, true) for m, true in zip(most, left, strict=True) if m is not None]
+    assert len(pairs) > 5 and all(m >= true - 31 for m, true in pairs)  # whole minutes
+    assert not any("longer than usual" in text for text in told[:36])
+
+
 @pytest.mark.parametrize("after", [3, 25])
 def test_ctrl_c_in_a_diagnosis_says_the_best_hypothesis_so_far(trials, after):
     count = 0

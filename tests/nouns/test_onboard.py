@@ -57,6 +57,10 @@ def test_the_file_runs_alone_and_gives_the_same_inputs(exported, tmp_path):
     assert ast.literal_eval(done.stdout) == expected
 
 
+def test_a_loaded_policy_has_the_horizon_that_the_docs_use(exported):
+    assert onboard.load(exported).policy.horizon == policy().horizon == H
+
+
 def test_the_file_is_valid_python_3_8():
     source = Path(onboard.__file__).read_text(encoding="utf-8")
     tree = ast.parse(source, feature_version=(3, 8))

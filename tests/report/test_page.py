@@ -175,6 +175,23 @@ def test_nothing_is_said_to_improve_that_did_not(car):
     assert heading(replace(findings, runs=runs)) == "What the runs changed"
 
 
+def test_a_gain_that_scatter_may_explain_is_headed_perhaps(car):
+    """An arm's page said "What improved" of 4 %, while its status said: perhaps."""
+    findings = gather(Folder(car))
+    now = findings.standing
+    two = [now.history[0], next(t for t in now.history if t is now.incumbent)]
+    pairs = (-10.0, -11.0), (-9.9, -10.7)
+    unsure = tuple(
+        replace(one, utilities=each, pieces=None, trials=one.trials * 2)
+        for one, each in zip(two, pairs, strict=True)
+    )
+    found = replace(findings, standing=replace(now, history=unsure, incumbent=unsure[1]))
+    text = page(found)
+    assert re.search(r"<h2>What perhaps improved \(probability 0\.[67]\d\)</h2>", text)
+    assert "which the scatter of repeats may explain" in text
+    assert "bias in 1 s, c0" in text and "bias per s" not in text  # its column is in rad, not rad/s
+
+
 def test_a_diagnosis_that_is_not_the_last_word_says_no_next_trial(cart):
     """A car's page said "adopt them" nine runs after all of them had been adopted."""
     findings = gather(Folder(cart))

@@ -10,15 +10,22 @@ import pytest
 from test_page import unwrapped
 
 from grounded.diagnosis.error_report import UtilityPrediction
+from grounded.diagnosis.pictures import where_figure
 from grounded.diagnosis.report import Diagnosis, Verdict
 from grounded.figures.figure import Curve, log_ticks
 from grounded.figures.interactive import in_lines, notebook_figure
+from grounded.model import Model
 from grounded.result import spread
 from grounded.search.pictures import search_figure
 from grounded_trials import Workspace
 from grounded_trials.report.calmed import WINDOWS, averaged, window_of
 from grounded_trials.report.diagnosis_words import utility_sentence
-from grounded_trials.report.figures.gap import _binned, forecast_figures, residual_figures
+from grounded_trials.report.figures.gap import (
+    _binned,
+    _telling,
+    forecast_figures,
+    residual_figures,
+)
 from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import (
     _timed,
@@ -63,6 +70,35 @@ def test_a_run_is_not_cut_off_for_little():
 def test_every_axis_has_a_name(cart):
     for figure in residual_figures(gather(Folder(cart))):
         assert all(panel.x_name and panel.y_name for panel in figure.panels), figure.name
+
+
+@pytest.mark.parametrize(("lent", "over"), [(0.0, "a"), (1.0, "b")])
+def test_a_residual_is_drawn_over_its_own_input_if_another_only_moves_with_it(lent, over):
+    """The missing boom_rate was drawn over stick_valve, with which boom_valve moved."""
+
+    def rates(s, a, p):
+        return {"v": a.a - s.v, "w": a.b - s.w}
+
+    units = {"v": "m/s", "w": "m/s"}
+    model = Model(states=units, inputs={"a": "1", "b": "1"}, derivative=rates)
+    rng = np.random.default_rng(0)
+    b = rng.uniform(-1, 1, 400)
+    a = b + 0.05 * rng.normal(size=400) + lent * rng.uniform(-1, 1, 400)
+    values = np.column_stack([rng.normal(size=(400, 2)), a, b])
+    k = _telling(model, 0, values, np.tanh(3 * b))  # b explains it best
+    assert [*model.states, *model.inputs][k] == over
+
+
+def test_the_evidence_says_what_bars_below_zero_mean(cart):
+    figure = where_figure(gather(Folder(cart)).diagnosis)
+    assert "below 0, it is not worth its parameters" in figure.caption
+    tall = [_rows(one) for one in (figure, replace(figure, caption=""))]
+    assert tall[0] > tall[1]  # the picture has the caption, too
+
+
+def _rows(figure):
+    """Return the height of a figure's PNG file in pixels."""
+    return int.from_bytes(png(figure)[20:24], "big")
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """The scatter between runs: two that agree by chance do not prove that there is none."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,6 +21,8 @@ from grounded.search.scatter import (
 )
 from grounded.search.standing import standing
 from grounded.search.step_size import SearchOptions
+from grounded.trial import Trial
+from grounded.utility import Reward
 from small_tasks import cart_task, drive, other
 
 
@@ -75,7 +78,7 @@ def test_one_number_serves_the_table_the_gain_and_the_doubt():
     for by, doubt in ((1.9, True), (2.1, False)):
         off = by * np.sqrt(each.variance * (1 / 2 + 1))
         loser = Tried(best.candidate, (None,), (best.utility - off,), False)
-        assert in_doubt(history[1], loser, history, 9) is doubt
+        assert in_doubt(cart_task(), history[1], loser, history, 9) is doubt
 
 
 def test_pieces_sum_to_the_utility():
@@ -126,3 +129,27 @@ def test_a_notebook_shows_the_candidates_and_the_phase():
     cells = [f"<td>{cell}</td>" for cell in row]
     assert "".join(cells) in shown and shown.index(row[0]) < shown.index(now.sentence)
     assert shown.index(now.sentence) < shown.index("<details>")
+
+
+def test_a_tenfold_error_of_a_state_that_makes_the_whole_loss_is_no_luck():
+    """Before any repeat: the scatter is unknown, but runs of one policy do not differ so much."""
+    reward = Reward(np.ones(2), np.zeros(2), np.zeros(1), np.zeros(1))
+    task = cart_task(target=np.zeros((41, 2)), reward=reward)
+    made = propose(task, [], [], SearchOptions()).candidate
+
+    def off(identity, **errors):
+        states = np.array(task.target)
+        for name, error in errors.items():
+            states[:, "xv".index(name)] += error
+        trial = Trial(states, np.zeros((40, 1)), task.dt, ("x", "v"), ("force",))
+        one = replace(made, id=identity, base="c0001")
+        return Tried(one, (trial,), (task.utility(trial),), identity == "c0001")
+
+    best = off("c0001", x=0.01, v=0.10)
+    for errors, doubt in (
+        ({"x": 0.14, "v": 0.01}, False),  # 1.9 times the cost, and fourteen times as far off in x
+        ({"x": 0.01, "v": 0.14}, True),  # as much more cost, but of the same kind
+        ({"x": 0.11, "v": 0.01}, True),  # of another kind, but of nearly equal cost
+    ):
+        loser = off("c0002", **errors)
+        assert in_doubt(task, best, loser, (best, loser), 9) is doubt

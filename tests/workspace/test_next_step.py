@@ -347,6 +347,24 @@ def test_what_a_fresh_diagnosis_claims_is_adopted_while_a_candidate_waits(tmp_pa
     assert "adopt" not in last(grounded("-C", folder, "status"))
 
 
+def test_a_plan_without_what_was_diagnosed_says_so(tmp_path):
+    """An arm's search promised 0.014 mrad with a model known to lack 60 ms of delay."""
+    folder = make(tmp_path / "w").folder
+    assert grounded("-C", folder, "learn", "--trials", 1).code == 0
+    (folder / "reports").mkdir(exist_ok=True)
+    found = {"trials": ["t0001"], "adopted": [], "params": {}}
+    diagnosed(folder, diagnosed=found)
+    assert grounded("-C", folder, "learn", "--trials", 1).code == 0  # newer trials change nothing
+    done = grounded("-C", folder, "propose")
+    words = " ".join(plain(done.err + done.out).split())
+    assert "the last diagnosis found that" in words and "not adopted: `grounded" in words
+    assert "adopt viscous_friction:v` first" in words
+    assert "this model lacks what the last diagnosis found" in words
+    assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
+    done = grounded("-C", folder, "propose")
+    assert "last diagnosis" not in plain(done.err + done.out)
+
+
 def test_after_a_crash_what_was_diagnosed_is_adopted_before_a_gentler_policy_runs(tmp_path):
     """A quadrotor's crude policy fell, and its feedback was made gentler: it fell again."""
     folder = make(tmp_path / "w", config=LOGGED).folder

@@ -67,6 +67,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
         "utilities": status.standing.utilities,
         "trials": status.standing.trials,
         "phase": status.standing.phase,
+        "ending": status.standing.ending or None,
         "optimum": best,
         "verdict": diagnosed.verdict.to_json(),
         "diagnosed_trials": len(diagnosed.made.trials if diagnosed.made else ()),

@@ -111,7 +111,7 @@ class _Walk:
         if len(self.buffer) - self.pos >= count:
             return
         if self.offset + count > self.size:
-            raise self.damaged(f"the file ends inside {what}")
+            raise self.damaged(f"the file ends inside {what}", self.size)
         self.fold()
         self.base += self.pos
         parts = [self.buffer[self.pos :]]
@@ -120,7 +120,7 @@ class _Walk:
         while have < count:
             block = self.stream.read(max(BLOCK, count - have))
             if not block:
-                raise self.damaged(f"the file ends inside {what}")
+                raise self.damaged(f"the file ends inside {what}", self.size)
             parts.append(block)
             have += len(block)
         self.buffer, self.pos, self.crc_pos = b"".join(parts), 0, 0

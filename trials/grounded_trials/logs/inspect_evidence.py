@@ -45,6 +45,7 @@ from grounded_trials.logs.joint_names import (
     joint_units,
     of_joint,
 )
+from grounded_trials.logs.measured import only_commands
 from grounded_trials.logs.stated_units import Stated, factor_between, unit_of, without_role
 
 LATEST = 0.5  # s: a command is sought up to this long before the angle that follows it
@@ -103,7 +104,8 @@ def weigh(
     guesses |= _taken_by_inputs(guesses, model)
     guesses = {name: _as_logged(guess, log) for name, guess in guesses.items()}
     guesses = {name: as_stated(stated, units[name], guess) for name, guess in guesses.items()}
-    return tuple(guesses[g.name] for g in states), tuple(guesses[g.name] for g in inputs)
+    found = tuple(guesses[g.name] for g in states)
+    return found, only_commands(found, [guesses[g.name] for g in inputs], log)
 
 
 def as_stated(stated: Stated, wanted: str, guess: Guess) -> Guess:

@@ -76,7 +76,7 @@ _BESIDE_U = ("linear.y", "v", "sway")  # meaning of v beside a state u: sway, no
 _COMPASS = (("north", "northing"), ("east", "easting"))  # axes of a plane; either may be x
 _RATES = {"rate", "rates", "dot", "vel", "velocity"}  # words of a rate, not of an angle
 _COMMANDED = ("ref", "desired", "des", "target", "setpoint", "goal", "cmd", "command")
-_COMMAND_TOPIC = re.compile("control|cmd|command|setpoint|ref|target")
+COMMAND_TOPIC = re.compile("control|cmd|command|setpoint|ref|target")
 _ANGLES = ("roll", "pitch", "yaw")
 _QUATERNION = tuple(f"{name}.{part}" for name in ("orientation", "rotation") for part in "xyzw")
 _POSE = ("position.x", "position.y", "@rpy.yaw")
@@ -154,7 +154,7 @@ def _commanded(log: LogReport, name: str) -> list[_Candidate]:
     if state == name:
         return []
     found = _candidates(log, state, _MEANINGS.get(state, (state,)), is_input=True)
-    return [c for c in found if _COMMAND_TOPIC.search(c.topic.topic.lower())]
+    return [c for c in found if COMMAND_TOPIC.search(c.topic.topic.lower())]
 
 
 def _of_unit(log: LogReport, candidates: list[_Candidate], unit: str) -> list[_Candidate]:
@@ -170,7 +170,7 @@ def _of_unit(log: LogReport, candidates: list[_Candidate], unit: str) -> list[_C
     moving = [
         _Candidate(LEAST, topic, field)
         for topic in log.topics
-        if not _COMMAND_TOPIC.search(topic.topic.lower())
+        if not COMMAND_TOPIC.search(topic.topic.lower())
         for field in topic.fields
         if field.low != field.high and unit_of(field.path) == unit
     ]
@@ -219,7 +219,7 @@ def _only_command(log: LogReport, guess: Guess, unit: str) -> Guess:
 
 def commands_of(log: LogReport, guess: Guess, taken: set[str]) -> Guess:
     """Give an input without a matching name the changing numbers of command topics."""
-    commands = [t for t in log.topics if _COMMAND_TOPIC.search(t.topic.lower())]
+    commands = [t for t in log.topics if COMMAND_TOPIC.search(t.topic.lower())]
     moving = [f.path for t in commands for f in t.fields if f.low != f.high]
     others = tuple(path for path in moving if path not in taken and not path.endswith(_QUATERNION))
     why = ("no name matches; these are commands",) if others else ()

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded_trials.formats.mcap_records import Channel, Messages
-from grounded_trials.logs.inspect_guess import Guess
+from grounded_trials.logs.inspect_guess import COMMAND_TOPIC, Guess
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.log_files import log_records
 from grounded_trials.logs.stated_units import SLIDING, TURNING
@@ -147,7 +147,8 @@ def of_joint(
         joints: see `joint_names`.
         log: an inspected log.
         sent: whether it is an input. An array with a command for each joint is then preferred to
-            measured efforts, which include the delay and the limits of the drive.
+            measured efforts, which include the delay and the limits of the drive; measured
+            positions and velocities are no commands.
     """
     there = _there(log)
     for topic, names in joints.items():
@@ -168,7 +169,8 @@ def of_joint(
                 why = f"commands name no joints; in order from the base, {at} is '{joint}'"
                 others = (*paths[1:], *rest)
                 return replace(guess, path=paths[0], sure=False, others=others, reasons=(why,))
-            if path in there:
+            measures = kind != "effort" and not COMMAND_TOPIC.search(topic.lower())
+            if path in there and not (sent and measures):
                 others = tuple(p for p in (guess.path, *guess.others) if p and p != path)
                 why = f"{topic} names its joint {i} '{joint}'"
                 return replace(guess, path=path, sure=True, others=others[:3], reasons=(why,))

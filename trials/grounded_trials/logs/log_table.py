@@ -160,6 +160,15 @@ def mapped_signals(
             f"[log] maps no {' and no '.join(missing)}; a trial needs at least one of each: add "
             f"{listed(f'[log.{one}.NAME]' for one in missing)} with its path"
         )
+    paths_of = {mapping.states[name].path: name for name in states}
+    same = [name for name in inputs if mapping.inputs[name].path in paths_of]
+    if same:
+        path = mapping.inputs[same[0]].path
+        raise GroundedError(
+            f"[log] maps the input {same[0]} and the state {paths_of[path]} to the same number, "
+            f"{path}: a measured state is not its command. Set path in [log.input.{same[0]}] to "
+            "what was sent to the robot"
+        )
     specs = {name: mapping.states[name] for name in states}
     specs |= {name: mapping.inputs[name] for name in inputs}
     return read_signals(paths, {**specs, **mapping.span.signals()})

@@ -101,7 +101,30 @@ def read_signals(
                     log.messages(record)
             for collector in collectors.values():
                 collector.topics |= set(log.topics)
+        _refuse_missing(collectors, str(files[0]))
         return {name: collector.series() for name, collector in collectors.items()}
+
+
+def _refuse_missing(collectors: Mapping[str, _Collector], file: str) -> None:
+    """Name all signals of the first topic that the log does not have."""
+    missing = {name: one for name, one in collectors.items() if not one.type}
+    if not missing:
+        return
+    first = next(iter(missing.values()))
+    topic, known = first.path.topic, sorted(first.topics)
+    names = [name for name, one in missing.items() if one.path.topic == topic]
+    few = 0 < len(known) <= FEW  # the nearest name may be another's: /left for /port
+    there = f"it has {listed(known)}" if few else nearest(topic, known)
+    of = f"'{names[0]}' is read from '{first.path.text}'"
+    if several := len(names) > 1:
+        of = f"{listed(names)} are read from {topic}"
+    ends = [one for one in known if one.rpartition("/")[2] == topic.rpartition("/")[2]]
+    renamed = f" to {ends[0]}" if len(ends) == 1 else ""
+    raise GroundedError(
+        f"{of}, but the log has no topic '{topic}': {there}. If it was renamed{renamed}, edit "
+        f"{'their paths' if several else 'its path'} in [log] of grounded.toml",
+        NextCommand("inspect", (file,)),
+    )
 
 
 class _Log:
@@ -266,14 +289,6 @@ class _Collector:
         return found.stamps
 
     def series(self) -> Series:
-        if not self.type:
-            known = sorted(self.topics)
-            few = 0 < len(known) <= FEW  # the nearest name may be another's: /left for /port
-            said = f"it has {listed(known)}" if few else nearest(self.path.topic, known)
-            raise GroundedError(
-                f"'{self.name}' is read from '{self.path.text}', but the log has no topic "
-                f"'{self.path.topic}': {said}"
-            )
         columns = [np.concatenate(part) for part in zip(*self.parts, strict=True)]
         if not columns or not len(columns[0]):
             what = "no messages" if not self.messages else f"{self.messages} messages, none with it"

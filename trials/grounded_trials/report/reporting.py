@@ -70,6 +70,7 @@ class Report(Result):
             "utilities": findings.standing.utilities,
             "phase": findings.standing.phase,
             "sentence": findings.standing.sentence,
+            "ending": findings.standing.ending or None,
             "optimum": findings.optimum,
             "lost": [vars(one) for one in findings.lost],
             "next": rendered(findings.then, findings.folder),

@@ -28,6 +28,7 @@ from grounded_trials.logs.inspect_pairs import velocities
 from grounded_trials.logs.joint_names import joint_names, joint_units, wide_joints
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
+from grounded_trials.logs.measured import only_commands
 from grounded_trials.logs.stated_units import Stated
 from grounded_trials.logs.unnamed import from_the_rest
 from grounded_trials.starting.examples import fresh_folder
@@ -207,7 +208,7 @@ def _begin(
         notes = (*notes, *_left_out(report, found), TO_COMPLETE)
     units = {**found.states, **found.inputs}
     both = from_the_rest((*states, *inputs), units, report, joint_units(joints))
-    states, inputs = both[: found.n], both[found.n :]
+    states, inputs = both[: found.n], only_commands(both[: found.n], both[found.n :], report)
     if ask is not None:
         said = Stated.by(files)
         states, inputs = (

@@ -10,6 +10,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded_trials.starting.shapes import has_plane
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import key
 from grounded_trials.workspace.config import FILE, OFFERED
@@ -17,6 +18,7 @@ from grounded_trials.workspace.off_target import usual_weights
 from grounded_trials.workspace.task_file import change_weight, write_target
 
 STOOD = 0.5  # [s] at the start of a log in which the robot may stand still
+BEGAN = 0.1  # [s] at its start in which one may stand still that nothing has to hold
 STILL = 0.05  # fraction of a state's range (or a rate's maximum) that counts as standing still
 
 
@@ -69,7 +71,8 @@ def write_first(
         f"horizon = {horizon}                 # steps",
         'target = "target.csv"         # `grounded target` draws another; no column: free',
         f"start = {_inline(held) if held else '{ }'}"
-        + "  # where it stood in the log's first rows, and the inputs that held it" * bool(held),
+        + "  # where it stood in the log's first rows" * bool(held)
+        + ", and the inputs that held it" * bool({*held} & {*model.inputs}),
         "feedback = true               # false: open loop",
         "latency = { }                 # [s] transport delay of inputs, unless `diagnose` finds it",
         "",
@@ -113,10 +116,11 @@ def held_first(
     """Return the states in which a robot stands at the start of a log, and the inputs holding it.
 
     A controller may sag at first and its commands may jitter, so inputs only need to stay nearly
-    constant in the second half of the first `STOOD` seconds. Returns {} if the robot moves, if an
-    input changes, or if no input has to hold it: inputs then count as 0 before a run, which is also
-    what is sent after it. Also returns {} for a model without a speed, since a slow drift could
-    not be detected.
+    constant in the second half of the first `STOOD` seconds. If none has to hold it, none is named:
+    inputs then count as 0 before a run, which is also what is sent after it; it may then stand for
+    a moment only (`BEGAN`). A robot that drives in a plane may start anywhere, so that no state is
+    named without such an input. Returns {} if the robot moves or an input changes. Also returns {}
+    for a model without a speed, since a slow drift could not be detected.
 
     Args:
         model: the model of the states and inputs.
@@ -130,28 +134,44 @@ def held_first(
     whole = set(sent) == set(model.inputs) and set(columns) == set(model.states)
     if not speeds or not whole or steps < 2:
         return {}
+    spans = {name: ranges[name] or (0.0, 0.0) for name in (*columns, *sent)}
+    found, held = _stood(columns, sent, speeds, steps, spans)
+    if held:
+        return found | held
+    brief, held = _stood(columns, sent, speeds, max(round(BEGAN / dt), 2), spans)
+    return {} if held or has_plane(model) else found or brief
+
+
+def _stood(
+    columns: Mapping[str, Array],
+    sent: Mapping[str, Array],
+    speeds: set[str],
+    steps: int,
+    spans: Mapping[str, tuple[float, float]],
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return where a robot stood in its first rows, and the inputs that had to hold it there."""
     first = {name: values[:steps] for name, values in {**columns, **sent}.items()}
     if not all(len(v) == steps and np.isfinite(v).all() for v in first.values()):
-        return {}
+        return {}, {}
     found, held = {}, {}
     for name in columns:
-        low, high = ranges[name] or (0.0, 0.0)
+        low, high = spans[name]
         most = max(abs(low), abs(high)) if name in speeds else high - low
         off = first[name].mean() if name in speeds else first[name][-1] - first[name][0]
         if abs(off) > STILL * most:
-            return {}
+            return {}, {}
         at = float(first[name][steps // 2 :].mean())
         if name not in speeds and abs(at) > STILL * most:
             found[name] = at
     needed = False
     for name in sent:
-        low, high = ranges[name] or (0.0, 0.0)
+        low, high = spans[name]
         later = first[name][steps // 2 :]
         if np.ptp(later) > STILL * (high - low):
-            return {}
+            return {}, {}
         held[name] = float(later.mean() if np.ptp(later) else later[0])
         needed |= held[name] != 0 and (not np.ptp(later) or abs(held[name]) > STILL * (high - low))
-    return found | held if needed else {}
+    return found, held if needed else {}
 
 
 def _span(ends: Sequence[float]) -> str:

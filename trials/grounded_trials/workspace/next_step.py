@@ -18,6 +18,7 @@ from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import GroundedError, NextCommand
 from grounded.model import all_at_bounds
 from grounded.search.standing import LOST, Standing
+from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.diagnosing import diagnosable, read_diagnosis
 from grounded_trials.workspace.fitting import fitted_in_vain
 from grounded_trials.workspace.folder import Folder
@@ -233,6 +234,21 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
         if gain(diagnosis.prediction_error, "crude", "with_effects") <= 0:
             return NextCommand("adopt", late) if late else None
     return NextCommand("adopt", (*new, *late))
+
+
+def not_adopted(workspace: Folder, diagnosis: Diagnosis | None) -> str:
+    """Return what the last diagnosis found that the model lacks, with the command; "" if nothing.
+
+    Nothing is said of a diagnosis of another model, or if its effects were adopted and undone.
+    """
+    if diagnosis is None or since_diagnosis(workspace, diagnosis, usable_ids(workspace)).changed:
+        return ""
+    then, clauses = to_adopt(workspace, diagnosis), diagnosis.verdict.clauses or diagnosis.effects
+    if then is None or then.verb not in ("adopt", "fit") or not clauses:
+        return ""
+    more = f", and {count(len(clauses) - 1, 'more cause')}" * (len(clauses) > 1)
+    done = "fitted" if then.verb == "fit" else "adopted"
+    return f"{clauses[0]}{more}; not {done}: `{rendered(then, workspace.address)}` first"
 
 
 def newer_alone(diagnosis: Diagnosis) -> NextCommand:

@@ -37,6 +37,7 @@ class Proposed(Result):
     then: NextCommand
     noise_cost: float = 0.0  # expected cost of sensor noise in its log, beyond what is predicted
     off_target: tuple[OffTarget, ...] = ()  # errors of the predicted run, in units
+    lacks: str = ""  # what the last diagnosis found and the model lacks
 
     @property
     def candidate(self) -> Candidate | None:
@@ -128,15 +129,18 @@ def propose_in(workspace: Folder) -> Proposed:
 
         held = held_before(workspace, _other_model(workspace, before))
         notes += left_open(workspace, proposal, held)
-    if doubt := proposal.standing.doubt:
-        from grounded_trials.workspace.next_step import doubted, usable_ids
+    from grounded_trials.workspace.next_step import doubted, not_adopted, usable_ids
 
-        since = status_of(workspace, proposal.standing).since
+    status = status_of(workspace, proposal.standing)
+    if lacks := not_adopted(workspace, status.diagnosis) if candidate else "":
+        notes.append(f"the last diagnosis found that {lacks}")
+    if doubt := proposal.standing.doubt:
+        since = status.since
         if doubted(proposal.standing, since, usable_ids(workspace)):
             notes.append(f"{doubt}: `{rendered(NextCommand('diagnose'), workspace.address)}`")
     proposal = replace(proposal, notes=(*proposal.notes, *notes))
     if candidate is None:
-        then = status_of(workspace, proposal.standing).then
+        then = status.then
         if held:
             then = PROPOSE  # after [task] start was changed as the note says
         return Proposed(proposal, None, then)
@@ -148,7 +152,7 @@ def propose_in(workspace: Folder) -> Proposed:
         noise = sensor_noise(workspace.task_trials(), workspace.base_model.n)
         cost = noise_cost(workspace.task, candidate.policy, noise)
     off_target = off_target_of(workspace.task, [candidate.predicted_run])
-    return Proposed(proposal, path, then, cost, off_target)
+    return Proposed(proposal, path, then, cost, off_target, lacks)
 
 
 def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:

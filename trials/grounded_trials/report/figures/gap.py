@@ -13,6 +13,8 @@ import numpy as np
 
 from grounded.figures.figure import Band, Curve, Figure, Key, Panel, fitted, legend, without_astray
 from grounded.frozen import Array
+from grounded.model import Model
+from grounded.places import SHORT, probe, samples
 from grounded.trial import Trial
 from grounded_trials.report.diagnosis_words import made_from
 from grounded_trials.report.findings import Findings, Run
@@ -26,6 +28,7 @@ CHANNELS = 4  # number of states whose residuals are drawn
 POINTS = 1500  # points of a residual
 BINS = 24
 LEAST = 3  # points of a bin; one with fewer, or half as many as usual, is merged with the next
+NEARLY = 0.05  # of a residual's variance: what another variable may explain more, by chance
 LAGS_S, LAGS = 1.0, 60  # largest lag of the autocorrelation, in [s] and in steps
 LEAST_STEPS = 30  # shortest trial whose residual is drawn
 
@@ -171,13 +174,12 @@ def _channels(findings: Findings, states: Array, residual: Array) -> list[int]:
 def _over(
     findings: Findings, trial: Trial, state: int, residual: Array, explained: Array | None
 ) -> Panel:
-    """Draw a state's residual over the state or input that explains most of its variance."""
+    """Draw a state's residual over the state or input that explains it, see `_telling`."""
     model, steps = findings.task.model, len(residual)
     units = [*model.states.items(), *model.inputs.items()]
     values = np.hstack([trial.states[:steps], trial.inputs[:steps]])
     rate = residual[:, state] / trial.dt
-    telling = [_told(values[:, k], rate) for k in range(values.shape[1])]
-    k = int(np.argmax(telling))
+    k = _telling(model, state, values, rate)
     x = values[:, k]
     some = np.linspace(0, steps - 1, min(steps, POINTS)).astype(int)
     curves = [
@@ -195,6 +197,26 @@ def _over(
         title, labelled(*units[k]), labelled(f"missing {name}", per_second(unit)), tuple(curves),
         y_range=bounds,
     )  # fmt: skip
+
+
+def _telling(model: Model, state: int, values: Array, rate: Array) -> int:
+    """Return the column of states and inputs that explains most of a residual's variance.
+
+    If what the state's rate depends on in the model explains nearly as much, that is preferred:
+    inputs may merely move together.
+    """
+    telling = [_told(column, rate) for column in values.T]
+    best = max(_own(model, state), key=telling.__getitem__)
+    return best if telling[best] > max(telling) - NEARLY else int(np.argmax(telling))
+
+
+def _own(model: Model, state: int) -> list[int]:
+    """Return the columns (states, then inputs) on which a state's rate depends, and its own."""
+    dt, (x, u) = probe(model, SHORT), samples(model, 8)
+    by_states, by_inputs = model.system.linearise(x, u, model.values, dt)[:2]
+    by_states = by_states - np.eye(model.n)
+    sizes = np.abs(np.concatenate([by_states[:, state], by_inputs[:, state]], axis=-1)).max(axis=0)
+    return [k for k, size in enumerate(sizes) if k == state or size > 1e-3 * dt]
 
 
 def _bins(x: Array) -> int:

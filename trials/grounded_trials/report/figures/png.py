@@ -30,6 +30,7 @@ POSES = 6  # drawn poses of a moving body
 DPI = 200
 MARKERS = {"disc": "o", "ring": "o", "cross": "x", "dash": "_"}
 TITLE = 52  # characters per line of a panel's title
+CAPTION, PER_INCH = 8.0, 17.0  # size of a caption [pt], and its characters per inch
 NOTE, NOTE_SIZE = 68, 8.0  # characters per line of a panel's note, and its size [pt]
 OTHERS = 3  # largest number of single trials named in a legend
 STYLE: Any = {
@@ -42,7 +43,7 @@ STYLE: Any = {
 
 
 def png(figure: Figure) -> bytes:
-    """Return the PNG file of a figure: its title, its panels, its legend.
+    """Return the PNG file of a figure: its title, its panels, its legend, and its caption.
 
     Raises:
         GroundedError: if matplotlib is not installed.
@@ -56,7 +57,10 @@ def png(figure: Figure) -> bytes:
     rows = [panels[i : i + columns] for i in range(0, len(panels), columns)]
     heights = [max(_height(panel) for panel in row) for row in rows] or [1.0]
     with rc_context(STYLE):
-        sheet = Sheet(figsize=(max(columns, 1.6) * WIDE, sum(heights) + 0.9), dpi=DPI)
+        wide = max(columns, 1.6) * WIDE
+        caption = textwrap.fill(figure.caption, round(wide * PER_INCH))
+        below = CAPTION / 72 * 1.3 * len(caption.splitlines())
+        sheet = Sheet(figsize=(wide, sum(heights) + 0.9 + below), dpi=DPI)
         sheet.suptitle(figure.title, x=0.01, ha="left", fontsize=12.0)
         grid = sheet.add_gridspec(len(heights), columns, height_ratios=heights)
         for i, row in enumerate(rows):
@@ -76,7 +80,12 @@ def png(figure: Figure) -> bytes:
                     _panel(axes, panel)
         handles = [_handle(key) for key in _keys(figure)]
         if handles:
-            sheet.legend(handles=handles, loc="outside lower left", ncols=columns + 1)
+            sheet.legend(
+                handles=handles, loc="outside lower left", ncols=columns + 1, alignment="left",
+                title=typeset(caption) or None, title_fontsize=CAPTION,
+            )  # fmt: skip
+        elif caption:
+            sheet.supxlabel(typeset(caption), x=0.01, ha="left", fontsize=CAPTION)
         stream = io.BytesIO()
         sheet.savefig(stream, format="png", metadata={"Software": None})
     return stream.getvalue()

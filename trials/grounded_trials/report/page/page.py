@@ -24,6 +24,7 @@ from grounded.errors import needs
 from grounded.figures.body import Motion
 from grounded.figures.figure import Bars, Panel, typeset
 from grounded.figures.interactive import label_lines, packed, palette, plotted
+from grounded.search.candidate import SURE
 from grounded.search.pictures import search_figure
 from grounded_trials.report.diagnosis_words import error_lines
 from grounded_trials.report.figures.paths import crash, path_figure
@@ -204,14 +205,31 @@ def _about(findings: Findings) -> str:
 
 
 def _heading(findings: Findings) -> str:
-    """Return the heading above `_improved`; "What improved" only if no row got worse."""
+    """Return the heading above `_improved`; "What improved" only if no row got worse.
+
+    If the scatter of repeats may explain the gain, it says so.
+    """
     runs, tried = compared(findings), [one for one in findings.history if one.trials]
     if len(runs) < 2:
         alone = len(tried) < 2 or findings.first is None
         return "Results" if alone else "The first run is still the best"
     rows = improvements_in(findings)
     worse = any(one.after > one.before and not one.is_same for one in rows)
-    return "What the runs changed" if worse else "What improved"
+    if worse:
+        return "What the runs changed"
+    sure = _probability(findings)
+    return f"What perhaps improved (probability {sure:.2f})" if sure < SURE else "What improved"
+
+
+def _probability(findings: Findings) -> float:
+    """Return the probability that the best policy is better than the first; NaN if unknown."""
+    from grounded.search.certainty import chance
+
+    first, best = findings.first, findings.best
+    tried = {one.candidate.id: one for one in findings.history}
+    if first is None or best is None or first.candidate.id == best.candidate.id:
+        return math.nan
+    return chance(tried[first.candidate.id], tried[best.candidate.id], findings.history)
 
 
 def _improved(findings: Findings) -> list[tuple[str, str]]:
@@ -231,6 +249,8 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
             if start := owed_to_start(*two, findings.history):
                 part = -100 * start / first.utility
                 gain += f", {part:.1f} % due to different start states, as the model predicts"
+            if _probability(findings) < SURE:
+                gain += ", which the scatter of repeats may explain"
         moved = f"{figure(first.utility)} → {figure(best.utility)}"
         rows.append((moved, f"utility, the model’s own policy to {best.candidate.id}{gain}"))
     elif best is not None:

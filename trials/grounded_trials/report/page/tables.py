@@ -117,7 +117,7 @@ def error_table(findings: Findings) -> list[Block]:
         return []
     columns = {f"off target, {r.candidate.id}": rms(off_target(findings, r)) for r in runs}
     columns |= {f"off prediction, {r.candidate.id}": rms(off_prediction(findings, r)) for r in runs}
-    columns |= {f"bias per s, {r.candidate.id}": rms(r.residual) / task.dt for r in runs}
+    columns |= {f"bias in 1 s, {r.candidate.id}": rms(r.residual) / task.dt for r in runs}
     rows = by_state(task.model, [*columns.values()])
     return [table("errors", ("state", "unit", *columns), rows)]
 

@@ -1,0 +1,107 @@
+"""Logs without the robot's commands, or with another topic than [log] names."""
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin
+
+from cli import grounded, plain
+from grounded.errors import GroundedError
+from grounded_trials import Workspace
+from grounded_trials.starting.begin import begin
+from ros_bags import START, T, bag, joints
+
+MODEL = """import grounded as gr
+
+model = gr.Model(
+    states={"boom": "rad", "stick": "rad", "boom_rate": "rad/s", "stick_rate": "rad/s"},
+    inputs={"boom_valve": "1", "stick_valve": "1"},
+    params={"k": gr.Param(0.6, "rad/s", 0.3, 1.2)},
+    derivative=lambda s, a, p: {
+        "boom": s.boom_rate,
+        "stick": s.stick_rate,
+        "boom_rate": 7 * (p.k * a.boom_valve - s.boom_rate),
+        "stick_rate": 7 * (p.k * a.stick_valve - s.stick_rate),
+    },
+)
+"""
+COMMANDS = "/valve_controller/commands"
+NAMES = ["boom_joint", "stick_joint"]
+
+
+def excavator(folder, topic="/joint_states", commands=True, still=0, storage=StoragePlugin.SQLITE3):
+    """An arm of two joints for 6 s, at first `still` for some rows; its commands may be missing."""
+    topics = {topic: "sensor_msgs/msg/JointState", COMMANDS: "std_msgs/msg/Float64MultiArray"}
+    layout = T["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
+
+    def messages():
+        q, w = np.array([0.3, -1.2]), np.zeros(2)
+        for k in range(600):
+            t = START + k * 10**7
+            u = 0.5 * np.sin(np.array([0.02, 0.031]) * max(k - still, 0))
+            yield topic, t, joints(t, NAMES, q, w, np.zeros(2))
+            if commands and k % 2 == 0:
+                yield COMMANDS, t, T[topics[COMMANDS]](layout=layout, data=u)
+            w = w + 0.07 * (0.6 * u - w)
+            q = q + 0.01 * w
+
+    return bag(folder, topics, messages(), storage)
+
+
+@pytest.fixture
+def model(tmp_path):
+    (tmp_path / "own.py").write_text(MODEL)
+    return tmp_path / "own.py"
+
+
+def test_joint_positions_are_no_commands_if_these_were_not_recorded(tmp_path, model):
+    log = excavator(tmp_path / "bag", commands=False)
+    begun = begin(tmp_path / "w", log, model=model)
+    assert [s.path for s in begun.states][:2] == [f"/joint_states.position[{i}]" for i in (0, 1)]
+    assert [guess.path for guess in begun.inputs] == ["", ""]
+    assert not any(one.sure or "joint_states" in str(one.others) for one in begun.inputs)
+    assert all(f"{COMMANDS} has no messages" in str(one.reasons) for one in begun.inputs)
+    assert begun.then.verb == "inspect"
+
+
+def test_ingest_refuses_an_input_on_the_path_of_a_state(tmp_path, model):
+    begin(tmp_path / "w", log := excavator(tmp_path / "bag"), model=model)
+    toml = tmp_path / "w" / "grounded.toml"
+    toml.write_text(toml.read_text().replace(f"{COMMANDS}.data[0]", "/joint_states.position[0]"))
+    with pytest.raises(GroundedError, match="input boom_valve and the state boom to the same"):
+        Workspace(tmp_path / "w").ingest(log, data=True)
+
+
+def test_a_renamed_topic_names_all_that_is_read_from_it(tmp_path, model):
+    begin(tmp_path / "w", excavator(tmp_path / "bag"), model=model)
+    renamed = excavator(tmp_path / "renamed", topic="/arm/joint_states")
+    with pytest.raises(GroundedError) as refused:
+        Workspace(tmp_path / "w").ingest(renamed, data=True)
+    told = str(refused.value)
+    assert "boom, stick, boom_rate and stick_rate are read from /joint_states" in told
+    assert "renamed to /arm/joint_states, edit their paths in [log]" in told
+    assert refused.value.then.verb == "inspect"
+
+
+def test_a_robot_that_stood_away_from_zero_starts_there(tmp_path, model):
+    """`target line --to` began at 0, 0, where the arm never was."""
+    begin(tmp_path / "w", excavator(tmp_path / "bag", still=100), model=model)
+    assert Workspace(tmp_path / "w").config.task.start == {"boom": 0.3, "stick": -1.2}
+    moving = tmp_path / "moving"
+    begin(moving, excavator(tmp_path / "bag2"), model=model)
+    assert Workspace(moving).config.task.start == {}
+
+
+def test_a_recovered_log_that_log_can_read_is_to_be_ingested(tmp_path, model):
+    """After `recover` of a manual log, `next:` was `inspect`."""
+    log = excavator(tmp_path / "bag", still=100, storage=StoragePlugin.MCAP)
+    begin(tmp_path / "w", log, model=model)
+    cut = tmp_path / "cut.mcap"
+    whole = next(log.glob("*.mcap")).read_bytes()
+    cut.write_bytes(whole[: len(whole) * 2 // 3])
+    refused = grounded("-C", tmp_path / "w", "ingest", "--data", cut)
+    assert f"(at byte {cut.stat().st_size})" in refused.err
+    done = grounded("-C", tmp_path / "w", "recover", cut)
+    saved = tmp_path / "cut-recovered.mcap"
+    assert plain(done.out).rstrip().endswith(f"ingest --data {saved}") and done.code == 3
+    elsewhere = grounded("-C", tmp_path, "recover", cut, "-o", tmp_path / "again.mcap")
+    assert "inspect" in plain(elsewhere.out).splitlines()[-1]
