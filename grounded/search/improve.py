@@ -221,8 +221,8 @@ def _ended(
         phase, then, ending = "converged", None, "no step improved"
         sentence = (
             f"{lost} steps from {own} did not improve, and the next promises "
-            f"{figure(doubted.predicted_gain)} with a likely error of "
-            f"{figure(doubted.likely_off)}: {own} is the result"
+            f"{doubted.predicted_gain:.3g} with a likely error of {doubted.likely_off:.3g}: {own} "
+            "is the result"
         )
     elif ruinous is not None:
         ending = "too doubtful"
