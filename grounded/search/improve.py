@@ -186,10 +186,11 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
     )
 
 
-def _surer(about: About, step: Step, corrected: Proposal) -> Proposal:
+def _surer(about: About, step: Step, corrected: Proposal) -> Proposal | None:
     """Return a step by the model's own derivatives if the corrected ones may lose much, else that.
 
-    Derivatives corrected by noisy trials promise much, within a larger likely error.
+    Derivatives corrected by noisy trials promise much, within a larger likely error. If the step by
+    the own derivatives is doubted after two losses, neither is made.
     """
     made = corrected.candidate
     assert made is not None
@@ -197,6 +198,9 @@ def _surer(about: About, step: Step, corrected: Proposal) -> Proposal:
         return corrected
     own = About(about.make, about.incumbent, about.options, about.way, about.original, plainly=True)
     found = own.step_from(step, [])
+    if own.doubted is not None:
+        about.doubted = own.doubted
+        return None
     if found is None or found.candidate is None:
         return corrected
     return found if found.candidate.expected_gain > made.expected_gain else corrected

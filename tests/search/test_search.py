@@ -409,11 +409,11 @@ def test_a_search_with_nothing_to_gain_ends_before_a_trial_is_spent():
 
 
 def test_another_model_starts_again_with_the_first_step_from_the_best_policy():
-    story = Story(max_halvings=2).add().add(bad).add(bad).add(bad)
-    assert story.candidates[-1].damping == 100.0
+    story = Story(max_halvings=2).add().add(bad).add(bad)
+    assert story.candidates[-1].damping == 10.0
     story.task = story.task.with_model(other(TASK.model, 1.3))  # fitted, say
     made = story.propose().candidate
-    assert (made.damping, made.base, made.id) == (1.0, "c0001", "c0005")
+    assert (made.damping, made.base, made.id) == (1.0, "c0001", "c0004")
     assert story.now.outstanding is made
 
 
