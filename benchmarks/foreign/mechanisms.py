@@ -2,17 +2,15 @@
 
 The crude models of the cart-pole and the two-link arm are their equations of motion in plain NumPy
 (`grounded.models`), with the simulator's masses and lengths, so that only what a set-up withholds
-differs. The seven-joint arm is planned in MuJoCo itself, the pushed block in a quasi-static model.
+differs. The seven-joint arm is planned in MuJoCo itself.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from benchmarks.foreign.robots import Robot, minimum_jerk, task_of, with_true_model
-from grounded.model import Model, Param
+from grounded.model import Model
 from grounded.models import arm, cart_pole
 from grounded.task import Task
 
@@ -160,79 +158,3 @@ def arm7_task() -> Task:
         change=(2e-1 / TORQUES**2).tolist(),
         past=holding(model, start),
     )
-
-
-# A block pushed over a floor with dry friction.
-
-BLOCK = """
-<mujoco model="block">
-  <option timestep="0.002" cone="elliptic" impratio="10"/>
-  <worldbody>
-    <body name="pusher" pos="-0.07 0 0">
-      <joint name="px" type="slide" axis="1 0 0" damping="1"/>
-      <joint name="py" type="slide" axis="0 1 0" damping="1"/>
-      <geom type="cylinder" size="0.02 0.05" mass="0.5" friction="0.4"/>
-    </body>
-    <body name="block">
-      <joint name="bx" type="slide" axis="1 0 0" frictionloss="1.5"/>
-      <joint name="by" type="slide" axis="0 1 0" frictionloss="1.5"/>
-      <joint name="byaw" axis="0 0 1" frictionloss="0.05"/>
-      <geom type="box" size="0.05 0.05 0.05" mass="{mass}" friction="0.4"/>
-    </body>
-  </worldbody>
-  <actuator>
-    <velocity name="vx" joint="px" kv="100"/><velocity name="vy" joint="py" kv="100"/>
-  </actuator>
-</mujoco>"""
-HALF, RADIUS, GAP = 0.05, 0.02, 0.07
-
-
-def push_dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
-    """Return ds/dt of quasi-static pushing by the left face; overlap moves and turns the block."""
-    cos, sin = np.cos(s.byaw), np.sin(s.byaw)
-    dx, dy = s.px - GAP - s.bx, s.py - s.by
-    ahead, aside = cos * dx + sin * dy, cos * dy - sin * dx
-    overlap = ahead + HALF + RADIUS
-    push = p.k * 0.002 * np.logaddexp(0.0, overlap / 0.002)
-    return {
-        "px": a.vx,
-        "py": a.vy,
-        "bx": cos * push,
-        "by": sin * push,
-        "byaw": -push * aside / p.c,
-    }
-
-
-def push_model() -> Model:
-    return Model(
-        name="pushed block",
-        states={"px": "m", "py": "m", "bx": "m", "by": "m", "byaw": "rad"},
-        inputs={"vx": "m/s", "vy": "m/s"},
-        params={"k": Param(20.0, "1/s", 5.0, 60.0), "c": Param(0.002, "m^2", 0.0005, 0.01)},
-        derivative=push_dynamics,
-    )
-
-
-def push_task() -> Task:
-    """Return the task: forward by 0.3 m with a turn of a quarter radian, in 2.5 s."""
-    t = 0.05 * np.arange(61)
-    block = minimum_jerk(np.zeros(3), np.array([0.3, 0.04, 0.25]), t / 2.5)
-    return task_of(
-        push_model(),
-        0.05,
-        np.hstack([np.full((61, 2), np.nan), block]),
-        np.zeros(5),
-        0.4,
-        state={"bx": 100.0, "by": 100.0, "byaw": 5.0},
-        input=0.05,
-        change=0.2,
-    )
-
-
-def push_setup(task: Task, mass: float = 0.5) -> tuple[Robot, Task]:
-    """Return the block in MuJoCo; its velocities and the pusher's are not measured."""
-    from grounded.adapters import mujoco
-
-    xml = BLOCK.format(mass=mass)
-    robot = Robot(MujocoRobot(xml, np.zeros(10), columns=list(range(5))))
-    return robot, with_true_model(task, mujoco.model(xml))

@@ -28,7 +28,7 @@ from grounded.trial import Trial
 
 FILE = Path(__file__).with_name("optima.json")
 SHIFT = 1e-4  # of the range of an input: the step of the differences
-ROUNDS = 8
+ROUNDS = 25
 STARTS = 20
 LOST = 1e3  # residual of every step after a run has ended early
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from benchmarks.foreign import aircraft, cars
+from benchmarks.foreign import aircraft, cars, pushing
 from benchmarks.foreign import mechanisms as mech
 from benchmarks.foreign.robots import Robot
 from grounded.challenge.mechanism import arm_xml, cart_xml
@@ -52,9 +52,8 @@ def arm7(name: str, withheld: str, **what: float) -> Setup:
     return Setup(name, withheld, task, *mech.mujoco_setup(task, mech.arm7_xml(**what)))
 
 
-def block(name: str, withheld: str, **what: float) -> Setup:
-    task = mech.push_task()
-    return Setup(name, withheld, task, *mech.push_setup(task, **what))
+def block(name: str, withheld: str, kind: str, **what: float) -> Setup:
+    return Setup(name, withheld, *pushing.setup(kind, **what))
 
 
 def cessna(name: str, withheld: str, **what: float) -> Setup:
@@ -89,7 +88,8 @@ SETUPS: dict[str, tuple[Callable[..., Setup], str, dict[str, object]]] = {
     "arm7": (arm7, "nothing", {}),
     "arm7-payload": (arm7, "payload 1.4 kg", {"payload": 1.5}),
     "arm7-friction": (arm7, "joint friction 1 N m", {"friction": 1.0}),
-    "block": (block, "inertia, contact, dry friction", {}),
+    "block": (block, "inertia, contact, pressure, friction", {"kind": "plane"}),
+    "block-axes": (block, "inertia, contact, dry friction by axis", {"kind": "axes"}),
     "cessna": (cessna, "sideslip, speed, engine", {}),
     "cessna-wind": (cessna, "the same and a cross-wind of 3 m/s", {"wind": 3.0}),
     "drift-car-3": (car, f"{SLIP}, 3.2 m/s2", {"kind": "drift", "acceleration": 3.2}),

@@ -57,8 +57,8 @@ class Row:
     trials: int
     reached: tuple[int | None, ...]
     optimum: float | None
-    refit: Other
-    ilc: Other
+    refit: Other | None
+    ilc: Other | None
     seconds: float
     phase: str
     sentence: str
@@ -88,8 +88,8 @@ def patience(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGPROF, before)
 
 
-def measured(setup: Setup) -> Row:
-    """Run the search, refit-and-replan and ILC on one set-up."""
+def measured(setup: Setup, alone: bool = False) -> Row:
+    """Run the search on one set-up and, unless `alone`, refit-and-replan and ILC."""
     utilities: list[float] = []
 
     def run(candidate: Candidate) -> Trial:
@@ -117,8 +117,8 @@ def measured(setup: Setup) -> Row:
         trials=len(utilities),
         reached=trials_to(setup, utilities, best),
         optimum=best,
-        refit=other(setup, refit_alone),
-        ilc=other(setup, learning_control),
+        refit=None if alone else other(setup, refit_alone),
+        ilc=None if alone else other(setup, learning_control),
         seconds=seconds,
         phase=phase,
         sentence=sentence,
@@ -217,7 +217,7 @@ def table(rows: list[Row]) -> str:
         reached = "/".join("-" if t is None else str(t) for t in r.reached)
         cells = (
             r.name, r.withheld, number(r.first), number(r.final), number(r.optimum), str(r.trials),
-            reached, str(r.refit), str(r.ilc),
+            reached, str(r.refit or "-"), str(r.ilc or "-"),
             f"{r.seconds:.1f}", f"{r.phase}: {r.sentence}",
         )  # fmt: skip
         lines.append("| " + " | ".join(cells) + " |")

@@ -157,6 +157,7 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
     ways, promised = options.ways(incumbent.candidate), list[float]()
     unsafe: Proposal | None = None
     ruinous: Candidate | None = None
+    doubted: Candidate | None = None
     least = 0.0
     for way in ways[ways.index(now.way) :]:
         step = now.step
@@ -177,18 +178,21 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
         if found is not None and found.candidate is not None:
             return found
         unsafe, ruinous = unsafe or found, ruinous or stepping.ruinous
+        if (doubted := stepping.doubted) is not None:
+            break
         lost = losers_of(now.history, incumbent.candidate.id, make.fingerprint)
         if promised and not lost and 0 <= max(promised) <= least:
             break  # at the model's optimum: no trial is spent on another way
     return unsafe or Proposal(
-        _ended(make, incumbent, promised, least, options.tolerance, ruinous), None, False
+        _ended(make, incumbent, promised, least, options.tolerance, ruinous, doubted), None, False
     )
 
 
-def _surer(about: About, step: Step, corrected: Proposal) -> Proposal:
+def _surer(about: About, step: Step, corrected: Proposal) -> Proposal | None:
     """Return a step by the model's own derivatives if the corrected ones may lose much, else that.
 
-    Derivatives corrected by noisy trials promise much, within a larger likely error.
+    Derivatives corrected by noisy trials promise much, within a larger likely error. If the step by
+    the own derivatives is doubted after two losses, neither is made.
     """
     made = corrected.candidate
     assert made is not None
@@ -196,6 +200,9 @@ def _surer(about: About, step: Step, corrected: Proposal) -> Proposal:
         return corrected
     own = About(about.make, about.incumbent, about.options, about.way, about.original, plainly=True)
     found = own.step_from(step, [])
+    if own.doubted is not None:
+        about.doubted = own.doubted
+        return None
     if found is None or found.candidate is None:
         return corrected
     return found if found.candidate.expected_gain > made.expected_gain else corrected
@@ -208,6 +215,7 @@ def _ended(
     least: float,
     tolerance: float,
     ruinous: Candidate | None,
+    doubted: Candidate | None,
 ) -> Standing:
     """Return the standing of a search in which no step is worth a trial, with the reason."""
     own, finite = incumbent.candidate.id, [gain for gain in promised if np.isfinite(gain)]
@@ -215,7 +223,14 @@ def _ended(
     ending: Ending
     then: NextCommand | None = NextCommand("diagnose")
     lost = len(losers_of(make.now.history, own, make.fingerprint))
-    if ruinous is not None:
+    if doubted is not None:
+        phase, then, ending = "converged", None, "no step improved"
+        sentence = (
+            f"{lost} steps from {own} did not improve, and the next promises "
+            f"{doubted.predicted_gain:.3g} with a likely error of {doubted.likely_off:.3g}: {own} "
+            "is the result"
+        )
+    elif ruinous is not None:
         ending = "too doubtful"
         sentence = (
             f"the model promises a gain of {figure(ruinous.predicted_gain)} from a step, but its "

@@ -19,7 +19,7 @@ from grounded.search.margin import steadied
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
 from grounded.search.scatter import beyond_noise
-from grounded.search.standing import Proposal, Standing, wild
+from grounded.search.standing import LOST, Proposal, Standing, wild
 from grounded.search.step_size import KEPT, SearchOptions, Step, losers_of
 from grounded.solve import ddp
 from grounded.solve.measured import measured_gains
@@ -102,6 +102,7 @@ class About:
         self.plain = plan.problem(exact=True)  # without a bias: independent of noise and start
         self.plainly = predicted(self.plain, incumbent.candidate.policy).utility
         self.ruinous: Candidate | None = None  # a step rejected because of its predicted loss
+        self.doubted: Candidate | None = None  # the next step after two losses
 
     @property
     def slopes(self) -> Slopes:
@@ -157,10 +158,11 @@ class About:
     def step_from(self, first: Step, promised: list[float]) -> Proposal | None:
         """Return the first step worth a trial, else one that is not allowed, else None.
 
-        A step whose likely error exceeds its gain is only used if there is no other. Steps for
-        which a model that explains the trials predicts a very large loss are skipped. So are steps
-        whose run is nearly that of a candidate that lost: if the damping penalty is small beside
-        the other weights, ten times the damping gives the same step.
+        A step whose likely error exceeds its gain is only used if there is no other. If two steps
+        have lost, not by chance, and the next one is such a step and promises little, none is
+        used. Steps for which a model that explains the trials predicts a very large loss are
+        skipped. So are steps whose run is nearly that of a candidate that lost: if the damping
+        penalty is small beside the other weights, ten times the damping gives the same step.
 
         Args:
             first: the due step, regardless of the derivatives of those that lost.
@@ -171,6 +173,7 @@ class About:
         first = options.due(history, self.incumbent, model, self.way, self.slopes) or first
         lost = losers_of(history, self.incumbent.candidate.id, model)
         foretold = [predicted(self.real, candidate.policy) for candidate in lost]
+        sure_losses = 0 if self.incumbent.standard_error > 0 else len(lost)
         unsafe: Proposal | None = None
         doubted: Proposal | None = None
         directions: dict[float, Policy] = {}
@@ -198,6 +201,9 @@ class About:
                 proposal = replace(proposal, candidate=told)
                 if self._ruinous(told):
                     self.ruinous = self.ruinous or told
+                elif sure_losses >= LOST and self._doubtful(told):
+                    self.doubted = told
+                    return unsafe
                 elif made.expected_gain > self.least:
                     return proposal
                 else:
@@ -225,6 +231,11 @@ class About:
         missed = [t.promised - t.utility for t in history if t.candidate.id in ids]
         lost = self.already - predicted(self.real, made.policy).utility
         return not lost <= max([-self.incumbent.utility, *(WITNESS * miss for miss in missed)])
+
+    def _doubtful(self, made: Candidate) -> bool:
+        """Return whether it promises little, and less than its likely error."""
+        little = made.predicted_gain < LITTLE * -self.incumbent.utility
+        return little and made.expected_gain <= 0.0
 
     @cached_property
     def _disturbed(self) -> float:

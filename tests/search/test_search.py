@@ -12,6 +12,7 @@ from grounded.errors import GroundedError
 from grounded.plant import Noise, Plant
 from grounded.search.ask_tell import learn
 from grounded.search.improve import propose
+from grounded.search.making import About
 from grounded.search.planner import model_fingerprint
 from grounded.search.standing import MAX_CAUTION, standing
 from grounded.search.step_size import OTHER_WAY, SearchOptions, Step, losers_of
@@ -117,6 +118,31 @@ def test_trials_that_do_not_improve_raise_the_damping_until_nothing_is_promised(
     assert set(others) <= {"recorded inputs"} and len(others) <= OTHER_WAY
     ended = story.propose().standing
     assert (ended.phase, ended.ending) == ("converged", "no step improved")
+
+
+@pytest.mark.parametrize(("share", "goes_on"), [(2.0, False), (0.5, True)])
+def test_after_two_losses_no_trial_is_spent_on_a_step_likelier_to_lose(monkeypatch, share, goes_on):
+    """A Cessna in wind flew two more steps that promised less than their likely errors."""
+    story = Story().add().add().add(bad).add(bad)
+
+    def told(about, made):
+        about.incumbent = replace(about.incumbent, utilities=(-1e3,))  # any promise is little
+        return replace(made, likely_off=share * made.predicted_gain)
+
+    monkeypatch.setattr(About, "_told", told)
+    proposal = story.propose()
+    assert (proposal.candidate is not None) == goes_on
+    if not goes_on:
+        ended = proposal.standing
+        assert (ended.phase, ended.ending) == ("converged", "no step improved")
+        assert holds(ended.sentence, 2, ended.incumbent.candidate.id)
+
+
+def test_after_one_loss_a_doubtful_step_is_tried(monkeypatch):
+    story = Story().add().add().add(bad)
+    doubled = lambda _, made: replace(made, likely_off=2 * made.predicted_gain)  # noqa: E731
+    monkeypatch.setattr(About, "_told", doubled)
+    assert story.propose().candidate is not None
 
 
 def test_a_system_that_repeats_itself_exactly_is_not_asked_again():
@@ -415,11 +441,11 @@ def test_a_search_with_nothing_to_gain_ends_before_a_trial_is_spent():
 
 
 def test_another_model_starts_again_with_the_first_step_from_the_best_policy():
-    story = Story(max_halvings=2).add().add(bad).add(bad).add(bad)
-    assert story.candidates[-1].damping == 100.0
+    story = Story(max_halvings=2).add().add(bad).add(bad)
+    assert story.candidates[-1].damping == 10.0
     story.task = story.task.with_model(other(TASK.model, 1.3))  # fitted, say
     made = story.propose().candidate
-    assert (made.damping, made.base, made.id) == (1.0, "c0001", "c0005")
+    assert (made.damping, made.base, made.id) == (1.0, "c0001", "c0004")
     assert story.now.outstanding is made
 
 
