@@ -196,7 +196,7 @@ def _pays(
         less = (search.score(f) for f in fits if set(f.hypothesis.names) <= rest)
         sure = sure and search.score(after) - max(less) > CLAIM
     further = effects > max(1, len(before.hypothesis.effects))
-    if gain.pays(*(ALONE if sure and effects < 2 else PAYS)):
+    if gain.pays(*(ALONE if sure and effects < 2 else PAYS), strictly=further):
         return True
     if not (sure and white and new and gain.largest > LEAST) or _as_given(after, new):
         return False
@@ -254,6 +254,8 @@ def _overrules(
 ) -> bool:
     """Check whether a less likely rival predicts better significantly and by enough."""
     more, whole = ruler.gain(found, rival), ruler.gain(crude, found).mean
+    if far == np.inf:  # not to hide a gap in other noise, only to choose one of its names
+        bar = more.of_few(bar[0]), bar[1]
     return more.beyond(*bar) and more.mean > AMOUNTS * min(whole, far)
 
 
