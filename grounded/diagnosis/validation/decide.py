@@ -250,13 +250,19 @@ def _beyond_doubt(search: HypothesisSearch, found: Fitted, rival: Fitted) -> boo
 
 
 def _overrules(
-    ruler: Ruler, crude: Fitted, found: Fitted, rival: Fitted, *bar: float, far: float = np.inf
+    ruler: Ruler,
+    crude: Fitted,
+    found: Fitted,
+    rival: Fitted,
+    scatters: float,
+    least: float,
+    far: float = np.inf,
 ) -> bool:
     """Check whether a less likely rival predicts better significantly and by enough."""
     more, whole = ruler.gain(found, rival), ruler.gain(crude, found).mean
-    if far == np.inf:  # not to hide a gap in other noise, only to choose one of its names
-        bar = more.of_few(bar[0]), bar[1]
-    return more.beyond(*bar) and more.mean > AMOUNTS * min(whole, far)
+    by_chance = more.of_few(BETTER[0])
+    clear = more.beyond(max(scatters, by_chance), least)
+    return clear and more.mean > AMOUNTS * min(whole, far)
 
 
 def _proposed(
