@@ -59,13 +59,22 @@ def late_positions(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -
         return None
     if lag.delay < max(SURE * lag.std, LEAST_STEPS * dt) or _apart(ways, lag, dt):
         return None
-    apart = len(plane.speed) < 2
+    apart = len(_velocities(model, both)) < 2
     if any(std > UNSURE * late for late, std in _left(ways, 0.0, dt, apart=apart)):
         return None
     for left, std in _left(ways, lag.delay / dt, dt, apart=apart):
         if std > UNSURE * lag.delay or abs(left) > max(AGREE * std, CLOSE * lag.delay):
             return None
     return Late((both[0].i, both[1].i), lag)
+
+
+def _velocities(model: Model, rows: Sequence[Row]) -> set[int]:
+    """Return the velocities that two positions follow from, without the angles between them.
+
+    A steering angle changes how far a car's rear wheels travel, but not sideways.
+    """
+    units = list(model.states.values())
+    return {j for row in rows for j in row.by if units[j].endswith("/s")}
 
 
 def _apart(ways: Sequence[Way], both: Lag, dt: float) -> bool:

@@ -234,6 +234,39 @@ def test_an_effect_of_one_channel_pays_there():
     assert not worse.pays(1.0, 0.01)
 
 
+def test_a_further_effect_has_to_exceed_the_chance_of_few_trials():
+    """Blind cases: 3 trials, whose scatter in one channel was small by chance."""
+    three = {"own": np.array([0.013, 0.02, -0.023])}
+    channels = {"channels": np.array([0.09, -0.05]), "scatters": np.array([0.025, 0.055])}
+    further = Gain(0.015, 0.014, 0.3, **channels, **three)
+    assert further.pays(2.0, 0.01) and not further.pays(2.0, 0.01, strictly=True)
+    many = replace(further, own=np.tile(further.own, 10))
+    assert many.pays(2.0, 0.01, strictly=True)
+    all_ = replace(further, mean=0.035, scatter=0.014)
+    assert all_.beyond(2.0, 0.01) and not all_.pays(2.0, 0.01, strictly=True)
+    assert replace(all_, mean=0.08).pays(2.0, 0.01, strictly=True)
+
+
+def test_three_trials_do_not_overrule_the_likeliest_by_chance(wavy):
+    search, _ = wavy
+    found, rival, crude = search.of_size(1)[0], search.of_size(1)[1], search.best_null()
+
+    class Few:
+        trials = 3
+
+        def gain(self, before, after):
+            mean = 0.05 if before is crude else 0.011
+            own = np.full(self.trials, mean)
+            return Gain(mean, 0.004, 0.13, np.zeros(1), np.ones(1), own=own)
+
+    few = Few()
+    assert not decide_module._overrules(few, crude, found, rival, 2.0, 0.05)
+    few.trials = 8
+    assert decide_module._overrules(few, crude, found, rival, 2.0, 0.05)
+    few.trials = 3
+    assert not decide_module._overrules(few, crude, found, rival, 2.5, 0.05, far=1.5)
+
+
 def test_what_two_of_eight_trials_show_is_seen_again():
     """Its scatter over trials is that of how much each shows, and says nothing of noise."""
     trial, visited = np.repeat(np.arange(8), 10), np.zeros(80)

@@ -8,6 +8,7 @@ from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.instruments.preflight import preflight
 from grounded.instruments.rows import Row, gaps, kinematic_rows, unheld
+from grounded.models.car import model as CAR
 from grounded.trial import Trial
 
 DT = 0.1
@@ -320,3 +321,25 @@ def test_a_tracked_point_or_a_slip_makes_no_position_late(model):
 
     for fault in (lambda x: x, ahead, slipping, drifting):
         assert not delayed(preflight(model, logged(model, fault)).findings)
+
+
+def test_a_steering_angle_is_no_speed_to_the_side(monkeypatch):
+    """Blind cases: a car whose tyres slip was given positions 42 ms late.
+
+    A delay that only shows across its way is a slip as well, since nothing measures that speed.
+    """
+    late_along_and_across = [(0.0, 0.003), (0.07, 0.003)]
+
+    def left(ways, steps, dt, *, apart):
+        return [(0.033 * (steps == 0), 0.006)] if not apart else late_along_and_across
+
+    monkeypatch.setattr("grounded.instruments.late_position._left", left)
+    rng, t = np.random.default_rng(5), np.arange(200) * 0.05
+    u = np.column_stack([0.6 * np.sin(t), 0.6 + 0.25 * np.sin(0.5 * t)])
+    x = [np.zeros(6)]
+    for one in u:
+        x.append(CAR.system.step(x[-1][None], one[None], CAR.values, 0.05)[0])
+    behind = np.array(x[5:]) + 0.003 * rng.standard_normal((196, 6))
+    behind[:, 2:4] = np.array(x)[:-5, 2:4]
+    trial = Trial(behind, u[5:], 0.05, CAR.state_names, CAR.input_names)
+    assert not delayed(preflight(CAR, [trial]).findings)
