@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.cause_words import sign_only
 from grounded.diagnosis.error_report import (
     Change,
     ChannelShare,
@@ -24,7 +25,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.next_trial import CHANGED, at_bounds, next_trial
-from grounded.diagnosis.report import Diagnosis, Estimate, NoiseLevels
+from grounded.diagnosis.report import Diagnosis, Estimate, NoiseLevels, Ranked
 from grounded.diagnosis.ruler_words import objection, open_noise
 from grounded.diagnosis.unconfirmed import another_look, marked, unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import Compared, by_trial
@@ -189,6 +190,7 @@ class Writer:
                 self.adopted,
                 further=further,
                 ended=at_bounds(self.claims),
+                flip=next((n for n in named if _sign_only(n, ranking)), "").partition(":")[2],
             ),
             unknowable=(*self.known.sentences, *joints_without_input(data.model, named)),
             noise=self.noise(),
@@ -255,6 +257,10 @@ class Writer:
         self.tick("utility")
         found = utility_prediction(self.predictor, self.best, bare, self.task, self.trials)
         return replace(found.summary(), feedback=self.task.feedback)
+
+
+def _sign_only(name: str, ranking: Sequence[Ranked]) -> bool:
+    return any(row.effect == name and sign_only(name, row.params) for row in ranking)
 
 
 def _identified(

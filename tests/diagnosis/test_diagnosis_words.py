@@ -87,6 +87,12 @@ def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt
     said = next_trial(claims, "", (), worse=why)
     assert why in said and not said.endswith("adopt the claimed effects.")
     assert "adopt" not in next_trial(claims, "", (), further=True)
+    pair = ("coulomb_friction:v", "viscous_friction:v")
+    said = next_trial(claims, "", (pair,), same=(pair,))
+    assert said.startswith("None helps") and said.endswith("the claimed one, coulomb_friction:v.")
+    assert why in next_trial(claims, "", (pair,), same=(pair,), worse=why)
+    said = next_trial(claims, "", (pair,), same=(pair,), flip="force")
+    assert holds(said, "flip the sign of force", "diagnose again") and "adopt" not in said
 
 
 def test_whole_trials_that_get_worse_are_contested_whatever_one_state_loses_sooner():

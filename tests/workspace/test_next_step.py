@@ -141,9 +141,15 @@ def test_what_is_calibrated_to_its_bound_is_not_to_be_adopted(cart, tmp_path, pa
     assert last(grounded("-C", folder, "status")) == f"grounded {then}"
 
 
-@pytest.mark.parametrize(("gain", "then"), [(-0.1, "adopt input_gain:force"), (-1.9, "diagnose")])
+@pytest.mark.parametrize(
+    ("gain", "then"),
+    [(-0.1, "adopt input_gain:force"), (-1.9, "diagnose"), (-1.63, "adopt input_gain:force")],
+)
 def test_a_command_of_the_wrong_sign_is_not_adopted_as_a_gain(cart, tmp_path, gain, then):
-    """The verdict said to flip its sign in model.py, `next:` to adopt a gain of -1.89."""
+    """The verdict said to flip its sign in model.py, `next:` to adopt a gain of -1.89.
+
+    Of another strength it says nothing of flipping: `next: diagnose` told the same again and again.
+    """
     folder = copied(cart, tmp_path / "w")
     row = DIAGNOSIS["ranking"][0] | {
         "effect": "input_gain:force",
