@@ -102,13 +102,16 @@ def at_bounds(claims: Claims) -> bool:
 
 
 def _own_numbers(claims: Claims, adopted: Collection[str]) -> bool:
-    """Check whether only parameters of the original model are blamed, none of adopted effects."""
-    from grounded.effects import ParamFamily, param_name
+    """Check whether only parameters are blamed, in a model without adopted effects.
 
-    effects, theirs = claims.best.hypothesis.effects, tuple(param_name(n, "") for n in adopted)
-    names = [e.site.target if isinstance(e.family, ParamFamily) else "" for e in effects]
-    off = names if claims.names else parameters_off(claims)
-    return all(off) and not any(theirs and name.startswith(theirs) for name in off)
+    Values that were found beside adopted effects are adopted as they are: a diagnosis is more
+    careful with what effects and parameters have in common than a fit.
+    """
+    from grounded.effects import ParamFamily
+
+    effects = claims.best.hypothesis.effects
+    own = all(isinstance(e.family, ParamFamily) for e in effects)
+    return not adopted and (own or not claims.names)
 
 
 HINTS = {

@@ -250,7 +250,9 @@ class _Bench:
         for relation, both in logged_behind(self.model, self.shown):  # their delay is adopted
             lag, q = lag_of(self.model, relation, self.trials), self.model.state_names[relation.i]
             clear = lag if lag is not None and lag.coherence > ALIKE else None
-            if clear and both and clear.filtered and clear.delay > 0:
+            if clear and (found := self.derived(relation, clear)):
+                yield self.filtered(relation, found)
+            elif clear and both and clear.filtered and clear.delay > 0:
                 yield self.in_time(relation.j, clear, f"the derivative of {q}")
             elif clear and not clear.filtered and clear.mean >= SMOOTH * self.dt:
                 yield self.smoothed(relation, clear.mean)

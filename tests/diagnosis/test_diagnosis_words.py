@@ -110,22 +110,22 @@ def _claiming(*effects, **more):
     return _claims(best=SimpleNamespace(hypothesis=hypothesis), names=names, **more)
 
 
-def test_numbers_of_the_model_are_fitted_those_of_adopted_effects_adopted():
+def test_numbers_of_the_model_are_fitted_those_beside_adopted_effects_adopted():
     """`next:` says so, and the sentence above it."""
     names = ("mass", "viscous_friction_v_k")
     data = SimpleNamespace(model=SimpleNamespace(param_names=names))
 
-    def said(*off):
+    def said(*off, adopted=("viscous_friction:v",)):
         blamed = tuple(SimpleNamespace(index=names.index(name)) for name in off)
         claims = _claiming(data=data, blamed=blamed, moved=blamed)
-        return next_trial(claims, "", (), adopted=("viscous_friction:v",))
+        return next_trial(claims, "", (), adopted=adopted)
 
-    assert "fit" in said("mass") and "adopt" not in said("mass")
-    assert said(*names).endswith("adopt the claimed effects.") and said(names[1]).endswith(
-        "adopt the claimed effects."
-    )
+    fit = said("mass", adopted=())
+    assert "fit" in fit and "adopt" not in fit
+    for off in (("mass",), names, names[1:]):
+        assert said(*off).endswith("adopt the claimed effects.")
     one = _claiming(Library().effect("parameter:mass", cart_task().model))
-    assert next_trial(one, "", ()) == said("mass")
+    assert next_trial(one, "", ()) == fit
 
 
 def test_predictions_that_run_away_are_compared_with_nothing():

@@ -1,10 +1,14 @@
 """Velocities that the robot's program computes from positions, as an overhead crane's did."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from grounded import Model, Trial
 from grounded.diagnosis.tables import instrument_lines
+from grounded.effects import Scales, Site, wrap
+from grounded.effects.sensor import sensor_lag
 from grounded.instruments.finding import a_mean, put_right
 from grounded.instruments.preflight import preflight
 
@@ -54,6 +58,18 @@ def test_a_rate_filtered_from_positions_is_not_used_and_no_scale_is_claimed(nois
     found = preflight(SWING, swung("filtered", noise, keep=keep))
     kinds = {f.kind for f in found.findings if f.signal == "w"}
     assert "smoothed" in kinds and kinds <= {"smoothed", "delay", "lag"}
+    assert np.isnan(found.trials[0].states[:, 1]).all()
+
+
+def test_a_rate_filtered_from_positions_is_not_used_once_its_filter_is_adopted():
+    """It follows from the positions as before: diagnoses were of their noise, fits ran away."""
+    site = Site(SWING, ("w",), Scales(dt=DT))
+    behind = wrap(sensor_lag.at(site), {"tau": 0.04}, DT)
+    (trial,) = swung("filtered", keep=0.8)
+    states = np.column_stack([trial.states, trial.states[:, 1]])
+    lifted = replace(trial, states=states, state_names=behind.state_names)
+    found = preflight(behind, [lifted], behind.state_names[2:])
+    assert [f.kind for f in found.findings if f.signal == "w"] == ["smoothed"]
     assert np.isnan(found.trials[0].states[:, 1]).all()
 
 

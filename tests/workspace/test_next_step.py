@@ -131,6 +131,23 @@ def test_numbers_that_are_wrong_are_fitted(cart, tmp_path):
     assert last(grounded("-C", folder, "status")) == "grounded fit"
 
 
+def test_numbers_found_beside_adopted_effects_are_adopted(cart, tmp_path):
+    """`fit` ran away to tau = 3.7 s where the diagnosis had the values, with effects of its own."""
+    folder = copied(cart, tmp_path / "w")
+    drag = {"name": "quadratic_drag:v", "k": 0.01}
+    set_in_model(folder / "grounded.toml", params={}, effects=[drag])
+    row = DIAGNOSIS["ranking"][0] | {
+        "effect": "parameter:mass",
+        "params": {"d": {"value": 0.4, "std": 0.01, "unit": "kg"}},
+    }
+    verdict = {"kind": "effect", "effects": ["parameter:mass"], "sentence": "One."}
+    made = {"trials": [], "adopted": [drag], "params": {}, "nominal": {"mass": 1.0}}
+    ruler = {"horizon_s": 1.0, "unit_by_channel": {"x": "m"}, "crude": {"x": 0.3}}
+    rows = [ruler | {"with_effects": {"x": 0.1}}]
+    diagnosed(folder, verdict=verdict, ranking=[row], diagnosed=made, prediction_error=rows)
+    assert last(grounded("-C", folder, "status")) == "grounded adopt parameter:mass"
+
+
 @pytest.mark.parametrize(("part", "then"), [(0.9, "adopt viscous_friction:v"), (1.0, "diagnose")])
 def test_what_is_calibrated_to_its_bound_is_not_to_be_adopted(cart, tmp_path, part, then):
     folder = copied(cart, tmp_path / "w")

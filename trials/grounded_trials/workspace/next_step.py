@@ -228,7 +228,8 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     if own.issuperset(new):
         made = diagnosis.made or Made()
         some = (*made.named, *made.compared)
-        if not fitted_in_vain(workspace, some):  # only parameters are off: fit all together
+        alone = not workspace.config.model.effects  # else found beside effects, to be adopted so
+        if alone and not fitted_in_vain(workspace, some):  # only parameters: fit all together
             return NextCommand("fit", ("--trials", ",".join(some)) if some else ())
         if gain(diagnosis.prediction_error, "crude", "with_effects") <= 0:
             return NextCommand("adopt", late) if late else None
