@@ -93,7 +93,7 @@ def _as_given(task: Task, stands: Array, target: Array) -> Array:
     """Return states and inputs at rest with each input as given if the robot rests under that too.
 
     In SETTLED steps, or a second, no state but the rates may then move, except for SLOW of its
-    range in the target. Within a dead zone, for example, the robot rests anywhere, not only at its edge.
+    range in the target. Within a dead zone, for example, it rests anywhere, not only at the edge.
 
     Args:
         task: the task.
