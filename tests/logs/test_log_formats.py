@@ -332,3 +332,17 @@ def test_constants_of_an_array_are_one_line(tmp_path):
     ]
     found = grounded("inspect", log, "--json").json["topics"]
     assert sum("covariance" in f["path"] for t in found for f in t["fields"]) == 27
+
+
+def test_a_missing_column_is_not_said_to_be_one_that_another_signal_is(tmp_path):
+    """`has no field 'Gierrate_dps': did you mean 'Nickrate_dps'?`, which was the pitch rate."""
+    path = tmp_path / "log.csv"
+    path.write_text("t,Nickrate_dps,U_Nick\n0,1,2\n0.1,1,2\n")
+    specs = {"q": SignalSpec("/csv.Nickrate_dps"), "r": SignalSpec("/csv.Gierrate_dps")}
+    with pytest.raises(GroundedError) as error:
+        read_signals(path, specs)
+    assert holds(str(error.value), "'r'", "Gierrate_dps") and "'Nickrate_dps'" not in str(
+        error.value
+    )
+    with pytest.raises(GroundedError, match=r"did you mean 'Nickrate_dps'"):
+        read_signals(path, {"r": specs["r"]})
