@@ -88,9 +88,12 @@ def next_trial(
         return AT_BOUNDS
     if flip:
         return f"None is needed yet: flip the sign of {flip}, as said above, and diagnose again."
-    if _own_numbers(claims, adopted):
-        return "None is needed to tell causes apart: fit the model's parameters."
-    return "None is needed to tell causes apart: adopt the claimed effects."
+    fit = _own_numbers(claims, adopted)
+    do = "fit the model's parameters" if fit else "adopt the claimed effects"
+    said = f"None is needed to tell causes apart: {do}"
+    if look:  # a gap without a cause
+        return f"{said} and diagnose again. If the gap is still there: {look[:1].lower()}{look[1:]}"
+    return f"{said}."
 
 
 def at_bounds(claims: Claims) -> bool:

@@ -135,7 +135,8 @@ def _without(type: Struct, name: str, taken: Collection[str]) -> str:
     left = [one for one in type.by_name if one not in taken]
     alike = in_another_unit(name, left)
     hint = f"did you mean '{alike[0]}'?" if alike else nearest(name, left)
-    hint = "other signals are read from all of its fields" if type.by_name and not left else hint
+    if taken and {*left} <= {"header"}:
+        hint = "other signals are read from its other fields"
     return f"{type} has no field '{name}': {hint}"
 
 
