@@ -34,6 +34,7 @@ from grounded.instruments.constant import constant_of
 from grounded.instruments.dead import judge_dead
 from grounded.instruments.derived import Derived, derived
 from grounded.instruments.finding import (
+    A_SECOND,
     DEGREES,
     Finding,
     Preflight,
@@ -169,7 +170,8 @@ class _Bench:
         for i in one.change.states:
             name = self.model.state_names[i]
             if one.change.factor > 0:
-                text = f"is in degrees{where}, not in {self.model.states[name]}"
+                unit = self.model.states[name]
+                text = f"is in degrees{A_SECOND * unit.endswith('/s')}{where}, not in {unit}"
                 log = f"scale = {1 / DEGREES:.8g}" * (not where)
                 yield put_right(name, text, "degrees", log, scale=DEGREES)
             else:
