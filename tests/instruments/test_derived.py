@@ -9,7 +9,7 @@ from grounded import Model, Trial
 from grounded.diagnosis.tables import instrument_lines
 from grounded.effects import Scales, Site, wrap
 from grounded.effects.sensor import sensor_lag
-from grounded.instruments.finding import a_mean, put_right
+from grounded.instruments.finding import a_mean, in_degrees, put_right
 from grounded.instruments.preflight import preflight
 
 DT = 0.04
@@ -100,3 +100,8 @@ def test_a_signal_that_is_not_used_has_one_line():
     (line,) = instrument_lines([late, a_mean("w", "q", 0.04)])
     assert "0.02 s later" in line and "mean over 0.04 s" in line and "delay_s = 0.02" in line
     assert "corrected here" not in line and "corrected here" in instrument_lines([late])[0]
+
+
+def test_a_rate_is_in_degrees_a_second():
+    assert in_degrees("w", "rad/s").finding == "is in degrees a second, not in rad/s"
+    assert in_degrees("q", "rad").finding == "is in degrees, not in rad"
