@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 import click
@@ -92,7 +92,7 @@ def command(
         if json_:
             odd = [one.to_json() for one in findings]
             return show_json({"preflight": odd, "unheld": list(alone)})
-        _instruments(findings)
+        _instruments(findings, workspace.base_model.inputs)
         return _unheld(alone, bool(findings))
     families = [name for text in without for name in names_in(text)]
     with stages() as tell:
@@ -108,9 +108,9 @@ def command(
     if json_:
         show_json(found.to_json())
     else:
-        params = workspace.base_model.params
-        nominal = {name: param.value for name, param in params.items()}
-        _show(found, nominal, details=details)
+        model = workspace.base_model
+        nominal = {name: param.value for name, param in model.params.items()}
+        _show(found, nominal, model.inputs, details=details)
         show("\n" + field("next trial", found.next_trial))
         if found.probe:
             from grounded_cli.propose import show_extent
@@ -120,7 +120,9 @@ def command(
         show(f"\n{next_line(found.then)}")
 
 
-def _show(found: Diagnosis, nominal: dict[str, float], *, details: bool) -> None:
+def _show(
+    found: Diagnosis, nominal: dict[str, float], inputs: Collection[str], *, details: bool
+) -> None:
     """Print a diagnosis: what a person needs to decide, or with `details` everything."""
     from grounded.diagnosis.tables import error_table
     from grounded_trials.report.diagnosis_words import (
@@ -131,7 +133,7 @@ def _show(found: Diagnosis, nominal: dict[str, float], *, details: bool) -> None
     )
 
     show(_verdict(found))
-    _instruments(found.preflight)
+    _instruments(found.preflight, inputs)
     for text in found.unknowable:
         if text != found.verdict.limit:
             show(field("caveats", text))
@@ -183,11 +185,15 @@ def _held_out(found: Diagnosis) -> str:
     return text
 
 
-def _instruments(findings: Sequence[Finding]) -> None:
+def _instruments(findings: Sequence[Finding], inputs: Collection[str]) -> None:
+    """Print what is odd in the sensors and in the commands."""
     from grounded.diagnosis.tables import instrument_lines
 
-    for k, line in enumerate(instrument_lines(findings)):
-        show(field("sensors" if k == 0 else "", line))
+    sent = [one for one in findings if one.signal in inputs]
+    seen = [one for one in findings if one.signal not in inputs]
+    for title, some in (("sensors", seen), ("commands", sent)):
+        for k, line in enumerate(instrument_lines(some)):
+            show(field(title if k == 0 else "", line))
 
 
 def _unheld(alone: Sequence[str], odd: bool) -> None:

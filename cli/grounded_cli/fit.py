@@ -82,6 +82,8 @@ def command(
     for k, line in enumerate(corrected):
         show(field("sensors" if k == 0 else "", line))
     show("\n" * bool(corrected) + _parameters(found))
+    if found.at_bounds:
+        show("\n".join(lines(_stopped(found.at_bounds), "  ", "  ")))
     if done.not_fitted:
         show("\n".join(lines(_not_fitted(done.not_fitted), "  ", "  ")))
     if found.before is not None and found.after is not None:
@@ -107,10 +109,21 @@ def _not_fitted(delays: Sequence[str]) -> str:
     )
 
 
+def _stopped(names: Sequence[str]) -> str:
+    """Say what parameters at their bounds mean for the others."""
+    many = len(names) > 1
+    return (
+        f"{listed(names)} stopped at {'their bounds' if many else 'its bound'}, and the trials ask "
+        "for more, so the other intervals say little: the model lacks something, which "
+        "`grounded diagnose` looks for, or the bounds in the model file are too narrow"
+    )
+
+
 def _parameters(found: Fit) -> str:
     rows = []
     for name, e in found.params.items():
         interval = f"{number(e.low)} .. {number(e.high)}" if e.identified else "not identified"
+        interval = "at its bound" if name in found.at_bounds else interval
         rows.append((name, number(e.start), number(e.value), interval, shown(e.unit)))
     return table(rows, ("parameter", "before", "fitted", "95 % interval", "unit"))
 

@@ -13,6 +13,7 @@ import gc
 import importlib
 import os
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from io import StringIO, TextIOWrapper
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -54,6 +55,8 @@ COMMANDS = {
     "completion": ("completion", "Print the shell's completion script."),
 }
 
+ABOUT = 0.1  # difference in likeness of two spellings that is hardly one
+
 
 class LazyGroup(click.Group):
     """A group that imports a command's module when it is called, so that start-up stays fast."""
@@ -86,7 +89,12 @@ class LazyGroup(click.Group):
         try:
             return super().invoke(ctx)
         except click.NoSuchOption as error:
-            if error.possibilities or not (meant := _meant(error)):
+            if error.possibilities:
+                near = _closest(error.option_name, error.possibilities)
+                raise click.NoSuchOption(
+                    error.option_name, possibilities=near, ctx=error.ctx
+                ) from None
+            if not (meant := _meant(error)):
                 raise
             text = f"{error.message} Did you mean {' or '.join(map(repr, meant))}?"
             raise click.NoSuchOption(error.option_name, text, ctx=error.ctx) from None
@@ -112,6 +120,14 @@ class LazyGroup(click.Group):
         """List the commands without importing any."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+
+def _closest(name: str, options: Sequence[str]) -> list[str]:
+    """Return the options that are about as close to a misspelt one as the closest (--hmtl)."""
+    from difflib import SequenceMatcher
+
+    near = {one: SequenceMatcher(None, name, one).ratio() for one in options}
+    return [one for one in options if near[one] > max(near.values()) - ABOUT]
 
 
 def _meant(error: click.NoSuchOption) -> list[str]:

@@ -310,7 +310,7 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     promise = f"{text}; this one promises a gain of {number(gain)}"
     if not gain < max(missed[-1], candidate.likely_off):
         return promise
-    doubt = f"{promise}, which is no more than such an error"
+    doubt = f"{promise}, less than such an error"
     if not gain < max(missed):
         doubt = f"{promise}, less than its likely error, {number(candidate.likely_off)}"
     blind = missed[-1] > MISSED * abs(last[-1].utility)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from grounded.frozen import Array
     from grounded.model import Model
     from grounded_trials import Workspace
+    from grounded_trials.workspace.config import TaskTable
 
 SECONDS = 5.0  # default duration of a step or a swing-up
 REACHED = 0.95  # of --speed: a path that stays below it brings a note
@@ -73,10 +74,11 @@ def command(
     begins at the position in [task] start, along x; what --to names, such as the height of a drone,
     keeps its value. With --hold a path ends at rest and stays there.
 
-    The previous target is kept as target.csv.bak. [task] horizon is updated, and so are the weights
-    in [reward] state unless you chose them, and input_change of inputs with [limits] if it is
-    still what `init` wrote. Earlier trials stay available to fit and diagnose; the search starts
-    again.
+    The previous target is kept as target.csv.bak, and grounded.toml as grounded.toml.bak. If
+    [task] start is empty and a stored trial begins at rest, it is set to where. [task] horizon is
+    updated, and so are the weights in [reward] state unless you chose them, and input_change of
+    inputs with [limits] if it is still what `init` wrote. Earlier trials stay available to fit and
+    diagnose; the search starts again.
     """
     from grounded_trials.starting.shapes import (
         PATHS,
@@ -87,11 +89,15 @@ def command(
         step_target,
         swing_up,
     )
+    from grounded_trials.workspace.config import set_start
+    from grounded_trials.workspace.off_target import rates_beside
+    from grounded_trials.workspace.rests_at import rest_of_trials
     from grounded_trials.workspace.task_file import without_range
 
     workspace = open_workspace()
     model, dt = workspace.base_model, workspace.config.task.dt
-    start, ends = workspace.config.task.start, _values(to)
+    rest, seen = rest_of_trials(workspace)
+    start, ends = workspace.config.task.start or rest, _values(to)
     paces = {k: v for k, v in (("speed", speed), ("accel", accel)) if v is not None}
     drive = Drive(size=size, lateral=lateral, laps=laps, hold=hold, **paces)
     long = SECONDS if seconds is None else seconds
@@ -113,9 +119,12 @@ def command(
     elif shape in PATHS:
         columns = path_target(shape, drive, model, dt, ends, start)
     else:
-        columns = _recorded(workspace, shape)
-    before = _reward(workspace)
-    path = workspace.target(columns)
+        columns, rest = _recorded(workspace, shape), {}
+    before, old = _reward(workspace), workspace.config.task
+    path, ran = workspace.target(columns), bool(workspace.candidate_ids())
+    if rest:
+        set_start(workspace.config.file, rest)
+        workspace.forget()
     reward = _reward(workspace)
     rows = len(next(iter(columns.values())))
     ranges = {name: (float(v.min()), float(v.max())) for name, v in columns.items()}
@@ -147,8 +156,17 @@ def command(
         show(field(name, text, "  "))
     if free:
         show(field("free", _free(free, reward, _rest_of(model, free) * (shape == "line")), "  "))
+    if ran:
+        _tell_undo(old, before, reward, rows - 1)
+    if rest:
+        sentence(
+            f"[task] start is new, where {seen} rests: "
+            f"{', '.join(f'{name} = {number(value)}' for name, value in rest.items())}. If runs "
+            "begin elsewhere, change it and draw the target again"
+        )
+    slower = ", a tenth of that for velocities of positions" * bool(rates_beside(model, columns))
     for kind, by in (
-        ("state", "1 / (range in the target)^2, a tenth of that for velocities of positions"),
+        ("state", f"1 / (range in the target)^2{slower}"),
         ("input_change", "0.04 / (range of [limits])^2"),
     ):
         if (weights := reward.get(kind, {})) != before.get(kind, {}):
@@ -171,6 +189,26 @@ def command(
             "[reward] state",
         )
     show(f"\n{next_line(NextCommand('propose'))}")
+
+
+def _tell_undo(
+    old: TaskTable,
+    before: dict[str, dict[str, float]],
+    reward: dict[str, dict[str, float]],
+    steps: int,
+) -> None:
+    """Say what a new target replaced, in a workspace with candidates, and how to go back."""
+    was = [f"horizon = {old.horizon}"] * (old.horizon != steps)
+    was += [
+        f"[reward] {kind}: {', '.join(f'{name} = {number(w)}' for name, w in weights.items())}"
+        for kind, weights in before.items()
+        if weights != reward.get(kind)
+    ]
+    sentence(
+        f"before: {'; '.join([*was, f'the target in {old.target}.bak'])}. To go back to it and its "
+        f"candidates, copy {old.target}.bak and grounded.toml.bak over {old.target} and "
+        "grounded.toml"
+    )
 
 
 def _driven(model: Model, columns: dict[str, Array], dt: float) -> tuple[float, float]:

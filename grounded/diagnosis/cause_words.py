@@ -151,16 +151,28 @@ def acts_reversed(params: Mapping[str, Estimate]) -> bool:
     return "g" in params and params["g"].value < -1
 
 
+def sign_only(name: str, params: Mapping[str, Estimate]) -> bool:
+    """Return whether an effect is an input of the wrong sign and of the modelled strength.
+
+    The verdict then says to flip the sign; a reversed input of another strength is adopted.
+    """
+    return (
+        name.startswith("input_gain:")
+        and acts_reversed(params)
+        and abs(-1 - params["g"].value - 1) < AS_STRONG
+    )
+
+
 def _turned(effect: Effect, params: Mapping[str, Estimate]) -> str:
     """Return the sentence for a gain of the opposite sign; "" if the sign is right."""
-    from grounded.effects import InputFamily
-
     text = effect.family.turned
     if not (text and acts_reversed(params)):
         return ""
+    if sign_only(effect.name, params):
+        return text + TURNED
     size = -1 - params["g"].value
     if abs(size - 1) < AS_STRONG:
-        return text + TURNED * isinstance(effect.family, InputFamily)
+        return text
     return f"{text} (with {number(100 * size)} % of the modelled strength)"
 
 

@@ -35,6 +35,7 @@ def next_trial(
     adopted: Collection[str] = (),
     further: bool = False,
     ended: bool = False,
+    flip: str = "",
 ) -> str:
     """Return a sentence on the next trial; `excitation.probe` designs the trial itself.
 
@@ -49,15 +50,17 @@ def next_trial(
         adopted: adopted effects, whose values are parameters of the model.
         further: whether more effects should be looked for first (`Verdict.look_for`).
         ended: whether all parameters that moved stopped at their bounds (`at_bounds`).
+        flip: an input whose sign is to be flipped before anything is adopted; "" for none.
     """
     from grounded import places
     from grounded.effects import like_a_load
 
     if claims.known.no_cause:
         return "Run two or more trials in which every input changes."
-    if groups and groups[0] in same:
-        return f"None helps: {told_apart(groups[0], same)}, so adopt either."
-    if groups:
+    if groups and groups[0] in same and not (worse or further or ended or flip):
+        own = next((name for name in groups[0] if name in claims.names), groups[0][0])
+        return f"None helps: {told_apart(groups[0], same)}, so adopt the claimed one, {own}."
+    if groups and groups[0] not in same:
         made = f"A trial designed for it may tell {tied(groups[0])}."
         turns = bool(places.plane(claims.data.model))
         return " ".join([made, *distinguishing(groups[0], turns=turns)])
@@ -83,9 +86,14 @@ def next_trial(
         return "None is needed yet: give the model a parameter for a load and diagnose again."
     if ended:
         return AT_BOUNDS
-    if _own_numbers(claims, adopted):
-        return "None is needed to tell causes apart: fit the model's parameters."
-    return "None is needed to tell causes apart: adopt the claimed effects."
+    if flip:
+        return f"None is needed yet: flip the sign of {flip}, as said above, and diagnose again."
+    fit = _own_numbers(claims, adopted)
+    do = "fit the model's parameters" if fit else "adopt the claimed effects"
+    said = f"None is needed to tell causes apart: {do}"
+    if look:  # a gap without a cause
+        return f"{said} and diagnose again. If the gap is still there: {look[:1].lower()}{look[1:]}"
+    return f"{said}."
 
 
 def at_bounds(claims: Claims) -> bool:
@@ -97,13 +105,16 @@ def at_bounds(claims: Claims) -> bool:
 
 
 def _own_numbers(claims: Claims, adopted: Collection[str]) -> bool:
-    """Check whether only parameters of the original model are blamed, none of adopted effects."""
-    from grounded.effects import ParamFamily, param_name
+    """Check whether only parameters are blamed, in a model without adopted effects.
 
-    effects, theirs = claims.best.hypothesis.effects, tuple(param_name(n, "") for n in adopted)
-    names = [e.site.target if isinstance(e.family, ParamFamily) else "" for e in effects]
-    off = names if claims.names else parameters_off(claims)
-    return all(off) and not any(theirs and name.startswith(theirs) for name in off)
+    Values that were found beside adopted effects are adopted as they are: a diagnosis is more
+    careful with what effects and parameters have in common than a fit.
+    """
+    from grounded.effects import ParamFamily
+
+    effects = claims.best.hypothesis.effects
+    own = all(isinstance(e.family, ParamFamily) for e in effects)
+    return not adopted and (own or not claims.names)
 
 
 HINTS = {

@@ -15,20 +15,26 @@ if TYPE_CHECKING:
 NAMED = 3  # channels named in one sentence
 MATTERS = 0.05  # share of the crude model's error below which a remaining error is given as a share
 HALF, MORE = 0.5, 0.2  # improvements: below HALF 1 s ahead and MORE of it over whole trials
+COMPARABLE = 0.2  # difference of two improvements, as shares, that hardly matters
 SHOWS = 0.1  # relative change below which a channel is not named
 COUNTS = 0.03  # relative change below which a loss is not compared with gains elsewhere
 
 
-def improvement(rows: Sequence[RulerRow]) -> str:
+def improvement(rows: Sequence[RulerRow], tracked: Sequence[str] = ()) -> str:
     """Return a sentence: `Predictions 1 s ahead miss v by 0.08 m/s instead of 0.31 m/s`.
 
     Whole trials are used if predictions 1 s ahead gain nothing, or whole trials gain much more.
+
+    Args:
+        rows: held-out prediction errors.
+        tracked: the states that the task follows, the most important first. They are named before
+            others whose errors shrink by hardly more.
     """
     row = told_row(rows)
     if row is None:
         first = telling(rows)
         return f"{_ahead(first)} hardly change." if first else ""
-    told = [(name, *_told(row, name, "with_effects", "crude")) for name in _best(row)]
+    told = [(name, *_told(row, name, "with_effects", "crude")) for name in _best(row, tracked)]
     parts = [f"{name} by {now} instead of {then}{noise}" for name, now, then, noise in told]
     return f"{_ahead(row)} miss {listed(parts)}."
 
@@ -39,10 +45,15 @@ def told_row(rows: Sequence[RulerRow]) -> RulerRow | None:
     return next((row for row in (telling(rows), *whole) if row and _best(row)), None)
 
 
-def _best(row: RulerRow) -> list[str]:
-    """Return the channels that improve most, best first, of those that improve enough to name."""
-    gains = _gains(row)
-    return sorted((n for n in gains if gains[n] > SHOWS), key=lambda n: -gains[n])[: NAMED - 1]
+def _best(row: RulerRow, tracked: Sequence[str] = ()) -> list[str]:
+    """Return the channels that improve most, best first, of those that improve enough to name.
+
+    Tracked ones that improve nearly as much (COMPARABLE) come first.
+    """
+    gains = {n: gain for n, gain in _gains(row).items() if gain > SHOWS}
+    close = max(gains.values(), default=0.0) - COMPARABLE
+    order = {n: k for k, n in enumerate(tracked) if gains.get(n, -1.0) >= close}
+    return sorted(gains, key=lambda n: (order.get(n, len(tracked)), -gains[n]))[: NAMED - 1]
 
 
 def telling(rows: Sequence[RulerRow]) -> RulerRow | None:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.cause_words import meaning
+from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.hypotheses.explored import CLAIM
 from grounded.diagnosis.next_trial import LOG, LOST
 from grounded.diagnosis.report import Ranked, Unconfirmed
@@ -31,18 +32,48 @@ from grounded.trial import Trial
 
 MENTIONED = 2
 FAR_OFF = 2.0  # times the range of the target and the best run: a run beyond it has failed
+TRIFLE = 0.1  # of a prediction error: an effect that changes states by less shows in none
 SURE = 2.0  # standard deviations by which one of its values differs from zero
 
 
 def unconfirmed(
-    claims: Claims, doubtful: Sequence[Doubtful], groups: Sequence[Sequence[str]] = ()
+    claims: Claims,
+    doubtful: Sequence[Doubtful],
+    groups: Sequence[Sequence[str]] = (),
+    row: RulerRow | None = None,
 ) -> tuple[Unconfirmed, ...]:
-    """Return the likeliest effects that were dropped and that few trials show, without ties."""
+    """Return the likeliest effects that were dropped and that few trials show, without ties.
+
+    Args:
+        claims: the causes that are claimed.
+        doubtful: the likely effects that were dropped.
+        groups: effects that the data cannot tell apart.
+        row: prediction errors; effects that are trifles beside these are not returned.
+    """
     if claims.known.no_cause:
         return ()
     tied = {name for group in groups for name in group}
-    found = [_seen(claims, one) for one in doubtful if one.name not in tied]
+    left = [one for one in doubtful if one.name not in tied]
+    found = [_seen(claims, one) for one in left if row is None or not _trifling(claims, one, row)]
     return tuple([one for one in found if one is not None][:MENTIONED])
+
+
+def _trifling(claims: Claims, one: Doubtful, row: RulerRow) -> bool:
+    """Return whether an effect hardly changes any state beside the errors of predictions.
+
+    Nobody needs to drive for a rate that is shown 0.05 % too large.
+    """
+    data, h, x = claims.data, one.fit.hypothesis, one.fit.track
+    less = h.minus(one.name)
+    both = [claims.predictor.next(each, x[:-1]) for each in (less, h)]
+    moved = np.where(data.valid.T[..., None], data.model.difference(*both), 0.0)
+    total = np.concatenate([np.zeros_like(moved[:1]), np.cumsum(moved, axis=0)])
+    steps = min(max(1, round(row.horizon_s / data.dt)), len(moved))
+    shown = np.zeros_like(x) + claims.predictor.offset(h, x) - claims.predictor.offset(less, x)
+    size = np.abs(total[steps:] - total[:-steps]).max(axis=(0, 1), initial=0.0)
+    size += np.abs(shown).max(axis=(0, 1), initial=0.0)
+    errors = [row.with_effects.get(name, 0.0) for name in data.model.state_names]
+    return bool((size <= TRIFLE * np.nan_to_num(errors)).all())
 
 
 def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:

@@ -62,6 +62,7 @@ def verdict(
     agreement: Sequence[Agreement] = (),
     changed: Sequence[Changed] | None = None,
     adopted: Collection[str] = (),
+    tracked: Sequence[str] = (),
 ) -> Verdict:
     """Return the verdict (effect, several, none or unknown) with its sentences.
 
@@ -81,6 +82,7 @@ def verdict(
         agreement: whether the trials agree on each of these values.
         changed: the values that differ between two groups of trials; None for one group.
         adopted: adopted effects, whose values are parameters of the model.
+        tracked: the states that the task follows, the most important first.
     """
     from grounded.effects import like_a_load
 
@@ -117,7 +119,7 @@ def verdict(
         {e.name: e for e in claims.best.hypothesis.effects},
         {row.effect: row.params for row in ranking},
     )
-    words = [sentence(told), improvement(rows), worsened(rows)]
+    words = [sentence(told), improvement(rows, tracked), worsened(rows)]
     words += [runaway(rows), wider(claims.parameters())]
     words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed])
     words += [f"{told_apart(group, same)}." for group in groups]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.cause_words import sign_only
 from grounded.diagnosis.error_report import (
     Change,
     ChannelShare,
@@ -24,7 +25,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.next_trial import CHANGED, at_bounds, next_trial
-from grounded.diagnosis.report import Diagnosis, Estimate, NoiseLevels
+from grounded.diagnosis.report import Diagnosis, Estimate, NoiseLevels, Ranked
 from grounded.diagnosis.ruler_words import objection, open_noise
 from grounded.diagnosis.unconfirmed import another_look, marked, unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import Compared, by_trial
@@ -39,6 +40,7 @@ from grounded.diagnosis.validation.prediction_error import by_region, by_time, e
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.verdict import verdict
 from grounded.effects import acting_order, wrapping_order
+from grounded.places import position
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -115,7 +117,7 @@ class Writer:
         when = region.told if region else ""
         look = another_look(self.task, self.trials, off, when) if off else ""
         named = [row.effect for row in ranking if row.claimed]
-        seen = unconfirmed(self.claims, self.decision.doubtful, groups)
+        seen = unconfirmed(self.claims, self.decision.doubtful, groups, furthest(rows))
         told = {one.effect for one in seen}.union(*groups)
         located = bool(named or remainder)  # else the gap is noise: shares of it tell nothing
         ranking = marked(ranking, {one.name for one in self.decision.doubtful} - told)
@@ -142,6 +144,7 @@ class Writer:
             agreement=() if apart else agreement,
             changed=apart.changed if apart else None,
             adopted=self.adopted,
+            tracked=() if self.task is None else _tracked(self.task),
         )
         further = said.look_for > 0
         differ = bool(apart and apart.changed) and not self.known.no_cause
@@ -189,6 +192,7 @@ class Writer:
                 self.adopted,
                 further=further,
                 ended=at_bounds(self.claims),
+                flip=next((n for n in named if _sign_only(n, ranking)), "").partition(":")[2],
             ),
             unknowable=(*self.known.sentences, *joints_without_input(data.model, named)),
             noise=self.noise(),
@@ -255,6 +259,20 @@ class Writer:
         self.tick("utility")
         found = utility_prediction(self.predictor, self.best, bare, self.task, self.trials)
         return replace(found.summary(), feedback=self.task.feedback)
+
+
+def _tracked(task: Task) -> tuple[str, ...]:
+    """Return the states that the reward weighs: those of the position, then others, rates last."""
+    weighed = task.reward.state + task.reward.terminal
+    followed = (weighed != 0) & np.isfinite(task.target).any(axis=0)
+    names = [n for n, own in zip(task.model.state_names, followed, strict=True) if own]
+    first = position(task.model)
+    rates = {n for n in names if task.model.states[n].endswith("/s")}
+    return tuple(sorted(names, key=lambda n: (n not in first, n in rates)))
+
+
+def _sign_only(name: str, ranking: Sequence[Ranked]) -> bool:
+    return any(row.effect == name and sign_only(name, row.params) for row in ranking)
 
 
 def _identified(

@@ -125,7 +125,7 @@ class FlightResult:
         gain = mean_text([run.improvement for run in self.flown])
         rows = (
             ("utility, model-based", first, "-13,028 (±330)"),
-            (f"utility, {ITERATIONS} iterations", last, "-3,000 (±100)"),
+            (f"utility, up to {ITERATIONS} iterations", last, "-3,000 (±100)"),
             ("improvement, mean of ratios", gain, "76 % (±2 %)"),
             ("improvement, ratio of means", f"{found['improvement']['ratio_of_means']:.1%}", ""),
             ("optimum with the true parameters", f"{self.optimum:,.0f}", "not given"),

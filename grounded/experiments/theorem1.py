@@ -124,7 +124,7 @@ class Theorem1Result:
             "epsilon",
             "|grad U - grad U^|",
             "|grad U|^2 at the end",
-            "of 2 K^2 epsilon^2, at most",
+            "share of 2 K^2 epsilon^2, at most",
         )
         found = self.slopes()
         slopes = tuple(

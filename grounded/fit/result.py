@@ -91,9 +91,18 @@ class Fit(Result):
     def helps(self) -> bool:
         """Whether held-out time is predicted better by more than TIE.
 
-        True if none was held out.
+        True if none was held out; False if nothing could be fitted.
         """
-        return _change(self.before, self.after) < -TIE
+        return bool(np.isfinite(self.loglik)) and _change(self.before, self.after) < -TIE
+
+    @property
+    def at_bounds(self) -> tuple[str, ...]:
+        """Names of the identified parameters that ended at a bound.
+
+        Their intervals are cut there, and those of the others hold only with them there.
+        """
+        known = {n: e for n, e in self.params.items() if e.identified and n in self.model.params}
+        return tuple(n for n, e in known.items() if self.model.params[n].at_bound(e.value))
 
     @property
     def worse(self) -> bool:
@@ -112,6 +121,7 @@ class Fit(Result):
             status=self.status,
             sentence=self.sentence,
             samples=self.samples,
+            at_bounds=list(self.at_bounds),
             applied=False,
         )
         for name, error in (("before", self.before), ("after", self.after)):

@@ -96,9 +96,15 @@ def derived_from(position: str, age: float) -> str:
     )
 
 
+A_SECOND = " a second"  # of a rate in degrees
+
+
 def in_degrees(name: str, unit: str) -> Finding:
     """Return the finding of a signal that was converted from degrees to radians."""
-    text, log = f"is in degrees, not in {unit}", f"scale = {1 / DEGREES:.8g}"
+    text, log = (
+        f"is in degrees{A_SECOND * unit.endswith('/s')}, not in {unit}",
+        f"scale = {1 / DEGREES:.8g}",
+    )
     return put_right(name, text, "degrees", log, scale=DEGREES)
 
 

@@ -34,6 +34,7 @@ from grounded.instruments.constant import constant_of
 from grounded.instruments.dead import judge_dead
 from grounded.instruments.derived import Derived, derived
 from grounded.instruments.finding import (
+    A_SECOND,
     DEGREES,
     Finding,
     Preflight,
@@ -169,7 +170,8 @@ class _Bench:
         for i in one.change.states:
             name = self.model.state_names[i]
             if one.change.factor > 0:
-                text = f"is in degrees{where}, not in {self.model.states[name]}"
+                unit = self.model.states[name]
+                text = f"is in degrees{A_SECOND * unit.endswith('/s')}{where}, not in {unit}"
                 log = f"scale = {1 / DEGREES:.8g}" * (not where)
                 yield put_right(name, text, "degrees", log, scale=DEGREES)
             else:
@@ -250,7 +252,9 @@ class _Bench:
         for relation, both in logged_behind(self.model, self.shown):  # their delay is adopted
             lag, q = lag_of(self.model, relation, self.trials), self.model.state_names[relation.i]
             clear = lag if lag is not None and lag.coherence > ALIKE else None
-            if clear and both and clear.filtered and clear.delay > 0:
+            if clear and (found := self.derived(relation, clear)):
+                yield self.filtered(relation, found)
+            elif clear and both and clear.filtered and clear.delay > 0:
                 yield self.in_time(relation.j, clear, f"the derivative of {q}")
             elif clear and not clear.filtered and clear.mean >= SMOOTH * self.dt:
                 yield self.smoothed(relation, clear.mean)

@@ -107,3 +107,9 @@ def test_a_path_that_never_reaches_its_speed_says_so(tmp_path):
     assert fast.json["columns"]["v"][1] == pytest.approx(2.0, rel=0.01)  # sqrt(4 m/s^2 * 1 m)
     said = grounded("-C", w, "target", "circle", "--size", "1", "--speed", "9")
     assert holds(said.err, "2 m/s", "--speed 9", "--lateral 4", "--accel 1")
+
+
+def test_the_nearest_option_alone_is_suggested():
+    """`--hmtl` was said to mean `--help` or `--html`."""
+    done = grounded("report", "--hmtl")
+    assert done.code == 2 and "'--html'" in done.err and "--help'?" not in done.err

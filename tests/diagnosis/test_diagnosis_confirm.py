@@ -8,6 +8,7 @@ import pytest
 
 from grounded import Model, Param, Search, Trial
 from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.hypotheses.attribution import attribute
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.report import Diagnosis, Ranked, Unconfirmed, Verdict
@@ -347,6 +348,11 @@ def test_what_one_trial_shows_is_told_with_its_place_and_is_no_cause(rare, neede
     assert one.effect == "saturation:u" and one.trial == "t3" and one.seen == (1, 5)
     assert 3.9 < one.start < 4.2 < 4.4 < one.end < 6.0 and one.evidence > 10
     assert one.params["c"].value == pytest.approx(1.5, abs=0.05)
+    errors = {"x": 0.01, "v": 0.05}
+    ahead = RulerRow(1.0, unit_by_channel={"x": "m", "v": "m/s"}, with_effects=errors)
+    assert unconfirmed(claims, decision.doubtful, (), ahead)
+    vague = replace(ahead, with_effects={name: 1e3 * e for name, e in errors.items()})
+    assert not unconfirmed(claims, decision.doubtful, (), vague)  # a trifle beside such errors
     told = verdict(claims, (), (), (), (), (), found)
     assert told.effects == () and one.meaning in told.lines[-1] and "t3" in told.lines[-1]
     assert Unconfirmed.from_json(one.to_json()) == one

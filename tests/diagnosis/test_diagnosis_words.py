@@ -44,6 +44,22 @@ def row(crude, after, floor=None, **more):
     )
 
 
+def test_what_the_task_follows_is_named_before_what_improves_by_hardly_more():
+    """The README's verdict named the steering angle and the speed, not where the car went."""
+    some = row({"x": 1.0, "v": 1.0}, {"x": 0.15, "v": 0.01})
+    units = {**UNITS, "w": "1/s"}
+    three = replace(
+        some,
+        unit_by_channel=units,
+        crude={**some.crude, "w": 1.0},
+        with_effects={**some.with_effects, "w": 0.02},
+    )
+    assert improvement((three,)).startswith("Predictions 1 s ahead miss v by 0.010 m/s")
+    assert holds(improvement((three,), ("x",)), "miss x by", "and v by")
+    poor = replace(three, with_effects={"x": 0.5, "v": 0.01, "w": 0.02})
+    assert " x " not in improvement((poor,), ("x",))
+
+
 def test_what_got_worse_is_said_of_the_channel_that_lost_most():
     short = row({"x": 0.2, "v": 0.5}, {"x": 0.1, "v": 0.6})
     whole = row({"x": 2.12, "v": 0.5}, {"x": 3.79, "v": 0.3}, whole_trial=True, horizon_s=60.0)
@@ -87,6 +103,15 @@ def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt
     said = next_trial(claims, "", (), worse=why)
     assert why in said and not said.endswith("adopt the claimed effects.")
     assert "adopt" not in next_trial(claims, "", (), further=True)
+    look = "Run c0001 twice more, to see whether the gap in v repeats."
+    said = next_trial(claims, look, ())  # the verdict speaks of a gap
+    assert holds(said, "adopt the claimed effects and diagnose again", "run c0001 twice more")
+    pair = ("coulomb_friction:v", "viscous_friction:v")
+    said = next_trial(claims, "", (pair,), same=(pair,))
+    assert said.startswith("None helps") and said.endswith("the claimed one, coulomb_friction:v.")
+    assert why in next_trial(claims, "", (pair,), same=(pair,), worse=why)
+    said = next_trial(claims, "", (pair,), same=(pair,), flip="force")
+    assert holds(said, "flip the sign of force", "diagnose again") and "adopt" not in said
 
 
 def test_whole_trials_that_get_worse_are_contested_whatever_one_state_loses_sooner():
@@ -104,22 +129,22 @@ def _claiming(*effects, **more):
     return _claims(best=SimpleNamespace(hypothesis=hypothesis), names=names, **more)
 
 
-def test_numbers_of_the_model_are_fitted_those_of_adopted_effects_adopted():
+def test_numbers_of_the_model_are_fitted_those_beside_adopted_effects_adopted():
     """`next:` says so, and the sentence above it."""
     names = ("mass", "viscous_friction_v_k")
     data = SimpleNamespace(model=SimpleNamespace(param_names=names))
 
-    def said(*off):
+    def said(*off, adopted=("viscous_friction:v",)):
         blamed = tuple(SimpleNamespace(index=names.index(name)) for name in off)
         claims = _claiming(data=data, blamed=blamed, moved=blamed)
-        return next_trial(claims, "", (), adopted=("viscous_friction:v",))
+        return next_trial(claims, "", (), adopted=adopted)
 
-    assert "fit" in said("mass") and "adopt" not in said("mass")
-    assert said(*names).endswith("adopt the claimed effects.") and said(names[1]).endswith(
-        "adopt the claimed effects."
-    )
+    fit = said("mass", adopted=())
+    assert "fit" in fit and "adopt" not in fit
+    for off in (("mass",), names, names[1:]):
+        assert said(*off).endswith("adopt the claimed effects.")
     one = _claiming(Library().effect("parameter:mass", cart_task().model))
-    assert next_trial(one, "", ()) == said("mass")
+    assert next_trial(one, "", ()) == fit
 
 
 def test_predictions_that_run_away_are_compared_with_nothing():

@@ -135,9 +135,11 @@ def test_flight_enlarges_what_is_too_small_to_see():
 
 def test_the_turn_shows_its_iterations_and_the_circle_its_ends():
     turn, circle, figure8, _ = PICTURES["car"](results()["car"]).panels
-    assert "with scatter" in turn.title and "quiet" in circle.title
+    assert "with scatter" in turn.title and "repeats itself" in circle.title
     roles = [curve.role for curve in turn.curves]
-    assert roles == ["model", "step1", "step2", "step3", "other", "best", "desired"]
+    assert roles == ["model", "step1", "step2", "step3", "step3", "best", "desired"]
+    key = [one.name for one in PICTURES["car"](results()["car"]).key]
+    assert "iteration 3 and later" in key
     assert [curve.role for curve in circle.curves] == ["model", "best", "desired"]
     assert [curve.role for curve in figure8.curves] == ["model", "desired"]  # nothing learned
 

@@ -411,6 +411,11 @@ def test_a_fit_that_predicts_no_better_is_not_recommended():
     better = fitted((0.0111, 0.0382), (0.00694, 0.0281))
     assert better.helps and not better.worse
     assert not found.worse and found.helps  # nothing was held out
+    assert not dataclasses.replace(found, loglik=-np.inf).helps  # nothing was fitted
+    known = found.model.params
+    moved = dataclasses.replace(found.params["d"], value=known["d"].high)
+    stopped = dataclasses.replace(found, params={**found.params, "d": moved})
+    assert found.at_bounds == ("k",) and stopped.at_bounds == ("k", "d")
     assert fitted((0.01, 0.02), (np.nan, 0.02)).worse
 
 

@@ -1,11 +1,15 @@
 """Velocities that the robot's program computes from positions, as an overhead crane's did."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from grounded import Model, Trial
 from grounded.diagnosis.tables import instrument_lines
-from grounded.instruments.finding import a_mean, put_right
+from grounded.effects import Scales, Site, wrap
+from grounded.effects.sensor import sensor_lag
+from grounded.instruments.finding import a_mean, in_degrees, put_right
 from grounded.instruments.preflight import preflight
 
 DT = 0.04
@@ -57,6 +61,18 @@ def test_a_rate_filtered_from_positions_is_not_used_and_no_scale_is_claimed(nois
     assert np.isnan(found.trials[0].states[:, 1]).all()
 
 
+def test_a_rate_filtered_from_positions_is_not_used_once_its_filter_is_adopted():
+    """It follows from the positions as before: diagnoses were of their noise, fits ran away."""
+    site = Site(SWING, ("w",), Scales(dt=DT))
+    behind = wrap(sensor_lag.at(site), {"tau": 0.04}, DT)
+    (trial,) = swung("filtered", keep=0.8)
+    states = np.column_stack([trial.states, trial.states[:, 1]])
+    lifted = replace(trial, states=states, state_names=behind.state_names)
+    found = preflight(behind, [lifted], behind.state_names[2:])
+    assert [f.kind for f in found.findings if f.signal == "w"] == ["smoothed"]
+    assert np.isnan(found.trials[0].states[:, 1]).all()
+
+
 @pytest.mark.parametrize("noise", [2e-4, 2e-3, 1e-2])
 def test_a_late_sensor_of_its_own_is_still_used(noise):
     found = preflight(SWING, swung("late", noise))
@@ -84,3 +100,8 @@ def test_a_signal_that_is_not_used_has_one_line():
     (line,) = instrument_lines([late, a_mean("w", "q", 0.04)])
     assert "0.02 s later" in line and "mean over 0.04 s" in line and "delay_s = 0.02" in line
     assert "corrected here" not in line and "corrected here" in instrument_lines([late])[0]
+
+
+def test_a_rate_is_in_degrees_a_second():
+    assert in_degrees("w", "rad/s").finding == "is in degrees a second, not in rad/s"
+    assert in_degrees("q", "rad").finding == "is in degrees, not in rad"

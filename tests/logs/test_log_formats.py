@@ -200,6 +200,12 @@ def test_units_below_the_names_are_the_columns(tmp_path):
     assert column_units(path) == {"/csv.Winkel": "Grad", "/csv.u": "V"} | {"/csv.t": "s"}
 
 
+def test_empty_cells_at_the_end_of_rows_are_passed_over(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,x\n0,1.5,\n0.1,2.5,\n")
+    assert read_signals(path, {"x": SignalSpec("/csv.x")})["x"].values.tolist() == [1.5, 2.5]
+
+
 def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path):
     """A logger that was stopped; `Time [ms]` was read as seconds."""
     path = tmp_path / "log.csv"
@@ -244,6 +250,8 @@ def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path
         ("run_time,b\n0,4\n1,4\n2,4\n", ("'run_time' increases", "'t'", "_ms")),
         ("time,b\nyesterday,4\n", ("line 2", "'time'", "'yesterday'", "2026-11-21 10:05:00")),
         ("time,b\n0,4\n,4\n", ("'time'", "1 of 2")),
+        ("t,b\n0,0,5\n1,0,75\n", ("line 2", "3 cells", "names 2", "decimal sign", "semicolons")),
+        ("t,b\n0,0.5\n1,0.75,9\n", ("line 3", "3 cells", "names 2")),  # was stored without the 9
         ("", ("log.csv",)),
     ],
 )
@@ -324,3 +332,17 @@ def test_constants_of_an_array_are_one_line(tmp_path):
     ]
     found = grounded("inspect", log, "--json").json["topics"]
     assert sum("covariance" in f["path"] for t in found for f in t["fields"]) == 27
+
+
+def test_a_missing_column_is_not_said_to_be_one_that_another_signal_is(tmp_path):
+    """`has no field 'Gierrate_dps': did you mean 'Nickrate_dps'?`, which was the pitch rate."""
+    path = tmp_path / "log.csv"
+    path.write_text("t,Nickrate_dps,U_Nick\n0,1,2\n0.1,1,2\n")
+    specs = {"q": SignalSpec("/csv.Nickrate_dps"), "r": SignalSpec("/csv.Gierrate_dps")}
+    with pytest.raises(GroundedError) as error:
+        read_signals(path, specs)
+    assert holds(str(error.value), "'r'", "Gierrate_dps") and "'Nickrate_dps'" not in str(
+        error.value
+    )
+    with pytest.raises(GroundedError, match=r"did you mean 'Nickrate_dps'"):
+        read_signals(path, {"r": specs["r"]})

@@ -14,6 +14,7 @@ from grounded_trials.logs.stated_units import (
     unit_in_name,
     without_unit,
 )
+from grounded_trials.logs.words_abroad import in_english
 
 MODEL = """from grounded import Model, Param
 model = Model(states={"x": "m", "v": "m/s", "theta": "rad"}, inputs={"volt": "V"},
@@ -231,3 +232,82 @@ def test_ingest_warns_of_a_name_whose_unit_no_scale_makes_up_for(tmp_path):
     file.write_text(file.read_text().replace("scale = 0.001\n", ""))
     done = grounded("-C", tmp_path / "w", "ingest", "--data", tmp_path / "log.csv", "--json")
     assert holds(done.json["trials"][0]["warnings"][0], "r", "mm", "scale = 0.001")
+
+
+ROLLING = """from grounded import Model, Param
+model = Model(
+    states={"pitch": "rad", "yaw": "rad", "pitch_rate": "rad/s", "yaw_rate": "rad/s"},
+    inputs={"u_pitch": "V", "u_yaw": "V"}, params={},
+    derivative=lambda s, a, p: {"pitch": s.pitch_rate, "yaw": s.yaw_rate,
+        "pitch_rate": 2 * a.u_pitch - s.pitch, "yaw_rate": 3 * a.u_yaw - s.yaw_rate})
+"""
+
+
+def helicopter(folder, names):
+    """A workspace for a log in degrees with these names, and its [log] table."""
+    t = np.arange(0, 12, 0.05)
+    pitch, yaw = 20 * np.sin(0.9 * t), 30 * np.sin(0.5 * t + 1)
+    rates = [np.gradient(angle, t) for angle in (pitch, yaw)]
+    rows = np.column_stack([t, pitch, yaw, *rates, np.cos(0.9 * t), np.cos(0.5 * t)])
+    np.savetxt(folder / "a.csv", rows, "%.5f", ";", header=";".join(["t", *names]), comments="")
+    (folder / "m.py").write_text(ROLLING)
+    files = ("--from", folder / "a.csv", "--model", folder / "m.py")
+    made = grounded("init", folder / "w", *files)
+    assert made.code == 0, made.err
+    return made.out, (folder / "w" / "grounded.toml").read_text()
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        "Nickwinkel_deg Gierwinkel_deg Nickrate_dps Gierwinkelgeschwindigkeit_dps U_Nick U_Gier",
+        "tangage_deg lacet_deg vitesse_tangage_dps lacet_rate_dps u_tangage u_lacet",
+    ],
+)
+def test_names_in_other_languages_are_found_with_their_units(tmp_path, names):
+    """All six were UNSURE, though `Zeit` is read as the time."""
+    names = names.split()
+    out, text = helicopter(tmp_path, names)
+    assert "UNSURE" not in out
+    log = tomllib.loads(text)["log"]
+    signals = {**log["state"], **log["input"]}
+    assert [one["path"] for one in signals.values()] == [f"/csv.{name}" for name in names]
+    assert [one["scale"] for one in log["state"].values()] == [pytest.approx(np.pi / 180)] * 4
+
+
+def test_a_path_that_is_only_offered_has_its_scale_beside_it(tmp_path):
+    """With the # removed as it said, degrees were stored as radians."""
+    out, text = helicopter(tmp_path, ["a_deg", "b_deg", "c_dps", "d_dps", "e", "f"])
+    assert "UNSURE" in out
+    table = text[text.index("[log]") :]
+    assert "remove all 3 #" in table and "remove both #" in table  # u_pitch has no unit
+    log = tomllib.loads(
+        table.replace("# [", "[").replace("# path", "path").replace("# scale", "scale")
+    )
+    for one in log["log"]["state"].values():
+        assert one["scale"] == pytest.approx(np.pi / 180)
+
+
+def test_words_are_translated_only_if_all_parts_are_known():
+    assert in_english("Gierwinkelgeschwindigkeit") == "yaw_rate"
+    assert in_english("U_Nick") == "u_pitch" and in_english("Lenkwinkel") == "steering_angle"
+    for name in ("nickname", "village", "Kraftwerk", "pitch_motor", "strombus", "x_soll_x1"):
+        assert in_english(name) == name.replace("soll", "target").lower()
+
+
+def test_the_last_column_with_the_unit_of_the_last_state_is_it(tmp_path):
+    t = np.arange(0, 400, 2.0)
+    heat = 50.0 * (t > 20)
+    warm = 23 + 20 * (1 - np.exp(-np.maximum(t - 20, 0) / 90))
+    rows = np.column_stack([1000 * t, warm, heat])
+    head = "millis,temp_C,heater_pct"
+    np.savetxt(tmp_path / "a.csv", rows, "%.4f", ",", header=head, comments="")
+    (tmp_path / "m.py").write_text(
+        'from grounded import Model\nmodel = Model(states={"T": "degC"}, inputs={"heater": "%"}, '
+        'params={}, derivative=lambda s, a, p: {"T": 0.01 * a.heater - 0.01 * (s.T - 20)})\n'
+    )
+    files = ("--from", tmp_path / "a.csv", "--model", tmp_path / "m.py")
+    made = grounded("init", tmp_path / "w", *files)
+    assert "UNSURE" not in made.out
+    log = tomllib.loads((tmp_path / "w" / "grounded.toml").read_text())["log"]
+    assert log["state"]["T"] == {"path": "/csv.temp_C"}

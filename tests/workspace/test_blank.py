@@ -228,6 +228,34 @@ def test_a_start_that_another_state_would_hold_is_told_with_it(tmp_path):
     assert "fan = 2970, pwm = 53.04" in note
 
 
+TILT = """
+from grounded import Model, Param
+
+def rate(s, a, p):
+    return {"q": s.w, "w": 2 * a.u - p.g, "y": s.r, "r": 3 * a.v - 4 * s.r - 0.01 * a.u}
+
+model = Model(states={"q": "rad", "w": "rad/s", "y": "rad", "r": "rad/s"},
+              inputs={"u": "V", "v": "V"}, params={"g": Param(GRAVITY, "rad/s^2")}, derivative=rate)
+"""
+
+
+@pytest.mark.parametrize(("gravity", "told"), [(0.002, False), (2.0, True)])
+def test_an_input_that_hardly_moves_the_start_is_not_asked_for(tmp_path, gravity, told):
+    """`next: propose` after `propose`, for 0.001 rad/s^2 and the edge of a dead zone."""
+    (tmp_path / "tilt.py").write_text(TILT.replace("GRAVITY", str(gravity)))
+    w = Workspace.create(tmp_path / "w", model=tmp_path / "tilt.py")
+    way = 0.3 * np.linspace(0, 1, 51)
+    w.target({"q": way, "y": way})
+    file = w.folder / "grounded.toml"
+    adopted = 'effects = [{name = "dead_zone:v", c = 1.5}]\n[task]'
+    text = file.read_text().replace("[limits]", "[limits]\nu = [-24, 24]\nv = [-24, 24]")
+    text = re.sub(r"(?m)^start = .*$", "start = { }", text)
+    file.write_text(text.replace("[task]", adopted, 1))
+    proposed = Workspace(w.folder).propose()
+    notes = [n for n in proposed.proposal.notes if "the plan assumes" in n]
+    assert bool(notes) == told and all("u = 1, v = 0" in n for n in notes)
+
+
 def test_a_friction_too_steep_for_a_step_is_followed_by_a_plan(blank):
     """A width of 0.06 % of the fastest speed: a ball was planned to 4 m instead of 0.6, or not."""
     file, way = blank.folder / "grounded.toml", np.linspace(0, 1, 41)

@@ -98,6 +98,27 @@ def test_what_the_sensors_filter_is_corrected_before_parameters_are_fitted(tmp_p
     assert w.base_model.params["mass"].value == pytest.approx(1.4, rel=0.02)
 
 
+def test_parameters_are_fitted_without_a_speed_that_follows_from_positions(tmp_path):
+    """Nothing was fitted: "the filter diverged at step 1", and `next: fit --apply`."""
+    w, rng = Workspace(make(tmp_path / "w").folder), np.random.default_rng(0)
+    robot = w.task.with_model(w.base_model.with_values({"mass": 1.4}))
+    names = (w.base_model.state_names, w.base_model.input_names)
+    for k in range(24):
+        force = np.repeat(rng.uniform(-4, 4, (10, 1)), 4, axis=0)
+        run = simulate(robot.problem(exact=True), robot.policy(force, None, None))
+        seen = run.states.copy()
+        seen[:, 0] += rng.normal(0, 0.002, len(seen))
+        speed = 0.0
+        for t in range(1, len(seen)):
+            speed = 0.5 * speed + 0.5 * (seen[t, 0] - seen[t - 1, 0]) / 0.05
+            seen[t, 1] = speed
+        write_trial(tmp_path / f"{k}.mcap", Trial(seen, force, 0.05, *names), {"kind": "data"})
+        w.ingest(tmp_path / f"{k}.mcap", data=True)
+    found = w.fit()
+    assert "smoothed" in {one.kind for one in found.preflight}
+    assert found.fit.helps and found.fit.params["mass"].value == pytest.approx(1.4, rel=0.05)
+
+
 def test_values_that_predict_worse_are_never_written(misled):
     before = misled.config.file.read_text()
     found = misled.fit()

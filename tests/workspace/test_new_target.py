@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
-from facts import holding
+from cli import grounded
+from facts import holding, holds
 from grounded.errors import GroundedError
+from grounded.trial import Trial
 from grounded_trials import Workspace
+from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace import new_target
 
 LINE = np.linspace(0, 1, 21)
@@ -77,3 +80,64 @@ def test_weights_of_large_ranges_are_not_taken_for_chosen_ones(tmp_path, size):
         w.target({"x": far * LINE})
         w.forget()
         assert w.task.reward.state[0] == pytest.approx(far**-2, rel=1e-4)
+
+
+PLATE = """from grounded import Model
+model = Model(states={"T": "degC", "x": "m"}, inputs={"heater": "%"}, params={},
+    derivative=lambda s, a, p: {"T": 0.01 * a.heater - 0.01 * (s.T - 20), "x": 0.01 * a.heater})
+"""
+
+
+def plate(folder, first=23.0, x=3.0):
+    """A workspace without a start, and a trial in which a plate is heated after a while."""
+    home = folder / "w"
+    home.mkdir(parents=True)
+    (home / "model.py").write_text(PLATE)
+    text = (
+        '[model]\nfile = "model.py"\n[task]\ndt = 2.0\nhorizon = 20\ntarget = "target.csv"\n'
+        "start = {}\n[reward]\nstate = { T = 1.0 }\n[limits]\nheater = [0, 100]\n"
+    )
+    (home / "grounded.toml").write_text(text)
+    rows = "\n".join(f"{2 * k},0.0" for k in range(21))
+    (home / "target.csv").write_text(f"t,T\n{rows}\n")
+    warm = np.concatenate([np.full(9, first), first + np.linspace(0, 20, 32)])
+    states = np.column_stack([warm, np.full(41, x)])
+    heat = np.where(np.arange(40) < 8, 0.0, 60.0)[:, None]
+    trial = Trial(states, heat, 2.0, ("T", "x"), ("heater",))
+    write_trial(folder / "a.mcap", trial, {"kind": "data"})
+    Workspace(home).ingest(folder / "a.mcap", data=True)
+    return Workspace(home)
+
+
+def test_a_step_begins_where_the_trials_rest_if_nobody_said_where(tmp_path):
+    """It was drawn from 0 degC in a room of 23 degC."""
+    w = plate(tmp_path)
+    done = grounded("-C", w.folder, "target", "step", "--to", "T=45", "--seconds", "60")
+    assert holds(" ".join(done.out.split()), "23.00 to 45.00 degC", "t0001 rests: T = 23.00")
+    w = Workspace(w.folder)
+    assert w.config.task.start == {"T": 23.0}  # x may be anywhere
+    assert w.task.start[0] == 23.0
+    assert "velocities" not in done.out  # there are none
+    again = grounded("-C", w.folder, "target", "step", "--to", "T=50", "--seconds", "60")
+    assert "rests" not in again.out and "23.00 to 50.00" in again.out
+
+
+def test_a_start_that_was_chosen_stays_as_it_is(tmp_path):
+    w = plate(tmp_path)
+    file = w.folder / "grounded.toml"
+    file.write_text(file.read_text().replace("start = {}", "start = { T = 30.0 }"))
+    done = grounded("-C", w.folder, "target", "step", "--to", "T=45", "--seconds", "60")
+    assert "30.00 to 45.00 degC" in done.out and "rests" not in done.out
+    moving = plate(tmp_path / "moving", first=0.0)
+    done = grounded("-C", moving.folder, "target", "step", "--to", "T=45", "--seconds", "60")
+    assert "0 to 45.00" in done.out and not Workspace(moving.folder).config.task.start
+
+
+def test_what_a_target_replaced_in_a_search_is_said_and_kept(w):
+    old = files(w)
+    w.propose()
+    done = grounded("-C", w.folder, "target", "step", "--to", "theta=1", "--seconds", "2")
+    told = " ".join(done.out.split())
+    assert holds(told, "before: horizon = ", "the target in target.csv.bak", "grounded.toml.bak")
+    assert files(w)["grounded.toml.bak"] == old["grounded.toml"]
+    assert files(w)["target.csv.bak"] == old["target.csv"]

@@ -10,6 +10,8 @@ ENDINGS = {  # unit by the ending of a name
     **dict.fromkeys(("m_s", "mps", "m_per_s"), "m/s"),
     **dict.fromkeys(("km_h", "kmh", "kph"), "km/h"),
     **{"mm_s": "mm/s", "cm_s": "cm/s", "m_s2": "m/s^2", "deg_s2": "deg/s^2", "RPM": "rpm"},
+    **{"Grad": "deg", "Grad_s": "deg/s", "U_min": "rpm", "Upm": "rpm"},
+    **dict.fromkeys(("C", "degC", "celsius", "Celsius"), "degC"),
     **dict.fromkeys(("pct", "percent", "perc"), "%"),
     **dict.fromkeys(("degree", "degrees"), "deg"),
     **dict.fromkeys(("radian", "radians"), "rad"),

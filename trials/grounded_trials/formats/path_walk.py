@@ -7,7 +7,7 @@ nodes of many messages by array operations. `number_paths` lists the paths of an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
@@ -115,10 +115,29 @@ def _field(type: Type, name: str) -> Type:
     if not isinstance(type, Struct):
         raise BadPath(f"'{name}' follows a {type}, which has no fields")
     if name not in type.by_name:
-        alike = in_another_unit(name, type.by_name)
-        hint = f"did you mean '{alike[0]}'?" if alike else nearest(name, type.by_name)
-        raise BadPath(f"{type} has no field '{name}': {hint}")
+        raise NoField(type, name)
     return type.by_name[name].type
+
+
+class NoField(BadPath):
+    """A path names a field that its type does not have."""
+
+    def __init__(self, type: Struct, name: str) -> None:
+        super().__init__(_without(type, name, ()))
+        self.type, self.name = type, name
+
+    def beside(self, taken: Collection[str]) -> str:
+        """Return the message without a suggestion of fields that other signals are read from."""
+        return _without(self.type, self.name, taken)
+
+
+def _without(type: Struct, name: str, taken: Collection[str]) -> str:
+    left = [one for one in type.by_name if one not in taken]
+    alike = in_another_unit(name, left)
+    hint = f"did you mean '{alike[0]}'?" if alike else nearest(name, left)
+    if taken and {*left} <= {"header"}:
+        hint = "other signals are read from its other fields"
+    return f"{type} has no field '{name}': {hint}"
 
 
 def _check_end(type: Type, path: MessagePath) -> None:

@@ -57,6 +57,7 @@ def csv_records(path: Path) -> Iterator[Record]:
         first = [stream.readline(LOOK) for _ in range(PREAMBLE + 2)]
         head = _head(first, path)
         width, times = len(head.names), _times_among(head, first, path)
+        _check_widths(stream, head, path)
         cut = _cut_in(stream, head)
         try:
             with warnings.catch_warnings():  # a table without rows is reported below
@@ -120,6 +121,34 @@ def cut_off(path: Path) -> str:
         f"its last row, line {cut.line} ({cut.text[:80]!r}), is incomplete and is left out: "
         "everything after that is lost"
     )
+
+
+def _check_widths(stream: TextIO, head: _Head, path: Path) -> None:
+    """Check that no row has more cells than there are names; empty ones at its end don't count.
+
+    Raises:
+        GroundedError: if one has, so that it is unclear which cell belongs to which name.
+    """
+    _pass_over(stream, head)
+    for number, line in enumerate(stream, start=head.rows + 1):
+        if line.count(head.mark) >= len(head.names):
+            cells = _cells(line, head.mark)
+            if any(cells[len(head.names) :]):
+                raise _misfit(path, number, cells, head)
+
+
+def _misfit(path: Path, line: int, cells: Sequence[str], head: _Head) -> GroundedError:
+    """Return the error for a row with a wrong number of cells, saying what may be its cause."""
+    names, has = len(head.names), len(cells)
+    text = f"{path}, line {line} has {has} cells, but line {head.line} names {names}"
+    whole = all("." not in cell and _share([cell]) == 1 for cell in cells)
+    if head.mark == "," and names < has <= 2 * names and whole:
+        return GroundedError(
+            f"{text} columns: the decimal sign seems to be a comma, as the separator is, so a row "
+            "can be read in several ways. Export the table again with a point as decimal sign, or "
+            "with semicolons or tabs between the columns"
+        )
+    return GroundedError(text)
 
 
 @dataclass(frozen=True)
@@ -262,9 +291,7 @@ def _with_texts(lines: Iterable[str], head: _Head, times: str, path: Path) -> tu
         if not any(cell.strip() for cell in row):
             continue
         if len(row) != width:
-            raise GroundedError(
-                f"{path}, line {number} has {len(row)} cells, but line {head.line} names {width}"
-            )
+            raise _misfit(path, number, row, head)
         texts.append((number, row[at], "" if date is None else row[date]))
         if head.mark != ",":  # decimal comma
             row = [cell.replace(",", ".", 1) if "." not in cell else cell for cell in row]

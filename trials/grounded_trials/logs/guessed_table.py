@@ -32,21 +32,31 @@ def _table(kind: str, guess: Guess, clock: str) -> list[str]:
         return [f"# {head}  # nothing in the log fits"]
     if not guess.path:
         rest = f"  # or {', '.join(guess.others[1:FEW])}" * (len(guess.others) > 1)
-        what = "no name in the log fits; to use one of these, remove both #"
-        return [f"# {head}  # {what}", f"# path = {_quote(guess.others[0])}{rest}"]
+        more = [f"# {line}" for line in (_scale(guess), _unwrap(guess.others[0])) if line]
+        what = f"no name in the log fits; to use one of these, remove all {len(more) + 2} #"
+        what = what if more else what.replace("all 2", "both")
+        return [f"# {head}  # {what}", f"# path = {_quote(guess.others[0])}{rest}", *more]
     lines = [head if guess.sure else f"{head}  # unsure{others}"]
     lines.append(f"path = {_quote(guess.path)}")
     if guess.field is not None and guess.field.low is not None:
         lines[-1] += f"  # {guess.field.low:.4g} to {guess.field.high:.4g} in this log"
     if guess.reasons:
         lines.insert(1, f"# {'; '.join(guess.reasons)}")
-    if guess.scale != 1.0:
-        lines.append(f"scale = {guess.scale:.10g}")
+    if scale := _scale(guess):
+        lines.append(scale)
     if guess.clock != clock:
         lines.append(f'clock = "{guess.clock}"')
-    if guess.is_angle and guess.path.endswith("yaw"):
-        lines.append("unwrap = true")
+    if unwrap := _unwrap(guess.path):
+        lines.append(unwrap)
     return lines
+
+
+def _scale(guess: Guess) -> str:
+    return f"scale = {guess.scale:.10g}" * (guess.scale != 1.0)
+
+
+def _unwrap(path: str) -> str:
+    return "unwrap = true" * path.endswith("@rpy.yaw")
 
 
 def _estimate(states: Sequence[Guess]) -> list[str]:

@@ -26,6 +26,7 @@ from grounded_trials.logs.stated_units import (
     without_role,
     without_unit,
 )
+from grounded_trials.logs.words_abroad import in_english
 
 FEW = 8  # alternatives listed in [log]
 SURE = 1.5  # lead in score over the next candidate, to be sure
@@ -255,13 +256,14 @@ def _score(
     inside = field.path[len(topic.topic) :].lower().strip('".')
     plain = bare_command if is_input else without_unit
     bare = plain(field.path)[len(topic.topic) :].lower().strip('".')
-    best = max(_fit(called, one, topic.topic.lower()) for one in {inside, bare})
+    ways = {inside, bare, in_english(inside), in_english(bare)}
+    best = max(_fit(called, one, topic.topic.lower()) for one in ways)
     folders = topic.topic.lower().split("/")[:-1]  # /thrusters/left/command is the input `left`
     if is_input and inside in ("data", "value") and set(called) & set(folders):
         best = max(best, 3.0)
     if best <= 0 or (is_input and topic.type.endswith(MEASURED)):
         return 0.0
-    words = set(_WORD.findall(path))
+    words = {*_WORD.findall(path), *_WORD.findall(in_english(inside))}
     commanded = any(word in words for word in _COMMANDED)
     best += (0.5 if is_input else -2.0) * commanded
     best -= 3.0 if field.low is None else 0.0

@@ -7,6 +7,7 @@ times: when it was logged, when it was published, and its header's stamp.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,7 +33,7 @@ from grounded_trials.formats.messages import (
     Type,
     json_messages,
 )
-from grounded_trials.formats.path_walk import Bound, Values, bind, evaluate
+from grounded_trials.formats.path_walk import Bound, NoField, Values, bind, evaluate
 from grounded_trials.formats.protobuf import protobuf_messages
 from grounded_trials.formats.schemas import struct_of
 from grounded_trials.logs.log_files import log_records, reading
@@ -187,6 +188,10 @@ class _Log:
 
     def _misfit(self, channel: Channel, collector: _Collector, error: Exception) -> GroundedError:
         name, said = self.topics[channel.topic], str(error)
+        if isinstance(error, NoField):
+            mapped = (c.path for c in self.collectors if c is not collector)
+            same = [path for path in mapped if path.topic == channel.topic]
+            said = error.beside({re.split(r"[./]", path.text)[-1].strip('"') for path in same})
         what = said.removeprefix(f"{name} has ")
         kind = f" ({name})" * (name != channel.topic)
         said = (

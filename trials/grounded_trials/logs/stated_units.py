@@ -47,12 +47,13 @@ _OF = {  # units as multiples of another unit, which may be a product
     "g": ("kg", 1e-3),
     "Nm": ("N m", 1.0),
     "%": ("1", 0.01),
+    "°C": ("degC", 1.0),
 }
 
 _ROLES = re.compile(  # suffixes that mark a command; its unit may come before or after them
     r"_(?:cmd|command|commanded|ref|reference|target|setpoint|sp|desired|des|goal|request|req)$"
 )
-_SHORT = ("s", "V", "A", "N")  # may be part of a name as well: `vel_N`
+_SHORT = ("s", "V", "A", "N", "C")  # may be part of a name as well: `vel_N`
 _NUMBER = re.compile(r"(?:\.(?:data|value))?(?:\[-?\d+\])*\"?$")  # what may follow a name
 TURNING = {"position": "rad", "velocity": "rad/s", "effort": "N m"}  # of a joint
 SLIDING = {"position": "m", "velocity": "m/s", "effort": "N"}

@@ -1,7 +1,8 @@
 """Candidates for states and inputs without a matching name: by unit, or all that are left.
 
 A unit in a table's header, such as `boom_angle [deg]`, fits a state in rad, but not an input in
-N m. If exactly one number fits the unit of exactly one state or input, it is proposed, but unsure.
+N m. If exactly one number fits the unit of exactly one state or input, it is proposed; unsure,
+unless nothing else is left of either.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ def from_the_rest(
     for guess in guesses:
         name = guess.name
         if name in alone:
-            one = _by_unit(guess, alone[name], log)
+            one = replace(_by_unit(guess, alone[name], log), sure=len(lost) == len(left) == 1)
             found.append(as_stated(stated, units[name], one))
         elif name in fits:
 
@@ -60,7 +61,14 @@ def from_the_rest(
             found.append(replace(guess, others=rest[:MOST]))
         else:
             found.append(guess)
-    return tuple(found)
+    return tuple(_scaled(guess, units[guess.name], stated) for guess in found)
+
+
+def _scaled(guess: Guess, wanted: str, stated: Stated) -> Guess:
+    """Give a guess without a path the factor of the first number that is offered for it."""
+    if guess.path or not guess.others:
+        return guess
+    return replace(guess, scale=stated.factor(guess.others[0], wanted))
 
 
 def _by_unit(guess: Guess, path: str, log: LogReport) -> Guess:

@@ -68,9 +68,14 @@ def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> 
 
 
 def measured_now(workspace: Folder) -> str:
-    """Return the current planning model's prediction error by the last diagnosis, or ""."""
+    """Return the current planning model's prediction error by the last diagnosis, or "".
+
+    If what that claims was adopted since, it is compared with the error just before.
+    """
     found, since = _last(workspace)
     settled = settled_in(workspace, found, since)
+    if found is not None and settled is not None and settled.closed:
+        return gained(found, workspace.origin, before="crude", who=NOW)
     if settled is not None or found is None or since.changed:
         return settled.gained if settled is not None else ""
     return gained(found, workspace.origin, now="crude", before="crude", who=NOW)

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 
 from grounded.diagnosis.cause_words import is_late
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.ruler_words import in_doubt, open_noise, rest, telling, worsened
+from grounded.diagnosis.ruler_words import COMPARABLE, in_doubt, open_noise, rest, telling, worsened
 from grounded.diagnosis.verdict import told_apart
 from grounded.result import listed, measured_alike
 from grounded.task import Task
 from grounded_trials.wording import count, shown
-from grounded_trials.workspace.off_target import weighed_groups
+from grounded_trials.workspace.off_target import rates_among, weighed_groups
 
 CAUSES = 2  # that the first line names
 SMALL = 0.05  # of the improvement: a cause below it is only counted
@@ -102,7 +102,14 @@ def _improved(
 ) -> list[tuple[list[str], str]]:
     groups = [g for g in weighed_groups(task) if all(before.get(n, 0.0) > 0 for n in g[0])]
     ratio = {what: _together(now, names) / _together(before, names) for names, what in groups}
-    return sorted(groups, key=lambda g: (len(g[0]) < 2, ratio[g[1]]))[:FEW]
+    best = min(ratio.values(), default=0.0)
+    rates = {g[1] for g, rate in zip(groups, rates_among(task, groups), strict=True) if rate}
+
+    def order(group: tuple[list[str], str]) -> tuple[bool, bool, bool, float]:
+        names, what = group
+        return len(names) < 2, ratio[what] > best + COMPARABLE, what in rates, ratio[what]
+
+    return sorted(groups, key=order)[:FEW]
 
 
 def _together(errors: Mapping[str, float], names: list[str]) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,8 @@ UNGIVEN = 3  # largest number of states without a start value that are solved fo
 STILL = 1e-3  # the robot is at rest if it moves less than this share of the motion as configured
 NOTHING = 1e-6  # fraction of an input's range (of 1 unit without limits) treated as zero
 MOVED = 0.01  # fraction of the same by which a given input must differ to be reported
+SETTLED = 10  # least steps over which a rest is tried
+SLOW = 0.05  # fraction of its range in the target that a state may move in that time
 BEGUN = (0.0, 1.0, -1.0)  # offsets tried: a thrust that is squared has zero slope at 0
 
 
@@ -59,11 +62,12 @@ def held_before(workspace: Folder, again: bool = False) -> list[str]:
         return []
     units = {**base.model.states, **task.model.inputs}
     given = np.concatenate([task.start[:n], task.past])
+    stands = _as_given(task, stands, base.target)
     stands = np.concatenate([stands[:n], stands[len(states) :]])
     span = np.append(np.ones(n), task.high - task.low)
     span = np.where(np.isfinite(span), span, np.maximum(1.0, np.abs(given)))
     stands[np.abs(stands) < NOTHING * span] = 0.0
-    if chosen and not (np.abs(stands - given) > MOVED * span).any():
+    if not (np.abs(stands - given) > (MOVED if chosen else NOTHING) * span).any():
         return []
     rate = moved_at_start(task, task.past) / task.dt
     k = int(np.argmax(np.abs(rate[:n])))
@@ -83,6 +87,41 @@ def held_before(workspace: Folder, again: bool = False) -> list[str]:
         "holds that input again. If the robot is at rest before the run, put what holds it into "
         f"[task] of {FILE} and propose again (if not, just propose again): start = {{ {told} }}"
     ]
+
+
+def _as_given(task: Task, stands: Array, target: Array) -> Array:
+    """Return states and inputs at rest with each input as given if the robot rests under that too.
+
+    In SETTLED steps, or a second, no state but the rates may then move, except for SLOW of its
+    range in the target. Within a dead zone, for example, it rests anywhere, not only at the edge.
+
+    Args:
+        task: the task.
+        stands: states and inputs at rest (n + m,).
+        target: of the states that are not the memory of effects, which may settle.
+    """
+    n, stands, own = task.model.n, stands.copy(), target.shape[1]
+    ranges = np.nan_to_num(np.ptp(target, axis=0))
+    units = [*task.model.states.values()][:own]
+    rates = np.array([unit.endswith("/s") for unit in units])
+    by = np.where(ranges > 0, SLOW * ranges, np.where(rates & ranges.any(), np.inf, NOTHING))
+    most = _drift(task, stands, own) + by
+    for j, given in enumerate(task.past):
+        other = stands.copy()
+        other[n + j] = given
+        if (_drift(task, other, own) <= most).all():
+            stands = other
+    return stands
+
+
+def _drift(task: Task, stands: Array, own: int) -> Array:
+    """Return how far each of the first `own` states goes from a rest while its inputs are held."""
+    problem, n = task.problem(exact=True), task.model.n
+    x, u = stands[None, :n], stands[None, n:]
+    with np.errstate(all="ignore"):
+        for _ in range(max(SETTLED, math.ceil(1 / task.dt))):
+            x = problem.system.step(x, u, problem.p, problem.dt)
+    return np.abs(np.asarray(task.model.difference(x[0], stands[:n])))[:own]
 
 
 def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> Array | None:

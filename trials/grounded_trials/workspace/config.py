@@ -232,6 +232,11 @@ def set_latency(file: Path, latency: Mapping[str, float]) -> None:
     _change(file, "task", {"latency": _inline(latency)})
 
 
+def set_start(file: Path, start: Mapping[str, float]) -> None:
+    """Replace [task] start."""
+    _change(file, "task", {"start": _inline(start)})
+
+
 def set_target(
     file: Path,
     name: str,

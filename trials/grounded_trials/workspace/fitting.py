@@ -89,6 +89,8 @@ def fit_in(
     asked += ("--trials", ",".join(trials)) if trials else ()
     asked += ("--latency",) * latency
     fitted = partial(Fitted, found, preflight=seen, not_fitted=kept, trials=_ids(used))
+    if apply and not np.isfinite(found.loglik):
+        raise GroundedError(f"nothing was written: {found.sentence}", then=after_fit(workspace))
     if apply and found.worse:
         why = f"nothing was written: {_worse(found)}"
         raise GroundedError(why, then=after_fit(workspace))
@@ -192,19 +194,17 @@ def fit_trials(
     model, n = planner.plan.model, planner.task.model.n
     shown = [i for i, name in enumerate(model.state_names[:n]) if name not in guessed]
     hidden = [name for i, name in enumerate(model.state_names) if i not in shown]
-    looked = sound_trials(planner.plan, [planner.lift(trial) for trial in used], hidden)
+    lifted = [planner.lift(trial) for trial in used]
+    looked = sound_trials(planner.plan, lifted, hidden)
     records = []
-    for trial in looked.trials:
-        width = np.ptp(trial.states, axis=0)
+    for trial, logged in zip(looked.trials, lifted, strict=True):
+        # a sensor that was left out still says where the filter may begin
+        states = np.where(np.isfinite(trial.states), trial.states, logged.states[: trial.steps + 1])
+        width = np.ptp(states, axis=0)
         known = np.where(np.arange(model.n) < n, np.maximum(width, 1.0), 0.1 * width + 1e-6)
         record = record_of(model, trial)
         records.append(
-            replace(
-                record,
-                measured=record.measured[:, shown],
-                start=trial.states,
-                start_std=known,
-            )
+            replace(record, measured=record.measured[:, shown], start=states, start_std=known)
         )
     found = fit(
         planner.plan,

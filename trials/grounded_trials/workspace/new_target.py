@@ -25,6 +25,8 @@ from grounded_trials.workspace.task_file import (
 def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -> Path:
     """Write target.csv, and its length and weights to grounded.toml, see `Workspace.target`.
 
+    Both files are kept as they were, with `.bak` behind their names.
+
     Raises:
         GroundedError: if the columns are no target of the model, see `checked`; or a file can't be
             written. The files are then as before.
@@ -49,6 +51,7 @@ def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -
             given = dict(zip(names[1:], values.T[1:], strict=True))
             before = usual_weights(model, given)
         write_atomically(path.with_name(path.name + ".bak"), old)
+        write_atomically(config.file.with_name(config.file.name + ".bak"), config.file.read_bytes())
     write_target(path, config.task.dt, columns)
     try:
         set_target(config.file, name, rows - 1, weights, before, limited_changes(config, model))

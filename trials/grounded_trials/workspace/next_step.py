@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.diagnosis.cause_words import acts_reversed
+from grounded.diagnosis.cause_words import sign_only
 from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import GroundedError, NextCommand
@@ -223,13 +223,14 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     known = {n: e.value for n, e in diagnosis.parameters.items() if n in params}
     if all_at_bounds(params, {n: known[n] for n in diagnosis.verdict.parameters if n in known}):
         return DIAGNOSE  # after widening their bounds, as the diagnosis says
-    if any(row.effect in new and acts_reversed(row.params) for row in diagnosis.ranking):
+    if any(row.effect in new and sign_only(row.effect, row.params) for row in diagnosis.ranking):
         return DIAGNOSE  # after flipping the sign, as the diagnosis says
     own = {f"parameter:{name}" for name in params}
     if own.issuperset(new):
         made = diagnosis.made or Made()
         some = (*made.named, *made.compared)
-        if not fitted_in_vain(workspace, some):  # only parameters are off: fit all together
+        alone = not workspace.config.model.effects  # else found beside effects, to be adopted so
+        if alone and not fitted_in_vain(workspace, some):  # only parameters: fit all together
             return NextCommand("fit", ("--trials", ",".join(some)) if some else ())
         if gain(diagnosis.prediction_error, "crude", "with_effects") <= 0:
             return NextCommand("adopt", late) if late else None

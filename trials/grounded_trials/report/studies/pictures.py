@@ -109,8 +109,12 @@ def car_figure(result: CarResult) -> Figure:
     shown = [(result.of(name, True) or result.of(name, False))[0] for name in names]
     panels = [_manoeuvre(run, stages=run.manoeuvre == "turn") for run in shown]
     key = [Key("desired", DESIRED), Key("model", FIRST)]
-    if "turn" in names:
-        key += [Key(role, f"iteration {i + 1}") for i, role in enumerate(STEPS)]
+    for run in (run for run in shown if run.manoeuvre == "turn"):
+        between = len(run.paths) - 3  # without the target, the first and the last
+        told = [f"iteration {i + 1}" for i in range(min(between, len(STEPS)))]
+        if between > len(STEPS):
+            told[-1] += " and later"
+        key += [Key(role, name) for role, name in zip(STEPS, told, strict=False)]
     key.append(Key("best", LAST))
     return Figure("car", "The RC car", "", (*panels, _improvements(result, names)), tuple(key))
 
@@ -118,7 +122,7 @@ def car_figure(result: CarResult) -> Figure:
 def _manoeuvre(run: CarRun, stages: bool) -> Panel:
     """Draw the paths of the first and last iteration, and with `stages` those between."""
     every = [p for name, p in run.paths.items() if name != "target"]
-    roles = ["model", *STEPS, *["other"] * len(every)][: len(every)]
+    roles = ["model", *STEPS, *[STEPS[-1]] * len(every)][: len(every)]
     roles[-1] = "best" if len(every) > 1 else "model"
     curves = []
     for role, path in (*zip(roles, every, strict=True), ("desired", run.paths["target"])):
@@ -127,9 +131,8 @@ def _manoeuvre(run: CarRun, stages: bool) -> Panel:
             curves.append(Curve(x, y, role, role, WIDTHS.get(role, 1.5)))
     number = PAPER_FIGURE.get(run.manoeuvre)
     ending = f"{len(every) - 1} iterations" if len(every) != 2 else "1 iteration"
-    title = (
-        f"Figure {number}: {run.manoeuvre}, {'with scatter' if run.noisy else 'quiet'}, {ending}"
-    )
+    words = "with scatter" if run.noisy else "repeats itself"
+    title = f"Figure {number}: {run.manoeuvre}, {words}, {ending}"
     return Panel(title, "x [m]", "y [m]", tuple(curves), equal=True)
 
 
@@ -137,7 +140,7 @@ def _improvements(result: CarResult, names: Sequence[str]) -> Bars:
     """Draw the reduction of the cost, with that of the paper."""
     bars = []
     for name in names:
-        for noisy, words in ((False, "quiet"), (True, "with scatter")):
+        for noisy, words in ((False, "repeats itself"), (True, "with scatter")):
             gains = [run.improvement for run in result.of(name, noisy)]
             if gains:
                 mean, _ = mean_se(gains)
