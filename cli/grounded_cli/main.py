@@ -70,6 +70,9 @@ class LazyGroup(click.Group):
         if name not in COMMANDS:
             return None
         module = importlib.import_module(f"grounded_cli.{COMMANDS[name][0]}")
+        if not gc.isenabled():  # see `main`
+            gc.freeze()
+            gc.enable()
         commands = (one for one in vars(module).values() if isinstance(one, click.Command))
         return next(one for one in commands if one.name == name)
 
@@ -151,6 +154,8 @@ def cli() -> None:
 
 def main() -> NoReturn:
     """Run the command line and exit with its code."""
+    gc.disable()  # until the command is imported: 80 collections on the way would find nothing
+    gc.set_threshold(30_000)  # not 700, for what it goes on to import
     atexit.register(gc.freeze)  # saves the 30 ms garbage collection at exit
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # show "?" for characters the encoding lacks

@@ -34,6 +34,7 @@ class Layout:
     n: int
     depths: tuple[int, ...]  # (m,)
     angles: tuple[bool, ...]  # (n,)
+    prompt: tuple[bool, ...]  # (m,) whether u_j acts at once: then its past costs, and does no more
 
     @property
     def m(self) -> int:
@@ -44,6 +45,16 @@ class Layout:
     def nz(self) -> int:
         """Size of z."""
         return self.n + sum(self.depths)
+
+    @property
+    def moving(self) -> list[int]:
+        """Entries of z that the next z depends on, in order."""
+        idle = {self.slot(j) for j, prompt in enumerate(self.prompt) if prompt}
+        return [i for i in range(self.nz) if i not in idle]
+
+    def input_of(self, i: int) -> int:
+        """Whose past entry i of z is, i >= n."""
+        return max(j for j in range(self.m) if self.slot(j) <= i)
 
     def slot(self, j: int, i: int = 0) -> int:
         """Index in z of u_j[t - 1 - i]."""

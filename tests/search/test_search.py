@@ -13,7 +13,7 @@ from grounded.plant import Noise, Plant
 from grounded.search.ask_tell import learn
 from grounded.search.improve import propose
 from grounded.search.making import About
-from grounded.search.planner import model_fingerprint
+from grounded.search.planner import fixed_draws, model_fingerprint
 from grounded.search.standing import MAX_CAUTION, standing
 from grounded.search.step_size import OTHER_WAY, SearchOptions, Step, losers_of
 from grounded.trial import Trial, mean_trial
@@ -672,3 +672,8 @@ def test_losses_of_other_slopes_raise_no_damping():
         for slopes in (None, "", "corrected")
     ]
     assert [step.damping for step in steps] == [10.0, 10.0, 1.0]
+
+
+def test_fingerprints_are_taken_where_numpys_generator_would_draw():
+    """Those of earlier versions were, and candidates keep them."""
+    assert (fixed_draws(3000) == np.random.default_rng(0).random(3000)).all()

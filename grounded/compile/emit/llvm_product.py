@@ -8,7 +8,7 @@ steps at once, just before the sweep needs them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence, Set
 
 from grounded.compile.emit.llvm_batch import Words, gather_rows, start_table
 from grounded.compile.emit.llvm_rollout import received
@@ -16,59 +16,75 @@ from grounded.compile.emit.llvm_step import Dynamics
 from grounded.compile.emit.llvm_text import Writer, integers, number, splat, vector
 from grounded.compile.kernel_words import Layout
 
-Row = Callable[[int | str], str]  # loads (a piece of) row r of a matrix
+Row = Callable[[int | str], list[str]]  # row r of a matrix, or some of its pieces: vectors
 UNROLLED = 400  # entries of the Jacobian whose products are written out; more are a loop
 
 
-def padded(size: int, width: int = 4) -> int:
-    """Rows are multiples of four doubles; what lies between them, of a vector.
+def pieces(size: int, width: int) -> range:
+    """Where the vectors of a row begin that is padded to whole ones.
 
     A vector that begins in one cache line and ends in the next costs two accesses.
     """
-    lanes = width if size > 4 else 4
-    return -(-size // lanes) * lanes
+    return range(0, -(-size // width) * width, width)
 
 
-def pieces(size: int, width: int) -> list[tuple[int, int]]:
-    """A padded row as vectors that the machine has: (first entry, W or 4 entries) of each."""
-    wide = size // width * width
-    cut = [(at, width) for at in range(0, wide, width)]
-    return cut + [(at, 4) for at in range(wide, size, 4)]
+def pieces_of(f: Writer, base: str, stride: int, cut: Sequence[int], size: int) -> Row:
+    """Loads vectors of `size` doubles of a matrix's rows, from where each of `cut` says."""
 
-
-def pieces_of(f: Writer, base: str, stride: int, at: int, size: int) -> Row:
-    """Loads entries at .. at + size - 1 of a matrix's rows."""
-
-    def piece(r: int | str) -> str:
+    def row(r: int | str) -> list[str]:
         if isinstance(r, int):
-            return f.load(base, r * stride + at, size)
-        return f.load(base, f.integer("add", f.integer("mul", r, stride), at), size)
+            return [f.load(base, r * stride + at, size) for at in cut]
+        start = f.at(base, f.integer("mul", r, stride))
+        return [f.load(start, at, size) for at in cut]
 
-    return piece
-
-
-def transpose(f: Writer, M: str, T: str, P: int, C: int, width: int) -> None:
-    """T (P, C) = M' of M (C, P), stored in the pieces that T is read in.
-
-    A store that a later load only partly covers would have to reach the cache first.
-    """
-    if C // width:
-        with f.loop(C // width) as block:
-            c = f.integer("mul", block, width)
-            _transpose_rows(f, f.at(M, f.integer("mul", c, P)), f.at(T, c), (P, C), width)
-    for tail in range(C // width * width, C, 4):
-        _transpose_rows(f, f.at(M, tail * P), f.at(T, tail), (P, C), 4)
+    return row
 
 
-def _transpose_rows(f: Writer, source: str, target: str, size: tuple[int, int], count: int) -> None:
-    """`count` rows of M to as many columns of T, in blocks of four by four."""
-    P, C = size
-    for r in range(0, P, 4):
-        rows = [f.load(source, i * P + r, 4) for i in range(count)]
-        if count > 4:  # blocks side by side are transposed at once
-            rows = [_beside(f, a, b) for a, b in zip(rows[:4], rows[4:], strict=True)]
-        for i, column in enumerate(_transpose_block(f, rows, count)):
-            f.store(column, target, (r + i) * C, count)
+def transposed(f: Writer, a: list[str]) -> list[str]:
+    """Columns of W rows of W, in registers; W is 4 or 8."""
+    size = len(a)
+    if size == 4:
+        return _transpose_block(f, a)
+    kind = vector(size)
+
+    def shuffled(a: str, b: str, lanes: tuple[int, ...]) -> str:
+        inside = ", ".join(f"i32 {i}" for i in lanes)
+        return f.emit(f"shufflevector {kind} {a}, {kind} {b}, <8 x i32> <{inside}>")
+
+    # Pairs of rows, then pairs of pairs: what moves is pairs of neighbours.
+    even = [shuffled(a[i], a[i + 1], (0, 8, 2, 10, 4, 12, 6, 14)) for i in (0, 2, 4, 6)]
+    odd = [shuffled(a[i], a[i + 1], (1, 9, 3, 11, 5, 13, 7, 15)) for i in (0, 2, 4, 6)]
+    first, second = (0, 1, 4, 5, 8, 9, 12, 13), (2, 3, 6, 7, 10, 11, 14, 15)
+    columns = [""] * 8
+    for parity, rows in enumerate((even, odd)):
+        for half, lanes in enumerate((first, second)):
+            upper, lower = (shuffled(rows[i], rows[i + 1], lanes) for i in (0, 2))
+            columns[2 * half + parity] = shuffled(upper, lower, first)
+            columns[2 * half + parity + 4] = shuffled(upper, lower, second)
+    return columns
+
+
+def chosen(f: Writer, row: list[str], places: list[int | None], size: int) -> str:
+    """Entries of a row in pieces, by their places, as one vector; 0 for None."""
+    used = sorted({place // size for place in places if place is not None})
+    if not used:
+        return splat(0.0, size)
+    first, last = row[used[0]], row[used[-1]]
+    kind, inside = vector(size), []
+    for place in places:
+        lane = "poison" if place is None else str(place % size + size * (place // size > used[0]))
+        inside.append(f"i32 {lane}")
+    lanes = ", ".join(inside)
+    same = all(p is None or p == used[0] * size + i for i, p in enumerate(places))
+    found = (
+        first
+        if same
+        else f.emit(f"shufflevector {kind} {first}, {kind} {last}, <{size} x i32> <{lanes}>")
+    )
+    if None not in places:
+        return found
+    kept = ", ".join(f"i32 {i + size * (place is None)}" for i, place in enumerate(places))
+    return f.emit(f"shufflevector {kind} {found}, {kind} zeroinitializer, <{size} x i32> <{kept}>")
 
 
 def symmetric(f: Writer, V: str, P: int) -> None:
@@ -88,15 +104,14 @@ def symmetric(f: Writer, V: str, P: int) -> None:
             f.store(row, above, r * P, 4)
 
 
-def _transpose_block(f: Writer, a: list[str], size: int = 4) -> list[str]:
-    """Columns of four rows of four; of two such blocks side by side where `size` is 8."""
-    kind = vector(size)
+def _transpose_block(f: Writer, a: list[str]) -> list[str]:
+    """Columns of four rows of four."""
+    kind = vector(4)
 
     def shuffled(a: str, b: str, *lanes: int) -> str:
-        """Lanes of a, from 4 on of b, in each block."""
-        places = (i % 4 + i // 4 * size + block for block in range(0, size, 4) for i in lanes)
-        inside = ", ".join(f"i32 {i}" for i in places)
-        return f.emit(f"shufflevector {kind} {a}, {kind} {b}, <{size} x i32> <{inside}>")
+        """Lanes of a, from 4 on of b."""
+        inside = ", ".join(f"i32 {i}" for i in lanes)
+        return f.emit(f"shufflevector {kind} {a}, {kind} {b}, <4 x i32> <{inside}>")
 
     lo = [shuffled(a[i], a[i + 1], 0, 4, 2, 6) for i in (0, 2)]
     hi = [shuffled(a[i], a[i + 1], 1, 5, 3, 7) for i in (0, 2)]
@@ -106,12 +121,6 @@ def _transpose_block(f: Writer, a: list[str], size: int = 4) -> list[str]:
         shuffled(lo[0], lo[1], 2, 3, 6, 7),
         shuffled(hi[0], hi[1], 2, 3, 6, 7),
     ]
-
-
-def _beside(f: Writer, a: str, b: str) -> str:
-    """Two vectors of four as one of eight."""
-    kind, lanes = vector(4), ", ".join(f"i32 {i}" for i in range(8))
-    return f.emit(f"shufflevector {kind} {a}, {kind} {b}, <8 x i32> <{lanes}>")
 
 
 def placed(f: Writer, value: str, lane: int, row: str, size: int) -> str:
@@ -174,57 +183,79 @@ class Linearised:
         """From here on `rows` means those of step t."""
         self.now = self.f.at(self.jac, self.f.integer("and", t, self.width - 1))
 
-    def inputs(self, row: Row, size: int) -> tuple[list[str], list[str]]:
-        """Rows of f_u'X, one an input, and of B'X, from pieces X(r, :) of `size` doubles."""
-        f, layout, now = self.f, self.layout, self.words.pointer("now")
-        G = self._sums(row, size, range(layout.n, layout.n + layout.m))
-        return G, [
-            f.fma(f.load_all(now, j, size), G[j], row(layout.slot(j)), size)
-            for j in range(layout.m)
-        ]
+    def columns(self, row: Row, size: int, some: Sequence[int]) -> list[list[str]]:
+        """Rows c of [A B]'X for some of the c, below nz a moving entry of z, nz + j for u_j.
 
-    def states(self, row: Row, size: int, G: list[str]) -> list[str]:
-        """Rows of A'X, given those of f_u'X."""
+        Args:
+            row: pieces of X(r, :), vectors of `size` doubles; a large model takes one at a time.
+            size: see `row`.
+            some: the c.
+        """
+        layout, own = self.layout, list[int]()
+        for c in some:
+            j = c - layout.nz if c >= layout.nz else layout.input_of(c) if c >= layout.n else 0
+            own.append(c if c < layout.n else layout.n + j)
+        sums = self._sums(row, size, set(own))
+        return [self._column(c, sums[i], row, size) for c, i in zip(some, own, strict=True)]
+
+    def _column(self, c: int, own: list[str], row: Row, size: int) -> list[str]:
+        """What column c of [A B] is made of the model's own one."""
         f, layout = self.f, self.layout
-        out = self._sums(row, size, range(layout.n))
-        past, D = self.words.pointer("past"), layout.nz - layout.n
-        for j, depth in enumerate(layout.depths):
-            for i in range(depth):
-                weight = f.load_all(past, j * D + layout.slot(j, i) - layout.n, size)
-                value = f.mul(weight, G[j], size)
-                older = i + 1 < depth
-                out.append(f.add(value, row(layout.slot(j, i + 1)), size) if older else value)
-        return out
+        if c < layout.n:
+            return own
+        if c >= layout.nz:
+            j = c - layout.nz
+            if not layout.prompt[j]:
+                now = f.load_all(self.words.pointer("now"), j, size)
+                own = [f.mul(now, a, size) for a in own]
+            return [f.add(a, b, size) for a, b in zip(own, row(layout.slot(j)), strict=True)]
+        j, D = layout.input_of(c), layout.nz - layout.n
+        weight = f.load_all(self.words.pointer("past"), j * D + c - layout.n, size)
+        own = [f.mul(weight, a, size) for a in own]
+        if c + 1 == layout.nz or layout.input_of(c + 1) != j:  # the oldest
+            return own
+        return [f.add(a, b, size) for a, b in zip(own, row(c + 1), strict=True)]
 
-    def _sums(self, row: Row, size: int, columns: range) -> list[str]:
-        """For each column c of the model's Jacobian, the sum over r of J(r, c) X(r, :)."""
-        if len(self.d.places) > UNROLLED:
+    def _sums(self, row: Row, size: int, columns: Set[int]) -> dict[int, list[str]]:
+        """For some columns c of the model's Jacobian, the sums over r of J(r, c) X(r, :)."""
+        f, d = self.f, self.d
+        if len(d.places) > UNROLLED:
             return self._looped_sums(row, size, columns)
-        f, sums = self.f, dict[int, str]()
-        for e, (r, c) in enumerate(self.d.places):
-            if c in columns:
-                a, value = self._entry(e, size), row(r)
-                sums[c] = f.fma(a, value, sums[c], size) if c in sums else f.mul(a, value, size)
-        return [sums.get(c, splat(0.0, size)) for c in columns]
+        sums, known = dict[int, list[str]](), dict[int, list[str]]()
+        for e, (r, c) in enumerate(d.places):
+            if c not in columns:
+                continue
+            known[r] = values = known[r] if r in known else row(r)
+            if d.constant(e):
+                sums[c] = (
+                    [f.add(a, b, size) for a, b in zip(values, sums[c], strict=True)]
+                    if c in sums
+                    else values
+                )
+                continue
+            a = f.load_all(self.now, e * self.width, size)
+            if c in sums:
+                sums[c] = [f.fma(a, x, b, size) for x, b in zip(values, sums[c], strict=True)]
+            else:
+                sums[c] = [f.mul(a, x, size) for x in values]
+        nothing = [splat(0.0, size)] * len(row(0))
+        return {c: sums.get(c, nothing) for c in columns}
 
-    def _looped_sums(self, row: Row, size: int, columns: range) -> list[str]:
+    def _looped_sums(self, row: Row, size: int, columns: Set[int]) -> dict[int, list[str]]:
         """The same for large models, by tables of indices."""
-        f, count = self.f, len(columns)
+        f, start = self.f, min(columns)
+        count = max(columns) + 1 - start
         with f.loop(count) as i:
-            c = f.integer("add", i, columns.start)
+            c = f.integer("add", i, start)
             first = f.index("@column_first", c)
             entries = f.integer("sub", f.index("@column_first", f.integer("add", c, 1)), first)
             with f.fold(entries, size, splat(0.0, size)) as total:
                 q = f.integer("add", first, total.i)
                 a = f.load_all(self.now, f.index("@column_entry", q), size)
-                total.set(f.fma(a, row(f.index("@column_row", q)), total.value, size))
+                (value,) = row(f.index("@column_row", q))
+                total.set(f.fma(a, value, total.value, size))
             f.store(total.result, self.sums_room, f.integer("mul", i, size), size)
-        return [f.load(self.sums_room, i * size, size) for i in range(count)]
-
-    def _entry(self, e: int, size: int) -> str:
-        """Value e of the Jacobian of this step, in every lane."""
-        # Read again at each use: a multiplication takes it from memory for nothing.
-        return self.f.load_all(self.now, e * self.width, size)
+        return {c: [f.load(self.sums_room, (c - start) * size, size)] for c in columns}
 
 
 def sweep_tables(d: Dynamics, width: int) -> str:

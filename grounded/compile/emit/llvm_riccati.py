@@ -5,23 +5,29 @@ shift, the two products of Q = [A B]' V [A B] are the same routine twice,
 
     M = [A B]' V,   Q = [A B]' M'      row c of [A B]'X = sum over r of [A B](r, c) X(r, :)
 
-with a transposition between (`llvm_product.py`). Rounding leaves V a little unsymmetric; where the
-model is unstable that part grows from step to step, so it is taken out again and again.
+with a transposition between (`llvm_product.py`). A past input that is only there for the cost of
+changes has no column in [A B], and in Q only that cost. Q_uu comes first: while its factor waits
+for one division after the other, the machine has Q_zz to add up. Rounding leaves V a little
+unsymmetric; where the model is unstable that part grows from step to step, so it is taken out again
+and again.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from grounded.compile.emit.llvm_batch import Words
 from grounded.compile.emit.llvm_box import ONE, ZERO, Lower, clipped, factored, loaded, solved
 from grounded.compile.emit.llvm_product import (
+    UNROLLED,
     Linearised,
-    padded,
+    chosen,
     pieces,
     pieces_of,
     placed,
     row_of,
     symmetric,
-    transpose,
+    transposed,
 )
 from grounded.compile.emit.llvm_rollout import wrap
 from grounded.compile.emit.llvm_step import Dynamics
@@ -41,9 +47,10 @@ def sweep_kernel(d: Dynamics, layout: Layout, width: int) -> str:
         writer.along.select(t)
         slopes = writer.product()
         writer.input_rows(t, slopes)
+        writer.factor(t)
+        writer.state_rows(t)
         writer.gains(t)
-        writer.state_rows(t, slopes)
-        writer.value()
+        writer.value(t, slopes)
     f.store(f.load(writer.sums, 0), writer.words.pointer("expected"), 0)
     f.store(f.load(writer.sums, 1), writer.words.pointer("expected"), 1)
     f.do("ret i64 -1")
@@ -51,26 +58,33 @@ def sweep_kernel(d: Dynamics, layout: Layout, width: int) -> str:
 
 
 class _Sweep:
-    """The parts of the kernel. P and C are the padded widths of a row over z and over [z, u]."""
+    """The parts of the kernel.
+
+    P and C are the padded widths of a row over z and over [the moving entries of z, u], both in
+    vectors of `size` doubles.
+    """
 
     def __init__(self, f: Writer, d: Dynamics, layout: Layout, width: int) -> None:
-        self.f, self.layout, self.width, self.words = f, layout, width, Words(f, SWEEP)
-        m, nz = layout.m, layout.nz
-        self.P, self.C = padded(nz, width), padded(nz + m, width)
-        self.cut = pieces(self.P, width)
+        self.f, self.layout, self.words = f, layout, Words(f, SWEEP)
+        m, nz, self.moving = layout.m, layout.nz, layout.moving
+        self.size = size = width if nz > 4 else 4
+        self.cut, self.wide = pieces(nz, size), pieces(len(self.moving) + m, size)
+        self.P, self.C = size * len(self.cut), size * len(self.wide)
         self.along = Linearised(f, d, layout, width, self.words)
+        self.large = len(d.places) > UNROLLED
+        self.together = 1 if self.large else 2  # pieces that share what is read of the Jacobian
         self.V, self.v = f.room(self.P * self.P), f.room(self.P)
-        self.M, self.T = f.room(self.C * self.P), f.room(self.P * self.C)
-        self.U, self.G = f.room(m * self.C), f.room(m * self.C)  # rows of [Q_uz Q_uu], f_u'T
-        self.g_u = f.room(m)
+        self.T, self.U = f.room(self.P * self.C), f.room(m * self.C)  # V [A B]; rows of B'T
+        self.F = f.room(m * self.P)  # rows of Q_uz
+        self.g_u, self.Q_uu = f.room(m), list[list[str]]()
         self.H, self.L, self.inv = f.room(m * m), f.room(m * m), f.room(m)
         self.k, self.free, self.low, self.high = (f.room(m) for _ in range(4))
-        self.K, self.F, self.sums = f.room(m * self.P), f.room(m * self.P), f.room(2)
+        self.K, self.sums = f.room(m * self.P), f.room(2)
 
     def end(self) -> None:
         """V and v of the last state; zeros in the padding."""
         f = self.f
-        for room, size in ((self.V, self.P**2), (self.M, self.C * self.P), (self.v, self.P)):
+        for room, size in ((self.V, self.P**2), (self.v, self.P)):
             with f.loop(size // 4) as four:
                 f.store(splat(0.0, 4), room, f.integer("mul", four, 4), 4)
         f.store(splat(0.0, 2), self.sums, 0, 2)
@@ -92,57 +106,152 @@ class _Sweep:
         return out
 
     def product(self) -> list[str]:
-        """V [A B], transposed into T; returns the products with v, z first and then u."""
-        f, P = self.f, self.P
-        for at, size in self.cut:
-            row = pieces_of(f, self.V, P, at, size)
-            G, inputs = self.along.inputs(row, size)
-            for c, value in enumerate([*self.along.states(row, size, G), *inputs]):
-                f.store(value, self.M, c * P + at, size)
-        G, inputs = self.along.inputs(lambda r: f.load(self.v, r), 1)
-        slopes = self.along.states(lambda r: f.load(self.v, r), 1, G) + inputs
-        transpose(f, self.M, self.T, P, self.C, self.width)
+        """V [A B] into T; returns the products with v, moving entries of z first and then u."""
+        f, layout, size = self.f, self.layout, self.size
+        order = [*self.moving, *range(layout.nz, layout.nz + layout.m)]
+        slopes = list[str]()
+
+        def gradient(r: int | str) -> list[str]:
+            return [f.load_all(self.v, r, size)]
+
+        for some in self._grouped(self.cut):
+            row = pieces_of(f, self.V, self.P, some, size)
+            both = not (slopes or self.large)
+            for first, block in self._blocks(order):
+                together = (lambda r, row=row: row(r) + gradient(r)) if both else row
+                found = self.along.columns(together, size, block)
+                if both:
+                    slopes += [self._first_lane(line[-1]) for line in found]
+                found += [[splat(0.0, size)] * len(some)] * (-len(found) % size)
+                for i, at in enumerate(some):
+                    self._turned([line[i] for line in found], at, first)
+        if self.large:
+            found = self.along.columns(gradient, size, order)
+            slopes = [self._first_lane(line[0]) for line in found]
         return slopes
 
+    def _first_lane(self, value: str) -> str:
+        """One number of a vector of equal ones; through memory, or LLVM would redo it alone."""
+        room = self.f.room(self.size)
+        self.f.store(value, room, 0, self.size)
+        return self.f.load(room)
+
+    def _turned(self, rows: list[str], at: int, first: int) -> None:
+        """Columns of rows first .. of M, a piece that begins `at`, as rows of T."""
+        size, C = self.size, self.C
+        for begin in range(0, len(rows), size):
+            for i, column in enumerate(transposed(self.f, rows[begin : begin + size])):
+                if at + i < self.layout.nz:
+                    self.f.store(column, self.T, (at + i) * C + first + begin, size)
+
+    def _grouped(self, cut: Sequence[int]) -> list[Sequence[int]]:
+        return [cut[i : i + self.together] for i in range(0, len(cut), self.together)]
+
+    def _blocks(self, columns: list[int]) -> list[tuple[int, list[int]]]:
+        """Columns that are summed up at once, as registers allow, after the place of the first."""
+        if self.large:
+            return [(0, columns)]
+        return [(i, columns[i : i + self.size]) for i in range(0, len(columns), self.size)]
+
+    def _over_z(self, row: list[str], at: int) -> str:
+        """Entries at .. of a row over z, from a row over the moving entries; 0 for the others."""
+        place = {i: c for c, i in enumerate(self.moving)}
+        lanes = [place.get(i) for i in range(at, at + self.size)]
+        return chosen(self.f, row, lanes, self.size)
+
     def input_rows(self, t: str, slopes: list[str]) -> None:
-        """[Q_uz Q_uu] into U, Q_u into g_u: first, so that their factor is under way early."""
-        f, layout, C = self.f, self.layout, self.C
-        doubled = []
-        for j in range(layout.m):
-            S, R = (f.load(self.words.pointer(name), j) for name in ("S", "R"))
-            doubled.append((f.add(S, S), f.add(R, R)))
-        for at, size in pieces(C, self.width):
-            G, rows = self.along.inputs(pieces_of(f, self.T, C, at, size), size)
-            for j, row in enumerate(rows):
-                S, R = doubled[j]
-                for place, value in ((layout.slot(j), f.neg(S)), (layout.nz + j, f.add(R, S))):
-                    if at <= place < at + size:
-                        row = placed(f, value, place - at, row, size)
-                f.store(G[j], self.G, j * C + at, size)
-                f.store(row, self.U, j * C + at, size)
+        """Rows of Q_uz into F, Q_uu, Q_u into g_u."""
+        f, layout, size = self.f, self.layout, self.size
+        rows: list[list[str]] = [[] for _ in range(layout.m)]
+        own = range(layout.nz, layout.nz + layout.m)
+        for some in self._grouped(self.wide):
+            B = self.along.columns(pieces_of(f, self.T, self.C, some, size), size, own)
+            for j, line in enumerate(B):
+                rows[j] += line
+                for at, piece in zip(some, line, strict=True):
+                    f.store(piece, self.U, j * self.C + at, size)
         before, u = self.words.row("z_run", t, layout.nz), self.words.row("u_run", t, layout.m)
         target = self.words.row("input_target", t, layout.m)
-        for j, (S, R) in enumerate(doubled):
+        first, self.Q_uu = len(self.moving), []
+        for j, whole in enumerate(rows):
+            S, R = (f.load(self.words.pointer(name), j) for name in ("S", "R"))
+            S, R, slot = f.add(S, S), f.add(R, R), layout.slot(j)
+            for at in self.cut:
+                row = self._over_z(whole, at)
+                if at <= slot < at + size:
+                    row = placed(f, f.neg(S), slot - at, row, size)
+                f.store(row, self.F, j * self.P + at, size)
+            line = [f.load(self.U, j * self.C + first + i) for i in range(layout.m)]
+            line[j] = f.add(line[j], f.add(R, S))
+            self.Q_uu.append(line)
             value = f.load(u, j)
-            slope = f.fma(R, f.sub(value, f.load(target, j)), slopes[layout.nz + j])
-            slope = f.fma(S, f.sub(value, f.load(before, layout.slot(j))), slope)
+            slope = f.fma(R, f.sub(value, f.load(target, j)), slopes[first + j])
+            slope = f.fma(S, f.sub(value, f.load(before, slot)), slope)
             f.store(slope, self.g_u, j)
 
-    def state_rows(self, t: str, slopes: list[str]) -> None:
-        """Q_zz into V, Q_z into v."""
-        f, P, C = self.f, self.P, self.C
-        cost = self._state_cost(t)
-        for at, size in self.cut:
-            G = [f.load(self.G, j * C + at, size) for j in range(self.layout.m)]
-            rows = self.along.states(pieces_of(f, self.T, C, at, size), size, G)
-            for c, row in enumerate(rows):
-                own = cost[c]
-                if own and at <= c < at + size:
-                    row = placed(f, own[1], c - at, row, size)
-                f.store(row, self.V, c * P + at, size)
-            here = zip(slopes[at : at + size], cost[at : at + size], strict=False)
-            slope = [f.add(value, own[0]) if own else value for value, own in here]
-            f.store(row_of(f, slope, size), self.v, at, size)
+    def state_rows(self, t: str) -> None:
+        """Q_zz into V."""
+        f, size, cost = self.f, self.size, self._state_cost(t)
+        rows: dict[int, list[str]] = {c: [] for c in range(self.layout.nz)}
+        for some in self._grouped(self.cut):
+            row = pieces_of(f, self.T, self.C, some, size)
+            for _, block in self._blocks(self.moving):
+                for c, line in zip(block, self.along.columns(row, size, block), strict=True):
+                    rows[c] += line
+            for c, own in enumerate(cost):
+                for at in some:
+                    piece = self._over_z(rows[c], at) if rows[c] else splat(0.0, size)
+                    if own and at <= c < at + size:
+                        piece = placed(f, own[1], c - at, piece, size)
+                    f.store(piece, self.V, c * self.P + at, size)
+
+    def value(self, t: str, slopes: list[str]) -> None:
+        """V = Q_zz + F'K, v = Q_z + F'k, for F = Q_uz less the damping's part."""
+        f, m, size, P = self.f, self.layout.m, self.size, self.P
+        self._gradient(self._state_cost(t), dict(zip(self.moving, slopes, strict=False)))
+        for some in self._grouped(self.cut):
+            K = [pieces_of(f, self.K, P, some, size)(j) for j in range(m)]
+            if self.large:
+                with f.loop(self.layout.nz) as i:
+                    self._add(f.at(self.V, f.integer("mul", i, P)), f.at(self.F, i), some, K)
+                continue
+            for c in range(self.layout.nz):
+                self._add(f.at(self.V, c * P), f.at(self.F, c), some, K)
+
+    def _add(self, row: str, column: str, some: Sequence[int], K: list[list[str]]) -> None:
+        """A row of V in some pieces, plus a row of F'K."""
+        f, size = self.f, self.size
+        values = [f.load(row, at, size) for at in some]
+        for j, gains in enumerate(K):
+            factor = f.load_all(column, j * self.P, size)
+            values = [f.fma(factor, k, a, size) for k, a in zip(gains, values, strict=True)]
+        for at, value in zip(some, values, strict=True):
+            f.store(value, row, at, size)
+
+    def _gradient(self, cost: list[tuple[str, str] | None], slopes: dict[int, str]) -> None:
+        """The value's gradient v, from the products of [A B] with the one of the next step."""
+        f, size, nz = self.f, self.size, self.layout.nz
+        k = [f.load_all(self.k, j, size) for j in range(self.layout.m)]
+        for at in self.cut:
+            terms = [slopes.get(i, ZERO) for i in range(at, min(at + size, nz))]
+            for i, own in enumerate(cost[at : at + size]):
+                terms[i] = f.add(terms[i], own[0]) if own else terms[i]
+            v = row_of(f, terms, size)
+            for j, alone in enumerate(k):
+                v = f.fma(alone, f.load(self.F, j * self.P + at, size), v, size)
+            f.store(v, self.v, at, size)
+
+    def _add_feedback(self) -> None:
+        """V += F'K in a loop, for large models."""
+        f, m, size, P = self.f, self.layout.m, self.size, self.P
+        with f.loop(self.layout.nz) as c:
+            start, column = f.at(self.V, f.integer("mul", c, P)), f.at(self.F, c)
+            factors = [f.load_all(column, j * P, size) for j in range(m)]
+            for at in self.cut:
+                row = f.load(start, at, size)
+                for j, factor in enumerate(factors):
+                    row = f.fma(factor, f.load(self.K, j * P + at, size), row, size)
+                f.store(row, start, at, size)
 
     def _state_cost(self, t: str) -> list[tuple[str, str] | None]:
         """(l_z, l_zz) for each entry of z, None where it has no cost."""
@@ -156,25 +265,31 @@ class _Sweep:
             cost += [(f.mul(twice, step), twice), *[None] * (depth - 1)]
         return cost
 
-    def gains(self, t: str) -> None:
-        """Gains k and K of step t inside the limits; the promise d1, d2."""
-        f, layout, C = self.f, self.layout, self.C
-        m, nz = layout.m, layout.nz
-        damping = [f.load(self.words.pointer("damping"), i) for i in range(m)]
-        H = [[f.load(self.U, i * C + nz + j) for j in range(m)] for i in range(m)]
+    def factor(self, t: str) -> None:
+        """The factor of Q_uu + diag(damping), and the unlimited k; returns where there is none.
+
+        The branch also keeps LLVM from moving this behind what does not need it.
+        """
+        f, m = self.f, self.layout.m
+        self.damping = [f.load(self.words.pointer("damping"), i) for i in range(m)]
+        self.damped = [list(line) for line in self.Q_uu]
         for i in range(m):
-            H[i][i] = f.add(H[i][i], damping[i])
-        L, inverse, good = factored(f, H)
-        g, infinity = [f.load(self.g_u, i) for i in range(m)], number(float("inf"))
-        for value in g:
+            self.damped[i][i] = f.add(self.damped[i][i], self.damping[i])
+        L, inverse, good = factored(f, self.damped)
+        inverse = [f.neg(value) for value in inverse]  # of -H: k and K are minus a solution
+        self.g = [f.load(self.g_u, i) for i in range(m)]
+        self.usual, infinity = (L, inverse, solved(f, self.g, L, inverse, 1)), number(float("inf"))
+        for value in self.g:
             finite = f.compare("olt", f.call("fabs", [value]), infinity)
             good = f.emit(f"and i1 {good}, {finite}")
         f.return_if(f.emit(f"xor i1 {good}, true"), f"i64 {t}")
-        inverse = [f.neg(value) for value in inverse]  # of -H: k and K are minus a solution
-        k = solved(f, g, L, inverse, 1)
-        L, inverse, k = self._limited(t, H, (L, inverse, k))
-        self._promise(k, g)
+
+    def gains(self, t: str) -> None:
+        """Gains k and K of step t inside the limits; the promise d1, d2."""
+        L, inverse, k = self._limited(t, self.damped, self.usual)
+        self._promise(k, self.g)
         self._feedback(t, L, inverse, k)
+        self._damp(self.damping)
 
     def _limited(
         self, t: str, H: list[list[str]], usual: tuple[Lower, list[str], list[str]]
@@ -212,63 +327,41 @@ class _Sweep:
         return [*L.values(), *inverse, *(f.load(self.k, i) for i in range(m))]
 
     def _promise(self, k: list[str], g: list[str]) -> None:
-        f, m, nz = self.f, self.layout.m, self.layout.nz
-        d1, d2 = f.load(self.sums, 0), ZERO
-        for i in range(m):
+        f, d1, d2 = self.f, self.f.load(self.sums, 0), ZERO
+        for i, line in enumerate(self.Q_uu):
             d1 = f.fma(k[i], g[i], d1)
-            row = f.mul(f.load(self.U, i * self.C + nz), k[0])
-            for j in range(1, m):
-                row = f.fma(f.load(self.U, i * self.C + nz + j), k[j], row)
+            row = f.mul(line[0], k[0])
+            for value, other in zip(line[1:], k[1:], strict=True):
+                row = f.fma(value, other, row)
             d2 = f.fma(k[i], row, d2)
         f.store(d1, self.sums, 0)
         f.store(f.fma(d2, number(0.5), f.load(self.sums, 1)), self.sums, 1)
 
     def _feedback(self, t: str, L: Lower, inverse: list[str], k: list[str]) -> None:
         """K = -Q_uu^-1 Q_uz on the free inputs, k and K to memory."""
-        f, m, nz, P = self.f, self.layout.m, self.layout.nz, self.P
-        for at, size in self.cut:
-            Q_uz = [f.load(self.U, j * self.C + at, size) for j in range(m)]
+        f, m, nz, size, P = self.f, self.layout.m, self.layout.nz, self.size, self.P
+        to_K, to_k = self.words.row("K", t, m * nz), self.words.row("k", t, m)
+        for at in self.cut:
+            Q_uz = [f.load(self.F, j * P + at, size) for j in range(m)]
             for j, row in enumerate(solved(f, Q_uz, L, inverse, size)):
                 f.store(row, self.K, j * P + at, size)
-        to_K, to_k = self.words.row("K", t, m * nz), self.words.row("k", t, m)
+                if at + size <= nz:
+                    f.store(row, to_K, j * nz + at, size)
         for j in range(m):
             f.store(k[j], self.k, j)
             f.store(k[j], to_k, j)
-            for i in range(0, nz - nz % 4, 4):
-                f.store(f.load(self.K, j * P + i, 4), to_K, j * nz + i, 4)
-            for i in range(nz - nz % 4, nz):
+            for i in range(nz - nz % size, nz):
                 f.store(f.load(self.K, j * P + i), to_K, j * nz + i)
 
-    def value(self) -> None:
-        """V = Q_zz + Q_uz'K - K'diag(damping)K, v = Q_z + Q_uz'k - K'diag(damping)k."""
-        self._add(self.U, self.C, "fadd")
-        f, m, P = self.f, self.layout.m, self.P
-        damping = [f.load(self.words.pointer("damping"), j) for j in range(m)]
-        damped = "false"
+    def _damp(self, damping: list[str]) -> None:
+        """F = Q_uz - diag(damping) K: what of it belongs to the value."""
+        f, P, size, damped = self.f, self.P, self.size, "false"
         for value in damping:
             damped = f.emit(f"or i1 {damped}, {f.compare('une', value, ZERO)}")
         with f.when(damped):
-            for at, size in self.cut:
-                for j in range(m):
-                    row = f.mul(f.spread(damping[j], size), f.load(self.K, j * P + at, size), size)
+            for j, value in enumerate(damping):
+                less = f.spread(f.neg(value), size)
+                for at in self.cut:
+                    row = f.load(self.F, j * P + at, size)
+                    row = f.fma(less, f.load(self.K, j * P + at, size), row, size)
                     f.store(row, self.F, j * P + at, size)
-            self._add(self.F, P, "fsub")
-
-    def _add(self, F: str, stride: int, op: str) -> None:
-        """V += F'K, v += F'k, or -=, for rows F_j."""
-        f, m, P = self.f, self.layout.m, self.P
-        K = {(j, at): f.load(self.K, j * P + at, size) for j in range(m) for at, size in self.cut}
-        for at, size in self.cut:
-            v = f.load(self.v, at, size)
-            for j in range(m):
-                k = f.load_all(self.k, j, size)
-                v = f.op(op, v, f.mul(k, f.load(F, j * stride + at, size), size), size)
-            f.store(v, self.v, at, size)
-        with f.loop(self.layout.nz) as c:
-            start, column = f.at(self.V, f.integer("mul", c, P)), f.at(F, c)
-            factors = [f.load_all(column, j * stride, self.cut[0][1]) for j in range(m)]
-            for at, size in self.cut:
-                row = f.load(start, at, size)
-                for j, factor in enumerate(factors):
-                    row = f.op(op, row, f.mul(factor, K[j, at], size), size)
-                f.store(row, start, at, size)

@@ -31,6 +31,9 @@ def received(
     now, past, D = words.pointer("now"), words.pointer("past"), layout.nz - layout.n
     sent = []
     for j in range(layout.m):
+        if layout.prompt[j]:
+            sent.append(u[j])
+            continue
         value = f.mul(f.load_all(now, j, width), u[j], width)
         for i in range(layout.depths[j]):
             slot = layout.slot(j, i)

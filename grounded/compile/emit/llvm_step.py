@@ -68,6 +68,10 @@ class Dynamics:
         diagonal = ((i, i) for i in range(self.n))
         return [*self.rates, *(at for at in diagonal if at not in self.rates)]
 
+    def constant(self, place: int) -> bool:
+        """Whether a place is always 1: of a state that no stage lets depend on itself."""
+        return bool(self.stages) and place >= len(self.rates)
+
 
 def dynamics_of(
     variant: Variant, n: int, m: int, width: int, kind: str, integrator: str
@@ -206,28 +210,42 @@ class StepWriter:
                 f.store(f.load_all("@chain_diagonal", rate, w), out, at, w)
 
     def _chain(self, body: Body, steps: tuple[str, str], stage: str, rates: str, out: str) -> None:
-        """K = f_x T + own takes the place of the K before, column by column; A += b dt K."""
+        """K = f_x T + own takes the place of the K before, some columns at a time; A += b dt K.
+
+        What a column becomes depends on that column alone. Two at once share what is read of f_x.
+        """
         f, d, w = self.f, self.d, self.width
         c_dt, b_dt = steps
-        own = {at: body.value(i) for at, i in d.entries.items()}
+        own = dict(zip(d.entries, body.values(list(d.entries.values())), strict=True))
         slot = {at: e * w for e, at in enumerate(d.rates)}
+        read = {s for _, s in d.entries}  # rows of K that another stage needs
         with f.when(f.emit(f"icmp eq i64 {stage}, 0")):  # nothing to chain with yet
             for (r, c), e in slot.items():
                 value = own.get((r, c), splat(0.0, w))
-                f.store(value, rates, e, w)
+                if r in read:
+                    f.store(value, rates, e, w)
                 f.store(f.fma(b_dt, value, splat(float(r == c), w), w), out, e, w)
         if len(d.stages) == 1:
             return
         with f.when(f.emit(f"icmp ne i64 {stage}, 0")):
-            scaled = {at: f.mul(c_dt, v, w) for at, v in own.items() if at[1] < d.n}
-            for column in _columns(d):
-                before = {at[0]: f.load(rates, slot[at], w) for at in column}
-                for at in column:
-                    value = own.get(at, "")
-                    for s in d.rates[at]:
-                        term = scaled[at[0], s], before[s]
+            scaled = f.room(len(own) * w)
+            for e, ((_, c), value) in enumerate(own.items()):
+                if c < d.n:
+                    f.store(f.mul(c_dt, value, w), scaled, e * w, w)
+            place = {at: e * w for e, at in enumerate(own)}
+            columns = _columns(d)
+            for first in range(0, len(columns), 2):
+                some = columns[first : first + 2]
+                before = {at: f.load(rates, slot[at], w) for c in some for at in c if at[0] in read}
+                factors: dict[Place, str] = {}
+                for at in sorted(at for column in some for at in column):
+                    value, row = own.get(at, ""), [(at[0], s) for s in d.rates[at]]
+                    factors |= {to: f.load(scaled, place[to], w) for to in row if to not in factors}
+                    for to in row:
+                        term = factors[to], before[to[1], at[1]]
                         value = f.fma(*term, value, w) if value else f.mul(*term, w)
-                    f.store(value, rates, slot[at], w)
+                    if at[0] in read:
+                        f.store(value, rates, slot[at], w)
                     f.store(f.fma(b_dt, value, f.load(out, slot[at], w), w), out, slot[at], w)
 
     def _looped_chain(

@@ -66,7 +66,8 @@ def _pack(problem: Problem) -> Packed:
     words = {name: word(array) for name, array in kept.items()}
     words |= {"dt": word(float(problem.dt)), "eps": word(float(problem.smoothing))}
     words["H"] = problem.horizon
-    layout = Layout(problem.system.n, problem.depths, tuple(bool(a) for a in problem.angles))
+    angles, prompt = (tuple(map(bool, some)) for some in (problem.angles, queue.now == 1.0))
+    layout = Layout(problem.system.n, problem.depths, angles, prompt)
     return Packed(words, tuple(kept.values()), layout)
 
 

@@ -180,7 +180,7 @@ def _chunked(columns: Sequence[Column], written: Sequence[int], before: bytes) -
             k + 1: np.stack([at[own == k], places[own == k]], axis=1).astype("<u8").tobytes()
             for k in dict.fromkeys(own.tolist())
         }
-        data = b"".join([before * (begin == 0), *(next(left[k]) for k in own.tolist())])
+        data = b"".join([before * (begin == 0), *map(next, map(left.__getitem__, own.tolist()))])
         found.append(_Chunk(data, int(at[0]), int(at[-1]), entries))
         begin = stop
     return found
