@@ -632,8 +632,9 @@ def test_a_loss_by_several_times_the_best_utility_is_no_luck():
     assert story.now.history[-1].accepted is False and story.now.phase == "propose"
 
 
-def test_what_another_model_gained_ends_no_search():
+def test_what_another_model_gained_ends_no_search(monkeypatch):
     """After `adopt`, small gains with the old model do not end the search."""
+    monkeypatch.setattr(About, "_doubtful", lambda *_: False)
     story = Story().add().add()
     for _ in range(4):
         story.add(bad)

@@ -69,7 +69,7 @@ def test_a_step_that_may_lose_much_gives_way_to_the_model_s_own_derivatives(
         way="",
         original=False,
     )
-    plain = SimpleNamespace(step_from=lambda first, promised: own)
+    plain = SimpleNamespace(step_from=lambda first, promised: own, doubted=None)
     monkeypatch.setattr(improve, "About", lambda *given, plainly: plain)
     found = improve._surer(about, Step(), corrected)
     assert found is (own if taken == "own" else corrected)
