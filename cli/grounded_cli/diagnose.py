@@ -121,7 +121,7 @@ def command(
 
 
 def _show(
-    found: Diagnosis, nominal: dict[str, float], inputs: Collection[str], *, details: bool
+    found: Diagnosis, nominal: dict[str, float], inputs: Collection[str] = (), *, details: bool
 ) -> None:
     """Print a diagnosis: what a person needs to decide, or with `details` everything."""
     from grounded.diagnosis.tables import error_table
