@@ -280,13 +280,6 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             "and diagnosis, and run a candidate of this task",
             NextCommand("ingest", (str(path), "--data")),
         )
-    if log and not other and whole.inputs.any() and (misused := misused_in(log, task, own)):
-        raise GroundedError(
-            f"{path} did not run {ran} as it should: its commands are not what {ran} sends on the "
-            f"logged states and times; {misused}, and run {ran} again. Ingest it with --data for "
-            "fitting and diagnosis",
-            NextCommand("ingest", (str(path), "--data")),
-        )
     known = replace(read.trial, id="").until(read.trial.known_steps)
     odd = []
     if not seen.silent:  # without them the model can't tell what moves the robot
@@ -298,6 +291,13 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         named += filter(None, [misled(log, task, own)])
     if named:
         raise GroundedError(f"{path} can't be read as a run of {ran}: {'; '.join(named)}")
+    if log and not other and whole.inputs.any() and (misused := misused_in(log, task, own)):
+        raise GroundedError(
+            f"{path} did not run {ran} as it should: its commands are not what {ran} sends on the "
+            f"logged states and times; {misused}, and run {ran} again. Ingest it with --data for "
+            "fitting and diagnosis",
+            NextCommand("ingest", (str(path), "--data")),
+        )
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
     if guessed := sorted(_guessed(log)):
         said += (
