@@ -172,29 +172,6 @@ def test_without_a_calibration_effects_are_weighed_against_effects_without_one(w
     assert all(f.hypothesis.spread == 0 for n in h.names for _, f in claims.rivals(n))
 
 
-def test_what_is_as_likely_with_free_parameters_ties(wavy, ruler):
-    """A blind case: a drag of 6.5 nats was named, an input's curve of 7.3 with them was not."""
-    search = copy(wavy[0])
-    one, other = (f for f in search.of_size(1)[:2])
-    plain = replace(one, hypothesis=replace(one.hypothesis, shift=None, spread=0.0))
-    free = replace(other.hypothesis, spread=0.1, shift=np.zeros(1))
-    structure, name = plain.noise.structure, other.hypothesis.names[0]
-    bare = {k: f for k, f in search.fits.items() if not k[2]}
-
-    def rivals(nats):
-        tied = replace(other, hypothesis=free)
-        search.fits = bare | {(structure, 0.0, plain.hypothesis.names): plain}
-        off = search.score(plain) + nats - search.score(tied)
-        tied = replace(tied, evidence=tied.evidence + off / search.tempering.factor)
-        search.fits[structure, 0.1, (name,)] = tied
-        decision = Decision(search, search, plain, search.exact_null(), {})
-        claims = Claims(decision, {plain.hypothesis.names[0]: 1.0}, limits(search.data), ruler)
-        return [found for found, _ in claims.rivals(plain.hypothesis.names[0])]
-
-    assert rivals(1.0) == [name]
-    assert not rivals(-4.0) and not rivals(4.0)
-
-
 def test_once_a_calibration_is_dropped_the_likelier_effect_is_named(wavy):
     search, _ = wavy
     alone = Said(lambda c: 1.0)
@@ -256,39 +233,6 @@ def test_an_effect_of_one_channel_pays_there():
     assert not vague.pays(2.0, 0.01)
     worse = Gain(-0.01, 0.014, 0.3, clear.channels, clear.scatters)
     assert not worse.pays(1.0, 0.01)
-
-
-def test_a_further_effect_has_to_exceed_the_chance_of_few_trials():
-    """Blind cases: 3 trials, whose scatter in one channel was small by chance."""
-    three = {"own": np.array([0.013, 0.02, -0.023])}
-    channels = {"channels": np.array([0.09, -0.05]), "scatters": np.array([0.025, 0.055])}
-    further = Gain(0.015, 0.014, 0.3, **channels, **three)
-    assert further.pays(2.0, 0.01) and not further.pays(2.0, 0.01, strictly=True)
-    many = replace(further, own=np.tile(further.own, 10))
-    assert many.pays(2.0, 0.01, strictly=True)
-    all_ = replace(further, mean=0.035, scatter=0.014)
-    assert all_.beyond(2.0, 0.01) and not all_.pays(2.0, 0.01, strictly=True)
-    assert replace(all_, mean=0.08).pays(2.0, 0.01, strictly=True)
-
-
-def test_three_trials_do_not_overrule_the_likeliest_by_chance(wavy):
-    search, _ = wavy
-    found, rival, crude = search.of_size(1)[0], search.of_size(1)[1], search.best_null()
-
-    class Few:
-        trials = 3
-
-        def gain(self, before, after):
-            mean = 0.05 if before is crude else 0.011
-            own = np.full(self.trials, mean)
-            return Gain(mean, 0.004, 0.13, np.zeros(1), np.ones(1), own=own)
-
-    few = Few()
-    assert not decide_module._overrules(few, crude, found, rival, 2.0, 0.05)
-    few.trials = 8
-    assert decide_module._overrules(few, crude, found, rival, 2.0, 0.05)
-    few.trials = 3
-    assert not decide_module._overrules(few, crude, found, rival, 2.5, 0.05, far=1.5)
 
 
 def test_what_two_of_eight_trials_show_is_seen_again():

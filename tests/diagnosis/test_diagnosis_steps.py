@@ -202,20 +202,6 @@ def test_calibration_takes_the_place_of_several_effects_that_are_not_each_beyond
     assert own_numbers._calibrated_instead(search, sure, Coarse(0.0)) is sure
 
 
-def test_calibration_takes_the_place_of_a_further_effect_beside_a_blamed_parameter(
-    search, calibrated
-):
-    """Blind cases: slip, a gain of both inputs and one parameter stood for all being 5 % off."""
-    free = calibrated[1]
-    own = next(e for e in search.candidates if e.name == "parameter:k")
-    fit = fit_of(search, FRICTION, "input_gain:u")
-    three = replace(fit, hypothesis=fit.hypothesis.plus(own, {"d": 0.01}))
-    nats = search.score(free) - search.score(three)
-    near, sure = (more_likely(search, three, nats + more) for more in (6.0, 10.0))
-    assert own_numbers._calibrated_instead(search, near, Coarse(0.0)) is free
-    assert own_numbers._calibrated_instead(search, sure, Coarse(0.0)) is sure
-
-
 def test_effects_are_also_fitted_with_parameters_that_seem_right_without_them():
     """An offset and an input that is 5 % off hid each other: neither was likely alone."""
     model, trials = sled()

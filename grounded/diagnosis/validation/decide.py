@@ -196,7 +196,7 @@ def _pays(
         less = (search.score(f) for f in fits if set(f.hypothesis.names) <= rest)
         sure = sure and search.score(after) - max(less) > CLAIM
     further = effects > max(1, len(before.hypothesis.effects))
-    if gain.pays(*(ALONE if sure and effects < 2 else PAYS), strictly=further):
+    if gain.pays(*(ALONE if sure and effects < 2 else PAYS)):
         return True
     if not (sure and white and new and gain.largest > LEAST) or _as_given(after, new):
         return False
@@ -250,19 +250,11 @@ def _beyond_doubt(search: HypothesisSearch, found: Fitted, rival: Fitted) -> boo
 
 
 def _overrules(
-    ruler: Ruler,
-    crude: Fitted,
-    found: Fitted,
-    rival: Fitted,
-    scatters: float,
-    least: float,
-    far: float = np.inf,
+    ruler: Ruler, crude: Fitted, found: Fitted, rival: Fitted, *bar: float, far: float = np.inf
 ) -> bool:
     """Check whether a less likely rival predicts better significantly and by enough."""
     more, whole = ruler.gain(found, rival), ruler.gain(crude, found).mean
-    by_chance = more.of_few(BETTER[0])
-    clear = more.beyond(max(scatters, by_chance), least)
-    return clear and more.mean > AMOUNTS * min(whole, far)
+    return more.beyond(*bar) and more.mean > AMOUNTS * min(whole, far)
 
 
 def _proposed(

@@ -92,29 +92,13 @@ class Gain:
         """Check whether the gain exceeds `scatters` of its scatter, and `least` in some channel."""
         return self.mean > scatters * self.scatter and self.largest > least
 
-    def of_few(self, scatters: float) -> float:
-        """Return how many scatters are as improbable for these few trials (Student's t).
-
-        The scatter of three trials is itself uncertain: chance exceeds twice that in one of eleven
-        cases, not in one of 44.
-        """
-        from scipy.special import ndtr, stdtrit
-
-        freedom = len(self.own) - 1
-        return float(stdtrit(freedom, ndtr(scatters))) if freedom > 0 else scatters
-
-    def pays(self, scatters: float, least: float, *, strictly: bool = False) -> bool:
+    def pays(self, scatters: float, least: float) -> bool:
         """Check whether the gain supports a claim.
 
         It does if it is significant over all channels, in pieces without the best trial, by single
         trials, or in one channel. The last needs one scatter more; without it, an effect on one
         channel would be lost in the mean over a dozen channels and in their scatter.
-
-        strictly: allow for the uncertainty of the scatter of few trials.
         """
-        all_, in_one = scatters, scatters + 1
-        if strictly:
-            all_, in_one = self.of_few(all_), self.of_few(in_one)
-        one = (self.channels > in_one * self.scatters) & (self.channels > least)
+        one = (self.channels > (scatters + 1) * self.scatters) & (self.channels > least)
         again = (self.again > AGAIN or self.chance < CHANCE) and self.largest > least
-        return self.beyond(all_, least) or (self.mean > 0 and (again or bool(one.any())))
+        return self.beyond(scatters, least) or (self.mean > 0 and (again or bool(one.any())))

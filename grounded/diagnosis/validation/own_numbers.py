@@ -43,15 +43,14 @@ def _calibrated_instead(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> 
     """Replace further effects by calibration of all parameters, unless they are much likelier.
 
     If all parameters are slightly off, no single shift equals an effect with two values, but all
-    shifts together do. So each effect beside another one must be worth SURE nats. Parameters that
-    are blamed one by one are among those that are free.
+    shifts together do. So each effect beside another cause must be worth SURE nats.
     """
     h, score, names = fit.hypothesis, search.score, equations(fit)
-    if h.spread > 0 or len(names) < 2:
+    if h.spread > 0 or len(h.names) < 2:
         return fit
     rests = {
-        tuple(sorted({*names} - {*some})): SURE * count
-        for count in range(1, len(names))
+        tuple(sorted({*h.names} - {*some})): SURE * count
+        for count in range(1, min(len(names), len(h.names) - 1) + 1)
         for some in combinations(names, count)
     }
 
