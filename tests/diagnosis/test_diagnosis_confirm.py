@@ -172,6 +172,29 @@ def test_without_a_calibration_effects_are_weighed_against_effects_without_one(w
     assert all(f.hypothesis.spread == 0 for n in h.names for _, f in claims.rivals(n))
 
 
+def test_what_is_as_likely_with_free_parameters_ties(wavy, ruler):
+    """A blind case: a drag of 6.5 nats was named, an input's curve of 7.3 with them was not."""
+    search = copy(wavy[0])
+    one, other = (f for f in search.of_size(1)[:2])
+    plain = replace(one, hypothesis=replace(one.hypothesis, shift=None, spread=0.0))
+    free = replace(other.hypothesis, spread=0.1, shift=np.zeros(1))
+    structure, name = plain.noise.structure, other.hypothesis.names[0]
+    bare = {k: f for k, f in search.fits.items() if not k[2]}
+
+    def rivals(nats):
+        tied = replace(other, hypothesis=free)
+        search.fits = bare | {(structure, 0.0, plain.hypothesis.names): plain}
+        off = search.score(plain) + nats - search.score(tied)
+        tied = replace(tied, evidence=tied.evidence + off / search.tempering.factor)
+        search.fits[structure, 0.1, (name,)] = tied
+        decision = Decision(search, search, plain, search.exact_null(), {})
+        claims = Claims(decision, {plain.hypothesis.names[0]: 1.0}, limits(search.data), ruler)
+        return [found for found, _ in claims.rivals(plain.hypothesis.names[0])]
+
+    assert rivals(1.0) == [name]
+    assert not rivals(-4.0) and not rivals(4.0)
+
+
 def test_once_a_calibration_is_dropped_the_likelier_effect_is_named(wavy):
     search, _ = wavy
     alone = Said(lambda c: 1.0)

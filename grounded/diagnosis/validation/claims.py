@@ -8,7 +8,7 @@ from functools import cached_property
 from itertools import islice
 from typing import Any
 
-from grounded.diagnosis.hypotheses.explored import TIE, parametric
+from grounded.diagnosis.hypotheses.explored import CLAIM, TIE, parametric
 from grounded.diagnosis.hypotheses.lookalike import lookalikes, of_parameters, one_thing
 from grounded.diagnosis.hypotheses.one_clock import one_clock
 from grounded.diagnosis.hypotheses.stand_in import moving, swap, twins
@@ -236,12 +236,23 @@ class Claims:
         return tuple(found)
 
     def rivals(self, name: str) -> list[tuple[str, Fitted]]:
-        """Return up to two effects that tie with a claimed one beside all the others, with fits."""
-        rest = set(self.names) - {name}
+        """Return up to two effects that tie with a claimed one beside all the others, with fits.
+
+        The rivals' parameters may be free though the claim's are not, or the other way round.
+        """
+        rest, score = set(self.names) - {name}, self.search.score
+        free, fits = self.best.hypothesis.spread > 0, self.search.fits.values()
+        without = max(score(f) for f in fits if set(f.hypothesis.names) <= rest)
         found: dict[str, Fitted] = {}  # likeliest first
-        for f in self.as_free(len(self.names)):
-            other, *more = set(f.hypothesis.names) - rest
-            if not more and other not in (name, *found) and self._ties(name, other, f):
+        for f in sorted(fits, key=lambda f: -score(f)):
+            h = f.hypothesis
+            if len(h.names) != len(self.names) or len(set(h.names) - rest) != 1:
+                continue
+            (other,) = set(h.names) - rest
+            # not if parameters that predictions refused make it likelier, or make all of it
+            as_likely = abs(score(f) - score(self.best)) < TIE and score(f) > without + CLAIM
+            needed = (h.spread > 0) == free or as_likely
+            if other not in (name, *found) and needed and self._ties(name, other, f):
                 found[other] = f
         return list(found.items())[:2]
 
