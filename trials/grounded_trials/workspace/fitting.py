@@ -196,15 +196,16 @@ def fit_trials(
     hidden = [name for i, name in enumerate(model.state_names) if i not in shown]
     lifted = [planner.lift(trial) for trial in used]
     looked = sound_trials(planner.plan, lifted, hidden)
-    records = []
+    records, unknown = [], np.array([name in guessed for name in model.state_names])
     for trial, logged in zip(looked.trials, lifted, strict=True):
         # a sensor that was left out still says where the filter may begin
         states = np.where(np.isfinite(trial.states), trial.states, logged.states[: trial.steps + 1])
-        width = np.ptp(states, axis=0)
+        width = np.where(unknown, 1.0, np.ptp(states, axis=0))
         known = np.where(np.arange(model.n) < n, np.maximum(width, 1.0), 0.1 * width + 1e-6)
+        start = np.where(unknown, 0.0, states)  # an estimate is by the model that is fitted
         record = record_of(model, trial)
         records.append(
-            replace(record, measured=record.measured[:, shown], start=states, start_std=known)
+            replace(record, measured=record.measured[:, shown], start=start, start_std=known)
         )
     found = fit(
         planner.plan,
