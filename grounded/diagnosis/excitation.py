@@ -314,8 +314,18 @@ def _rivals(
 def _effect(
     library: Library, name: str, task: Task, diagnosis: Diagnosis, scales: Scales
 ) -> Effect:
-    """Return the effect as the diagnosis had it: for an adopted delay, its change."""
+    """Return the effect as the diagnosis had it: for an adopted delay, its change.
+
+    A quantity that the diagnosis did not estimate is held: whether parameters already describe the
+    viscous part of a friction may depend on their values, which are calibrated here.
+    """
     effect, adopted = library.effect(name, task.model, scales), diagnosis.made or Made()
+    if row := diagnosis.ranked(name):
+        kept = (
+            q if q.fixed or q.name in row.params else replace(q, fixed=True)
+            for q in effect.quantities
+        )
+        effect = replace(effect, quantities=tuple(kept))
     if name not in adopted.effects or effect.family.name != "delay":
         return effect
     assert task.latency is not None

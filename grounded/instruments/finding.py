@@ -108,13 +108,16 @@ def in_degrees(name: str, unit: str) -> Finding:
     return put_right(name, text, "degrees", log, scale=DEGREES)
 
 
+def in_rpm(name: str) -> Finding:
+    """Return the finding of a velocity that was converted from rpm to radians a second."""
+    log = f"scale = {1 / RPM:.8g}"
+    return put_right(name, "is in rpm, not in rad/s", "degrees", log, scale=RPM)
+
+
 def scaled(name: str, position: str, size: float, unit: str) -> Finding:
     """Return the finding of a velocity that is `size` times the rate of its position."""
     text = f"shows {100 * size:.3g} % of the rate of {position}"
-    if unit == "rad/s" and abs(size / RPM - 1) < ALIKE:
-        mend = f"if so, set [log] scale = {1 / RPM:.8g}"
-        text = f"{text}, 60 / (2 pi) times it: it is probably in rpm; {mend}"
-    elif unit == "rad/s" and abs(size * RPM - 1) < ALIKE:
+    if unit == "rad/s" and abs(size * RPM - 1) < ALIKE:
         text = f"{text}, 2 pi / 60 times it: it was probably converted from rpm by mistake"
     else:
         text = f"{text}; either may be wrong"

@@ -36,11 +36,13 @@ from grounded.instruments.derived import Derived, derived
 from grounded.instruments.finding import (
     A_SECOND,
     DEGREES,
+    RPM,
     Finding,
     Preflight,
     a_mean,
     derived_from,
     in_degrees,
+    in_rpm,
     put_right,
     scaled,
 )
@@ -79,6 +81,7 @@ from grounded.trial import Trial
 
 LEAST_STEPS = 0.1  # of a time step: smaller delays may come from the time stamps
 ALIKE = 0.9  # coherence above which two sensors are compared
+ALIKE_RPM = 0.02  # relative tolerance within which it counts as that of rpm
 UNIT = 0.1  # relative tolerance within which a scale counts as that of degrees
 SMOOTH = 2.0  # time steps: a velocity averaged over less still resolves the motion
 
@@ -271,7 +274,10 @@ class _Bench:
             if abs(factor / DEGREES - 1) < UNIT:
                 yield self.from_degrees(i)
                 return
-        if lag.off(OFF):
+        if self.model.states[w] == "rad/s" and abs(lag.scale / RPM - 1) < ALIKE_RPM:
+            self.put(relation.j, [x / RPM for x in self.column(relation.j)])
+            yield in_rpm(w)
+        elif lag.off(OFF):
             yield scaled(w, q, lag.scale, self.model.states[w])
         elif relation.exact and lag.one_size:
             self.refuted |= {f"sensor_scale:{w}", f"sensor_scale:{q}", f"rate_gain:{q}"}

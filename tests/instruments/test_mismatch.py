@@ -323,7 +323,6 @@ def test_a_tracked_point_or_a_slip_makes_no_position_late(model):
         assert not delayed(preflight(model, logged(model, fault)).findings)
 
 
-
 def test_a_steering_angle_is_no_speed_to_the_side(monkeypatch):
     """Blind cases: a car whose tyres slip was given positions 42 ms late.
 

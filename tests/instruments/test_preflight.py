@@ -656,12 +656,27 @@ def test_one_factor_of_all_rates_is_the_clock(off, told):
 
 
 @pytest.mark.parametrize(
-    ("factor", "rpm", "scale"),
+    ("factor", "rpm", "mended"),
     [(60 / (2 * np.pi), True, True), (2 * np.pi / 60, True, False), (9.2, False, False)],
 )
-def test_a_rate_in_rpm_is_said_to_be_in_rpm(factor, rpm, scale):
+def test_a_rate_in_rpm_is_said_to_be_in_rpm(factor, rpm, mended):
     """`w shows 955 % of the rate of q`: a motor's driver gives turns a minute."""
     (found,) = preflight(ARM, arm(columns(w=lambda x: factor * x))).findings
-    assert (found.signal, found.kind, found.corrected) == ("w", "scale", False)
+    assert (found.signal, found.corrected) == ("w", mended)
     assert ("rpm" in found.finding) == rpm
-    assert ("[log] scale = 0.1047" in found.finding) == scale
+    assert found.log == "scale = 0.10471976" * mended
+
+
+def test_two_rates_in_rpm_are_no_clock():
+    """It said to multiply the stamps by 0.105, and offered six effects to adopt."""
+    trials, factor = [], 60 / (2 * np.pi)
+    for first, second in zip(arm(seed=1), arm(seed=2), strict=True):
+        a, b = first.states, second.states
+        states = np.column_stack([a[:, 0], b[:, 0], factor * a[:, 1], factor * b[:, 1]])
+        trials.append(Trial(states, first.inputs, DT, BOTH.state_names, ("u",)))
+    looked = preflight(BOTH, trials)
+    assert [(one.signal, one.kind, one.corrected) for one in looked.findings] == [
+        ("w1", "degrees", True),
+        ("w2", "degrees", True),
+    ]
+    np.testing.assert_allclose(looked.trials[0].states[:, 2], trials[0].states[:, 2] / factor)
