@@ -13,7 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from grounded.effects.family import Quantity, RateFamily, Site, Values, per
+from grounded.effects.family import (
+    Quantity,
+    RateFamily,
+    Site,
+    Values,
+    coupled,
+    from_source,
+    per,
+)
 
 KNOTS = 7
 WIDTH = 0.7  # standard deviation of a bell, in distances between knots
@@ -36,16 +44,15 @@ def _targets(model: Any) -> list[str]:
 
 
 def _quantities(site: Site) -> tuple[Quantity, ...]:
-    target, _, source = site.target.partition("<-")
+    target, source = coupled(site)
     ends = [Quantity(n, site.unit(source), fixed=True) for n in ("lo", "hi")]
     unit = per(site.unit(target))
     return (*ends, *[Quantity(f"w{k}", unit, fixed=True) for k in range(KNOTS)])
 
 
 def _rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    target, _, source = site.target.partition("<-")
-    r = s[source] if source in site.model.states else a[source]
-    return {target: sum(c[f"w{k}"] * g for k, g in enumerate(bells(r, c["lo"], c["hi"])))}
+    values = bells(from_source(s, a, site), c["lo"], c["hi"])
+    return {coupled(site)[0]: sum(c[f"w{k}"] * g for k, g in enumerate(values))}
 
 
 correction = RateFamily(

@@ -141,6 +141,12 @@ def coupled(site: Site) -> tuple[str, str]:
     return target, source
 
 
+def from_source(s: Any, a: Any, site: Site) -> Any:
+    """Return the value of the source of a target `v<-delta`, a state or an input."""
+    _, source = coupled(site)
+    return s[source] if source in site.model.states else a[source]
+
+
 def width(site: Site, speed: str) -> Quantity:
     """Return the speed over which a dry friction builds up: a hundredth of the largest speed.
 

@@ -28,6 +28,7 @@ from grounded.effects.family import (
     Values,
     beyond,
     coupled,
+    from_source,
     per,
     two_axes,
 )
@@ -123,9 +124,8 @@ def _grip_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
 
 
 def _drag_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    driven, source = coupled(site)
-    turned = s[source] if source in site.model.state_names else a[source]
-    return {driven: -c["k"] * np.abs(turned) * s[driven]}
+    driven, _ = coupled(site)
+    return {driven: -c["k"] * np.abs(from_source(s, a, site)) * s[driven]}
 
 
 def _corners(model: Model) -> list[str]:

@@ -27,6 +27,7 @@ from grounded.effects.family import (
     Values,
     beyond,
     coupled,
+    from_source,
     per,
     speed_limit,
 )
@@ -60,8 +61,7 @@ def _periodic(site: Site) -> tuple[Quantity, ...]:
 
 
 def _coupling_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    target, source = coupled(site)
-    return {target: c["k"] * s[source]}
+    return {coupled(site)[0]: c["k"] * from_source(s, a, site)}
 
 
 def _periodic_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
@@ -132,7 +132,7 @@ crosstalk = RateFamily(
     quantities=_coupling,
     lookalikes=("coupling", "input_gain", "periodic", "cornering_drag"),
     vague=0.7,
-    rate=lambda s, a, own, t, c, site: {coupled(site)[0]: c["k"] * a[coupled(site)[1]]},
+    rate=_coupling_rate,
 )
 
 periodic = RateFamily(
