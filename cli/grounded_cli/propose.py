@@ -115,10 +115,13 @@ def _otherwise(candidate: Candidate, best: Tried) -> bool:
 def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection[str] = ()) -> str:
     """Return the best one's utility and, if it differs clearly, what the model gives it and why.
 
-    The difference is split into two parts: the start (the model's own run starts at s_0, the real
-    ones elsewhere, if by more than sensor noise), and the rest, which is compared with the scatter
-    of its runs if that is known. The parts shown add up to the difference.
+    The difference is split into three parts: the start (the model's own run starts at s_0, the real
+    ones elsewhere, if by more than sensor noise), the mean of several runs (which the model
+    replays: it costs less than they do, because their scatter is averaged out), and the rest, which
+    is compared with the scatter of its runs if that is known. The parts shown add up to the
+    difference.
     """
+    from grounded.trial import mean_trial
     from grounded_trials.workspace.off_target import began_elsewhere
 
     text = f"{number(best.utility)} by {best.candidate.id}{noise_share(best)}"
@@ -137,7 +140,16 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
         why.append(f"{_apart(start)} than its runs, because they began {where}")
     else:
         start = 0.0
-    rest, known = same - start - best.utility, math.isfinite(best.standard_error)
+    each = [task.utility(trial) for trial in best.trials]
+    mean = task.utility(mean_trial(best.trials, task.model.angle_mask)) - sum(each) / len(each)
+    if mean > told:
+        runs = "" if why else " than its runs"
+        why.append(
+            f"{_apart(mean)}{runs}, because it replays their mean, which lacks their scatter"
+        )
+    else:
+        mean = 0.0
+    rest, known = same - start - mean - best.utility, math.isfinite(best.standard_error)
     if abs(rest) > told and (known or why):
         within = abs(rest) <= LUCKY * best.standard_error
         scatter = "which is within their scatter" if within else "which their scatter can't explain"

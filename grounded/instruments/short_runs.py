@@ -159,7 +159,8 @@ class Ahead:
 
         def off(theta: Array) -> Array:
             """Return the errors (K, N, shown) for several parameter vectors (K, q)."""
-            moved, values = (np.tile(one, (len(theta), 1)) for one in (gains, self.model.values))
+            own = (gains, self.model.values)
+            moved, values = (np.repeat(one[None], len(theta), axis=0) for one in own)
             moved[:, :m] += theta[:, :m]
             shifted = values[:, self.moving] + theta[:, m:] * self.spread
             values[:, self.moving] = np.clip(shifted, self.low, self.high)

@@ -243,11 +243,11 @@ model = Model(
 """
 
 
-def helicopter(folder, names):
+def helicopter(folder, names, linked=True):
     """A workspace for a log in degrees with these names, and its [log] table."""
     t = np.arange(0, 12, 0.05)
     pitch, yaw = 20 * np.sin(0.9 * t), 30 * np.sin(0.5 * t + 1)
-    rates = [np.gradient(angle, t) for angle in (pitch, yaw)]
+    rates = [np.gradient(angle, t) if linked else angle**2 for angle in (pitch, yaw)]
     rows = np.column_stack([t, pitch, yaw, *rates, np.cos(0.9 * t), np.cos(0.5 * t)])
     np.savetxt(folder / "a.csv", rows, "%.5f", ";", header=";".join(["t", *names]), comments="")
     (folder / "m.py").write_text(ROLLING)
@@ -277,7 +277,8 @@ def test_names_in_other_languages_are_found_with_their_units(tmp_path, names):
 
 def test_a_path_that_is_only_offered_has_its_scale_beside_it(tmp_path):
     """With the # removed as it said, degrees were stored as radians."""
-    out, text = helicopter(tmp_path, ["a_deg", "b_deg", "c_dps", "d_dps", "e", "f"])
+    names = ["a_deg", "b_deg", "c_dps", "d_dps", "e", "f"]
+    out, text = helicopter(tmp_path, names, linked=False)
     assert "UNSURE" in out
     table = text[text.index("[log]") :]
     assert "remove all 3 #" in table and "remove both #" in table  # u_pitch has no unit
@@ -286,6 +287,18 @@ def test_a_path_that_is_only_offered_has_its_scale_beside_it(tmp_path):
     )
     for one in log["log"]["state"].values():
         assert one["scale"] == pytest.approx(np.pi / 180)
+
+
+def test_states_of_one_s_own_model_are_found_by_their_derivatives_if_no_name_fits(tmp_path):
+    """With --model nothing was mapped, though a skeleton's states were."""
+    names = ["a_deg", "b_deg", "c_dps", "d_dps", "e", "f"]
+    out, text = helicopter(tmp_path, names)
+    log = tomllib.loads(text)["log"]
+    signals = {**log["state"], **log["input"]}
+    assert [one["path"] for one in signals.values()] == [f"/csv.{name}" for name in names]
+    assert out.count("UNSURE") == 7 and "or /csv.f" in out  # 6, and a sentence that says so
+    done = grounded("-C", tmp_path / "w", "ingest", "--data", tmp_path / "a.csv")
+    assert done.code == 0, done.err  # a model without parameters brought a traceback
 
 
 def test_words_are_translated_only_if_all_parts_are_known():

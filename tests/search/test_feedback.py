@@ -246,6 +246,25 @@ def test_of_what_the_model_gives_otherwise_only_known_reasons_are_told(as_run, e
     assert "itself" not in _so_far(made, near, task)
 
 
+def test_what_the_scatter_of_runs_costs_is_not_called_unexplained():
+    """The model replays the mean of three runs; -0.25 of -1.25 was "not explained by scatter"."""
+    from grounded_cli.propose import _so_far
+
+    task = cart_task()
+    runs = [begun(task, noise=0.02, seed=seed) for seed in range(3)]
+    each = [task.utility(run) for run in runs]
+    mean = task.utility(mean_trial(runs, task.model.angle_mask))
+    best = SimpleNamespace(
+        candidate=SimpleNamespace(id="c0001"),
+        utility=np.mean(each),
+        standard_error=1e-4,
+        noise_cost=0.0,
+        trials=runs,
+    )
+    text = _so_far(promise("c0001", mean, 0.1 * abs(mean), mean), best, task)
+    assert "replays their mean" in text and "explain" not in text
+
+
 def promise(base, of_base, gain, as_run):
     """Return a candidate with the model's utility of its base, the gain, and the base as run."""
     return Candidate(

@@ -24,12 +24,12 @@ from grounded_trials.logs.guessed_table import mapping_toml
 from grounded_trials.logs.inspect_evidence import as_stated, weigh
 from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated
 from grounded_trials.logs.inspect_log import LogReport, inspect_log
-from grounded_trials.logs.inspect_pairs import velocities
+from grounded_trials.logs.inspect_pairs import rates_among, velocities
 from grounded_trials.logs.joint_names import joint_names, joint_units, wide_joints
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.measured import only_commands
-from grounded_trials.logs.stated_units import Stated
+from grounded_trials.logs.stated_units import Stated, factor_between
 from grounded_trials.logs.unnamed import from_the_rest
 from grounded_trials.starting.examples import fresh_folder
 from grounded_trials.starting.first_toml import held_first, write_first
@@ -194,7 +194,7 @@ def _begin(
     else:
         text = skeleton(chosen, report, joints, named, column_units(files[0])).source()
         found = _model_in(folder, text)
-    states, inputs = _matched(report, found, joints, unnamed=not own)
+    states, inputs = _matched(report, found, joints)
     if not (kind or own or any(g.path for g in states)):
         why = f"no number in the log matches a state of kind {chosen}; names are the log's"
         chosen = "generic"
@@ -247,33 +247,47 @@ def _begin(
 
 
 def _matched(
-    report: LogReport, model: Model, joints: Joints, *, unnamed: bool = False
+    report: LogReport, model: Model, joints: Joints
 ) -> tuple[tuple[Guess, ...], tuple[Guess, ...]]:
     """Match the states and inputs to numbers of the log, by name and then by their values.
 
-    With `unnamed`, the names are a skeleton's and the log need not contain them. If no name matches
-    a position and its rate, any two numbers are tried of which one follows the other's derivative;
-    if a single number is then left over, it is matched to a single input.
+    The log need not contain the names, which may be a skeleton's. If no name matches a state, any
+    numbers are tried as a position and its rate of which one follows the other's derivative; if as
+    many numbers are then left over as there are inputs, they are matched in the order of the log,
+    unless the model's steps tell them apart.
     """
-    units = {**model.states, **model.inputs}
-    names = guess_mapping(report, model.state_names, model.input_names, units)
+    both = {**model.states, **model.inputs}
+    names = guess_mapping(report, model.state_names, model.input_names, both)
     states, inputs = weigh(report, model, *names, joints)
-    if not unnamed or any(g.path or g.others for g in states):
+    if any(g.path or g.others for g in states):
         return states, inputs
     found, taken = moving(report), {g.path for g in inputs}
     free = [f.path for f in reversed(found.values()) if f.path not in taken]
     sent = {f.path for name, f in found.items() if called_input(name, f.path)}
-    others = tuple(path for path in free if path not in sent)
-    pair = {name for both in velocities(model).items() for name in both}
-    tried = tuple(replace(g, others=others) if g.name in pair else g for g in states)
+    stated, rates = Stated.by(report.files), rates_among(report, [p for p in free if p not in sent])
+    kinds = {q: list(rates) for q in velocities(model)}
+    kinds |= {w: [path for path, _ in rates.values()] for w in velocities(model).values()}
+
+    def offered(name: str) -> tuple[str, ...]:
+        units = {path: stated.unit(path) for path in kinds.get(name, ())}
+        may = {path: not said or factor_between(said, both[name]) for path, said in units.items()}
+        return tuple(path for path in free if may.get(path))
+
+    tried = tuple(replace(g, others=offered(g.name) or g.others) for g in states)
     tried, inputs = weigh(report, model, tried, inputs, joints)
     pairs = zip(tried, states, strict=True)
-    states = tuple(replace(g, sure=False, others=()) if g.path else old for g, old in pairs)
-    rest = [path for path in free if path not in {g.path for g in states}]
-    if all(g.path for g in states) and len(inputs) == len(rest) == 1 and not inputs[0].path:
-        left = replace(inputs[0], path=rest[0], reasons=("the only number left",))
-        _, (left,) = weigh(report, model, states, (left,), joints)
-        inputs = (replace(left, sure=False),)
+    states = tuple(replace(g, sure=False) if g.path else old for g, old in pairs)
+    used = {g.path for g in states}
+    rest = [path for path in free if path not in used]
+    if all(g.path for g in states) and not any(g.path for g in inputs) and len(rest) == len(inputs):
+        why = "the only number left" if len(rest) == 1 else "the numbers left, in the log's order"
+        others = [tuple(other for other in rest if other != path) for path in rest]
+        left = [
+            replace(guess, path=path, others=rivals, reasons=(why,))
+            for guess, path, rivals in zip(inputs, rest, others, strict=True)
+        ]
+        _, inputs = weigh(report, model, states, left, joints)
+        inputs = tuple(replace(guess, sure=False) for guess in inputs)
     return states, inputs
 
 
