@@ -47,6 +47,14 @@ def spread(std: float) -> str:
     return f"{std:.{1 - math.floor(math.log10(std))}f}"
 
 
+def with_error(value: float, error: float) -> str:
+    """Format a value to the second digit of its error: `0.0014 +- 0.0012`, `-12.3 +- 1.2`."""
+    if not 1e-9 < error < 1e4:
+        return f"{figure(value, 3)} +- {figure(error, 2)}"
+    decimals = max(1 - math.floor(math.log10(error)), 0)
+    return f"{round(value, decimals) + 0.0:.{decimals}f} +- {error:.{decimals}f}"
+
+
 def listed(names: Iterable[str]) -> str:
     """Join names as in `a`, `a and b` or `a, b and c`."""
     *most, last = [*names] or [""]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded.result import listed
+from grounded.result import listed, measured_alike
 from grounded.search.candidate import LITTLE, UNLIKE
 from grounded.search.step_size import Step
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
@@ -295,7 +295,7 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     last = sorted(same, key=lambda tried: max(trial.id for trial in tried.trials))[-LAST:]
     promises = [one.promised for one in last]
     missed = [abs(promise - one.utility) for promise, one in zip(promises, last, strict=True)]
-    whole = [number(off) for off in missed if math.isfinite(off)]
+    whole = measured_alike([off for off in missed if math.isfinite(off)], "")
     failed = len(missed) - len(whole)
     if len(missed) == 1:
         promised, real = number(promises[-1]), number(last[-1].utility)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.frozen import Array
+from grounded.result import with_error
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.scatter import (
     Repeats,
@@ -189,7 +190,7 @@ def last_improvement(history: Sequence[Tried], again: str = "run the best one ag
     if error == 0:
         return f"the last gain is {gain:.3g}; repeated trials agree exactly"
     return (
-        f"the last gain is {gain:.3g} +- {error:.2g}: an improvement with probability "
+        f"the last gain is {with_error(gain, error)}: an improvement with probability "
         f"{chance(before, after, history):.2f}" + ", from few repeats" * (freedom < FEW)
     )
 

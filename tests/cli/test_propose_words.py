@@ -14,4 +14,4 @@ def test_a_prediction_has_one_value_and_the_noise_of_its_log_is_named():
     said = _came_true(made, [tried], SimpleNamespace(incumbent=None, history=(tried,)))
     assert said.index("-0.01330") < said.index("or -0.01340 with the sensor noise seen since")
     twice = _came_true(made, [tried, tried], SimpleNamespace(incumbent=None, history=(tried,)))
-    assert "with sensor noise, missed the utility by 0.006600" in twice
+    assert "with sensor noise, missed the utility by 0.0066" in twice

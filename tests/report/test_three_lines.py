@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from grounded.diagnosis.report import Diagnosis, Verdict
-from grounded.result import measured, measured_alike
+from grounded.result import measured, measured_alike, percent
 from grounded_trials.report.diagnosis_words import verdict_lines
 from grounded_trials.report.three_lines import gained_most, three_lines
 from reported import DIAGNOSIS
@@ -53,7 +53,10 @@ def test_causes_gain_and_what_is_left(diagnosis):
     assert CAUSES[2] in wrong  # a delay, however small its share: it decides stability
     (*_, bias) = diagnosis.credit
     other = replace(diagnosis, credit=(*diagnosis.credit[:2], replace(bias, of="input_bias:force")))
-    assert "1 smaller cause" in three_lines(other, cart_task())[0]
+    assert f"1 smaller cause ({percent(bias.share)} of the" in three_lines(other, cart_task())[0]
+    large = replace(bias, of="input_bias:force", share=0.22)  # was only counted
+    other = replace(diagnosis, credit=(*diagnosis.credit[:2], large))
+    assert CAUSES[2] in three_lines(other, cart_task())[0]
     assert "x by 1.2 cm instead of 25 cm" in gained
     assert "v" in left and "0.020 m/s" in left and "0.0050 m/s" in left and "x > 0.2" in left
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from grounded.diagnosis.cause_words import is_late
+from grounded.diagnosis.cause_words import is_late, with_share
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.ruler_words import COMPARABLE, in_doubt, open_noise, rest, telling, worsened
 from grounded.diagnosis.verdict import told_apart
@@ -14,7 +14,8 @@ from grounded.task import Task
 from grounded_trials.wording import count, shown
 from grounded_trials.workspace.off_target import rates_among, weighed_groups
 
-CAUSES = 2  # that the first line names
+CAUSES = 2  # that the first line names in any case
+LARGE = 0.15  # of the improvement: a further cause above it is named too
 SMALL = 0.05  # of the improvement: a cause below it is only counted
 FEW = 2  # states in the second line
 
@@ -39,19 +40,21 @@ def three_lines(diagnosis: Diagnosis, task: Task) -> list[str]:
 
 
 def _wrong(diagnosis: Diagnosis) -> str:
-    """The largest causes without their shares, which the bars show; the others are counted.
+    """The largest causes without their shares, which the bars show; the others with one for all.
 
     Delays and lags are named in any case, as they decide whether a loop is stable.
     """
     told: list[str] = []
-    small = 0
+    small = []
     for clause, credit in zip(diagnosis.verdict.causes, diagnosis.credit, strict=True):
-        many = len(told) >= CAUSES or credit.share < SMALL
+        many = credit.share < (LARGE if len(told) >= CAUSES else SMALL)
         if told and many and not is_late(credit.of):
-            small += 1
+            small.append(credit.share)
         else:
             told.append(clause)
-    text = "; ".join(told) + f"; {count(small, 'smaller cause')}" * bool(small)
+    if small:
+        told.append(with_share(count(len(small), "smaller cause"), sum(small)))
+    text = "; ".join(told)
     return f"{text[:1].upper()}{text[1:]}."
 
 
