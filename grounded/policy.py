@@ -191,6 +191,8 @@ class Policy:
         off = z_difference(states, self.reference[:T, :n], self.angles)
         asked += np.einsum("tij,btj->bti", self.gain[:T, :, :n], off)
         memory, newest = self.gain[:T, :, n:], np.cumsum([0, *self.depths[:-1]])
+        if not memory.any():
+            return np.clip(asked, self.low, self.high)
         asked -= np.einsum("tij,tj->ti", memory, self.reference[:T, n:])
         if sent is not None:
             oldest = max(self.depths)

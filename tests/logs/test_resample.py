@@ -107,8 +107,9 @@ def test_held_inputs_grow_old() -> None:
 
 
 def test_a_command_that_is_no_number_for_long_is_a_gap() -> None:
-    u, x = command(), pose(np.sin)
+    x = pose(np.sin)
     for count, refused in ((2, False), (8, True)):  # 5 intervals of 0.05 s may be bridged
+        u = command()
         u.values[10 : 10 + count] = np.nan
         if refused:
             with pytest.raises(GroundedError, match="has a gap of"):

@@ -384,6 +384,7 @@ def test_a_strange_log_has_no_start_and_is_taken_with_a_warning_where_it_is_name
     [
         ((57.29578, 57.29578, 1), ("theta and omega", "large", "degrees", "0.0174533")),
         ((1 / 57.29578, 1, 1), ("theta 57.3", "small", "57.2958")),
+        ((1 / 57.29578, 1 / 57.29578, 1), ("passed to `runner.action` in degrees", "pass rad")),
         ((1, 1, 1e-3), ("torque 1000", "small", "by 1000")),
     ],
 )

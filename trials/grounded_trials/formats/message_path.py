@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NoReturn
 
 from grounded.errors import GroundedError, nearest
@@ -98,6 +99,11 @@ def parse_path(text: str) -> MessagePath:
     Raises:
         GroundedError: if it is invalid, stating the character.
     """
+    return _parsed(text) if isinstance(text, str) else _Parser(text).path()
+
+
+@lru_cache(maxsize=4096)
+def _parsed(text: str) -> MessagePath:
     return _Parser(text).path()
 
 

@@ -12,8 +12,9 @@ else is counted and reported.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -89,8 +90,21 @@ class Gridded:
     moved_s: float  # further shift to where the commands change [s]
     row_s: float  # interval of rows that repeat commands, by which these may be logged late [s]
     last_ns: int  # last sample of the state whose samples end first, on the same clock [ns]
-    reports: tuple[SignalReport, ...]  # of the states, then of the inputs
-    warnings: tuple[str, ...]
+    told: Callable[[], tuple[tuple[SignalReport, ...], tuple[str, ...]]]  # reports and warnings
+
+    @property
+    def reports(self) -> tuple[SignalReport, ...]:
+        """The reports of the states, then of the inputs."""
+        return self._told[0]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is odd about the samples."""
+        return self._told[1]
+
+    @cached_property
+    def _told(self) -> tuple[tuple[SignalReport, ...], tuple[str, ...]]:
+        return self.told()  # on request: a run is sought in many spans of a log
 
 
 def to_grid(
@@ -152,13 +166,20 @@ def to_grid(
     count = _steps(start, stop, dt, steps, origin, stamped_otherwise(samples.values(), dt))
     grid = start + np.round(dt * 1e9 * np.arange(count + 1)).astype(np.int64)
     middle = start + np.round(dt * 1e9 * (np.arange(count) + 0.5)).astype(np.int64)
-    columns, reports = [], []
-    for name in names:
-        at = grid if name in states else middle
-        value = whole[name].linear if how[name] == "linear" else whole[name].hold
-        columns.append(value(at, dt, start))
-        reports.append(report_of(samples[name], series[name], columns[-1], at, start))
-    stairs = staircases(tracked, start, int(grid[-1]), dt)
+    times = {name: grid if name in states else middle for name in names}
+    columns = [
+        (whole[name].linear if how[name] == "linear" else whole[name].hold)(at, dt, start)
+        for name, at in times.items()
+    ]
+
+    def told() -> tuple[tuple[SignalReport, ...], tuple[str, ...]]:
+        reports = tuple(
+            report_of(samples[name], series[name], column, at, start)
+            for (name, at), column in zip(times.items(), columns, strict=True)
+        )
+        stairs = staircases(tracked, start, int(grid[-1]), dt)
+        return reports, (*warnings_of(reports, late), *filter(None, (uneven,)), *stairs)
+
     held = np.array([s.before(start - round(dt * 0.5e9)) for s in sent])
     if still and rest is not None:
         held = np.where(np.isfinite(held), held, rest)
@@ -174,8 +195,7 @@ def to_grid(
         moved_s=moved * 1e-9,
         row_s=rows_apart(sent, [samples[name] for name in states]),
         last_ns=min(int(samples[name].t[-1]) for name in states),
-        reports=tuple(reports),
-        warnings=(*warnings_of(tuple(reports), late), *filter(None, (uneven,)), *stairs),
+        told=told,
     )
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -159,8 +160,13 @@ class Samples:
         )
 
 
+TIDIED: WeakKeyDictionary[Series, dict[tuple[str, bool], Samples]] = WeakKeyDictionary()
+
+
 def tidy(name: str, series: Series, *, unwrap: bool) -> Samples:
     """Return the usable samples of a signal: sorted, finite, scaled, unwrapped.
+
+    They are kept for as long as the raw samples are: a run is sought at many instants of a log.
 
     Args:
         name: of the signal, for messages.
@@ -170,6 +176,13 @@ def tidy(name: str, series: Series, *, unwrap: bool) -> Samples:
     Raises:
         GroundedError: if there are none, or their clock jumps back.
     """
+    known, key = TIDIED.setdefault(series, {}), (name, unwrap)
+    if key not in known:
+        known[key] = _tidied(name, series, unwrap)
+    return known[key]
+
+
+def _tidied(name: str, series: Series, unwrap: bool) -> Samples:
     spec, t = series.spec, series.t
     finite = np.isfinite(series.values)
     if not (t != 0).any() and len(t) > 1:

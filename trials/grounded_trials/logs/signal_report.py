@@ -70,7 +70,7 @@ def report_of(
         largest_gap_s=widest,
         largest_gap_at_s=place,
         bridged=_bridged(samples, at),
-        skew_s=_skew(series),
+        skew_s=series.skew_s,
         not_finite=samples.not_finite,
         repeated=samples.repeated,
         out_of_order=samples.out_of_order,
@@ -89,19 +89,13 @@ def _bridged(samples: Samples, at: Ints) -> int:
     return int((wide & (at > t[i - 1]) & (at < t[i])).sum())
 
 
-def _skew(series: Series) -> float | None:
-    if series.spec.clock == "log":
-        return None
-    return float(np.median(series.t - series.log_times)) * 1e-9
-
-
 def check_clocks(series: Mapping[str, Series]) -> None:
     """Raise an error for signals on different clocks, such as simulation time and log time.
 
     Raises:
         GroundedError: naming two of them, and the difference.
     """
-    first, last, apart = _furthest({name: _skew(s) for name, s in series.items()})
+    first, last, apart = _furthest({name: s.skew_s for name, s in series.items()})
     if apart > MIXED_S:
         a, b = series[first].spec.clock, series[last].spec.clock
         raise GroundedError(

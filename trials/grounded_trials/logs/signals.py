@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -74,6 +75,13 @@ class Series:
     messages: int  # number of messages of its topic, with this number or not
     type: str  # of the topic's messages
     stamped: bool  # the messages have a header stamp, used as the clock or not
+
+    @cached_property
+    def skew_s(self) -> float | None:
+        """By how much its stamps are behind (ahead) of the log's own times [s]; None for these."""
+        if self.spec.clock == "log":
+            return None
+        return float(np.median(self.t - self.log_times)) * 1e-9
 
 
 def read_signals(

@@ -78,8 +78,8 @@ class ForeignLog:
             rates=() if candidate else _rates(model),
             past=self.workspace.task.past if candidate and start is not None else None,
         )
-        logged = tuple(one for one in found.reports if one.name in self.series)
-        found = replace(found, reports=logged)
+        logged = tuple(one for one in found.reports if one.name in self.series), found.warnings
+        found = replace(found, told=lambda: logged)
         trial = Trial(
             states=found.states,
             inputs=found.inputs,

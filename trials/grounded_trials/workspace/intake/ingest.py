@@ -17,10 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.model import Model
 from grounded.result import listed
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.returned.as_predicted import odd_columns
-from grounded.search.returned.other_scale import other_units, units_tried
+from grounded.search.returned.other_scale import other_units, unit_named, units_tried
 from grounded.search.returned.who_drove import OTHERS, Following
 from grounded.search.safety import COASTS
 from grounded.task import Task
@@ -262,6 +263,8 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             )
         return replace(read, warnings=(*read.warnings, *doubts), doubted=True)
     if units:
+        if log and _in_programs_unit(task.model, units, by):
+            _refuse_misused(path, log, task, own)
         other_unit = units_told(task.model, units, by, read.log is not None)
         raise GroundedError(f"{path} ran {ran}, {other_unit}")
     if pace:
@@ -291,13 +294,8 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         named += filter(None, [misled(log, task, own)])
     if named:
         raise GroundedError(f"{path} can't be read as a run of {ran}: {'; '.join(named)}")
-    if log and not other and whole.inputs.any() and (misused := misused_in(log, task, own)):
-        raise GroundedError(
-            f"{path} did not run {ran} as it should: its commands are not what {ran} sends on the "
-            f"logged states and times; {misused}, and run {ran} again. Ingest it with --data for "
-            "fitting and diagnosis",
-            NextCommand("ingest", (str(path), "--data")),
-        )
+    if log and not other and whole.inputs.any():
+        _refuse_misused(path, log, task, own)
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
     if guessed := sorted(_guessed(log)):
         said += (
@@ -317,6 +315,29 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         f"anyway{begins}",
         NextCommand("ingest", (str(path), "--data")),
     )
+
+
+def _in_programs_unit(model: Model, names: Sequence[str], by: float) -> bool:
+    """Return whether rather the robot's program than its log has states in another unit.
+
+    No unit has numbers that are smaller than radians by 57.3; but if a program works in degrees,
+    that is the ratio of the log to what it passed, for all angles and their rates.
+    """
+    mine = {model.states.get(name, "") for name in names}
+    turning = {name for name, unit in model.states.items() if unit.split("/")[0] in mine}
+    known = unit_named(model, names, 1 / by) and not unit_named(model, names, by)
+    return bool(known) and turning <= {*names}
+
+
+def _refuse_misused(path: Path, log: Recording, task: Task, own: Candidate) -> None:
+    """Raise an error if the robot's program misused its candidate, with how and the remedy."""
+    if told := misused_in(log, task, own):
+        raise GroundedError(
+            f"{path} did not run {own.id} as it should: its commands are not what {own.id} sends "
+            f"on the logged states and times; {told}, and run {own.id} again. Ingest it with "
+            "--data for fitting and diagnosis",
+            NextCommand("ingest", (str(path), "--data")),
+        )
 
 
 def _lasting(log: Recording, task: Task) -> str:
