@@ -199,21 +199,34 @@ def owed_to_start(before: Tried, after: Tried, history: Sequence[Tried]) -> floa
     """Return how much of a gain is due to different start states; 0 if it is a small part.
 
     The models that were grounded on these trials give the estimate: U^ of the run from s_0 less U^
-    of the run from where the trials began.
+    of the run from where the trials began. It is 0 if both began alike, or if a candidate that
+    began elsewhere has no such model.
     """
+    if not (before.trials and after.trials and _began_apart(before, after)):
+        return 0.0
 
     def worth(one: Tried) -> float:
+        s_0 = one.candidate.predicted_states[0]
+        off = np.array([trial.states[0] - s_0 for trial in one.trials])
+        if not beyond_noise(one.trials, off, s_0).any():
+            return 0.0
         found = [c for t in history if (c := t.candidate).base == one.candidate.id]
         starts = [c.expected_of_base - c.base_as_run for c in found]
         known = [start for start in starts if math.isfinite(start)]
-        if not known or not one.trials:
-            return 0.0
-        s_0 = one.candidate.predicted_states[0]
-        off = np.array([trial.states[0] - s_0 for trial in one.trials])
-        return known[-1] if beyond_noise(one.trials, off, s_0).any() else 0.0
+        return known[-1] if known else math.nan
 
     gain, start = after.utility - before.utility, worth(before) - worth(after)
     return start if abs(start) > PART * abs(gain) and math.isfinite(start) else 0.0
+
+
+def _began_apart(one: Tried, other: Tried) -> bool:
+    """Return whether the trials of two candidates began apart, by more than the sensors' noise."""
+    first, second = (np.array([t.states[0] for t in tried.trials]) for tried in (one, other))
+    s_0 = one.candidate.predicted_states[0]
+    return bool(
+        beyond_noise(one.trials, first - second.mean(axis=0), s_0).any()
+        and beyond_noise(other.trials, second - first.mean(axis=0), s_0).any()
+    )
 
 
 def student(x: float, freedom: float) -> float:

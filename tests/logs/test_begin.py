@@ -559,6 +559,21 @@ def test_numbers_without_a_fitting_name_are_found_by_their_unit_or_listed(swung,
     assert said.code == 1 and all(path in said.err for path in every)
 
 
+def test_a_number_that_never_changes_gives_way_to_one_that_does(tmp_path):
+    """A balancer's pitch was the constant 0 of an Odometry, its measured tilt not even a rival."""
+    t = 0.02 * np.arange(500)
+    tilt, still = 0.1 * np.sin(2 * t), np.zeros_like(t)
+    drive = 0.3 * np.sin(0.7 * t)
+    named = "x,v,pitch,pitch_rate,lean.tilt,lean.tilt_rate,voltage"
+    rows = [t, drive, np.gradient(drive, t), still, still, tilt, np.gradient(tilt, t), np.cos(t)]
+    log = tmp_path / "log.csv"
+    np.savetxt(log, np.column_stack(rows), "%.5f", ",", header=f"t,{named}", comments="")
+    found = {g.name: g for g in begin(tmp_path / "w", log, kind="balance").states}
+    assert found["pitch"].path.endswith("tilt") and not found["pitch"].sure
+    assert "never changes" in found["pitch"].reasons[0]
+    assert found["pitch_rate"].path.endswith("tilt_rate")
+
+
 def test_names_with_other_letters_and_times_in_an_unsaid_unit(tmp_path):
     log, t = tmp_path / "log.csv", 10.0 * np.arange(400)
     rows = np.column_stack([t, np.sin(t / 300), np.sign(np.cos(t / 300))])

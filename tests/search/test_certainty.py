@@ -55,7 +55,7 @@ def test_noise_of_a_repeated_candidate_stands_in_for_the_others():
     history = [tried(-9.0), tried(-5.0, -5.2, accepted=False), tried(-4.0), tried(-3.9)]
     error, freedom = error_between(history[-2], history[-1], history)
     assert (error, freedom) == (pytest.approx(2**0.5 * np.std([-5.0, -5.2], ddof=1)), 1)
-    assert holds(last_improvement(history), "0.1 +- 0.2")
+    assert holds(last_improvement(history), "0.10 +- 0.20")
 
 
 def test_the_wild_first_policy_says_nothing_of_the_noise_of_later_ones():
@@ -165,5 +165,9 @@ def test_what_a_start_is_worth_is_no_improvement():
     here = ran("c0001", "", -6.0, off=0.0)
     assert owed_to_start(here, second, [here, second]) == 0.0
     assert "probability" in last_improvement([here, second])
+    same = ran("c0002", "c0001", -3.9, off=0.07, as_run=-5.9)
+    assert owed_to_start(first, same, [first, same]) == 0.0  # both began 7 cm away
+    away = ran("c0002", "c0001", -3.9, off=-0.07, as_run=-5.9)
+    assert owed_to_start(first, away, [first, away]) == 0.0  # nothing tells what -7 cm is worth
     little = ran("c0002", "c0001", -3.9, off=0.0, as_run=-4.1)
     assert owed_to_start(first, little, [first, little]) == 0.0

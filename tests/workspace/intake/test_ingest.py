@@ -15,6 +15,7 @@ from grounded.trial import Trial
 from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import set_aside
+from grounded_trials.workspace.intake import begun
 from grounded_trials.workspace.intake.ingest import ingest_log
 from grounded_trials.workspace.proposing import propose_in, standing_in
 from grounded_trials.workspace.running import run_candidate
@@ -128,6 +129,20 @@ def test_a_start_is_no_warning_where_earlier_ones_scatter_as_far(w, tmp_path):
         told.append([one for one in warnings if "the run started with" in one])
     assert [len(one) for one in told] == [1, 1, 0, 0, 1]
     assert "no need to repeat it" in told[0][0] and "`discard t0005`" in told[-1][0]
+
+
+def test_a_start_that_spoils_a_run_is_told_however_earlier_ones_scatter(w, tmp_path, monkeypatch):
+    """A balancer that began 4.5 cm away lost by "bad luck": two runs had begun as far."""
+    ran, *_ = read_trial(run(w))
+    a_step = np.sqrt(-w.task.utility(ran) / len(ran.states) / 10)
+    for off in (0.7, -0.7, 0.6):
+        moved = np.array(ran.states)
+        moved[0, 0] += off * a_step
+        write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
+        if off == 0.6:  # as if the model were unstable
+            monkeypatch.setattr(begun, "_changes", lambda *_: 0.5 * w.task.utility(ran))
+        warnings = ingest_log(w, tmp_path / "t.mcap", "c0001").warnings
+    assert any("the run started with" in one and "`discard t0003`" in one for one in warnings)
 
 
 @pytest.mark.parametrize("data", [False, True])

@@ -47,7 +47,10 @@ _MEANINGS: dict[str, tuple[str, ...]] = {
     "theta": _TURN,
     "th": _TURN,
     "pitch": ("@rpy.pitch", "pitch", "theta", "tilt", "lean"),
-    "pitch_rate": ("angular.y", "angular_velocity.y", "pitch_rate", "pitch_velocity"),
+    "pitch_rate": (
+        *("angular.y", "angular_velocity.y", "pitch_rate", "pitch_velocity"),
+        *("tilt_rate", "lean_rate"),
+    ),
     "phi": ("@rpy.roll", "roll", "phi"),
     "roll": ("@rpy.roll", "roll", "phi"),
     **{f"v{axis}": (f"@{WORLD}.{axis}", f"linear.{axis}", f"v{axis}") for axis in AXES},
@@ -343,7 +346,7 @@ def _choose(
 
 
 def _moving(ranked: list[_Candidate]) -> _Candidate:
-    """Return the best candidate; if it never changes, the best one of the same name that does."""
+    """Return the best candidate; if it never changes, the best of its name or kind that does."""
     best = ranked[0]
     if best.field.low is None or best.field.low != best.field.high:
         return best
@@ -352,9 +355,8 @@ def _moving(ranked: list[_Candidate]) -> _Candidate:
 
 
 def _alike(path: str, other: str) -> bool:
-    """Check whether two numbers have the same name in their messages, or the same known unit."""
-    said = unit_of(path)
-    return path.split(".")[-2:] == other.split(".")[-2:] or said == unit_of(other) != ""
+    """Check whether two numbers have the same name in their messages, or units that may agree."""
+    return path.split(".")[-2:] == other.split(".")[-2:] or unit_of(path) in ("", unit_of(other))
 
 
 def _clock(log: LogReport, topic: TopicReport) -> str:

@@ -45,7 +45,8 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
 
     A state that [reward] weighs along the way is judged by the cost of its offset relative to a
     mean step of the run, the most costly first; another state relative to its range in the run.
-    Offsets within the scatter of earlier starts are unavoidable and tolerated.
+    Offsets within the scatter of earlier starts are unavoidable, and tolerated unless they spoil
+    the utility by the model.
 
     Args:
         workspace: the workspace with the task, the model and the earlier runs.
@@ -68,18 +69,19 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
     with np.errstate(all="ignore"):
         share = np.where(weight > 0, weight * off**2 / usually, np.abs(off) / usual)
     told = (share > FAR) & (np.abs(off) > np.maximum(SURE * noise, 1e-9))
+    beyond = np.full(len(off), True)
     if len(before) >= FEWEST:
-        told &= (np.abs(off) > SURE * before.std(axis=0, ddof=1)) | (share > MUCH)
-    found = []
+        beyond = (np.abs(off) > SURE * before.std(axis=0, ddof=1)) | (share > MUCH)
+    found, real = [], abs(task.utility(trial))
+    cost = real if np.isfinite(real) else -_promised(workspace, trial)
     for i in sorted(np.flatnonzero(told), key=lambda i: (weight[i] == 0, -share[i])):
+        changes = _changes(workspace, trial, off * (np.arange(len(off)) == i))
+        again = abs(changes) > SPOILT * cost
+        if not (beyond[i] or again):
+            continue
         name, unit = list(task.model.states.items())[i]
         began, start = in_digits_apart(float(trial.states[0, i]), float(task.start[i]))
         turned = f" ({np.rad2deg(off[i]):+.2g} degrees)" if unit == "rad" else ""
-        changes = _changes(workspace, trial, off * (np.arange(len(off)) == i))
-        real = abs(task.utility(trial))
-        again = abs(changes) > SPOILT * (
-            real if np.isfinite(real) else -_promised(workspace, trial)
-        )
         does = (
             f"by the model this changes its utility by {changes:+.3g}: `discard {trial.id}`, place "
             f"the robot nearer to the start and run {trial.candidate} again. If it always starts "
