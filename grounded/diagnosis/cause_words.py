@@ -16,7 +16,10 @@ if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.effects import Effect
 
 AS_STRONG = 0.2  # a gain this close to -1 is a wrong sign and nothing else
-TURNED = ": flip its sign in model.py, or, if only the log has it so, set {log} scale = -1"
+TURNED = (
+    ": flip its sign in model.py, or, if only the log has it so, set {log} scale = -1, discard the "
+    "trials and ingest their logs again"
+)
 MOST_DIGITS = 6  # significant digits of a value
 DISAGREE = "but the trials disagree"
 KNOWN = 2.0  # standard deviations from zero that a value needs to be worded

@@ -152,7 +152,10 @@ def another_look(task: Task | None, trials: Sequence[Trial], left: str, when: st
     ran = [trial for trial in trials if trial.candidate] if task else []
     best = max(ran, key=task.utility, default=None) if task else None
     if task is None or best is None or math.isinf(task.utility(best)):
-        return f"Record one run three times, sending the same inputs each time, {why}."
+        return (
+            "Record one run three times, sending the same inputs each time (if the robot needs "
+            f"feedback: the same setpoints, from the same start), {why}."
+        )
     return f"Run {best.candidate} twice more, {why}."
 
 

@@ -36,6 +36,8 @@ PREDICTED = 1.0  # error relative to the motion, below which a prediction is inf
 FULL_TURNS = 4 * np.pi  # [rad] range of an angle that suggests degrees (or a wheel, or a heading)
 SOON = 0.1  # [s] horizon: a very crude model soon diverges
 CONCORDANT, PLAINLY = 0.1, 1.5  # least concordance, and factor by which it must exceed others
+SMALL = 1.0  # [rad] angles that stay below it are not in degrees
+FEW, CLEAR = 120, 1.0  # samples of a trial to predict from, and gain [nats] of the calibrated model
 WHOLE = 0.3  # least concordance of each angle with the motion by its rate
 
 
@@ -128,7 +130,7 @@ def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) 
     """Return the signals that are in degrees in all trials, one `Odd` per trial; else [].
 
     They are found by the model: dividing by 57.3 must at least halve its errors, and factors far
-    from that must not do better.
+    from that must not do better. A model that can't predict the body is calibrated first.
 
     Args:
         model: however crude.
@@ -160,7 +162,9 @@ def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) 
     )
     if not told and angles:
         best = Odd(0, DEGREES, moving)
-        told = _turning_as_degrees(model, some, shown, best)
+        told = _turning_as_degrees(model, some, shown, best) or (
+            model.m > 0 and all(_calibrated_as_degrees(model, t, shown, best) for t in some)
+        )
     return [replace(best, trial=k) for k in range(len(trials))] if told else []
 
 
@@ -291,3 +295,30 @@ def predicted(
         x = model.system.step(x, trial.inputs[at + j], model.values, trial.dt)
         x = np.fmax(np.fmin(x, FAR), -FAR)
     return logged[at], x, logged[at + steps]
+
+
+def _calibrated_as_degrees(model: Model, trial: Trial, shown: Sequence[int], odd: Odd) -> bool:
+    """Check whether a calibrated model predicts a trial far better with its angles as degrees.
+
+    A crude model of an unstable body errs by more than the body moves, in any unit. Where all is
+    linear, inputs of another strength explain the log as well as degrees do: that strength must
+    then be about 57.3 times the model's.
+    """
+    from grounded.instruments.short_runs import Ahead
+
+    units, usual = list(model.states.values()), np.ones(model.m)
+    angles = np.abs(trial.states[:, [i for i in odd.states if units[i] == "rad"]])
+    if not (angles > SMALL).any() or not np.isfinite(trial.inputs).all():
+        return False
+    with np.errstate(all="ignore"):
+        logged, mended = (Ahead(model, t, shown, FEW) for t in (trial, odd.mended(trial)))
+        if not (logged.enough and mended.enough):
+            return False
+        own, free = logged.best([usual], free=False), logged.best([usual])
+        rms = mended.best([usual], free=False).rms
+    rms[list(odd.states)] *= odd.factor  # as large as in the log
+    gained = np.log(own.rms / rms)
+    strong = (free.gains > odd.factor / LIKE) & (free.gains < odd.factor * LIKE)
+    if free.score - np.log(rms).sum() < CLEAR and not strong.all():
+        return False
+    return bool(gained.sum() > CLEAR and gained.max() > np.log(2.0))
