@@ -22,7 +22,7 @@ from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.formats.mcap_walk import DamagedFile
-from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
+from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
 from grounded_trials.store.store import Damaged, Store, Stored
 from grounded_trials.workspace.unknown_id import unknown_trial
 
@@ -54,6 +54,8 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "likely_off": float,
     "seen": lambda text: tuple(filter(None, text.split(","))),
 }
+MOST_KNOWN = 4  # decoded candidates that are kept
+_KNOWN: dict[tuple[bytes, str], tuple[Candidate, dict[str, str]]] = {}  # by contents and id
 _ABSENT = {
     "predicted_gain": "nan",
     "damping": "1.0",
@@ -238,13 +240,16 @@ def named_apart(
 
 
 def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
-    """Encode a candidate as the bytes of its file; `kind` is "search" or "probe"."""
+    """Encode a candidate as the bytes of its file; `kind` is "search" or "probe".
+
+    `candidate_of` knows these bytes from then on: the process that wrote a file need not decode it.
+    """
     values = vars(candidate) | {"task": task.hash}
     meta = {"kind": kind} | {
         name: repr(values[name]) if of is float else _text(values[name])
         for name, of in _FIELDS.items()
     }
-    return candidate_bytes(
+    data, table = encoded_candidate(
         candidate.policy,
         candidate.predicted_states,
         candidate.predicted_inputs,
@@ -252,6 +257,8 @@ def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
         state_units=dict(task.model.states),
         input_units=dict(task.model.inputs),
     )
+    _remember(data, candidate.id, (candidate, table))
+    return data
 
 
 def _text(value: object) -> str:
@@ -268,13 +275,21 @@ def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]
     Raises:
         GroundedError: if the file is damaged, rewritten, or another candidate's.
     """
-    candidate, meta = _proven(data, identity)
+    if (known := _KNOWN.get((data, identity))) is None:
+        known = _decoded(data, identity)
+        _remember(data, identity, known)
+    candidate, meta = known
     return candidate, dict(meta)
 
 
-@lru_cache(maxsize=4)
-def _proven(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
-    """Decode a candidate, cached: one command decodes the same bytes up to three times."""
+def _remember(data: bytes, identity: str, found: tuple[Candidate, dict[str, str]]) -> None:
+    """Keep a decoded candidate: one command decodes the same bytes up to three times."""
+    while len(_KNOWN) >= MOST_KNOWN:
+        _KNOWN.pop(next(iter(_KNOWN)), None)
+    _KNOWN[data, identity] = found
+
+
+def _decoded(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
     name = f"candidates/{identity}.mcap"
     try:
         policy, states, inputs, meta = read_candidate(data, name)
