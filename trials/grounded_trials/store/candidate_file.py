@@ -74,7 +74,7 @@ def encoded_candidate(
         policy=json.dumps(_policy_table(policy)),
     )
     table["sha256"] = _hash(table, [*_controls(policy), states, inputs])
-    times = np.array([round(k * policy.dt * 1e9) for k in range(H + 1)])
+    times = np.rint(np.arange(H + 1) * policy.dt * 1e9).astype(np.int64)
     controls = rows_of_lists(_controls(policy))
     lists = ("feedforward", "gain", "reference")
     columns = (

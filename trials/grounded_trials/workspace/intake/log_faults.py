@@ -7,7 +7,7 @@ reported with its correction, in [log] or in the program that wrote the trial.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -192,7 +192,7 @@ def _clocks_apart(workspace: Folder, trial: Trial) -> list[Fault]:
     from grounded.instruments.clocks import answers_early, one_clock, too_soon
 
     model, table = workspace.base_model, workspace.config.estimate
-    measured: Sequence[str] = model.state_names
+    measured: Collection[str] = model.state_names
     if table.names():
         from grounded_trials.workspace.intake.estimating import read_estimate
 
