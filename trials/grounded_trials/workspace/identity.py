@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
@@ -54,8 +54,8 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "likely_off": float,
     "seen": lambda text: tuple(filter(None, text.split(","))),
 }
-MOST_KNOWN = 4  # decoded candidates that are kept
-_KNOWN: dict[tuple[bytes, str], tuple[Candidate, dict[str, str]]] = {}  # by contents and id
+T = TypeVar("T")
+MOST_KNOWN = 4  # files of candidates about which something is kept
 _ABSENT = {
     "predicted_gain": "nan",
     "damping": "1.0",
@@ -196,10 +196,32 @@ def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> 
     return SetAside(tuple(one.id for one in found), workspace.discarded(), tuple(same))
 
 
-@lru_cache(maxsize=4)
+class _Recent(Generic[T]):
+    """What was found out about the latest few files, by their bytes.
+
+    Those are megabytes: comparing them takes a third of the time of hashing them for a dictionary.
+    """
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[bytes, T]] = deque(maxlen=MOST_KNOWN)
+
+    def get(self, data: bytes) -> T | None:
+        """Return what is known about a file, or None."""
+        return next((found for own, found in tuple(self._kept) if own == data), None)
+
+    def add(self, data: bytes, found: T) -> T:
+        """Keep what is known about a file, and return it."""
+        self._kept.append((data, found))
+        return found
+
+
+_HASHES = _Recent[str]()
+_DECODED = _Recent[tuple[Candidate, dict[str, str]]]()
+
+
 def sha256(data: bytes) -> str:
     """Return the hash that identifies a candidate's file."""
-    return hashlib.sha256(data).hexdigest()
+    return _HASHES.get(data) or _HASHES.add(data, hashlib.sha256(data).hexdigest())
 
 
 def named_apart(
@@ -257,7 +279,7 @@ def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
         state_units=dict(task.model.states),
         input_units=dict(task.model.inputs),
     )
-    _remember(data, candidate.id, (candidate, table))
+    _DECODED.add(data, (candidate, table))
     return data
 
 
@@ -275,18 +297,11 @@ def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]
     Raises:
         GroundedError: if the file is damaged, rewritten, or another candidate's.
     """
-    if (known := _KNOWN.get((data, identity))) is None:
-        known = _decoded(data, identity)
-        _remember(data, identity, known)
+    known = _DECODED.get(data)  # one command decodes the same bytes up to three times
+    if known is None or known[0].id != identity:
+        known = _DECODED.add(data, _decoded(data, identity))
     candidate, meta = known
     return candidate, dict(meta)
-
-
-def _remember(data: bytes, identity: str, found: tuple[Candidate, dict[str, str]]) -> None:
-    """Keep a decoded candidate: one command decodes the same bytes up to three times."""
-    while len(_KNOWN) >= MOST_KNOWN:
-        _KNOWN.pop(next(iter(_KNOWN)), None)
-    _KNOWN[data, identity] = found
 
 
 def _decoded(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
