@@ -20,7 +20,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.experiments.real_car import CALIBRATION, LATENCY, UNMODELLED, real_car
 from grounded_trials import Workspace
-from grounded_trials.workspace.diagnosing import diagnosable, read_diagnosis
+from grounded_trials.workspace.last_diagnosis import diagnosable, read_diagnosis
 
 AHEAD, STARTS = (0.1, 0.5, 1.0), 400
 THREAD = ("drift", "thread_yaw", "thread_speed", "thread_stall")

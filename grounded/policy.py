@@ -202,12 +202,18 @@ class Policy:
                 asked += memory[:, :, k] * held[:, start : start + T, j, None]
             return np.clip(asked, self.low, self.high)
         z = np.repeat(np.repeat(past, self.depths)[None], len(states), 0)
-        for t in range(T):
-            low = np.maximum(asked[:, t] + z @ memory[t].T, self.low)  # clip takes twice as long
-            asked[:, t] = np.minimum(low, self.high)
-            z[:, 1:] = z[:, :-1].copy()
-            z[:, newest] = asked[:, t]
-        return asked
+        low, high, together = self.low, self.high, z.shape[1] == len(past)  # one past value each
+        by_step = np.ascontiguousarray(asked.swapaxes(0, 1))
+        for now, gain in zip(by_step, memory.swapaxes(1, 2), strict=True):
+            now += z @ gain
+            np.maximum(now, low, out=now)  # clip takes twice as long
+            np.minimum(now, high, out=now)
+            if together:
+                z = now
+            else:
+                z[:, 1:] = z[:, :-1].copy()
+                z[:, newest] = now
+        return np.ascontiguousarray(by_step.swapaxes(0, 1))
 
 
 def z_difference(a: Array, b: Array, angles: tuple[bool, ...]) -> Array:

@@ -52,7 +52,7 @@ def trials(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[
 def effects(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """Complete the effects that the last diagnosis ranked, best first."""
     from grounded.errors import GroundedError
-    from grounded_trials.workspace.diagnosing import read_diagnosis
+    from grounded_trials.workspace.last_diagnosis import read_diagnosis
 
     try:
         found = read_diagnosis(_folder(ctx) / "reports")

@@ -25,16 +25,18 @@ LEGEND = "damp: penalty on leaving the last trial's inputs; +-: standard error"
 def command(json_: bool) -> None:
     """Show where the search stands, from the stored trials; nothing is written."""
     workspace = open_workspace()
-    from grounded_trials.report.settled import settled_in
-    from grounded_trials.workspace.next_step import Since
-
     with progress("reading trials"):
         status = workspace.status()
     if json_:
         show_json(status.to_json())
         return
     show(summary(status))
-    settled = settled_in(workspace, status.diagnosis, status.since or Since())
+    settled, model = None, workspace.config.model
+    if model.effects or model.params:  # else nothing was adopted, and slow imports are saved
+        from grounded_trials.report.settled import settled_in
+        from grounded_trials.workspace.next_step import Since
+
+        settled = settled_in(workspace, status.diagnosis, status.since or Since())
     for note in status.notes:
         remark("note", note)
     for name, why in status.discarded.items():

@@ -50,6 +50,8 @@ def jumps(inputs: Array, range_: Array) -> Array:
 
 def _swings(values: Array, size: float) -> int:
     """Count how often a signal reverses and moves by `size` or more."""
+    if not (np.abs(values - values[0]) >= size).any():  # as a rule
+        return 0
     found, way, last = 0, 0.0, float(values[0])
     for value in values.tolist():  # Python's own numbers: three times as fast
         if (value - last) * way > 0:

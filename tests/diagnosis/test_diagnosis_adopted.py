@@ -31,8 +31,9 @@ from grounded.task import Task
 from grounded.utility import Reward
 from grounded_trials.store.documents import write_document
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.diagnosing import _chosen, diagnosable, read_diagnosis
+from grounded_trials.workspace.diagnosing import _chosen
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.last_diagnosis import diagnosable, read_diagnosis
 from grounded_trials.workspace.next_step import to_adopt
 
 LAG = 0.12

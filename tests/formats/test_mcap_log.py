@@ -19,7 +19,7 @@ from grounded.trial import Trial
 from grounded_trials.formats.mcap_records import Schema
 from grounded_trials.formats.mcap_writer import file_descriptor_set
 from grounded_trials.formats.schemas import parse_protobuf, struct_of
-from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
+from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
 from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
 from rewriting import with_metadata
 
@@ -87,7 +87,7 @@ def test_a_candidate_comes_back_exactly(feedback: bool, tmp_path: Path) -> None:
     policy, rng = a_policy(feedback=feedback), np.random.default_rng(2)
     x, u = rng.normal(size=(21, 3)), rng.normal(size=(20, 2))
     path = tmp_path / "c0001.mcap"
-    path.write_bytes(candidate_bytes(policy, x, u, {"alpha": "0.5"}))
+    path.write_bytes(encoded_candidate(policy, x, u, {"alpha": "0.5"})[0])
     back, px, pu, meta = read_candidate(path)
     for part in ("feedforward", "low", "high", "past", "gain", "reference"):
         mine, theirs = getattr(policy, part), getattr(back, part)
@@ -104,7 +104,7 @@ def test_other_tools_read_named_fields() -> None:
     )
     seen = [m.decoded_message for m in reader.iter_decoded_messages(topics=["/state"])]
     assert [s.x for s in seen] == trial.states[:, 1].tolist()
-    candidate = candidate_bytes(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})
+    candidate = encoded_candidate(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})[0]
     reader = make_reader(io.BytesIO(candidate), decoder_factories=[DecoderFactory()])
     seen = [m.decoded_message for m in reader.iter_decoded_messages(topics=["/policy"])]
     gain = a_policy().gain
@@ -191,13 +191,13 @@ def test_refusals() -> None:
     gain = np.array(policy.gain)
     gain[7, 0, 0] = np.nan
     with pytest.raises(GroundedError, match=holding("gain", "step 7")):
-        candidate_bytes(replace(policy, gain=gain), x, u, {})
+        encoded_candidate(replace(policy, gain=gain), x, u, {})
     with pytest.raises(GroundedError, match=holding("(21, 3)", "(20, 3)")):
-        candidate_bytes(policy, x[1:], u, {})
+        encoded_candidate(policy, x[1:], u, {})
     with pytest.raises(
         GroundedError, match=holding("'grounded trial 1'", "'grounded candidate 1'")
     ):
-        read_trial(candidate_bytes(policy, x, u, {}))
+        read_trial(encoded_candidate(policy, x, u, {})[0])
     with pytest.raises(
         GroundedError, match=holding("'grounded trial 1'", "'grounded candidate 1'")
     ):
@@ -230,7 +230,7 @@ NASTY += ['{"v": "m/s", "x": "m", "psi": 3}', '{"depths": [1e300, -1], "low": 3}
 @pytest.mark.parametrize("value", [None, *NASTY])
 def test_a_strangers_metadata_is_read_or_refused_with_a_message(value: str | None) -> None:
     trial = trial_bytes(a_trial(4), {})
-    candidate = candidate_bytes(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})
+    candidate = encoded_candidate(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})[0]
     candidate = with_metadata(candidate, "sha256", None)  # else it alone would refuse everything
     for key in ("dt", "states", "inputs", "candidate", "start_inputs", "start_ns"):
         try:
@@ -269,7 +269,7 @@ def test_a_file_without_its_checksum_is_refused() -> None:
 
 
 def test_a_candidate_that_lost_its_end_is_refused() -> None:
-    candidate = candidate_bytes(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})
+    candidate = encoded_candidate(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})[0]
     with pytest.raises(GroundedError, match=holding("21 steps", "21 messages")):
         read_candidate(with_metadata(candidate, "steps", "21"))
 

@@ -26,7 +26,7 @@ from grounded.errors import GroundedError
 from grounded.policy import Policy
 from grounded.trial import Trial
 from grounded_trials.logs.recover import recover_log
-from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
+from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
 from grounded_trials.store.store import Store
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 
@@ -61,7 +61,8 @@ def a_candidate() -> tuple[Policy, bytes]:
         gain=rng.normal(size=(4, 1, 3)),
         reference=rng.normal(size=(4, 3)),
     )
-    return policy, candidate_bytes(policy, np.zeros((5, 2)), np.zeros((4, 1)), {"alpha": "1.0"})
+    data, _ = encoded_candidate(policy, np.zeros((5, 2)), np.zeros((4, 1)), {"alpha": "1.0"})
+    return policy, data
 
 
 def damaged(source: bytes, flips: bool, stride: int = 1) -> list[tuple[str, bytes]]:

@@ -10,7 +10,7 @@ from cli import grounded, plain
 from facts import holding, holds
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
-from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
+from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
 from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.handover import checked_candidate, outside_limits
 from rewriting import with_metadata
@@ -51,7 +51,7 @@ def rewrite(w, checksum, **arrays):
     path = w.candidate_path("c0001")
     policy, x, u, meta = read_candidate(path)
     own = {key: value for key, value in meta.items() if key not in RESERVED}
-    data = candidate_bytes(replace(policy, **arrays), x, u, own, **UNITS)
+    data = encoded_candidate(replace(policy, **arrays), x, u, own, **UNITS)[0]
     if checksum != "new":
         data = with_metadata(data, "sha256", meta["sha256"] if checksum == "old" else None)
     path.write_bytes(data)

@@ -16,7 +16,8 @@ from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from grounded_trials.report.reporting import save_optimum
 from grounded_trials.store.documents import StudyStore, proven
-from grounded_trials.workspace.diagnosing import read_diagnosis
+from grounded_trials.workspace.identity import _decoded, candidate_of
+from grounded_trials.workspace.last_diagnosis import read_diagnosis
 from grounded_trials.workspace.proposing import standing_in
 from reported import cart, copied
 from workspaces import CONFIG, make
@@ -181,6 +182,23 @@ def test_another_policy_never_gets_the_name_of_one_that_was_handed_out(w):
     other = w.propose().candidate
     assert other.id != first.id
     assert not np.array_equal(other.policy.feedforward, first.policy.feedforward)
+
+
+def test_what_propose_knows_of_its_candidate_is_what_its_file_says(w):
+    """The process that wrote a file does not decode it: see `encoded`."""
+    made = w.propose().candidate
+    data = w.candidate_bytes(made.id)
+    (known, meta), (read, stated) = candidate_of(data, made.id), _decoded(data, made.id)
+    assert known is made and meta == stated
+    for name, own in vars(read).items():
+        mine = getattr(known, name)
+        if name == "policy":
+            for part, value in vars(own).items():
+                assert np.array_equal(value, vars(mine)[part])
+        elif isinstance(own, np.ndarray):
+            assert np.array_equal(own, mine)
+        else:
+            assert repr(own) == repr(mine) or float(own) == float(mine)  # caution: 0 and 0.0
 
 
 def test_a_hand_out_is_recorded_once(w):

@@ -27,8 +27,9 @@ from grounded_trials.store.documents import write_document
 from grounded_trials.wording import ELSEWHERE, folded, placed, rendered
 from grounded_trials.workspace.adopting import diagnosed_again
 from grounded_trials.workspace.config import set_in_model
-from grounded_trials.workspace.diagnosing import _in_vain, read_diagnosis
+from grounded_trials.workspace.diagnosing import _in_vain
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.last_diagnosis import read_diagnosis
 from grounded_trials.workspace.next_step import (
     DIAGNOSE,
     EXPORT,

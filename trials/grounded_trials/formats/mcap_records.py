@@ -141,7 +141,7 @@ class BadRecord(Exception):
 class Fields:
     """Parses a record's content from left to right."""
 
-    def __init__(self, content: bytes) -> None:
+    def __init__(self, content: bytes | memoryview) -> None:
         self.content, self.pos = content, 0
 
     def skip(self, count: int) -> bytes:
@@ -149,7 +149,7 @@ class Fields:
         end = self.pos + count
         if end > len(self.content):
             raise BadRecord("it is too short for its contents")
-        piece = self.content[self.pos : end]
+        piece = bytes(self.content[self.pos : end])
         self.pos = end
         return piece
 
@@ -202,7 +202,7 @@ PARSERS: dict[int, Callable[[Fields], Record]] = {
 }
 
 
-def chunk_content(content: bytes, limit: int) -> tuple[bytes, bool]:
+def chunk_content(content: bytes | memoryview, limit: int) -> tuple[bytes, bool]:
     """Return the decompressed records of a chunk, and whether it has a checksum.
 
     Args:
@@ -214,13 +214,14 @@ def chunk_content(content: bytes, limit: int) -> tuple[bytes, bool]:
     """
     try:
         size, crc, length = _CHUNK.unpack_from(content)
-        name, start = content[32 : 32 + length], 40 + length
+        name, start = bytes(content[32 : 32 + length]), 40 + length
         stored = _U64.unpack_from(content, 32 + length)[0]
     except struct.error:
         raise BadRecord("it is too short for its contents") from None
     if start + stored > len(content):
         raise BadRecord("it is too short for its contents")
-    data = decompress(name.decode("utf-8", "replace"), content[start : start + stored], size, limit)
+    packed = bytes(content[start : start + stored])
+    data = decompress(name.decode("utf-8", "replace"), packed, size, limit)
     if crc and zlib.crc32(data) != crc:
         raise BadRecord("its checksum does not match its content")
     return data, bool(crc)

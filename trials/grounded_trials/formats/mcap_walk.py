@@ -15,6 +15,7 @@ takes 40 ms.
 
 from __future__ import annotations
 
+import io
 import zlib
 from collections.abc import Iterator
 from struct import Struct
@@ -69,28 +70,32 @@ class DamagedFile(GroundedError):
         super().__init__(f"{name}: {found} (at byte {offset}); {advice}", then)
 
 
-def read_records(stream: BinaryIO, name: str, *, limit: int = RECORD_LIMIT) -> Iterator[Record]:
+def read_records(
+    source: BinaryIO | bytes, name: str, *, limit: int = RECORD_LIMIT
+) -> Iterator[Record]:
     """Yield the records of an MCAP stream in order, ending with `End`.
 
     Args:
-        stream: a seekable binary file, read from its beginning.
+        source: a seekable binary file, read from its beginning, or the bytes of one.
         name: of the file, for messages.
         limit: largest record, and largest chunk when decompressed [bytes].
 
     Raises:
         DamagedFile: if it is not a complete, undamaged MCAP file.
     """
-    yield from _Walk(stream, name, limit).records()
+    yield from _Walk(source, name, limit).records()
 
 
 class _Walk:
     """One pass over a file; `buffer[pos:]` has been read, but not used yet."""
 
-    def __init__(self, stream: BinaryIO, name: str, limit: int) -> None:
-        self.stream, self.name, self.limit = stream, name, limit
-        self.size = stream.seek(0, 2)
-        stream.seek(0)
+    def __init__(self, source: BinaryIO | bytes, name: str, limit: int) -> None:
         self.buffer, self.pos, self.base = b"", 0, 0
+        if isinstance(source, bytes):
+            self.buffer, source = source, io.BytesIO()
+        self.stream, self.name, self.limit = source, name, limit
+        self.size = len(self.buffer) or source.seek(0, 2)
+        source.seek(0)
         self.crc, self.crc_pos = 0, 0  # of the bytes up to buffer[crc_pos]
         self.data_crc: bool | None = None  # None: still in the data section
         self.defined: dict[tuple[type, int], Schema | Channel] = {}
@@ -146,7 +151,7 @@ class _Walk:
                 self.pos += 9 + length
                 continue
             at, start = self.offset, self.pos + 9
-            content = self.buffer[start : start + length]
+            content = memoryview(self.buffer)[start : start + length]
             if opcode == DATA_END and self.data_crc is None:
                 yield from self._together()
                 self._data_end(content)
@@ -161,7 +166,7 @@ class _Walk:
     def _magic(self) -> None:
         if self.size == 0:
             raise DamagedFile(self.name, 0, "the file is empty", "nothing can be saved")
-        head = self.stream.read(8)
+        head = self.buffer[:8] or self.stream.read(8)
         self.stream.seek(0)
         if head != MAGIC:
             advice = "give a log in the MCAP format (`mcap convert` converts ROS 1 bags)"
@@ -222,7 +227,7 @@ class _Walk:
                 raise BadRecord(again(known, record))
         return record
 
-    def _data_record(self, opcode: int, content: bytes, at: int) -> Iterator[Record]:
+    def _data_record(self, opcode: int, content: memoryview, at: int) -> Iterator[Record]:
         try:
             if opcode == CHUNK:
                 yield from self._chunk(chunk_content(content, self.limit)[0])
@@ -232,7 +237,7 @@ class _Walk:
             what = _NAMES.get(opcode, f"a record of type {opcode}")
             raise self.damaged(f"{what} is damaged: {error}", at) from None
 
-    def _data_end(self, content: bytes) -> None:
+    def _data_end(self, content: memoryview) -> None:
         stated = Fields(content).uint(32) if len(content) >= 4 else 0
         if stated and stated != self.fold():
             raise self.damaged("the checksum of the data section does not match its content")
@@ -240,7 +245,7 @@ class _Walk:
         start = self.pos + 9 + len(content)
         self.crc, self.crc_pos = 0, start
 
-    def _footer(self, content: bytes) -> None:
+    def _footer(self, content: memoryview) -> None:
         if self.data_crc is None:
             raise self.damaged("the footer comes before the end of the data")
         if len(content) < 20:

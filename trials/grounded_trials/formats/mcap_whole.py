@@ -88,13 +88,15 @@ def whole_file(
     chunks = _chunked(columns, written, before)
     offset, indices = at[-1], []
     for chunk in chunks:
-        record, index = chunk.at(offset)
-        parts += [record]
+        records, index = chunk.at(offset)
+        parts += records
         indices.append(index)
-        offset += len(record)
+        offset += sum(map(len, records))
 
-    data = b"".join(parts)
-    end = _record(0x0F, struct.pack("<I", crc32(data)))
+    checked = 0
+    for part in parts:
+        checked = crc32(part, checked)
+    end = _record(0x0F, struct.pack("<I", checked))
     counts = [len(one.rows) for one in columns]
     order = [k + 1 for k in sorted(range(len(columns)), key=written.index) if counts[k]]
     times = np.concatenate([one.times for one in columns])
@@ -119,7 +121,7 @@ def whole_file(
         (0x0A, about_index),
         (0x0D, table_index),
     ]
-    start = len(data) + len(end)
+    start = offset + len(end)
     starts = np.cumsum([start, *(len(group) for _, group in groups)]).tolist()
     offsets = [
         _record(0x0E, struct.pack("<BQQ", code, begin, len(group)))
@@ -128,7 +130,7 @@ def whole_file(
     summary = b"".join([*(group for _, group in groups), *offsets])
     footer = struct.pack("<BQQQ", 0x02, 20, start, starts[-1])
     crc = struct.pack("<I", crc32(summary + footer))
-    return b"".join([data, end, summary, footer, crc, MAGIC])
+    return b"".join([*parts, end, summary, footer, crc, MAGIC])
 
 
 @dataclass(frozen=True)
@@ -140,25 +142,25 @@ class _Chunk:
     last: int  # [ns]
     entries: Mapping[int, bytes]  # by channel: times and positions in the data
 
-    def at(self, offset: int) -> tuple[bytes, bytes]:
-        """Return the chunk record with its message indexes, and the chunk's index record."""
+    def at(self, offset: int) -> tuple[list[bytes], bytes]:
+        """Return the chunk and its message indexes in pieces, and the chunk's index record."""
         size, span = len(self.data), struct.pack("<QQ", self.first, self.last)
         head = span + struct.pack("<QI", size, crc32(self.data)) + _text("") + _long(size)
-        chunk, places = _record(0x06, head, self.data), b""
-        indexes = b""
+        head, places = _head(0x06, len(head) + size) + head, b""
+        length, indexes = len(head) + size, b""
         for channel, entries in self.entries.items():
-            places += struct.pack("<HQ", channel, offset + len(chunk) + len(indexes))
+            places += struct.pack("<HQ", channel, offset + length + len(indexes))
             indexes += _record(0x07, struct.pack("<HI", channel, len(entries)), entries)
         index = _record(
             0x08,
             span,
-            struct.pack("<QQI", offset, len(chunk), len(places)),
+            struct.pack("<QQI", offset, length, len(places)),
             places,
             _long(len(indexes)),
             _text(""),
             struct.pack("<QQ", size, size),
         )
-        return chunk + indexes, index
+        return [head, self.data, indexes], index
 
 
 def _chunked(columns: Sequence[Column], written: Sequence[int], before: bytes) -> list[_Chunk]:
@@ -192,8 +194,11 @@ def _cut(records: Rows, width: int) -> list[bytes]:
 
 
 def _record(opcode: int, *parts: bytes) -> bytes:
-    data = b"".join(parts)
-    return struct.pack("<BQ", opcode, len(data)) + data
+    return b"".join([_head(opcode, sum(map(len, parts))), *parts])
+
+
+def _head(opcode: int, length: int) -> bytes:
+    return struct.pack("<BQ", opcode, length)
 
 
 def _text(text: str) -> bytes:

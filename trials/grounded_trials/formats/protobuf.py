@@ -153,7 +153,9 @@ def uniform_doubles(
     for (tag, _), found in zip(fields, parts[::2], strict=True):
         if (found != np.frombuffer(tag, dtype=np.uint8)).any():
             return None
-    return [np.ascontiguousarray(part).view("<f8").astype(np.float64) for part in parts[1::2]]
+    return [
+        np.ascontiguousarray(part).view("<f8").astype(float, copy=False) for part in parts[1::2]
+    ]
 
 
 def _occurrences(node: _ProtobufNode, number: int) -> tuple[Ints, Ints, Ints, Ints]:

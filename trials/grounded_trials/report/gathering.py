@@ -25,8 +25,8 @@ from grounded_trials.report.forecast import anchored
 from grounded_trials.report.settled import settled_in
 from grounded_trials.store.documents import read_document
 from grounded_trials.workspace.adopted import Better, better_model
-from grounded_trials.workspace.diagnosing import LEAST_STEPS, read_diagnosis
 from grounded_trials.workspace.folder import Contents, Folder, Lost
+from grounded_trials.workspace.last_diagnosis import LEAST_STEPS, read_diagnosis
 from grounded_trials.workspace.next_step import Since, next_command, since_diagnosis
 from grounded_trials.workspace.proposing import standing_in, uncounted
 

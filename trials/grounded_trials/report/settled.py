@@ -19,8 +19,8 @@ from grounded_trials.report.three_lines import gained, still_open, three_lines
 from grounded_trials.wording import ALONE, changed
 from grounded_trials.workspace.adopting import joined, left_behind
 from grounded_trials.workspace.config import ModelTable
-from grounded_trials.workspace.diagnosing import read_diagnosis
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.last_diagnosis import read_diagnosis
 from grounded_trials.workspace.next_step import Since, since_diagnosis, usable_ids
 
 NOW = "the model now"

@@ -30,7 +30,7 @@ from grounded_trials.store.own_files import (
 DEPTH_LIMIT = 10_000  # largest number of past values of one input
 
 
-def candidate_bytes(
+def encoded_candidate(
     policy: Policy,
     predicted_states: Array,
     predicted_inputs: Array,
@@ -38,8 +38,10 @@ def candidate_bytes(
     *,
     state_units: Units | None = None,
     input_units: Units | None = None,
-) -> bytes:
-    """Return a candidate as the bytes of a file; equal arguments give equal bytes.
+) -> tuple[bytes, dict[str, str]]:
+    """Return a candidate as the bytes of a file, and the metadata that `read_candidate` returns.
+
+    Equal arguments give equal bytes.
 
     Args:
         policy: what the robot runs, H steps.
@@ -72,7 +74,7 @@ def candidate_bytes(
         policy=json.dumps(_policy_table(policy)),
     )
     table["sha256"] = _hash(table, [*_controls(policy), states, inputs])
-    times = np.array([round(k * policy.dt * 1e9) for k in range(H + 1)])
+    times = np.rint(np.arange(H + 1) * policy.dt * 1e9).astype(np.int64)
     controls = rows_of_lists(_controls(policy))
     lists = ("feedforward", "gain", "reference")
     columns = (
@@ -80,7 +82,7 @@ def candidate_bytes(
         Column("/predicted_state", "State", policy.state_names, rows_of(states), times),
         Column("/predicted_input", "Input", policy.input_names, rows_of(inputs), times[:-1]),
     )
-    return whole_file(table, _ABOUT, columns, written=(0, 2, 1))
+    return whole_file(table, _ABOUT, columns, written=(0, 2, 1)), table
 
 
 def read_candidate(

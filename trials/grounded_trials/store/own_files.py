@@ -8,7 +8,6 @@ file and the position.
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import math
 from collections import Counter
@@ -238,7 +237,7 @@ def _read(source: bytes, name: str, kind: str) -> OwnFile:
     channels: dict[int, Channel] = {}
     messages: dict[str, list[Messages]] = {}
     counts: Counter[str] = Counter()
-    for record in read_records(io.BytesIO(source), name, limit=FILE_LIMIT):
+    for record in read_records(source, name, limit=FILE_LIMIT):
         if isinstance(record, Metadata) and record.name == "grounded":
             meta = record.data
         elif isinstance(record, Attachment):

@@ -17,9 +17,9 @@ from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.result import Result, listed, percent
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.workspace.config import ModelTable, as_toml, set_in_model
-from grounded_trials.workspace.diagnosing import read_diagnosis
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.where_to_mend import in_time_now
+from grounded_trials.workspace.last_diagnosis import read_diagnosis
 
 Effect = dict[str, Any]  # {"name": "dead_zone:throttle", "c": 0.146}
 AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")

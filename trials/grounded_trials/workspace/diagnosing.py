@@ -1,9 +1,4 @@
-"""Run a diagnosis in a workspace: choose trials and model, store the result and read it again.
-
-A diagnosis uses the stored trials up to the first missing input or unbounded number; gaps in single
-states stay gaps. reports/diagnosis.json holds the result. It may come from another version or an
-untrusted source, so no text in it is trusted.
-"""
+"""Run a diagnosis in a workspace: choose trials and model, store the result."""
 
 from __future__ import annotations
 
@@ -11,23 +6,22 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from grounded.diagnosis.error_report import gain
-from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked
+from grounded.diagnosis.report import Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand
 from grounded.instruments.finding import in_the_log
-from grounded_trials.store.documents import read_document, write_document
-from grounded_trials.store.store import made_folder
 from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.identity import ROWS
 from grounded_trials.workspace.intake.where_to_mend import where_to_mend
+from grounded_trials.workspace.last_diagnosis import diagnosable, write_diagnosis
 from grounded_trials.workspace.unknown_id import named_trials
 
 if TYPE_CHECKING:
+    from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
     from grounded.engine import Engine
     from grounded.frozen import Array
@@ -39,8 +33,6 @@ if TYPE_CHECKING:
     from grounded.trial import Trial
     from grounded_trials.workspace.folder import Folder
 
-FILE = "diagnosis.json"
-LEAST_STEPS = 2
 PROBE = NextCommand("diagnose", ("--probe",))
 
 
@@ -111,7 +103,7 @@ def diagnose_in(
     seen = where_to_mend(workspace, used + others, measured)
     known = _as_known(workspace, found.ranking, made)
     found = replace(found, made=made, preflight=seen, ranking=known)
-    _keep(workspace, found)
+    write_diagnosis(workspace.reports, found)
     diagnosed_again(workspace)
     try:
         identity, words = _probe(workspace, found, lifted + second, library, write=probe)
@@ -139,7 +131,7 @@ def diagnose_in(
     if unasked := found.no_cause and more > 0:
         words = f"{count(more, 'stored trial')} of this task can be diagnosed as well."
         found = replace(found, next_trial=words)
-    _keep(workspace, found)  # again, now with `next_trial`
+    write_diagnosis(workspace.reports, found)  # again, now with `next_trial`
     then = REPORT if undo else DIAGNOSE if unasked else after_diagnosis(workspace, found)
     then = NextCommand("discard", wrong) if wrong else then
     if then == EXPORT and found.kind != "none":
@@ -211,36 +203,6 @@ def unheld_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[str, ...]:
     from grounded.instruments.rows import unheld
 
     return unheld(workspace.planner.task.model, _chosen(workspace, trials))
-
-
-def _keep(workspace: Folder, found: Diagnosis) -> None:
-    write_document(made_folder(workspace.reports) / FILE, found.to_json())
-
-
-def read_diagnosis(folder: Path) -> Diagnosis | None:
-    """Read the diagnosis in a reports folder; return None if there is none.
-
-    Raises:
-        GroundedError: if the file can't be read, or does not hold a diagnosis.
-    """
-    path = folder / FILE
-    try:
-        return _with_limit(Diagnosis.from_json(read_document(path)))
-    except FileNotFoundError:
-        return None
-    except (ValueError, RecursionError, GroundedError) as error:
-        raise GroundedError(
-            f"{path} can't be read ({error}): diagnose again", then=NextCommand("diagnose")
-        ) from None
-
-
-def _with_limit(found: Diagnosis) -> Diagnosis:
-    """Add `Verdict.limit` to a diagnosis of an older version, which has it only in the sentence."""
-    said = found.verdict
-    if said.limit or said.kind != "unknown":
-        return found
-    why = next((text for text in found.unknowable if text in said.sentence), "")
-    return replace(found, verdict=replace(said, limit=why))
 
 
 def _chosen(workspace: Folder, names: Sequence[str]) -> list[Trial]:
@@ -376,16 +338,3 @@ def _narrower(task: Task, strays: Array) -> Task | None:
     assert task.safety_low is not None and task.safety_high is not None
     low, high = task.safety_low + room, task.safety_high - room
     return replace(task, safety_low=low, safety_high=high) if (low < high).all() else None
-
-
-def diagnosable(workspace: Folder) -> list[Trial]:
-    """Return the trials in order of arrival, each up to the first missing or unbounded number.
-
-    A fit needs complete states. A diagnosis does not, so a sensor dropout only costs its own
-    samples, not the rest of the trial.
-
-    Raises:
-        GroundedError: if a stored file is damaged.
-    """
-    cut = [trial.until(trial.known_steps) for trial in workspace.task_trials(measured=True)]
-    return [trial for trial in cut if trial.steps >= LEAST_STEPS]

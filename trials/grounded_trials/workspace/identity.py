@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
@@ -22,7 +22,7 @@ from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.formats.mcap_walk import DamagedFile
-from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
+from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
 from grounded_trials.store.store import Damaged, Store, Stored
 from grounded_trials.workspace.unknown_id import unknown_trial
 
@@ -54,6 +54,8 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "likely_off": float,
     "seen": lambda text: tuple(filter(None, text.split(","))),
 }
+T = TypeVar("T")
+MOST_KNOWN = 4  # files of candidates about which something is kept
 _ABSENT = {
     "predicted_gain": "nan",
     "damping": "1.0",
@@ -194,10 +196,32 @@ def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> 
     return SetAside(tuple(one.id for one in found), workspace.discarded(), tuple(same))
 
 
-@lru_cache(maxsize=4)
+class _Recent(Generic[T]):
+    """What was found out about the latest few files, by their bytes.
+
+    Those are megabytes: comparing them takes a third of the time of hashing them for a dictionary.
+    """
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[bytes, T]] = deque(maxlen=MOST_KNOWN)
+
+    def get(self, data: bytes) -> T | None:
+        """Return what is known about a file, or None."""
+        return next((found for own, found in tuple(self._kept) if own == data), None)
+
+    def add(self, data: bytes, found: T) -> T:
+        """Keep what is known about a file, and return it."""
+        self._kept.append((data, found))
+        return found
+
+
+_HASHES = _Recent[str]()
+_DECODED = _Recent[tuple[Candidate, dict[str, str]]]()
+
+
 def sha256(data: bytes) -> str:
     """Return the hash that identifies a candidate's file."""
-    return hashlib.sha256(data).hexdigest()
+    return _HASHES.get(data) or _HASHES.add(data, hashlib.sha256(data).hexdigest())
 
 
 def named_apart(
@@ -238,13 +262,16 @@ def named_apart(
 
 
 def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
-    """Encode a candidate as the bytes of its file; `kind` is "search" or "probe"."""
+    """Encode a candidate as the bytes of its file; `kind` is "search" or "probe".
+
+    `candidate_of` knows these bytes from then on: the process that wrote a file need not decode it.
+    """
     values = vars(candidate) | {"task": task.hash}
     meta = {"kind": kind} | {
         name: repr(values[name]) if of is float else _text(values[name])
         for name, of in _FIELDS.items()
     }
-    return candidate_bytes(
+    data, table = encoded_candidate(
         candidate.policy,
         candidate.predicted_states,
         candidate.predicted_inputs,
@@ -252,6 +279,8 @@ def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
         state_units=dict(task.model.states),
         input_units=dict(task.model.inputs),
     )
+    _DECODED.add(data, (candidate, table))
+    return data
 
 
 def _text(value: object) -> str:
@@ -268,13 +297,14 @@ def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]
     Raises:
         GroundedError: if the file is damaged, rewritten, or another candidate's.
     """
-    candidate, meta = _proven(data, identity)
+    known = _DECODED.get(data)  # one command decodes the same bytes up to three times
+    if known is None or known[0].id != identity:
+        known = _DECODED.add(data, _decoded(data, identity))
+    candidate, meta = known
     return candidate, dict(meta)
 
 
-@lru_cache(maxsize=4)
-def _proven(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
-    """Decode a candidate, cached: one command decodes the same bytes up to three times."""
+def _decoded(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
     name = f"candidates/{identity}.mcap"
     try:
         policy, states, inputs, meta = read_candidate(data, name)

@@ -9,22 +9,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.diagnosis.cause_words import sign_only
-from grounded.diagnosis.error_report import gain
-from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import GroundedError, NextCommand
 from grounded.model import all_at_bounds
 from grounded.search.standing import LOST, Standing
 from grounded_trials.wording import count, rendered
-from grounded_trials.workspace.diagnosing import diagnosable, read_diagnosis
-from grounded_trials.workspace.fitting import fitted_in_vain
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.where_to_mend import in_time_now
+from grounded_trials.workspace.last_diagnosis import diagnosable, read_diagnosis
 from grounded_trials.workspace.off_target import logged_target
 from grounded_trials.workspace.proposing import standing_in, status_of, to_run
+
+if TYPE_CHECKING:
+    from grounded.diagnosis.report import Diagnosis, Made
 
 PROPOSE = NextCommand("propose")
 DIAGNOSE = NextCommand("diagnose")
@@ -207,7 +206,10 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     Filters and delays of sensors are adopted too if states are fed back: feedback gains designed
     without them make the robot oscillate.
     """
+    from grounded.diagnosis.cause_words import sign_only
+    from grounded.diagnosis.error_report import gain
     from grounded_trials.workspace.adopting import declined
+    from grounded_trials.workspace.fitting import fitted_in_vain
 
     new = diagnosis.open(workspace.config.model.effects, workspace.config.model.params)
     if diagnosis.changed:  # values of two robots together fit neither
@@ -218,7 +220,7 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     if not claimed or {*new} <= undone or _like_a_load(workspace, new):
         return NextCommand("adopt", late) if late else None
     if most := diagnosis.verdict.look_for:
-        return _with_more(most, diagnosis.made or Made())
+        return _with_more(most, _made(diagnosis))
     params = workspace.base_model.params
     known = {n: e.value for n, e in diagnosis.parameters.items() if n in params}
     if all_at_bounds(params, {n: known[n] for n in diagnosis.verdict.parameters if n in known}):
@@ -227,7 +229,7 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
         return DIAGNOSE  # after flipping the sign, as the diagnosis says
     own = {f"parameter:{name}" for name in params}
     if own.issuperset(new):
-        made = diagnosis.made or Made()
+        made = _made(diagnosis)
         some = (*made.named, *made.compared)
         alone = not workspace.config.model.effects  # else found beside effects, to be adopted so
         if alone and not fitted_in_vain(workspace, some):  # only parameters: fit all together
@@ -254,9 +256,16 @@ def not_adopted(workspace: Folder, diagnosis: Diagnosis | None) -> str:
 
 def newer_alone(diagnosis: Diagnosis) -> NextCommand:
     """Return the diagnosis of the newer of the two groups that a diagnosis compared."""
-    made = diagnosis.made or Made()
+    made = _made(diagnosis)
     newer = max(made.named, made.compared, key=lambda group: max(group, default=""))
     return NextCommand("diagnose", ("--trials", ",".join(newer)))
+
+
+def _made(diagnosis: Diagnosis) -> Made:
+    """Return what a diagnosis was made from; of an older version it does not say."""
+    from grounded.diagnosis.report import Made  # slow: most commands find no diagnosis
+
+    return diagnosis.made or Made()
 
 
 def _like_a_load(workspace: Folder, effects: Sequence[str]) -> bool:
@@ -270,6 +279,8 @@ def _like_a_load(workspace: Folder, effects: Sequence[str]) -> bool:
 
 def late_open(workspace: Folder, diagnosis: Diagnosis) -> tuple[str, ...]:
     """Return the filters and delays of sensors that a diagnosis found and the model lacks."""
+    from grounded_trials.workspace.intake.where_to_mend import in_time_now
+
     task = workspace.config.task
     if not (task.target and task.feedback):
         return ()
@@ -334,7 +345,7 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
         diagnosis: the diagnosis.
         usable: the trials that can be used now, in order of arrival.
     """
-    model, made = workspace.config.model, diagnosis.made or Made()
+    model, made = workspace.config.model, _made(diagnosis)
     seen, params = set(made.trials), made.params
     last = max((k for k, name in enumerate(usable) if name in seen), default=-1)
     missing = diagnosis.open(model.effects, model.params)
@@ -357,7 +368,7 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
 def _other_value(diagnosis: Diagnosis, name: str, params: Mapping[str, float]) -> bool:
     """Return whether a claimed parameter differs from the claimed value: it was not adopted."""
     family, _, own = name.partition(":")
-    row, made = diagnosis.ranked(name), diagnosis.made or Made()
+    row, made = diagnosis.ranked(name), _made(diagnosis)
     if family != "parameter" or own not in params or own not in made.nominal or row is None:
         return False
     said = row.params["d"].moved(made.nominal[own])

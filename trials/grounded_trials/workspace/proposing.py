@@ -313,7 +313,7 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
     Raises:
         GroundedError: if a stored file is damaged.
     """
-    from grounded_trials.workspace.diagnosing import read_diagnosis
+    from grounded_trials.workspace.last_diagnosis import read_diagnosis
     from grounded_trials.workspace.next_step import next_command, since_diagnosis, usable_ids
 
     usable = usable_ids(workspace)

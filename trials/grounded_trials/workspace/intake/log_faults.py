@@ -7,7 +7,7 @@ reported with its correction, in [log] or in the program that wrote the trial.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +19,6 @@ from grounded.trial import Trial
 from grounded_trials.logs.log_table import LogMapping
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.estimating import read_estimate
 
 PART = re.compile(r"((?:^|[._])(?:orientation|rotation|quaternion))\.([xyzw])$")
 ABOUT = {"x": "roll", "y": "pitch", "z": "yaw", "w": "yaw"}  # the angle closest to each component
@@ -193,7 +192,11 @@ def _clocks_apart(workspace: Folder, trial: Trial) -> list[Fault]:
     from grounded.instruments.clocks import answers_early, one_clock, too_soon
 
     model, table = workspace.base_model, workspace.config.estimate
-    measured = read_estimate(table, model).measured if table.names() else model.state_names
+    measured: Collection[str] = model.state_names
+    if table.names():
+        from grounded_trials.workspace.intake.estimating import read_estimate
+
+        measured = read_estimate(table, model).measured
     shown = [i for i, name in enumerate(model.state_names) if name in measured]
     if (early := answers_early(model, trial, shown)) is None:
         return []

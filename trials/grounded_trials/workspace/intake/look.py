@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
+from typing import TYPE_CHECKING
 
 from grounded.result import listed
 from grounded.search.candidate import Candidate
@@ -14,10 +15,12 @@ from grounded.task import Task
 from grounded.trial import interpolate_gaps
 from grounded_trials.workspace.intake.acted_on import on_other_speeds, rival_in, sender_of
 from grounded_trials.workspace.intake.fell import fall_in, who_fell
-from grounded_trials.workspace.intake.foreign import ForeignLog
 from grounded_trials.workspace.intake.missed_steps import not_sent
 from grounded_trials.workspace.intake.reading import Read, cut_log
 from grounded_trials.workspace.intake.run_start import Recording, Start, elsewhere
+
+if TYPE_CHECKING:
+    from grounded_trials.workspace.intake.foreign import ForeignLog
 
 
 class Look:

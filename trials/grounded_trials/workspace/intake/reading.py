@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.trial import Trial
@@ -26,7 +27,6 @@ from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, ROWS, sha256
 from grounded_trials.workspace.intake.crossed import crossed
-from grounded_trials.workspace.intake.foreign import ForeignLog, begun, mapping_of, read_foreign
 from grounded_trials.workspace.intake.log_faults import no_angles
 from grounded_trials.workspace.intake.stored_before import (
     refuse_as_another,
@@ -35,6 +35,9 @@ from grounded_trials.workspace.intake.stored_before import (
     set_aside_of,
 )
 from grounded_trials.workspace.proposing import standing_in
+
+if TYPE_CHECKING:
+    from grounded_trials.workspace.intake.foreign import ForeignLog
 
 HOLE = 10.0  # length of a gap, in usual intervals between samples, that is reported
 
@@ -171,6 +174,8 @@ def read_log_file(workspace: Folder, path: Path, candidate: str | None, data: bo
     Raises:
         GroundedError: if it can't be mapped or sampled, or no candidate is outstanding.
     """
+    from grounded_trials.workspace.intake.foreign import mapping_of, read_foreign
+
     log = read_foreign(workspace, path, mapping_of(workspace, path))
     ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
     refuse_as_another(path, log.stored, "" if data else candidate)
@@ -189,6 +194,8 @@ def read_log_file(workspace: Folder, path: Path, candidate: str | None, data: bo
 
 def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read:
     """Cut the trial from a log, from `start` [s] on; None: from [log.span] or the first command."""
+    from grounded_trials.workspace.intake.foreign import begun
+
     trial, found = log.cut(candidate, start)
     about = _about(log.workspace, candidate) | log.source
     about |= {ROWS: f"{found.row_s:.6g}"} if found.row_s and not candidate else {}

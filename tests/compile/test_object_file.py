@@ -1,0 +1,125 @@
+"""Cached kernels load without LLVM, and are left to it where they are not what is known here."""
+
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from grounded.compile.run import jit, object_file
+from problems import system
+from shared_data import SUPPORT
+
+HERE = sys.platform == "linux" and platform.machine() == "x86_64"
+here = pytest.mark.skipif(not HERE, reason="only x86-64 Linux loads kernels without LLVM")
+TEXT = """
+@table = internal constant [3 x double] [double 1.0, double 2.0, double 4.0]
+declare double @cbrt(double)
+define i64 @run(ptr %words) {
+  %x = load double, ptr %words
+  %i = fptosi double %x to i64
+  %at = getelementptr double, ptr @table, i64 %i
+  %known = load double, ptr %at
+  %root = call double @cbrt(double %known)
+  %sum = fadd double %root, 0.1
+  store double %sum, ptr %words
+  ret i64 7
+}
+"""
+
+
+@pytest.fixture
+def code() -> bytes:
+    return jit._compiled(TEXT)
+
+
+def called(loaded: object, x: float) -> tuple[int, float]:
+    words = np.array([x])
+    status = jit.Library(loaded, ("run",))["run"](words.ctypes.data)
+    return status, float(words[0])
+
+
+@here
+@pytest.mark.parametrize("x", [0.0, 1.0, 2.0])
+def test_code_constants_and_calls_of_the_c_library_are_found(code: bytes, x: float) -> None:
+    loaded = object_file.load(code)
+    assert loaded is not None
+    assert called(loaded, x) == called(jit._loaded(code), x)
+    assert called(loaded, x) == (7, pytest.approx(2.0 ** (x / 3) + 0.1, abs=1e-15))
+
+
+@here
+def test_what_is_not_known_is_left_to_llvm(code: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert object_file.load(b"") is None
+    assert object_file.load(b"\x7fELF" + bytes(100)) is None
+    assert object_file.load(code.replace(b"cbrt", b"cbrq")) is None  # no such function
+    with monkeypatch.context() as other:
+        other.setattr(object_file, "RELATIVE", -1)
+        other.setattr(object_file, "ABSOLUTE", -1)
+        assert object_file.load(code) is None  # a kind of relocation
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    assert object_file.load(code) is None
+
+
+@here
+def test_kernels_give_the_same_through_both_loaders(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+
+    def derivatives() -> list[np.ndarray]:
+        made, p = system("car")
+        x, u = rng.normal(size=(50, made.n)), rng.normal(size=(50, made.m))
+        return [made.step(x, u, p, 0.02), *made.linearise(x, u, p, 0.02)]
+
+    own = derivatives()
+    rng = np.random.default_rng(0)
+    monkeypatch.setattr(jit, "load", lambda code: None)
+    for mine, theirs in zip(own, derivatives(), strict=True):
+        assert np.array_equal(mine, theirs, equal_nan=True)
+
+
+@here
+def test_a_warm_process_does_not_import_llvm(tmp_path: Path) -> None:
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "import numpy as np\nfrom problems import system\n"
+        "made, p = system('pendulum')\n"
+        "made.step(np.array([[0.3, -0.2]]), np.array([[0.1]]), p, 0.05)\n"
+        "print(made.how, 'llvmlite.binding' in sys.modules)"
+    )
+    environment = os.environ | {"GROUNDED_CACHE": str(tmp_path / "cache")}
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+    command = [sys.executable, "-c", code, str(SUPPORT)]
+    said = [
+        subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    ]
+    assert [line.split() for line in said] == [["compiled", "True"], ["compiled", "False"]]
+
+
+def test_a_machine_is_asked_again_once_it_was_started_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GROUNDED_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(jit, "BOOT", tmp_path / "boot")
+    asked = jit._host.__wrapped__
+    jit._here.cache_clear()
+    try:
+        assert jit._here() == "" and jit._remembered() is None  # no such file
+        (tmp_path / "boot").write_text("first")
+        jit._here.cache_clear()
+        assert jit._remembered() is None
+        if not jit._here():
+            pytest.skip("LLVM is not where llvmlite's wheels have it")
+        assert asked() == jit._remembered() == asked()
+        (file,) = (tmp_path / "cache").glob("*.machine")
+        file.write_bytes(file.read_bytes()[:-1])
+        assert jit._remembered() is None  # damaged
+        assert asked() == jit._remembered()
+        (tmp_path / "boot").write_text("second")
+        jit._here.cache_clear()
+        assert jit._remembered() is None
+    finally:
+        jit._here.cache_clear()
