@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 MOST = 3  # target states whose range is shown at most
 ENDS = 8  # final values are shown for models with at most this many states
 LAST = 3  # number of recent predictions whose errors are shown
+MINOR = 0.1  # of the largest reason: a smaller one is not mentioned
 LUCKY = 2.0  # standard errors within which a difference counts as scatter
 NOISY = 0.1  # share of the predicted cost above which the cost of sensor noise is shown
 MUCH = 0.2  # share of the best cost above which its part due to sensor noise is shown
@@ -118,8 +119,7 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
     The difference is split into three parts: the start (the model's own run starts at s_0, the real
     ones elsewhere, if by more than sensor noise), the mean of several runs (which the model
     replays: it costs less than they do, because their scatter is averaged out), and the rest, which
-    is compared with the scatter of its runs if that is known. The parts shown add up to the
-    difference.
+    is compared with the scatter of its runs if that is known.
     """
     from grounded.trial import mean_trial
     from grounded_trials.workspace.off_target import began_elsewhere
@@ -133,29 +133,23 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
         return f"{own}, so it does not reproduce those runs"
     if not math.isfinite(candidate.base_as_run):
         return own
-    elsewhere, why = began_elsewhere(task, best.trials, estimated), []
+    elsewhere, parts = began_elsewhere(task, best.trials, estimated), []
     start = same - candidate.base_as_run if elsewhere else 0.0
-    if abs(start) > told:
-        where = f"away from [task] start in {listed(elsewhere)}"
-        why.append(f"{_apart(start)} than its runs, because they began {where}")
-    else:
-        start = 0.0
+    parts.append((start, f"its runs began away from [task] start in {listed(elsewhere)}"))
     each = [task.utility(trial) for trial in best.trials]
     mean = task.utility(mean_trial(best.trials, task.model.angle_mask)) - sum(each) / len(each)
-    if mean > told:
-        runs = "" if why else " than its runs"
-        why.append(
-            f"{_apart(mean)}{runs}, because it replays their mean, which lacks their scatter"
-        )
-    else:
-        mean = 0.0
-    rest, known = same - start - mean - best.utility, math.isfinite(best.standard_error)
-    if abs(rest) > told and (known or why):
+    parts.append((mean, "it replays their mean, without their scatter"))
+    parts = [(part, why) for part, why in parts if abs(part) > told]
+    rest = same - best.utility - sum(part for part, _ in parts)
+    if math.isfinite(best.standard_error):
         within = abs(rest) <= LUCKY * best.standard_error
-        scatter = "which is within their scatter" if within else "which their scatter can't explain"
-        than = "" if why else " than its runs"
-        why.append(f"{_apart(rest)}{than}, {scatter if known else 'for a reason not known yet'}")
-    return f"{own}: {', and '.join(why)}" if why else own
+        parts.append((rest, "the scatter of its runs" if within else "not explained by its runs"))
+    elif parts:
+        parts.append((rest, "not known yet"))
+    most = max((abs(part) for part, _ in parts), default=0.0)
+    parts = [(part, why) for part, why in parts if abs(part) > max(told, MINOR * most)]
+    said = "; ".join(f"{why}: {'+' * (part > 0)}{number(part)}" for part, why in parts)
+    return f"{own} ({said})" if said else own
 
 
 def noise_share(best: Tried) -> str:
@@ -163,10 +157,6 @@ def noise_share(best: Tried) -> str:
     if not best.noise_cost > MUCH * -best.utility:
         return ""
     return f", about {number(min(best.noise_cost, -best.utility))} of it sensor noise"
-
-
-def _apart(gain: float) -> str:
-    return f"{'better' if gain > 0 else 'worse'} by {number(abs(gain))}"
 
 
 def _what(candidate: Candidate, standing: Standing, task: Task) -> str:

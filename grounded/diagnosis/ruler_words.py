@@ -41,8 +41,15 @@ def improvement(rows: Sequence[RulerRow], tracked: Sequence[str] = ()) -> str:
 
 def told_row(rows: Sequence[RulerRow]) -> RulerRow | None:
     """Return the row of which `improvement` gives numbers; None if predictions hardly change."""
-    whole = (row for row in rows if row.whole_trial)
-    return next((row for row in (telling(rows), *whole) if row and _best(row)), None)
+    both = (telling(rows), _whole(rows))
+    return next((row for row in both if row and _best(row)), None)
+
+
+def _whole(rows: Sequence[RulerRow]) -> RulerRow | None:
+    """Return the row of whole trials; None if noise alone exceeds everything measured in less."""
+    if any(row.drowned for row in rows):
+        return None
+    return next((row for row in rows if row.whole_trial), None)
 
 
 def _best(row: RulerRow, tracked: Sequence[str] = ()) -> list[str]:
@@ -61,8 +68,7 @@ def telling(rows: Sequence[RulerRow]) -> RulerRow | None:
 
     A heating process, for example, moves so little within 1 s that any model predicts it well.
     """
-    ahead = furthest(rows)
-    whole = next((row for row in rows if row.whole_trial), None)
+    ahead, whole = furthest(rows), _whole(rows)
     if ahead and whole and _most(ahead) < HALF and _most(whole) > _most(ahead) + MORE:
         return whole
     return ahead
@@ -119,8 +125,8 @@ def _lost_most(rows: Sequence[RulerRow]) -> tuple[float, RulerRow | None, str]:
 
     Whole trials come first if they lose over all states, as they are what a plan is made for.
     """
-    whole = [] if any(row.drowned for row in rows) else [row for row in rows if row.whole_trial]
-    found = [_losses(some) for some in (whole, rows)]
+    whole = [row for row in (_whole(rows),) if row]
+    found = [_losses(some) for some in (whole, [r for r in rows if not r.whole_trial] + whole)]
     lost, other = (max(some, key=lambda loss: loss[0], default=(0.0, None, "")) for some in found)
     return lost if lost[0] > 1 + SHOWS and lost[1] is not None and _loses(lost[1]) else other
 

@@ -78,6 +78,10 @@ def test_where_noise_alone_leaves_all_that_was_measured_nothing_is_told_of_a_hor
     far = row({"x": 2.0, "v": 5.0}, {"x": 1.9, "v": 9.0}, horizon_s=1.0, drowned=True)
     assert furthest((short, far)) is short and furthest((far,)) is far and furthest(()) is None
     assert "0.5 s ahead" in improvement((short, far)) and worsened((short, far)) == ""
+    fell = row({"x": 2.0, "v": 1.6}, {"x": 0.1, "v": 2.2}, whole_trial=True, horizon_s=40.0)
+    assert "get worse for v" in worsened((short, fell))
+    assert worsened((short, far, fell)) == ""  # a balancer's 40 s without feedback
+    assert "whole" not in improvement((short, far, fell)) and telling((short, far, fell)) is short
 
 
 def test_what_few_repeats_may_have_missed_of_the_noise_is_not_left_over():

@@ -212,16 +212,16 @@ def test_the_noise_of_a_first_sample_is_no_motion():
 @pytest.mark.parametrize(
     ("as_run", "error", "parts", "never"),
     [
-        (-9.0, 0.1, ("better by 1.000 than its runs, because", "start"), ("scatter", "explain")),
+        (-9.0, 0.1, ("start in x: +1.000)",), ("scatter", "explain")),
         # a car's line told 0.003 of the 0.129 that its two figures differ by
         (
             -7.5,
             np.nan,
-            ("worse by 0.5000 than its runs, because", "better by 1.500", "not known"),
+            ("start in x: -0.5000; not known yet: +1.500)",),
             (),
         ),
-        (-8.0, 0.6, ("within their scatter",), ("start",)),
-        (-8.0, 0.1, ("scatter can't explain",), ("start",)),
+        (-8.0, 0.6, ("the scatter of its runs: +1.000",), ("start",)),
+        (-8.0, 0.1, ("not explained by its runs: +1.000",), ("start",)),
         (-8.0, np.nan, (), ("scatter", "start")),  # one run: the scatter is unknown
         (np.nan, 0.1, (), ("scatter", "start")),  # from an older version
     ],
@@ -301,4 +301,4 @@ def test_the_noise_of_a_first_row_is_no_start_elsewhere():
     )
     best.trials = [begun(task, noise=0.02)]
     text = _so_far(made, best, task)
-    assert "began" not in text and "better by 2.000 than its runs" in text
+    assert "began" not in text and "+2.000" in text
