@@ -197,6 +197,8 @@ def _causes(
     for one in credit:
         if one.of in effects:
             text = meaning(effects[one.of], values[one.of])
+            if one.share < BARELY and one.of in claims.held_up:
+                text += f", without which {listed(claims.held_up[one.of])} would end at a bound"
             text += OPEN * (open_gap and one.of.startswith("parameter:"))
             text += UNSURE * (not has_size(effects[one.of], values[one.of], KNOWN))
             text += f", {apart[one.of]}" if one.of in apart else ""
@@ -259,6 +261,7 @@ def _moved(claims: Claims) -> str:
     return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
 
 
+BARELY = 0.01  # share of the improvement below which a claim needs another reason
 OPEN = ", unless the gap that remains is the reason"  # a value that a parameter should have
 UNSURE = ", but its size is uncertain: within 2 standard deviations of zero"
 

@@ -51,7 +51,7 @@ class Claims:
     ) -> None:
         self.search, self.best, self.known = decision.search, decision.fit, known
         self.ruler = ruler
-        self.whole = decision.whole
+        self.whole, self.held_up = decision.whole, decision.held_up
         search, best, self.credit = decision.search, decision.fit, credit
         self.predictor, self.data = search.predictor, search.data
         self.names, self._same = best.hypothesis.names, dict[tuple[str, str], bool]()

@@ -12,6 +12,7 @@ under every other noise structure, are compared by the `ruler`:
        effect with very high evidence, beside white innovations only, is dropped only if predictions
        gain nothing.
     3. An effect that a parameter's shift undoes is dropped; the parameter alone describes both.
+       A likely effect stays without which the model's parameters would end at their bounds.
     4. An effect without a mechanism that a single motion shows is dropped, however often the motion
        was repeated.
     5. The remaining effects must be likelier than none.
@@ -85,6 +86,17 @@ class Decision:
     def causes(self) -> tuple[str, ...]:
         """The effects of the fit, and calibration if its parameters are free."""
         return causes(self.fit)
+
+    @property
+    def held_up(self) -> dict[str, tuple[str, ...]]:
+        """By effect, the model's parameters that would end at their bounds without it."""
+        stopped = {*_stopped(self.search, self.fit)}
+        found = {n: _stopped(self.search, less) for n, less in self.without.items()}
+        return {
+            n: tuple(name for name in names if name not in stopped)
+            for n, names in found.items()
+            if _held_up(self.search, self.fit, self.without[n], n)
+        }
 
 
 def causes(fit: Fitted) -> tuple[str, ...]:
@@ -315,6 +327,8 @@ def _pruned(
                 if gains[name].channels.max() < least or not _pays(search, ruler, less, fit, white)
             ]
         )
+        if not undone:
+            idle = [n for n in idle if not _held_up(search, fit, without[n], n)]
         if not idle:
             return fit, without, doubtful
         name = _least_needed(search, ruler, without, min(idle, key=lambda n: gains[n].mean), idle)
@@ -322,6 +336,23 @@ def _pruned(
         if nats > LIKELY and name in equations(fit) and name not in undone:
             doubtful.append(Doubtful(name, nats, fit, repeated[name], gains[name].alone))
         fit = without[name]
+
+
+def _held_up(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -> bool:
+    """Check whether a likely effect keeps the model's parameters off their bounds.
+
+    Without it, they describe the data only with values that the user excludes.
+    """
+    sure = name in equations(fit) and search.score(fit) - search.score(less) > LARGE_GAIN
+    return sure and len(_stopped(search, less)) > len(_stopped(search, fit))
+
+
+def _stopped(search: HypothesisSearch, fit: Fitted) -> list[str]:
+    """Return the model's parameters that a fit leaves at a bound."""
+    model, shift = search.data.model, fit.hypothesis.shift
+    values = model.values if shift is None else model.values + shift
+    params = zip(model.params.items(), values, strict=True)
+    return [name for (name, param), value in params if param.stopped(float(value))]
 
 
 def _least_needed(

@@ -1,0 +1,53 @@
+"""A likely effect stays without which the model's parameters would end at their bounds.
+
+A balancer's delay of 24 ms was dropped: its moment of inertia, at 7 times the model's value and at
+its bound, predicted 0.5 s ahead as well. Nothing could be adopted from that.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from grounded import Model, Param
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.validation.decide import Decision
+from grounded.effects import Library
+
+MODEL = Model(
+    states={"q": "rad", "w": "rad/s"},
+    inputs={"u": "V"},
+    params={"I": Param(0.003, "kg m^2", 0.0005, 0.02), "km": Param(0.05, "N m/V", 0.02, 0.12)},
+    derivative=lambda s, a, p: {"q": s.w, "w": p.km * a.u / p.I},
+)
+
+
+def fitted(inertia, *names):
+    """A fit with these effects and this moment of inertia."""
+    library = Library()
+    effects = tuple(library.effect(name, MODEL) for name in names)
+    values = tuple({q.name: 0.02 for q in effect.free} for effect in effects)
+    shift = np.array([inertia - 0.003, 0.0])
+    return SimpleNamespace(hypothesis=Hypothesis(effects, values, shift, 1.0))
+
+
+def decision(fit, less, nats):
+    """The decision for `fit`, whose delay is worth `nats`."""
+    search = SimpleNamespace(
+        data=SimpleNamespace(model=MODEL), score=lambda f: nats if f is fit else 0.0
+    )
+    return Decision(search, search, fit, less, {"delay:u": less})
+
+
+@pytest.mark.parametrize(
+    ("inside", "without", "nats", "held"),
+    [
+        (0.005, 0.02, 766.0, {"delay:u": ("I",)}),
+        (0.005, 0.019, 766.0, {}),  # no bound is reached
+        (0.02, 0.02, 766.0, {}),  # it does not help
+        (0.005, 0.02, 20.0, {}),  # too unlikely to be held against better predictions
+    ],
+)
+def test_what_keeps_a_parameter_off_its_bound_is_told(inside, without, nats, held):
+    fit = fitted(inside, "delay:u")
+    assert decision(fit, fitted(without), nats).held_up == held
