@@ -68,6 +68,7 @@ def judged(
         if accepted:
             iteration += incumbent is not None
             incumbent, losses = tried, 0
+            history = [_settled(one) for one in history]
         elif incumbent is not None and (candidate.base, candidate.model) == (
             incumbent.candidate.id,
             model,
@@ -94,6 +95,11 @@ def _with_noise(task: Task, tried: Tried, noise: Array) -> Tried:
     if not tried.trials:
         return tried
     return replace(tried, noise_cost=noise_cost(task, tried.candidate.policy, noise))
+
+
+def _settled(tried: Tried) -> Tried:
+    """Return a candidate whose loss was in doubt as one that lost: a later one beat both runs."""
+    return replace(tried, accepted=False, in_doubt=False) if tried.in_doubt else tried
 
 
 def repeated_exactly(trials: Sequence[Trial]) -> bool:

@@ -242,6 +242,28 @@ def test_a_lucky_winner_loses_its_luck():
     assert story.now.incumbent.candidate.id == "c0002" and story.now.iteration == 1
 
 
+def test_a_doubt_ends_with_the_best_that_it_was_about():
+    """An excavator's third best was run 35 times because the second seemed unlucky beside the first.
+
+    c0002 wins, c0003 loses by little, so c0002 runs again, badly: now it is c0002 that lost to c0001
+    by little, but c0003 has beaten both.
+    """
+    story = Story(rerun_incumbent=True, tolerance=0.0).add().add().add(worse(0.02))
+    first, second, third = (story.task.utility(t) for t in story.trials)
+    assert first < third < second and story.now.outstanding.id == "c0002"
+    again = replace(story.trials[1])
+    by = next(d for d in np.linspace(0.0, 1.0, 1000) if mean_of(story, bad(again, d)) < first)
+    story.trials.append(bad(again, by))
+    now = story.now
+    assert [t.accepted for t in now.history] == [True, False, True]
+    assert now.incumbent.candidate.id == "c0003" and now.phase == "propose"
+
+
+def mean_of(story, again):
+    """Return the mean utility of the second trial and another one of its candidate."""
+    return (story.task.utility(story.trials[1]) + story.task.utility(again)) / 2
+
+
 def test_losses_are_not_checked_for_ever():
     """At most one additional trial is run for each loss, however much trials scatter."""
     noisy = Plant(PLANT.model, noise=Noise(process={"v": 0.2}))
