@@ -12,8 +12,8 @@ from grounded.errors import GroundedError
 from grounded.plant import Noise, Plant
 from grounded.search.ask_tell import learn
 from grounded.search.improve import propose
-from grounded.search.making import About
-from grounded.search.planner import fixed_draws, model_fingerprint
+from grounded.search.making import About, Maker
+from grounded.search.planner import Planner, fixed_draws, model_fingerprint
 from grounded.search.standing import MAX_CAUTION, standing
 from grounded.search.step_size import OTHER_WAY, SearchOptions, Step, losers_of
 from grounded.trial import Trial, mean_trial
@@ -136,6 +136,19 @@ def test_after_two_losses_no_trial_is_spent_on_a_step_likelier_to_lose(monkeypat
         ended = proposal.standing
         assert (ended.phase, ended.ending) == ("converged", "no step improved")
         assert holds(ended.sentence, 2, ended.incumbent.candidate.id)
+
+
+def test_a_step_like_one_that_an_earlier_best_lost_by_is_as_doubtful():
+    """A belt drive ran two steps that both lost twice the best cost, one from each of two bests."""
+    story = Story().add().add(bad).add()
+    best, lost = story.now.incumbent, story.now.history[1]
+    assert best.candidate.id == "c0003" and lost.lost and lost.candidate.base == "c0001"
+    plain = Planner(TASK, TASK)
+    about = About(Maker(plain, story.now, "c0004", plain.fingerprint), best, story.options, "")
+    again = about._told(about.candidate(lost.candidate.policy, Step(), ""))
+    assert again.expected_gain <= lost.utility - best.utility + 1e-9
+    stay = about._told(about.candidate(best.candidate.policy, Step(), ""))
+    assert stay.likely_off < 1e-3 * again.likely_off  # another run is not concerned
 
 
 def test_after_one_loss_a_doubtful_step_is_tried(monkeypatch):
