@@ -84,6 +84,9 @@ SETUPS: dict[str, tuple[Callable[..., Setup], str, dict[str, object]]] = {
     "arm-both": (arm, "payload and joint friction", {"payload": 0.5, "f1": 0.6, "f2": 0.6}),
     "arm-delay": (arm, "delay 30 ms", {"delay": 0.03}),
     "arm-armature": (arm, "armature 0.1 kg m2", {"armature": 0.1}),
+    "arm-armature-lag": (
+        arm, "armature 0.15 kg m2, filter 20 ms", {"armature": 0.15, "lag": (0.02, 0.02)},
+    ),
     "arm-gear": (arm, "gear 0.8 of joint 1", {"gear": 0.8}),
     "arm7": (arm7, "nothing", {}),
     "arm7-payload": (arm7, "payload 1.4 kg", {"payload": 1.5}),

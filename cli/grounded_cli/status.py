@@ -68,7 +68,7 @@ def verify(json_: bool) -> None:
 
 def summary(status: Status) -> str:
     """Return the history as a table, the utilities as bars, and the certainty of the last gain."""
-    from grounded.search.certainty import last_improvement
+    from grounded.search.certainty import beyond_one_trial, last_improvement
 
     standing, lines = status.standing, []
     if standing.history:
@@ -86,6 +86,9 @@ def summary(status: Status) -> str:
     then = ", then" if status.again.verb == "next" else ":"  # its file was exported
     again = f"run the best one again{then} `{rendered(status.again)}`"
     if certainty := last_improvement(standing.history, again):
+        if (waiting := standing.outstanding) is not None and standing.incumbent is not None:
+            small = beyond_one_trial(waiting, standing.incumbent, standing.missing)
+            certainty = "; ".join(filter(None, (certainty, small)))
         lines.append(field("certainty", certainty))
     lines.append(field("phase", f"{standing.outcome}: {standing.sentence}"))
     return "\n".join(lines)

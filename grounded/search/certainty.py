@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 PART = 0.3  # share of a gain due to different start states from which on it is reported
 ANOTHER = 99.0  # ratio of a state's costs in two runs that is no scatter, see `another_kind`
+LUCK = 2.0  # standard errors that a loss must exceed to break a promise
+SHOWN = 1.645  # standard errors of a gain that is one with probability SURE, 0.95
 FEW = 4.0  # degrees of freedom below which the sentence mentions the few repeats
 
 
@@ -69,6 +71,7 @@ def judged(
         if accepted:
             iteration += incumbent is not None
             incumbent, losses = tried, 0
+            history = [_settled(one) for one in history]
         elif incumbent is not None and (candidate.base, candidate.model) == (
             incumbent.candidate.id,
             model,
@@ -95,6 +98,11 @@ def _with_noise(task: Task, tried: Tried, noise: Array) -> Tried:
     if not tried.trials:
         return tried
     return replace(tried, noise_cost=noise_cost(task, tried.candidate.policy, noise))
+
+
+def _settled(tried: Tried) -> Tried:
+    """Return a candidate whose loss was in doubt as one that lost: a later one beat both runs."""
+    return replace(tried, accepted=False, in_doubt=False) if tried.in_doubt else tried
 
 
 def repeated_exactly(trials: Sequence[Trial]) -> bool:
@@ -192,6 +200,32 @@ def last_improvement(history: Sequence[Tried], again: str = "run the best one ag
     return (
         f"the last gain is {with_error(gain, error)}: an improvement with probability "
         f"{chance(before, after, history):.2f}" + ", from few repeats" * (freedom < FEW)
+    )
+
+
+def one_trial_error(best: Tried, repeats: int = 1) -> float:
+    """Return the standard error of a new candidate's gain over the best; 0 if no noise is known."""
+    each = best.deviation
+    return each * math.sqrt(1 / repeats + 1 / len(best.utilities)) if each > 0 else 0.0
+
+
+def runs_to_show(gain: float, best: Tried) -> int:
+    """Return how many runs of a candidate and as many of the best show a gain, see `SHOWN`."""
+    return math.ceil(2 * (SHOWN * best.deviation / gain) ** 2)
+
+
+def beyond_one_trial(made: Candidate, best: Tried, repeats: int = 1) -> str:
+    """Return a sentence saying that a trial can't show what a candidate promises; "" if it can."""
+    own, least = best.candidate.id, SHOWN * one_trial_error(best, repeats)
+    gain = made.promised_over(best) if made.base == own else 0.0
+    if not 0 < gain < least:
+        return ""
+    runs = runs_to_show(gain, best)
+    stop = f". You may stop here, with {own}" * (not made.doubtful)  # `Candidate.doubt` says it
+    return (
+        f"{made.id} promises {gain:.2g} over {own}, less than its trial can show: the utilities of "
+        f"single runs scatter by {best.deviation:.2g}, so a gain below {least:.2g} may be luck. To "
+        f"show it takes {runs} runs of each of the two{stop}"
     )
 
 

@@ -32,10 +32,11 @@ from grounded.errors import GroundedError, NextCommand, list_of, type_of
 from grounded.model import Model
 from grounded.result import figure
 from grounded.search.candidate import Candidate, Tried
+from grounded.search.certainty import one_trial_error, runs_to_show
 from grounded.search.making import About, Maker
 from grounded.search.original import keeping_promises
 from grounded.search.planner import Planner
-from grounded.search.standing import Ending, Phase, Proposal, Standing, standing
+from grounded.search.standing import Ending, Phase, Proposal, Standing, let_down, standing
 from grounded.search.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
 from grounded.trial import Trial
@@ -176,7 +177,8 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
         if way == ways[0] and (own := about.own_plan(found)) is not None:
             found = own
         if found is not None and found.candidate is not None:
-            return found
+            noise = _below_noise(make, incumbent, found.candidate, options)
+            return found if noise is None else Proposal(noise, None, False)
         unsafe, ruinous = unsafe or found, ruinous or stepping.ruinous
         if (doubted := stepping.doubted) is not None:
             break
@@ -186,6 +188,32 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
     return unsafe or Proposal(
         _ended(make, incumbent, promised, least, options.tolerance, ruinous, doubted), None, False
     )
+
+
+def _below_noise(
+    make: Maker, best: Tried, made: Candidate, options: SearchOptions
+) -> Standing | None:
+    """Return the ended search if a step lost and the next promises less than its trial can show.
+
+    Else a search under noise goes on for as long as the model promises anything. None: it goes on,
+    as it does before a loss, since many small gains add up.
+    """
+    lost = losers_of(make.now.history, best.candidate.id, make.fingerprint)
+    error = one_trial_error(best, options.repeats)
+    gain = made.promised_over(best)
+    if not (options.damps and lost and made.grounded and gain < error):
+        return None
+    own = best.candidate.id
+    sentence = (
+        f"{len(lost)} step{'s' * (len(lost) > 1)} from {own} did not improve, and the next "
+        f"promises {figure(gain)}, less than the standard error of a trial's gain, {error:.2g}"
+    )
+    if gain > 0:
+        runs = runs_to_show(gain, best)
+        sentence += f" (it takes {runs} runs of each candidate to show such a gain)"
+    sentence += f": {own} is the result"
+    ended = replace(make.now, phase="converged", step=None, ending="below the noise", doubt="")
+    return let_down(replace(ended, sentence=sentence, then=None), make.fingerprint)
 
 
 def _surer(about: About, step: Step, corrected: Proposal) -> Proposal | None:
@@ -261,4 +289,5 @@ def _ended(
             f"the model promises less than {100 * tolerance:g} % more from any step "
             f"([search] tolerance): {own} is the result"
         )
-    return replace(make.now, phase=phase, step=None, sentence=sentence, ending=ending, then=then)
+    now = replace(make.now, phase=phase, step=None, sentence=sentence, ending=ending, then=then)
+    return let_down(now, make.fingerprint) if phase == "converged" else now

@@ -11,7 +11,7 @@ import numpy as np
 
 from grounded.compile import Problem
 from grounded.policy import Policy
-from grounded.rollout import Rollout, apart
+from grounded.rollout import Rollout, Run, apart
 from grounded.search.candidate import LITTLE, Candidate, Slopes, Tried, Way
 from grounded.search.directions import base_columns, direction
 from grounded.search.limit_cycle import between_limits, limit_cycle
@@ -250,15 +250,47 @@ class About:
     def _told(self, made: Candidate) -> Candidate:
         """Return the candidate with its likely error raised to what other models imply.
 
-        These are the alternatives, and the plain model if it predicted the incumbent's trial.
+        These are the alternatives, and the plain model if it predicted the incumbent's trial. Steps
+        from earlier bests that lost are evidence, too (`_missed_before`).
         """
-        gains = [made.predicted_gain - made.likely_off]
+        gains = [made.predicted_gain - max(made.likely_off, self._missed_before(made))]
         if self.alternatives:
             cost = sum(a.cost(made.policy) for a in self.alternatives)
             gains.append(self._disturbed - cost)
         if (plainly := self._plain_gain(made)) is not None and plainly + self._plain_off < 0:
             gains.append(plainly + self._plain_off)
         return replace(made, likely_off=made.predicted_gain - min(gains))
+
+    def _missed_before(self, made: Candidate) -> float:
+        """Return what a candidate would miss of its gain, judging by losses from earlier bests.
+
+        This model predicts a gain for the policy of each of those steps; the trial showed what came
+        of it. The larger the part of that predicted change b of the run in the candidate's change
+        a, the more of the shortfall is expected again: (a'b / b'b)^2 of it, at most all.
+        """
+        run = (made.predicted_states, made.predicted_inputs)
+        moved = apart(self.real, run, self.run)
+        missed = [0.0]
+        for other, far, short in self._lost_before:
+            part = (moved + far - apart(self.real, run, other)) / (2 * far)
+            if part > 0:
+                missed.append(short * min(part, 1.0) ** 2)
+        return max(missed)
+
+    @cached_property
+    def _lost_before(self) -> list[tuple[Run, float, float]]:
+        """Losses from earlier bests: predicted run, distance from the incumbent's, shortfall."""
+        best, found = self.incumbent, []
+        for tried in self.make.now.history:
+            made = tried.candidate
+            if not (tried.lost and np.isfinite(tried.utility)) or made.base == best.candidate.id:
+                continue
+            again = predicted(self.real, made.policy)
+            run = (again.states, again.inputs)
+            short = (again.utility - self.already) - (tried.utility - best.utility)
+            if short > 0 and (far := apart(self.real, run, self.run)) > 0:
+                found.append((run, far, short))
+        return found
 
     @property
     def _plain_off(self) -> float:

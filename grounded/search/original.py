@@ -22,14 +22,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.search.candidate import LITTLE, Tried
-from grounded.search.certainty import error_between
+from grounded.search.certainty import LUCK, error_between
 from grounded.search.making import FORETOLD, About
 from grounded.search.planner import Planner
 from grounded.search.step_size import BROKEN
 from grounded.task import Task
 from grounded.trial import Trial
 
-LUCK = 2.0  # standard errors that a loss must exceed to break a promise
 ON_PATH = 2.0  # a run that ended early was on its path if it cost at most this times the best one
 
 

@@ -23,9 +23,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from grounded.errors import NextCommand
 from grounded.result import Result, document, figure, html_table, spread
-from grounded.search.candidate import Candidate, Tried, Way
-from grounded.search.certainty import error_between, judged, last_improvement
-from grounded.search.step_size import SearchOptions, Step
+from grounded.search.candidate import LITTLE, Candidate, Tried, Way
+from grounded.search.certainty import LUCK, error_between, judged, last_improvement
+from grounded.search.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -43,6 +43,7 @@ Ending = Literal[
     "crashed",  # every first policy crashed
     "not allowed",  # the next candidate violates [limits] or [safety]
     "too little gained",  # by the last candidates
+    "below the noise",  # steps lost, and the next promises less than a trial can show
     "trials used up",
 ]
 PATIENCE = 4  # candidates in a row that may gain less than the tolerance each
@@ -248,7 +249,7 @@ def standing(
     if options.damps and (hardly := _hardly(history, options.tolerance, model)):
         ending, why = hardly
         why = f"{why}: {own} is the result"
-        return replace(now, phase="converged", sentence=why, ending=ending)
+        return let_down(replace(now, phase="converged", sentence=why, ending=ending), model)
     last = history[-1]
     lost = f", since {last.candidate.id} crashed" * (last.accepted is False and bool(last.failed))
     sentence = f"improve on {own} with {step}{lost}"
@@ -283,6 +284,31 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
     if known and gained < error:
         return "too little gained", f"{told} its standard error of {error:.2g} from repeats"
     return None
+
+
+def let_down(ended: Standing, model: str) -> Standing:
+    """Return an ended search; it asks for a diagnosis if a step that promised much has lost.
+
+    Much is more than LITTLE of the best cost, more than the step's own likely error, and not to be
+    explained by noise.
+    """
+    best = ended.incumbent
+    assert best is not None
+    own, missed = best.candidate.id, list[float]()
+    lost = losers_of(ended.history, own, model)
+    for tried in ended.history:
+        made = tried.candidate
+        error, known = error_between(best, tried, ended.history)
+        short = best.utility + made.predicted_gain - tried.utility
+        if made in lost and not made.doubtful and not (known and short <= LUCK * error):
+            missed.append(made.predicted_gain)
+    if not missed or not max(missed) > LITTLE * -best.utility:
+        return ended
+    why = (
+        f"{ended.sentence}. But a step that lost had promised {figure(max(missed))} more: the "
+        f"model is wrong near {own}, and a diagnosis may show what it lacks"
+    )
+    return replace(ended, sentence=why, then=NextCommand("diagnose"))
 
 
 def _suspicion(history: tuple[Tried, ...], incumbent: Tried, model: str) -> str:

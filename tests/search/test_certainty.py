@@ -1,18 +1,21 @@
 """The sentence on the certainty of an improvement, and the verdicts on candidates."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.stats import t, ttest_ind
+from scipy.stats import norm, t, ttest_ind
 
 from facts import holds
 from grounded.search.candidate import Tried
 from grounded.search.certainty import (
+    beyond_one_trial,
     chance,
     error_between,
     last_improvement,
     owed_to_start,
+    runs_to_show,
     student,
     with_chances,
 )
@@ -82,6 +85,36 @@ def test_a_gain_within_its_own_standard_error_ends_a_search():
     assert ending(-1.02, repeated=(-1.1,)) is None  # the noise is unknown
     assert ending(-1.02, repeated=(-1.1,), tolerance=0.05) == "too little gained"
     assert ending(-0.9, repeated=(-9.0, -0.2, -4.0), base="") is None  # the wild first policy
+
+
+def promising(gain, utilities=(-1.2, -1.0), deviation=0.1, doubtful=False):
+    best = replace(tried(*utilities), deviation=deviation)
+    made = SimpleNamespace(id="c2", base="c", promised_over=lambda _: gain, doubtful=doubtful)
+    return made, best
+
+
+def test_a_gain_that_a_trial_cannot_show_is_called_so_with_the_runs_it_takes():
+    """A belt drive was promised 0.0019 where runs scatter by 0.0012."""
+    found = beyond_one_trial(*promising(0.05))
+    assert holds(found, "c2", "0.05", "0.1", "0.2", "22 runs", "may stop")
+    assert runs_to_show(0.05, promising(0.05)[1]) == 22
+    error = 0.1 * (2 / 22) ** 0.5  # of the difference of two means
+    assert norm.cdf(0.05 / error) == pytest.approx(0.95, abs=0.01)
+    assert beyond_one_trial(*promising(0.25)) == ""  # one trial shows it
+    made, best = promising(0.05)
+    made.base = "c0"  # it was made before that best one, or is that one
+    assert beyond_one_trial(made, best) == ""
+    assert "may stop" not in beyond_one_trial(*promising(0.05, doubtful=True))  # `doubt` says it
+
+
+@pytest.mark.parametrize("deviation", [np.nan, 0.0])
+def test_nothing_is_below_a_noise_that_is_unknown_or_absent(deviation):
+    assert beyond_one_trial(*promising(0.05, deviation=deviation)) == ""
+
+
+def test_more_repeats_of_each_candidate_show_smaller_gains():
+    made, best = promising(0.1, utilities=(-1.0,) * 9)
+    assert beyond_one_trial(made, best) and not beyond_one_trial(made, best, repeats=9)
 
 
 def test_failed_runs_are_left_out_and_trials_that_agree_say_so():

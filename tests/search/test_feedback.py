@@ -46,7 +46,7 @@ def noisy():
     noise = Noise(process={"x": 0.003, "v": 0.03}, measurement={"x": 0.002, "v": 0.01})
     plant = Plant(model.with_values({"mass": 1.2}), noise=noise)
     candidates, trials = [], []
-    for seed in range(5):
+    for seed in range(4):
         made = propose(task, candidates, trials, OPTIONS)
         candidates += [made.candidate] if made.is_new else []
         trials.append(drive(task, plant, made.candidate, seed))

@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from facts import holding, holds
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded.plant import Noise, Plant
 from grounded.search.ask_tell import learn
 from grounded.search.improve import propose
-from grounded.search.making import About
-from grounded.search.planner import fixed_draws, model_fingerprint
+from grounded.search.making import About, Maker
+from grounded.search.planner import Planner, fixed_draws, model_fingerprint
 from grounded.search.standing import MAX_CAUTION, standing
 from grounded.search.step_size import OTHER_WAY, SearchOptions, Step, losers_of
 from grounded.trial import Trial, mean_trial
@@ -138,6 +138,55 @@ def test_after_two_losses_no_trial_is_spent_on_a_step_likelier_to_lose(monkeypat
         assert holds(ended.sentence, 2, ended.incumbent.candidate.id)
 
 
+def test_steps_that_lose_what_they_promised_ask_for_a_diagnosis():
+    """An arm with armature and a lag lost half its cost four times, and ended as converged."""
+    story = Story().add()
+    while story.propose().candidate is not None:
+        story.add(bad)
+    ended = story.propose().standing
+    assert ended.ending == "no step improved" and ended.then == NextCommand("diagnose")
+    assert holds(ended.sentence, ended.incumbent.candidate.id, "diagnosis")
+
+
+def test_a_small_promise_that_is_not_kept_asks_for_nothing():
+    story = Story(tolerance=0.0).add().add().add().add()
+    while story.propose().candidate is not None:
+        story.add(worse(0.05))
+    ended = story.propose().standing
+    assert ended.phase == "converged" and ended.then is None
+
+
+@pytest.mark.parametrize(("scatter", "goes_on"), [(1e-6, True), (1e3, False)])
+@pytest.mark.parametrize("lost", [True, False])
+def test_after_a_loss_no_trial_is_spent_on_a_gain_below_the_noise(
+    monkeypatch, scatter, goes_on, lost
+):
+    """An excavator at its noise went on for 9 trials, to no better policy."""
+    story = Story().add().add()
+    story = story.add(bad) if lost else story
+    noisy = lambda h: tuple(replace(one, deviation=scatter) for one in h)  # noqa: E731
+    monkeypatch.setattr("grounded.search.certainty.with_errors", noisy)
+    proposal = story.propose()
+    assert (proposal.candidate is not None) == (goes_on or not lost)
+    if proposal.candidate is None:
+        ended = proposal.standing
+        assert (ended.phase, ended.ending) == ("converged", "below the noise")
+        assert holds(ended.sentence, ended.incumbent.candidate.id, "runs of each")
+
+
+def test_a_step_like_one_that_an_earlier_best_lost_by_is_as_doubtful():
+    """A belt drive ran two steps that both lost twice the best cost, one from each of two bests."""
+    story = Story().add().add(bad).add()
+    best, lost = story.now.incumbent, story.now.history[1]
+    assert best.candidate.id == "c0003" and lost.lost and lost.candidate.base == "c0001"
+    plain = Planner(TASK, TASK)
+    about = About(Maker(plain, story.now, "c0004", plain.fingerprint), best, story.options, "")
+    again = about._told(about.candidate(lost.candidate.policy, Step(), ""))
+    assert again.expected_gain <= lost.utility - best.utility + 1e-9
+    stay = about._told(about.candidate(best.candidate.policy, Step(), ""))
+    assert stay.likely_off < 1e-3 * again.likely_off  # another run is not concerned
+
+
 def test_after_one_loss_a_doubtful_step_is_tried(monkeypatch):
     story = Story().add().add().add(bad)
     doubled = lambda _, made: replace(made, likely_off=2 * made.predicted_gain)  # noqa: E731
@@ -240,6 +289,28 @@ def test_a_lucky_winner_loses_its_luck():
         story.trials.append(bad(story.trials[1], 2.0))
         story.trials[-1] = replace(story.trials[-1], candidate="c0001")
     assert story.now.incumbent.candidate.id == "c0002" and story.now.iteration == 1
+
+
+def test_a_doubt_ends_with_the_best_that_it_was_about():
+    """An excavator's third best ran 35 times because the second seemed unlucky beside the first.
+
+    c0002 wins, c0003 loses by little, so c0002 runs again, badly: now it is c0002 that lost to
+    c0001 by little, but c0003 has beaten both.
+    """
+    story = Story(rerun_incumbent=True, tolerance=0.0).add().add().add(worse(0.02))
+    first, second, third = (story.task.utility(t) for t in story.trials)
+    assert first < third < second and story.now.outstanding.id == "c0002"
+    again = replace(story.trials[1])
+    by = next(d for d in np.linspace(0.0, 1.0, 1000) if mean_of(story, bad(again, d)) < first)
+    story.trials.append(bad(again, by))
+    now = story.now
+    assert [t.accepted for t in now.history] == [True, False, True]
+    assert now.incumbent.candidate.id == "c0003" and now.phase == "propose"
+
+
+def mean_of(story, again):
+    """Return the mean utility of the second trial and another one of its candidate."""
+    return (story.task.utility(story.trials[1]) + story.task.utility(again)) / 2
 
 
 def test_losses_are_not_checked_for_ever():
@@ -471,10 +542,10 @@ def test_trials_of_no_candidate_are_ignored():
 def test_the_order_of_stored_trials_decides_nothing():
     noisy = Plant(PLANT.model, noise=Noise(process={"v": 0.02}))
     story = Story(plant=noisy, repeats=2)
-    for _ in range(6):
+    for _ in range(4):
         story.add()
     made = story.propose().candidate
-    turned = propose(story.task, story.candidates[:3], list(reversed(story.trials)), story.options)
+    turned = propose(story.task, story.candidates[:2], list(reversed(story.trials)), story.options)
     assert turned.standing.utilities == pytest.approx(story.now.utilities)
     np.testing.assert_allclose(
         turned.candidate.policy.feedforward, made.policy.feedforward, atol=1e-9

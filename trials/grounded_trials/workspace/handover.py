@@ -26,6 +26,7 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
+from grounded.search.certainty import beyond_one_trial
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.store.store import Stored
@@ -245,8 +246,12 @@ class Check:
     def notes(self) -> Iterator[str]:
         """Yield remarks that the user should know although they do not prevent its use."""
         made, name = self.candidate, self.candidate.id
-        if made.doubtful and not self._trials(name):
-            yield made.doubt(self.standing.incumbent)
+        best, untried = self.standing.incumbent, not self._trials(name)
+        if made.doubtful and untried:
+            yield made.doubt(best)
+        if best is not None and untried:
+            small = beyond_one_trial(made, best, self.workspace.config.search.repeats)
+            yield from [small] if small else []
         yield from self._became()
         if "sha256" not in self.meta:
             yield f"{name} was written by an older version: its file has no checksum of its own"
