@@ -1,0 +1,124 @@
+"""Change a set of effects without making it larger: other effects, one for several, other orders.
+
+A set that grew one effect at a time may have begun with a wrong one, and each further effect then
+fits what that one leaves. So the likeliest set of each size is changed in three ways:
+
+    other effects   one of them is replaced by any other that fits better beside the rest
+    one for several effects of single inputs are replaced by one of several inputs (`delay:a+b`)
+    other orders    effects act on a command in another order: a gain before or after a rate limit
+
+Changed sets are compared only once they have converged, with constants of their own. A friction
+with the constant of another law, or a rate limit before a gain that it really follows, can lack
+hundreds of nats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch, Start
+from grounded.diagnosis.hypotheses.tuning import tune
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.effects import InputFamily, MemoryFamily, acting_order
+
+HOPEFUL = 4  # best sets of a size that are fitted to convergence
+TUNED = 2  # best sets whose constants are optimised
+ROUNDS = 3  # most rounds of swaps; after one, another may be better
+AT_FIRST = 6  # iterations of the first fit of a swapped effect
+LATE = ("delay", "first_order_lag", "rate_limit")  # one of all inputs replaces any of these
+MATTERS = 1e-3  # rms change of an input, relative to its spread, from which the order matters
+
+
+def swapped(search: HypothesisSearch, best: Fitted) -> Fitted:
+    """Change a set of effects while its evidence rises; return the likeliest fit.
+
+    All fits are added to the search. The result may have fewer effects than `best`.
+    """
+    size = len(best.hypothesis.effects)
+    for _ in range(ROUNDS):
+        known = {fit.hypothesis.names for fit in search.of_size(size)[:HOPEFUL]}
+        for name in best.hypothesis.names:  # does another effect fit better beside the others?
+            search.extended(search.without(best, name), AT_FIRST)
+        search.refined(list(merged(search, best)), TO_THE_TOP)
+        new = [f for f in search.of_size(size)[:HOPEFUL] if f.hypothesis.names not in known]
+        search.finished(new, TO_THE_TOP)
+        reordered(search, new)
+        tune(search, [f for f in search.of_size(size)[:TUNED] if f.hypothesis.names not in known])
+        before, best = best, search.of_size(size)[0]
+        if set(best.hypothesis.names) == set(before.hypothesis.names):
+            break
+    return max([best, *search.of_size(size - 1)[:1]], key=search.score)
+
+
+def merged(search: HypothesisSearch, fit: Fitted) -> Iterator[Start]:
+    """Yield a fit with one effect of several inputs in place of two or more effects of fewer.
+
+    They are of the same family, or all of them make the inputs late.
+    """
+    for effect in search.candidates:
+        targets, family = set(effect.site.targets), effect.family
+        if len(targets) < 2 or not isinstance(family, InputFamily | MemoryFamily):
+            continue
+        kinds = LATE if family.name in LATE else (family.name,)
+        old = [
+            (e, v)
+            for e, v in fit.hypothesis.pairs
+            if e.family.name in kinds and set(e.site.targets) <= targets
+        ]
+        if len(old) < 2:
+            continue
+        h = fit.hypothesis
+        for other, _ in old:
+            h = h.minus(other.name)
+        same = [v for e, v in old if e.family.name == family.name]
+        values = {q.name: float(np.mean([v[q.name] for v in same])) for q in effect.free}
+        if same:
+            yield h.plus(effect, values), fit.noise, fit.track
+
+
+def reordered(search: HypothesisSearch, fits: Sequence[Fitted]) -> None:
+    """Fit the sets of these fits with their effects on inputs in other orders, while they gain."""
+    for fit in fits:
+        for _ in range(ROUNDS):
+            starts = [(h, fit.noise, fit.track) for h in orders(search.predictor, fit.hypothesis)]
+            found = search.refined(starts, TO_THE_TOP, rivals=True)
+            best = max([fit, *found], key=search.score)
+            if best is fit:
+                break
+            fit = best
+
+
+def orders(predictor: Predictor, h: Hypothesis) -> list[Hypothesis]:
+    """Return a hypothesis with one of its effects on inputs moved to another place in their order.
+
+    Orders in which all inputs arrive nearly as in another one are left out: effects on different
+    inputs, or ones that commute.
+    """
+    acting = acting_order([effect.family for effect in h.effects])
+    u = predictor.inputs(h)
+    known, least = [u], MATTERS * np.maximum(u.std(axis=(0, 1)), 1e-12)
+    found = []
+    for i in acting:
+        rest = [j for j in acting if j != i]
+        for at in range(len(acting)):
+            other = _in_order(h, [*rest[:at], i, *rest[at:]])
+            u = predictor.inputs(other)
+            apart = [np.sqrt(((u - v) ** 2).mean(axis=(0, 1))) for v in known]
+            if all((a > least).any() for a in apart):
+                known.append(u)
+                found.append(other)
+    return found
+
+
+def _in_order(h: Hypothesis, acting: Sequence[int]) -> Hypothesis:
+    """Return a hypothesis with its effects on inputs in another order, the others in place."""
+    places = iter(acting)
+    order = [next(places) if i in acting else i for i in range(len(h.effects))]
+    return replace(
+        h, effects=tuple(h.effects[i] for i in order), values=tuple(h.values[i] for i in order)
+    )
