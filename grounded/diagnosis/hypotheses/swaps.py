@@ -27,7 +27,7 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import InputFamily, MemoryFamily, acting_order
 
 HOPEFUL = 4  # best sets of a size that are fitted to convergence
-TUNED = 2  # best sets whose constants are optimised
+TUNED = 2  # best larger sets whose constants are optimised
 ROUNDS = 3  # most rounds of swaps; after one, another may be better
 AT_FIRST = 6  # iterations of the first fit of a swapped effect
 LATE = ("delay", "first_order_lag", "rate_limit")  # one of all inputs replaces any of these
@@ -48,7 +48,7 @@ def swapped(search: HypothesisSearch, best: Fitted) -> Fitted:
         new = [f for f in search.of_size(size)[:HOPEFUL] if f.hypothesis.names not in known]
         search.finished(new, TO_THE_TOP)
         reordered(search, new)
-        tune(search, [f for f in search.of_size(size)[:TUNED] if f.hypothesis.names not in known])
+        tune(search, [search.latest(fit) for fit in new])
         before, best = best, search.of_size(size)[0]
         if set(best.hypothesis.names) == set(before.hypothesis.names):
             break
@@ -70,15 +70,14 @@ def merged(search: HypothesisSearch, fit: Fitted) -> Iterator[Start]:
             for e, v in fit.hypothesis.pairs
             if e.family.name in kinds and set(e.site.targets) <= targets
         ]
-        if len(old) < 2:
+        same = [v for e, v in old if e.family.name == family.name]
+        if len(old) < 2 or not same:
             continue
         h = fit.hypothesis
         for other, _ in old:
             h = h.minus(other.name)
-        same = [v for e, v in old if e.family.name == family.name]
         values = {q.name: float(np.mean([v[q.name] for v in same])) for q in effect.free}
-        if same:
-            yield h.plus(effect, values), fit.noise, fit.track
+        yield h.plus(effect, values), fit.noise, fit.track
 
 
 def reordered(search: HypothesisSearch, fits: Sequence[Fitted]) -> None:
