@@ -19,11 +19,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from grounded.diagnosis.hypotheses.explored import CLAIM
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch, Start
 from grounded.diagnosis.hypotheses.tuning import tune
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.likelihood.refine import refine
 from grounded.effects import InputFamily, MemoryFamily, acting_order
 
 HOPEFUL = 4  # best sets of a size that are fitted to convergence
@@ -81,14 +83,19 @@ def merged(search: HypothesisSearch, fit: Fitted) -> Iterator[Start]:
 
 
 def reordered(search: HypothesisSearch, fits: Sequence[Fitted]) -> None:
-    """Fit the sets of these fits with their effects on inputs in other orders, while they gain."""
+    """Fit the sets of these fits with their effects on inputs in other orders, while they gain.
+
+    Another order has to be clearly likelier. A dead zone before a gain, for example, is the same as
+    another one after it.
+    """
     for fit in fits:
         for _ in range(ROUNDS):
             starts = [(h, fit.noise, fit.track) for h in orders(search.predictor, fit.hypothesis)]
-            found = search.refined(starts, TO_THE_TOP, rivals=True)
-            best = max([fit, *found], key=search.score)
-            if best is fit:
+            found = refine(search.predictor, starts, iterations=TO_THE_TOP, worth=search.score)
+            best = max(found, key=search.score, default=fit)
+            if search.score(best) < search.score(search.latest(fit)) + CLAIM:
                 break
+            search.keep([best])
             fit = best
 
 
