@@ -89,4 +89,3 @@ def test_one_effect_of_all_inputs_replaces_one_for_each(search):
     assert min(own) <= late <= max(own)
     (alone,) = search.refined([search.fresh(h.minus("delay:b"))], 1)
     assert not list(merged(search, alone))
-
