@@ -15,25 +15,22 @@ hundreds of nats.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import CLAIM
+from grounded.diagnosis.hypotheses.orders import orders
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch, Start
 from grounded.diagnosis.hypotheses.tuning import tune
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
-from grounded.effects import InputFamily, MemoryFamily, acting_order
+from grounded.effects import InputFamily, MemoryFamily
 
 HOPEFUL = 4  # best sets of a size that are fitted to convergence
 TUNED = 2  # best larger sets whose constants are optimised
 ROUNDS = 3  # most rounds of swaps; after one, another may be better
 AT_FIRST = 6  # iterations of the first fit of a swapped effect
 LATE = ("delay", "first_order_lag", "rate_limit")  # one of all inputs replaces any of these
-MATTERS = 1e-3  # rms change of an input, relative to its spread, from which the order matters
 
 
 def swapped(search: HypothesisSearch, best: Fitted) -> Fitted:
@@ -97,34 +94,3 @@ def reordered(search: HypothesisSearch, fits: Sequence[Fitted]) -> None:
                 break
             search.keep([best])
             fit = best
-
-
-def orders(predictor: Predictor, h: Hypothesis) -> list[Hypothesis]:
-    """Return a hypothesis with one of its effects on inputs moved to another place in their order.
-
-    Orders in which all inputs arrive nearly as in another one are left out: effects on different
-    inputs, or ones that commute.
-    """
-    acting = acting_order([effect.family for effect in h.effects])
-    u = predictor.inputs(h)
-    known, least = [u], MATTERS * np.maximum(u.std(axis=(0, 1)), 1e-12)
-    found = []
-    for i in acting:
-        rest = [j for j in acting if j != i]
-        for at in range(len(acting)):
-            other = _in_order(h, [*rest[:at], i, *rest[at:]])
-            u = predictor.inputs(other)
-            apart = [np.sqrt(((u - v) ** 2).mean(axis=(0, 1))) for v in known]
-            if all((a > least).any() for a in apart):
-                known.append(u)
-                found.append(other)
-    return found
-
-
-def _in_order(h: Hypothesis, acting: Sequence[int]) -> Hypothesis:
-    """Return a hypothesis with its effects on inputs in another order, the others in place."""
-    places = iter(acting)
-    order = [next(places) if i in acting else i for i in range(len(h.effects))]
-    return replace(
-        h, effects=tuple(h.effects[i] for i in order), values=tuple(h.values[i] for i in order)
-    )
