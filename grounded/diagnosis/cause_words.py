@@ -174,8 +174,10 @@ def counted(effect: Effect, acting: Sequence[Effect]) -> str:
     if not gains:
         return ""
     at = [e.name for e in acting].index(effect.name) if on_input else len(acting)
-    where = "before" if at < gains[0] else "after" if at > gains[-1] else "between the changes of"
-    return f", counted {where} {'' if 'changes' in where else 'the change of '}its gain"
+    gain = "its gain" if len(own) == 1 else "their gains"
+    if gains[0] < at < gains[-1]:
+        return f", counted between the changes of {gain}"
+    return f", counted {'before' if at < gains[0] else 'after'} the change of {gain}"
 
 
 def acts_reversed(params: Mapping[str, Estimate]) -> bool:
