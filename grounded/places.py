@@ -204,6 +204,24 @@ def only_read(model: Model) -> dict[str, str]:
     return {name: rate for name, (rate, _) in pairs.items() if name in free}
 
 
+def levelled(model: Model) -> list[str]:
+    """Return angles and positions that act on their own velocity alone, such as a balance's.
+
+    Gravity or a spring that acts about another angle than the model's then looks in every log like
+    a sensor with another zero.
+    """
+    dt, found = probe(model, 1e-6), []
+    f_x, _ = model.system.linearise(*samples(model, 8), model.values, dt)
+    felt = (np.abs(f_x - np.eye(model.n)) / dt).max(axis=0)
+    for name, (rate, _) in integrated(model).items():
+        column = felt[:, model.state_names.index(name)]
+        own = model.state_names.index(rate)
+        others = np.delete(column, own).max(initial=0.0)
+        if column[own] > 0 and others < 1e-4 * column[own]:
+            found.append(name)
+    return found
+
+
 @dataclass(frozen=True)
 class Integral:
     """The rate of state i is c times state j; `exact` if the model says so, not only its roles."""

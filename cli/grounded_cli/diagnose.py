@@ -272,4 +272,4 @@ def _if_right(found: Diagnosis) -> str:
     """Say what standard deviations leave out: errors of the equations themselves."""
     if found.leftover:
         return ", but a gap remains, so true values may be further off"
-    return ", if the equations are right"
+    return ", if the equations and the model's constants are right"

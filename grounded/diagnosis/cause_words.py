@@ -23,6 +23,7 @@ TURNED = (
 MOST_DIGITS = 6  # significant digits of a value
 DISAGREE = "but the trials disagree"
 KNOWN = 2.0  # standard deviations from zero that a value needs to be worded
+RESCALE = ("input_gain", "input_curve", "input_fade")  # they change what a volt of an input does
 FEW = 3  # up to so many causes get a clause each
 LATE = ("delay", "sensor_delay", "first_order_lag", "sensor_lag")  # they decide if a loop is stable
 TOLD = 4  # clauses otherwise: one per kind of effect, the smallest causes only counted
@@ -147,6 +148,39 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     text = re.sub(r"\[([^]]*)\]", kept, _turned(effect, params) or effect.family.sentence)
     text = re.sub(r"\{(\w+)>([^{}|]+)\|([^{}|]+)\}", signed, text)
     return re.sub(r"\{(\w+)(%)?(?:([^{}|]+)\|([^{}|]+))?\}", filled, text)
+
+
+def counted(effect: Effect, acting: Sequence[Effect]) -> str:
+    """Return a clause: before or after a claimed gain of its input an effect's volts are counted.
+
+    Args:
+        effect: a claimed effect.
+        acting: all claimed effects, those on inputs in the order in which they act.
+
+    Returns:
+        The clause; "" for an effect without a value in its input's unit, or beside no gain.
+    """
+    from grounded.effects import InputFamily, LossFamily, MemoryFamily
+
+    family, site = effect.family, effect.site
+    on_input = isinstance(family, InputFamily | MemoryFamily)
+    if family.name in RESCALE or not (on_input or isinstance(family, LossFamily)):
+        return ""
+    own = set(site.targets) if on_input else {site.target.partition("<-")[0]}
+    units = {site.model.inputs[name] for name in own}
+    ends = tuple(unit + end for unit in units for end in (" ", "/"))
+    if not any(q.unit in units or q.unit.startswith(ends) for q in effect.free):
+        return ""
+    gains = [
+        i for i, e in enumerate(acting) if e.family.name in RESCALE and own & {*e.site.targets}
+    ]
+    if not gains:
+        return ""
+    at = [e.name for e in acting].index(effect.name) if on_input else len(acting)
+    gain = "its gain" if len(own) == 1 else "their gains"
+    if gains[0] < at < gains[-1]:
+        return f", counted between the changes of {gain}"
+    return f", counted {'before' if at < gains[0] else 'after'} the change of {gain}"
 
 
 def acts_reversed(params: Mapping[str, Estimate]) -> bool:

@@ -10,6 +10,7 @@ from grounded.diagnosis.cause_words import (
     ENDED,
     clauses,
     comparison,
+    counted,
     disagreement,
     give_or_take,
     meaning,
@@ -125,6 +126,7 @@ def verdict(
     words += [f"{told_apart(group, same)}." for group in groups]
     words += [one.sentence() for one in claims.one_clock[:1]]
     words += _geared(claims.data.model, [row.effect for row in claimed])[:1]
+    words += _level(claims.data.model, [row.effect for row in claimed])
     more = 0
     if remainder and len(claims.names) == most:
         more = min(most + FURTHER, MOST_EFFECTS) * any(one.above for one in remainder)
@@ -188,7 +190,8 @@ def _causes(
     from grounded.diagnosis.validation.claims import has_size
     from grounded.diagnosis.validation.motions import KNOWN
 
-    effects = {e.name: e for e in claims.best.hypothesis.effects}
+    acting = claims.best.hypothesis.effects
+    effects = {e.name: e for e in acting}
     given = {one.parameter: tuple(one.given) for one in identified}
     lost = {one.parameter for one in identified if one.lost}
     joint = {one.parameter for one in identified if one.jointly}
@@ -197,6 +200,7 @@ def _causes(
     for one in credit:
         if one.of in effects:
             text = meaning(effects[one.of], values[one.of])
+            text += counted(effects[one.of], acting)
             if one.share < BARELY and one.of in claims.held_up:
                 text += f", without which {listed(claims.held_up[one.of])} would end at a bound"
             text += OPEN * (open_gap and one.of.startswith("parameter:"))
@@ -227,6 +231,20 @@ def _geared(model: Model, claimed: Sequence[str]) -> list[str]:
         f"same in any log: measure how far {name} really moves."
         for name, rate in pairs.items()
         if f"sensor_scale:{name}" in claimed
+    ]
+
+
+def _level(model: Model, claimed: Sequence[str]) -> list[str]:
+    """Return a sentence on claimed biases of sensors that another level equals."""
+    from grounded import places
+
+    biased = [n for n in claimed if n.startswith("sensor_bias:")]
+    names = [n for n in places.levelled(model) if f"sensor_bias:{n}" in biased] if biased else []
+    if not names:
+        return []
+    return [
+        f"Gravity or a spring that acts about another {listed(names)} than the model's 0 looks the "
+        "same in any log as a sensor's wrong zero, and is adopted in the same way."
     ]
 
 

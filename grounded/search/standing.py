@@ -25,6 +25,7 @@ from grounded.errors import NextCommand
 from grounded.result import Result, document, figure, html_table, spread
 from grounded.search.candidate import LITTLE, Candidate, Tried, Way
 from grounded.search.certainty import LUCK, error_between, judged, last_improvement
+from grounded.search.scatter import Repeats
 from grounded.search.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
 from grounded.trial import Trial
@@ -344,10 +345,12 @@ def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | No
     doubt = next((t for t in now.history if t.in_doubt), None)
     if doubt is not None and now.incumbent is not None:
         made, missing = now.incumbent.candidate, 1
-        sentence = (
-            f"{doubt.candidate.id} lost to {made.id} by no more than noise may explain: {made.id} "
-            "is waiting for another trial"
-        )
+        lost = f"{doubt.candidate.id} lost to {made.id}"
+        if Repeats(now.history).near(now.incumbent.utility).known:
+            lost += " by no more than noise may explain"
+        else:
+            lost += ", but none as good ran twice, so how much runs differ is not known"
+        sentence = f"{lost}: {made.id} is waiting for another trial"
     elif waiting is not None:
         made, missing = waiting.candidate, options.repeats - len(waiting.trials)
         sentence = f"{made.id} is waiting for {missing} trial{'s' * (missing > 1)}"

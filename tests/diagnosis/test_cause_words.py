@@ -10,6 +10,7 @@ from grounded.diagnosis.cause_words import (
     all_called,
     called,
     clauses,
+    counted,
     disagreement,
     meaning,
 )
@@ -53,6 +54,20 @@ def test_three_causes_are_told_one_by_one_and_one_without_a_share():
     found = told([ONE, TWO, GAIN], [0.5, 0.3, 0.2])
     assert len(found) == 3 and found[1].endswith("(30 % of the improvement)")
     assert told([GAIN], [1.0]) == ("the input t1 acts 12 % weaker than modelled",)
+
+
+def test_volts_are_said_to_be_counted_before_or_after_a_gain_of_their_input():
+    known = {name: Library().effect(name, arm) for name in (ONE, TWO, GAIN, BIAS, INERTIA)}
+    zone, late = (Library().effect(name, arm) for name in ("dead_zone:t1", "delay:t1"))
+    gain, friction = known[GAIN], known[ONE]
+    assert "after" in counted(friction, [friction, gain])  # a joint is behind all of its input
+    assert "before" in counted(zone, [zone, friction, gain, late])
+    assert "after" in counted(zone, [gain, zone])
+    fade = Library().effect("input_fade:t1", arm)
+    assert holds(counted(zone, [gain, zone, fade]), "between")
+    for without in (friction, zone):
+        assert not counted(without, [friction, zone, known[BIAS]])
+    assert not any(counted(one, [gain, one]) for one in (known[TWO], late, known[BIAS], fade))
 
 
 def test_the_smallest_of_many_are_counted():

@@ -9,6 +9,7 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses.plainest import plain_forms, plainer
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.hypotheses.swaps import swapped
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.effects import Library
@@ -94,6 +95,26 @@ def test_what_holds_the_plain_friction_as_a_case_is_compared_with_it(search):
     assert better.hypothesis.names == (JOINT,)
     assert better.hypothesis.values[0]["c"] == pytest.approx(FRICTION, rel=0.03)
     assert better.hypothesis.shift[0] == pytest.approx(K - 1.0, rel=0.2)
+
+
+def test_the_plain_friction_is_compared_with_a_constant_of_its_own(search):
+    """With the speed over which another law builds up it lost, though it was the right one."""
+    (loaded,) = (e for e in search.candidates if e.name == LOADED)
+    wide = loaded.fixed["width"] * 4
+    fit = fitted(search, (loaded.tuned("width", wide), {"c": 0.31, "k": 0.2, "width": wide}))
+    search.fits = {key: one for key, one in search.fits.items() if key[2] != (JOINT,)}
+    (better,) = plainer(search, fit)
+    assert better.hypothesis.values[0]["width"] < wide / 3
+    assert search.score(better) > search.score(fit) + 10
+
+
+def test_what_a_swap_gives_gets_constants_of_its_own(search):
+    effects = {e.name: e for e in search.candidates}
+    fit = fitted(search, (effects["coulomb_friction:w"], {"c": 5.2}))
+    search.fits = {key: one for key, one in search.fits.items() if key[2] != (LOADED,)}
+    swapped(search, fit)
+    (loaded,) = (f for f in search.of_size(1) if f.hypothesis.names == (LOADED,))
+    assert loaded.hypothesis.values[0]["width"] != effects[LOADED].fixed["width"]
 
 
 def test_two_names_of_one_friction_are_compared_with_one(search):

@@ -13,10 +13,10 @@ from grounded.diagnosis.error_report import Credit, Remainder
 from grounded.diagnosis.hypotheses.lookalike import related
 from grounded.diagnosis.report import Estimate, Ranked
 from grounded.diagnosis.validation.blame import Blame
-from grounded.diagnosis.verdict import verdict
+from grounded.diagnosis.verdict import _level, verdict
 from grounded.effects import Library
 from grounded.models.pendulum import model as pendulum
-from grounded.places import only_read
+from grounded.places import levelled, only_read
 
 STICK = Model(
     name="stick",
@@ -41,6 +41,27 @@ def test_the_scale_of_a_sensor_is_offered_and_no_gain_that_equals_it():
     assert "rate_gain:theta" in names(pendulum)  # gravity feels the true angle
     gyro, encoder = (Library().effect(f"sensor_scale:{n}", STICK) for n in ("stick_rate", "stick"))
     assert related(gyro, encoder)  # a gyro that reads too much is compared with it
+
+
+def test_a_wrong_zero_of_a_sensor_may_be_another_level():
+    """A beam that hangs 0.06 rad off level was said to have a log that is off."""
+    assert levelled(pendulum) == ["theta"] and not levelled(STICK)
+    params = {"g": Param(9.8, "m/s^2"), "l": Param(0.5, "m")}
+    coupled = Model(  # the angle also moves the cart
+        name="cart",
+        states={"x": "m", "v": "m/s", "q": "rad", "w": "rad/s"},
+        inputs={"f": "N"},
+        params=params,
+        derivative=lambda s, a, p: {
+            "x": s.v,
+            "v": a.f + np.sin(s.q),
+            "q": s.w,
+            "w": -p.g / p.l * np.sin(s.q),
+        },
+    )
+    assert levelled(coupled) == []
+    assert len(_level(pendulum, ["sensor_bias:theta"])) == 1
+    assert not _level(pendulum, ["sensor_bias:omega", "dead_zone:torque"])
 
 
 def short(scale=0.94, trials=3, steps=200, dt=0.02):

@@ -6,6 +6,8 @@ The modules:
     scan          linear estimate of what every candidate effect would gain, at `grid_points`
     explored      the hypotheses fitted so far, and their evidence
     search        the fits to try next
+    swaps         other effects in place of those of a set
+    orders        other orders in which effects act on a command
     tuning        the constants of effects, which are no parameters of a fit
     joint_model   friction and inertia of all joints of an arm at once
     plainest      plain dry friction of a joint, as a rival of effects with more parameters

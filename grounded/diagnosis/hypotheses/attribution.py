@@ -24,6 +24,7 @@ from grounded.diagnosis.hypotheses.search import (
     TO_THE_TOP,
     HypothesisSearch,
 )
+from grounded.diagnosis.hypotheses.swaps import HOPEFUL, TUNED, reordered, swapped
 from grounded.diagnosis.hypotheses.tuning import sweep, tune
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
@@ -35,8 +36,6 @@ from grounded.progress import interruptible
 from grounded.result import listed
 
 USUAL_EFFECTS = 3  # most effects searched for at first
-HOPEFUL = 4  # best larger sets of effects that are fitted to convergence
-TUNED = 2  # best sets whose constants are optimised
 FORETOLD = (2.0, 0.05)  # scatters and gain by which a rival must predict better to be extended too
 AT_FIRST = 8  # iterations of the first fit of a further effect
 HALVES = 2  # single effects that are also extended though other hypotheses are likelier
@@ -254,6 +253,7 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         firsts = [max(fits, key=search.score) for fits in grown if fits]  # noise differs between
         search.finished(list(dict.fromkeys([*search.of_size(size + 1)[:HOPEFUL], *firsts])), 10)
         search.again(search.of_size(size + 1)[:2])
+        reordered(search, search.of_size(size + 1)[:HOPEFUL])
         search.finished(search.of_size(size + 1)[:TUNED], TO_THE_TOP)
         tune(search, search.of_size(size + 1)[:TUNED])
         for fit in search.of_size(size + 1)[:TUNED]:
@@ -265,11 +265,8 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
             best = search.of_size(size)[0]
         if not larger or search.score(larger[0]) < search.score(best) + CLAIM:
             break
-        best = larger[0]
-        for name in best.hypothesis.names:  # does another effect fit better beside the others?
-            search.extended(search.without(best, name), 6)
-        best = search.of_size(size + 1)[0]
-        size += 1
+        best = swapped(search, larger[0])
+        size = len(best.hypothesis.effects)
     for _ in range(most):  # what was fitted last may have given the chosen set its constants
         chosen = search.chosen(most)
         _nested(search, chosen)

@@ -16,6 +16,7 @@ import numpy as np
 
 from grounded import places
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
+from grounded.diagnosis.hypotheses.tuning import tune
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import Structure
@@ -30,7 +31,8 @@ def plainer(search: HypothesisSearch, fit: Fitted) -> list[Fitted]:
     for h in plain_forms(search, fit.hypothesis):
         key = _key(replace(fit, hypothesis=h))
         if key not in search.fits or h.names == fit.hypothesis.names:
-            search.refined([(h, fit.noise, fit.track)], TO_THE_TOP)
+            # the speed over which another law builds up is not that of this one
+            tune(search, search.refined([(h, fit.noise, fit.track)], TO_THE_TOP))
         plain_fit = search.fits.get(key)
         if plain_fit is not None and _numbers(plain_fit) < _numbers(fit):
             found.append(plain_fit)

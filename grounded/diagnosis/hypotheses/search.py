@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import FittedHypotheses, parametric
+from grounded.diagnosis.hypotheses.orders import first
 from grounded.diagnosis.hypotheses.scan import Look, scan_candidates
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delayed
@@ -271,11 +272,9 @@ class HypothesisSearch(FittedHypotheses):
         """Return the starts of a fit with each shortlisted effect added."""
         starts: list[Start] = []
         for look in self.shortlist(fit, count):
-            h = fit.hypothesis
-            starts += [
-                (h.plus(look.effect, values), fit.noise, fit.track)
-                for values in (look.values, *look.others)
-            ]
+            more = [fit.hypothesis.plus(look.effect, v) for v in (look.values, *look.others)]
+            more += first(self.predictor, more[0])
+            starts += [(h, fit.noise, fit.track) for h in more]
             if isinstance(look.effect.family, SensorLagFamily):
                 # the signal before a sensor's filter is much faster, and so is its noise
                 starts.append(self.anew(fit, look.effect, look.values))

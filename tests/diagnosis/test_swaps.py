@@ -1,0 +1,149 @@
+"""Changes of a set of effects: another order on one command, one effect for several inputs."""
+
+import numpy as np
+import pytest
+
+from grounded import Model, Param, Trial
+from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.hypotheses.orders import first, orders
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.hypotheses.swaps import merged, reordered
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.effects import Library
+
+DT, FADE, RATE = 0.02, 0.03, 5.0
+VALVES = Model(
+    name="valves",
+    states={"v": "m/s", "w": "m/s"},
+    inputs={"a": "1", "b": "1"},
+    params={"tau": Param(0.15, "s")},
+    derivative=lambda s, a, p: {"v": (a.a - s.v) / p.tau, "w": (a.b - s.w) / p.tau},
+)
+LIMIT, WEAKER, DELAY = "rate_limit:a", "input_fade:a", "delay:a"
+
+
+def driven(trials=3, steps=300):
+    """Valves whose first spool is slow and whose oil then flows ever less: limit, then fade."""
+    rng, found = np.random.default_rng(3), []
+    for k in range(trials):
+        t = DT * np.arange(steps)
+        u = np.stack([np.sign(np.sin((2.1 + 0.4 * k) * t)), np.sin((1.3 + 0.3 * k) * t)], axis=1)
+        x, spool, rows = np.zeros(2), 0.0, [np.zeros(2)]
+        for time, command in zip(t, u, strict=True):
+            for _ in range(20):
+                spool += np.clip(command[0] - spool, -RATE * DT / 20, RATE * DT / 20)
+                acting = np.array([(1 - FADE * time) * spool, command[1]])
+                x = acting + (x - acting) * np.exp(-DT / 20 / 0.15)
+            rows.append(x := x + rng.normal(0, 1e-3, 2))
+        noisy = np.array(rows) + rng.normal(0, 2e-3, (steps + 1, 2))
+        found.append(Trial(noisy, u, DT, ("v", "w"), ("a", "b")))
+    return found
+
+
+@pytest.fixture(scope="module")
+def search():
+    data = prepare(VALVES, driven())
+    found = HypothesisSearch(data, Library().candidates(VALVES, data.scales))
+    found.refined([found.fresh(Hypothesis())])
+    return found
+
+
+def hypothesis(search, *parts):
+    known, h = {effect.name: effect for effect in search.candidates}, Hypothesis()
+    for name, values in parts:
+        h = h.plus(known[name], values)
+    return h
+
+
+def test_only_orders_that_change_an_input_are_tried(search):
+    limit, fade = (LIMIT, {"r": RATE}), (WEAKER, {"k": FADE})
+    (other,) = orders(search.predictor, hypothesis(search, fade, limit))
+    assert other.names == (LIMIT, WEAKER)
+    assert other.values[0]["r"] == RATE
+    gain, late = ("input_gain:a", {"g": -0.2}), (DELAY, {"d": 0.04})
+    assert not orders(search.predictor, hypothesis(search, fade, gain, late))  # they commute
+    elsewhere = ("dead_zone:b", {"c": 0.1})
+    assert not orders(search.predictor, hypothesis(search, elsewhere, fade))
+    (early,) = first(search.predictor, hypothesis(search, fade, limit))
+    assert early.names == (LIMIT, WEAKER)
+    assert not first(search.predictor, hypothesis(search, fade, gain))
+    pull = ("coulomb_friction:v", {"c": 0.1})
+    (other,) = orders(search.predictor, hypothesis(search, fade, pull, limit))
+    assert other.names == (LIMIT, "coulomb_friction:v", WEAKER)
+
+
+def test_effects_found_in_the_wrong_order_are_put_right(search):
+    wrong = hypothesis(search, (WEAKER, {"k": FADE}), (LIMIT, {"r": RATE}))
+    (fit,) = search.refined([search.fresh(wrong)], 25)
+    reordered(search, [fit])
+    (best,) = (f for f in search.of_size(2) if set(f.hypothesis.names) == {LIMIT, WEAKER})
+    assert best.hypothesis.names == (LIMIT, WEAKER)
+    assert search.score(best) > search.score(fit) + 50
+    assert best.hypothesis.values[0]["r"] == pytest.approx(RATE, rel=0.02)
+    assert best.hypothesis.values[1]["k"] == pytest.approx(FADE, rel=0.05)
+
+
+def test_one_effect_of_all_inputs_replaces_one_for_each(search):
+    h = hypothesis(search, (DELAY, {"d": 0.04}), (WEAKER, {"k": FADE}), ("delay:b", {"d": 0.06}))
+    (fit,) = search.refined([search.fresh(h)], 1)
+    found = {start[0].names: start[0].values for start in merged(search, fit)}
+    assert (WEAKER, "delay:a+b") in found
+    late = found[WEAKER, "delay:a+b"][1]["d"]
+    own = [fit.hypothesis.values[i]["d"] for i in (0, 2)]
+    assert min(own) <= late <= max(own)
+    (alone,) = search.refined([search.fresh(h.minus("delay:b"))], 1)
+    assert not list(merged(search, alone))
+
+
+AXES = Model(
+    name="axes",
+    states={"x": "m", "y": "m", "v": "m/s", "w": "m/s"},
+    inputs={"a": "1", "b": "1"},
+    params={"tau": Param(0.15, "s")},
+    derivative=lambda s, a, p: {
+        "x": s.v,
+        "y": s.w,
+        "v": (0.6 * a.a - s.v) / p.tau,
+        "w": (0.8 * a.b - s.w) / p.tau,
+    },
+)
+
+
+def levels(rng, steps):
+    """Levels that are held for 0.25 to 0.9 s each, (steps, 2)."""
+    held = [
+        np.repeat(rng.uniform(-0.9, 0.9, steps), rng.integers(12, 45, steps))[:steps]
+        for _ in range(2)
+    ]
+    return np.stack(held, axis=1)
+
+
+def stepped(trials=3, steps=450, late=2):
+    """A valve that loses a dead zone of 0.08, then has an offset of 0.14, 40 ms late."""
+    rng, found, gain = np.random.default_rng(1), [], np.array([0.6, 0.8])
+    for _ in range(trials):
+        u = levels(rng, steps)
+        x, v, rows = np.zeros(2), np.zeros(2), [np.zeros(4)]
+        for old, now in zip(np.vstack([np.zeros((late, 2)), u]), u, strict=False):
+            zone = np.sign(old[0]) * max(abs(old[0]) - 0.08, 0.0) + 0.14
+            for _ in range(10):
+                v = v + DT / 10 * (gain * [zone, now[1]] - v) / 0.15
+                x = x + DT / 10 * v
+            v = v + rng.normal(0, 2e-3, 2)
+            rows.append(np.array([*x, *v]))
+        noisy = np.array(rows) + rng.normal(0, 1, (steps + 1, 4)) * [5e-4, 5e-4, 4e-3, 4e-3]
+        found.append(Trial(noisy, u, DT, AXES.state_names, AXES.input_names))
+    return found
+
+
+@pytest.mark.slow
+def test_an_offset_found_before_a_dead_zone_acts_after_it():
+    """A gain and a curve stood in for the dead zone, which was tried behind the offset alone."""
+    found = diagnose(AXES, stepped())
+    assert set(found.effects) == {"dead_zone:a", "input_bias:a", DELAY}, found.sentence
+    assert found.acting.index("dead_zone:a") < found.acting.index("input_bias:a")
+    values = {row.effect: row.values for row in found.ranking if row.claimed}
+    assert values["dead_zone:a"]["c"] == pytest.approx(0.08, rel=0.1)
+    assert values["input_bias:a"]["b"] == pytest.approx(0.14, rel=0.05)
+    assert values[DELAY]["d"] == pytest.approx(0.04, rel=0.1)
