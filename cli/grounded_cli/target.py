@@ -179,6 +179,16 @@ def command(
             bound = least if low < least else most
             goes = with_unit(number(low if low < least else high), model.states[name])
             remark("note", f"{name} goes to {goes}, beyond its bound in [safety], {number(bound)}")
+    for effect in workspace.config.model.effects:
+        family, _, name = str(effect["name"]).partition(":")
+        if family == "sensor_bias" and name in columns:
+            by = with_unit(f"{abs(effect['b']):.3g}", model.states[name])
+            remark(
+                "note",
+                f"the target of {name} is in readings of its sensor, which by the adopted "
+                f"sensor_bias:{name} reads {by} too {'low' if effect['b'] < 0 else 'high'}: a true "
+                f"0 is {effect['b']:.3g} there. Draw it, and set [task] start, in readings",
+            )
     if still := without_range(columns, model.states):
         at = {number(ranges[name][0]) for name in still}
         stay = f"{'stay' if len(still) > 1 else 'stays'} at {listed(at)}"

@@ -141,3 +141,16 @@ def test_what_a_target_replaced_in_a_search_is_said_and_kept(w):
     assert holds(told, "before: horizon = ", "the target in target.csv.bak", "grounded.toml.bak")
     assert files(w)["grounded.toml.bak"] == old["grounded.toml"]
     assert files(w)["target.csv.bak"] == old["target.csv"]
+
+
+def test_a_target_beside_an_adopted_bias_is_told_to_be_in_readings(w):
+    """A balancer's tilt was drawn to 0 without a word, with its sensor 0.0044 rad off."""
+    config = w.folder / "grounded.toml"
+    text = config.read_text()
+    assert "effects = [" not in text
+    config.write_text(
+        text.replace("[model]\n", '[model]\neffects = [{ name = "sensor_bias:theta", b = 0.02 }]\n')
+    )
+    said = grounded("-C", w.folder, "target", "step", "--to", "theta=1")
+    assert said.code == 0, said.err
+    assert holds(said.err, "in readings of its sensor", "0.02 rad too high", "sensor_bias:theta")
