@@ -123,3 +123,17 @@ def test_a_machine_is_asked_again_once_it_was_started_again(
         assert jit._remembered() is None
     finally:
         jit._here.cache_clear()
+
+
+@here
+def test_code_that_writes_to_its_own_memory_is_left_to_llvm() -> None:
+    text = """
+@calls = internal global i64 0
+define i64 @run(ptr %words) {
+  %old = load i64, ptr @calls
+  %new = add i64 %old, 1
+  store i64 %new, ptr @calls
+  ret i64 %new
+}
+"""
+    assert object_file.load(jit._compiled(text)) is None

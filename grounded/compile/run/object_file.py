@@ -26,7 +26,7 @@ WORD = Struct("<Q")
 ELF64 = b"\x7fELF\x02\x01\x01"  # 64 bits, little-endian, version 1
 RELOCATABLE, X86_64 = 1, 62  # a type of files, a machine
 SYMBOLS, RELOCATIONS, NOTHING = 2, 4, 8  # types of sections: their contents; zeros
-LOADED = 2  # flag of sections that belong in memory
+WRITTEN, LOADED = 1, 2  # flags of sections that the code writes to, that belong in memory
 UNDEFINED = 0  # section of a symbol that another library has
 ABSOLUTE, RELATIVE = 1, 24  # R_X86_64_64, R_X86_64_PC64
 READ, EXECUTE = 1, 4  # PROT_READ, PROT_EXEC
@@ -57,6 +57,8 @@ def load(code: bytes) -> ObjectFile | None:
         for i, own in enumerate(sections)
         if own[2] & LOADED and _name(code, sections[names], own[0]) != UNWINDING
     }
+    if any(own[2] & WRITTEN for own in kept.values()):
+        return None  # the memory is for reading only
     at, size = dict[int, int](), 0
     for i, own in kept.items():  # from a page each, as aligned as LLVM would have them
         at[i], size = size, size + -(-own[5] // mmap.PAGESIZE) * mmap.PAGESIZE
