@@ -64,9 +64,18 @@ class ActedOn:
         return np.isfinite(self.off)
 
     @property
+    def enough(self) -> bool:
+        """Whether enough steps are informative; few are if all are the policy's to the last digits.
+
+        An input at its limits most of the time leaves few.
+        """
+        few = self.told.sum() >= FEW and float(self.off[self.told].max()) < EXACT
+        return bool(few or self.told.sum() >= LEAST)
+
+    @property
     def exact(self) -> bool:
         """Whether at least half of the commands are the policy's to the last digits."""
-        return bool(self.told.sum() >= LEAST and self.left < EXACT)
+        return self.enough and self.left < EXACT
 
     @property
     def throughout(self) -> bool:

@@ -12,7 +12,8 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.search.planner import predicted
-from grounded.search.returned.who_drove import second_differences
+from grounded.search.returned.who_drove import LEAST, second_differences
+from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.wording import in_digits_apart, with_unit
 from grounded_trials.workspace.folder import Folder
@@ -45,7 +46,8 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
 
     A state that [reward] weighs along the way is judged by the cost of its offset relative to a
     mean step of the run, the most costly first; another state relative to its range in the run.
-    Offsets within the scatter of earlier starts are unavoidable and tolerated.
+    Offsets within the scatter of earlier starts are unavoidable and tolerated. Of a run that left
+    [safety], only the part before counts: a robot on the floor makes every start seem near.
 
     Args:
         workspace: the workspace with the task, the model and the earlier runs.
@@ -57,7 +59,8 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
     if not trial.candidate or trial.finite_steps < 0:
         return []
     off = task.model.difference(trial.states[0], task.start)
-    states = trial.states[: trial.finite_steps + 1]
+    states = _inside(task, trial.states[: trial.finite_steps + 1])
+    failed = len(states) <= trial.finite_steps
     usual = np.ptp(states, axis=0)
     jumps = np.abs(second_differences(states, task.model.angle_mask))
     noise = np.median(jumps, axis=0) / WHITE if len(jumps) else np.zeros(len(usual))
@@ -78,7 +81,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
         changes = _changes(workspace, trial, off * (np.arange(len(off)) == i))
         real = abs(task.utility(trial))
         again = abs(changes) > SPOILT * (
-            real if np.isfinite(real) else -_promised(workspace, trial)
+            real if np.isfinite(real) and not failed else -_promised(workspace, trial)
         )
         does = (
             f"by the model this changes its utility by {changes:+.3g}: `discard {trial.id}`, place "
@@ -97,6 +100,13 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
             )
         )
     return found
+
+
+def _inside(task: Task, states: Array) -> Array:
+    """Return the states before they left [safety], at least a few; all if they never did."""
+    assert task.safety_low is not None and task.safety_high is not None
+    out = ((states < task.safety_low) | (states > task.safety_high)).any(axis=1)
+    return states[: max(int(np.argmax(out)), LEAST)] if out.any() else states
 
 
 def _starts_before(workspace: Folder, identity: str) -> Array:

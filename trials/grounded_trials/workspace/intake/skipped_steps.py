@@ -1,0 +1,59 @@
+"""Tell of a program that ran only some steps of its candidate: its loop is slower than dt.
+
+A policy's plan, gains and reference change from step to step, so its commands change even if no new
+states arrive. Where they stay the same to the last digit all the same, the step was not run. A loop
+at half the rate runs every other step and holds each command twice as long.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from grounded.policy import Policy
+from grounded.search.returned.who_drove import LEAST
+from grounded.task import Task
+from grounded.trial import Trial
+
+CHANGES = 2e-3  # smallest change of a command by its step alone, relative to its size, that tells
+MOST = 0.3  # share of the steps that tell which may be lost in a run
+
+
+def steps_skipped(task: Task, policy: Policy, trial: Trial, ran: str) -> str:
+    """Return the warning for a run in which many steps were not run; or "".
+
+    Args:
+        task: the task with the control step.
+        policy: the policy that was run.
+        trial: the run, with gaps bridged.
+        ran: the candidate's id.
+    """
+    T = min(trial.finite_steps, policy.horizon)
+    if T < LEAST:
+        return ""
+    sent = np.clip(trial.inputs[:T], policy.low, policy.high)
+    past = policy.past if trial.start_inputs is None else trial.start_inputs
+    before = policy.commands(trial.states[None, :T], past, sent[None])[0][:-1]
+    shifted = trial.states[None, np.r_[0, : T - 1]]  # no new states since the step before
+    after = policy.commands(shifted, past, sent[None])[0][1:]
+    size = np.maximum(np.abs(policy.feedforward).max(axis=0), np.abs(sent).max(axis=0)) + 1e-12
+    moved = np.abs(np.diff(sent, axis=0))
+    finest = np.where(moved > 0, moved, np.inf).min(axis=0)  # to which the log is rounded
+    tells = np.abs(after - before) > np.maximum(
+        CHANGES * size, np.where(finest < np.inf, finest, 0)
+    )
+    changed = np.flatnonzero(moved.any(axis=1))
+    held = tells.any(axis=1) & ~moved.any(axis=1)
+    if tells.any(axis=1).sum() < 2 * LEAST or len(changed) < LEAST:
+        return ""
+    if held.sum() < MOST * tells.any(axis=1).sum():
+        return ""
+    every = float(np.median(np.diff(changed)))
+    if every < 2:
+        return ""
+    ms, dt = 1e3 * every * task.dt, 1e3 * task.dt
+    return (
+        f"its commands change every {ms:.3g} ms, dt is {dt:.3g} ms: about {1 - 1 / every:.0%} of "
+        f"the steps of {ran} were not run, or not logged. Call the runner every {dt:.3g} ms and "
+        f"log every command, and run {ran} again; if the robot can't, set [task] dt = "
+        f"{every * task.dt:.3g}"
+    )
