@@ -25,8 +25,8 @@ from grounded.trial import Trial
 
 SAME = 2.0  # ratio of the differences left by two misuses that explain a log equally well
 LEAVES = 0.25  # largest share of the original difference that a misuse may leave
-TELLS = 0.02  # smallest difference of two commands, relative to their size, that tells them apart
-NEAR, NEARLY_ALL = 0.1, 0.9  # a misuse must be that near in that share of the steps that tell
+TELLS = 0.1  # smallest difference of two commands, relative to their size, that tells them apart
+NEARER, NEARLY_ALL = 0.5, 0.95  # a misuse must be so much nearer in that share of these steps
 TIMES = {"ms": 1e3, "us": 1e6, "minutes": 1 / 60}  # units of a time that should be in seconds
 
 
@@ -96,8 +96,8 @@ def _tells(plain: Following, fit: Following) -> bool:
     size = fit.fine / FINE
     with np.errstate(invalid="ignore"):
         told = np.abs(plain.off - fit.off) > TELLS * size
-        near = np.abs(fit.off) < NEAR * size
-    return bool(told.any() and near[told].mean() >= NEARLY_ALL)
+        nearer = np.abs(fit.off) < NEARER * np.abs(plain.off)
+    return bool(told.any() and nearer[told].mean() >= NEARLY_ALL)
 
 
 def ways(model: Model, own: Candidate, *, unsent: bool) -> Iterator[Way]:

@@ -225,9 +225,9 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     if look.read.log and look.read.cut:  # states may be unknown when the run begins
         look.read.log.refuse_late(look.read.cut)
     read, log, found, whole, seen = look.read, look.log, look.found, look.whole, look.suspicion
-    if found and found.alike and not look.exact:
-        loose = loosely(found.loose_s, ran) if found.loose_s > LOOSE * workspace.task.dt else ""
-        unsure = filter(None, [loose, doubtful(found, ran)])
+    if found and found.alike:
+        loose = found.loose_s > LOOSE * workspace.task.dt and not look.exact
+        unsure = filter(None, [loosely(found.loose_s, ran) if loose else "", doubtful(found, ran)])
         read = replace(read, warnings=(*read.warnings, *unsure))
     why, other = seen.why, seen.other
     fell, stored = look.fell, read.log.stored if read.log else ()

@@ -13,18 +13,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded.frozen import Array
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart
-from grounded.search.returned.misused import NEAR, NEARLY_ALL, TELLS, Way, likeliest, misused, ways
+from grounded.search.returned.misused import NEARLY_ALL, TELLS, Way, likeliest, misused, ways
 from grounded.search.returned.who_drove import follows, latest
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.workspace.intake.acted_on import EXACT, FEW, acted_on
+from grounded_trials.workspace.intake.acted_on import EXACT, FEW, acted_on, held_before
 from grounded_trials.workspace.intake.instants import BATCH, least_of
 from grounded_trials.workspace.intake.run_start import TRIED, Recording
 
-EACH, ALL = 3, 16  # numbers of instants that are examined for a misuse, and in all
+NEAR = 0.02  # largest difference of a command, relative to its size, that is no stray
+MANY = 1_000_000  # largest number of commands that are computed for a misuse, roughly
+EACH, ALL = 2, 24  # numbers of instants that are examined for a misuse, and in all
 
 
 def exactly_misused(log: Recording, task: Task, own: Candidate) -> str:
@@ -38,12 +39,12 @@ def exactly_misused(log: Recording, task: Task, own: Candidate) -> str:
     Returns:
         The end of a sentence about its commands; "" if nothing reproduces them.
     """
-    tried = [
-        (*one, way) for way in ways(task.model, own, unsent=False) for one in _begins(log, way)
-    ]
+    first, every = _steps_of(log, own)
+    misuses = ways(task.model, own, unsent=False)
+    tried = [(*one, way) for way in misuses for one in _begins(every, way)]
     found = list[tuple[float, Way]]()
     for _, k, way in sorted(tried, key=lambda one: one[0])[:ALL]:
-        at = log.on_step(way.policy, log.first + k * log.dt / log.parts)
+        at = first + k * log.dt
         left = _left(log, own, way, at)
         if left < EXACT and not _rather_logged(log, own, way, at):
             found.append((left, way))
@@ -67,36 +68,37 @@ def misused_in(log: Recording, task: Task, own: Candidate) -> str:
     return ""
 
 
-def _begins(log: Recording, way: Way) -> Iterator[tuple[float, int]]:
-    """Yield the instants at which a misused run begins most likely, with the share of strays.
+def _steps_of(log: Recording, own: Candidate) -> tuple[float, Trial]:
+    """Return the steps of a whole log with the samples before each command, and their first [s]."""
+    first = log.on_step(own.policy, log.first)
+    middle = round((first - log.first) * log.parts / log.dt) + log.parts // 2
+    sent = log.whole.inputs[max(0, middle) :: log.parts]
+    return first, Trial(held_before(log, first, len(sent) + 1), sent, log.dt, *log.names)
+
+
+def _begins(every: Trial, way: Way) -> Iterator[tuple[float, int]]:
+    """Yield the share of strays, and the steps from which a misused run leaves fewest.
 
     Commands at a limit that the policy sends as well don't count.
     """
-    whole, policy = log.whole, way.policy
-    T, parts = least_of(policy.horizon), log.parts
-    states = way.passed(Trial(whole.states, whole.inputs, log.dt / parts, *log.names)).states
-    sent = np.clip(whole.inputs, policy.low, policy.high)
+    policy, steps = way.policy, every.steps
+    T = int(np.clip(MANY // max(steps, 1), least_of(policy.horizon), policy.horizon))
+    states = way.passed(every).states
+    sent = np.clip(every.inputs, policy.low, policy.high)
     size = np.abs(sent).max(axis=0) + 1e-12
-    every = np.arange(0, len(sent) - parts * T, parts)
-    strays = np.full(len(every), np.inf)
-    for first in range(0, len(every), BATCH):
-        here = every[first : first + BATCH, None] + parts * np.arange(T)
-        u = sent[here + parts // 2]
+    strays = np.full(steps, np.inf)
+    for first in range(0, steps, BATCH):
+        here = np.arange(first, min(first + BATCH, steps))[:, None] + np.arange(T)
+        known, here = here < steps, np.minimum(here, steps - 1)
+        u = sent[here]
         asked = policy.commands(states[here], policy.past, u)
-        told = (_inside(policy.low, asked, policy.high) | _inside(policy.low, u, policy.high)) | (
-            asked != u
-        )
-        off = np.abs(asked - u) / size > NEAR
-        count, stray = told.any(axis=2).sum(axis=1), (told & off).any(axis=2).sum(axis=1)
-        strays[first : first + BATCH] = np.where(count < FEW, np.inf, stray / np.maximum(count, 1))
-    for i in np.argsort(strays)[:EACH]:
-        if np.isfinite(strays[i]):
-            yield float(strays[i]), int(every[i])
-
-
-def _inside(low: Array, u: Array, high: Array) -> Array:
-    found: Array = (u > low) & (u < high)
-    return found
+        told = known[:, :, None] & ((asked != u) | ((u > policy.low) & (u < policy.high)))
+        stray = told & (np.abs(asked - u) / size > NEAR)
+        count, lost = (one.any(axis=2).sum(axis=1) for one in (told, stray))
+        strays[first : first + BATCH] = np.where(count < FEW, np.inf, lost / np.maximum(count, 1))
+    for k in np.argsort(strays, kind="stable")[:EACH]:
+        if np.isfinite(strays[k]):
+            yield float(strays[k]), int(k)
 
 
 def _left(log: Recording, own: Candidate, way: Way, at: float) -> float:
@@ -105,8 +107,10 @@ def _left(log: Recording, own: Candidate, way: Way, at: float) -> float:
     if fit is None or plain is None or plain.exact or not fit.throughout:
         return np.inf
     tells = fit.told & (np.abs(fit.asked - plain.asked) > TELLS * fit.size).any(axis=1)
-    sure = tells.sum() >= FEW and np.mean(fit.off[tells] < EXACT) >= NEARLY_ALL
-    return fit.left if sure else np.inf
+    moves = np.abs(np.diff(fit.asked[tells], axis=0)) > EXACT * fit.size
+    if moves.any(axis=1).sum() < FEW:  # many a program holds an input
+        return np.inf
+    return fit.left if np.mean(fit.off[tells] < EXACT) >= NEARLY_ALL else np.inf
 
 
 def _as_passed(log: Recording, way: Way) -> Recording:

@@ -158,13 +158,17 @@ class Recording:
         told = [(fit, one) for fit, one in fits if fit is not None and fit.enough]
         fit, best = min(told, key=lambda pair: pair[0].left, default=(None, likeliest))
         if fit is not None and fit.throughout:
-            return replace(best, alike=True, opens_alike=True, exact=True)
+            rival = self._rival(best, [one for fit, one in told if fit.throughout])
+            return replace(best, alike=True, opens_alike=True, exact=True, rival_s=rival)
         usual = next((other.left for other, one in told if one is likeliest), 0.0)
         if fit is not None and alike and fit.left < SAME * usual:
             return replace(best, opens_alike=True)
-        apart = [one for one in near if abs(one.seconds - likeliest.seconds) > LEAST * self.dt]
-        rival = min(apart, key=lambda one: one.apart, default=None)
-        return replace(likeliest, rival_s=rival and rival.seconds) if alike else None
+        return replace(likeliest, rival_s=self._rival(likeliest, near)) if alike else None
+
+    def _rival(self, found: Start, others: Sequence[Start]) -> float | None:
+        """Return the likeliest of the other starts far from the one found [s], or None."""
+        apart = [one for one in others if abs(one.seconds - found.seconds) > LEAST * self.dt]
+        return min(apart, key=lambda one: one.apart).seconds if apart else None
 
     def _by_its_samples(self, policy: Policy, strays: Array) -> Start | None:
         """Find where the first commands are the policy's to the last digits, on samples of any age.
@@ -383,7 +387,7 @@ def doubtful(found: Start, ran: str) -> str:
     return (
         f"where {ran} begins is in doubt: its commands fit about as well from {found.rival_s:.3f} "
         f"s of the log on as from {found.seconds:.3f} s, which is used. If the run began "
-        f"elsewhere, `discard` it and set [log.span] start = SECONDS"
+        "elsewhere, or the log has several, `discard` it and set [log.span] start = SECONDS"
     )
 
 
