@@ -143,8 +143,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     history = now.history if now else ()
     tried = next((t for t in history if t.candidate.id == trial.candidate), None)
     verdict = ASIDE if aside else _verdict(trial, tried, workspace.config.search.repeats)
-    own = workspace.candidate(trial.candidate)[0] if trial.candidate else None
-    slow = own and steps_skipped(workspace.task, own.policy, interpolate_gaps(trial).trial, own.id)
+    slow = steps_skipped(workspace, trial)
     warnings = (*filter(None, [slow]), *warnings)
     wrong = bool(slow) or any(one.again for one in elsewhere)
     if not (odd or wrong or aside):
@@ -276,8 +275,8 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         return replace(read, warnings=(*read.warnings, *doubts), doubted=True)
     if units:
         its = log and _in_programs_unit(task.model, units, by)
-        if log and its and (told := misused_in(log, task, own)):
-            raise _misused(path, own, told)
+        if log and its and (how := misused_in(log, task, own)):
+            raise _misused(path, own, how)
         other_unit = units_told(task.model, units, by, read.log is not None)
         raise GroundedError(f"{path} ran {ran}, {other_unit}")
     if pace:
@@ -307,8 +306,8 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         named += filter(None, [misled(log, task, own)])
     if named:
         raise GroundedError(f"{path} can't be read as a run of {ran}: {'; '.join(named)}")
-    if log and not other and whole.inputs.any() and (told := misused_in(log, task, own)):
-        raise _misused(path, own, told)
+    if log and not other and whole.inputs.any() and (how := misused_in(log, task, own)):
+        raise _misused(path, own, how)
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
     if guessed := sorted(_guessed(log)):
         said += (

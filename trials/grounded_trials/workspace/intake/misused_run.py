@@ -106,7 +106,8 @@ def _left(log: Recording, own: Candidate, way: Way, at: float) -> float:
     fit, plain = acted_on(_as_passed(log, way), way.policy, at), acted_on(log, own.policy, at)
     if fit is None or plain is None or plain.exact or not fit.throughout:
         return np.inf
-    tells = fit.told & (np.abs(fit.asked - plain.asked) > TELLS * fit.size).any(axis=1)
+    differs = np.abs(fit.asked - plain.asked) > TELLS * fit.size
+    tells = np.isfinite(fit.off) & differs.any(axis=1)
     moves = np.abs(np.diff(fit.asked[tells], axis=0)) > EXACT * fit.size
     if moves.any(axis=1).sum() < FEW:  # many a program holds an input
         return np.inf

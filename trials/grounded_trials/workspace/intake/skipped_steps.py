@@ -9,24 +9,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from grounded.policy import Policy
 from grounded.search.returned.who_drove import LEAST
-from grounded.task import Task
-from grounded.trial import Trial
+from grounded.trial import Trial, interpolate_gaps
+from grounded_trials.workspace.folder import Folder
 
 CHANGES = 2e-3  # smallest change of a command by its step alone, relative to its size, that tells
 MOST = 0.3  # share of the steps that tell which may be lost in a run
 
 
-def steps_skipped(task: Task, policy: Policy, trial: Trial, ran: str) -> str:
+def steps_skipped(workspace: Folder, trial: Trial) -> str:
     """Return the warning for a run in which many steps were not run; or "".
 
     Args:
-        task: the task with the control step.
-        policy: the policy that was run.
-        trial: the run, with gaps bridged.
-        ran: the candidate's id.
+        workspace: the workspace with the task and the candidate.
+        trial: the trial as stored.
     """
+    if not (ran := trial.candidate):
+        return ""
+    trial, task = interpolate_gaps(trial).trial, workspace.task
+    policy = workspace.candidate(ran)[0].policy
     T = min(trial.finite_steps, policy.horizon)
     if T < LEAST:
         return ""
