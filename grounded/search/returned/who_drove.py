@@ -111,7 +111,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
         input=policy.input_names[j],
         rms=float(np.sqrt(off[:, j].mean())),
         until_s=float(left) * policy.dt if sane else 0.0,
-        opens=bool(sane and left >= LEAST and _telling(policy, asked, sent)[:left].sum() >= FEW),
+        opens=bool(sane and _opens(policy, asked[:left], sent[:left], off[:left], size)),
         late=late,
         moved=error / unmoved if unmoved > 1e-4 else 1.0,
         off=apart,
@@ -119,13 +119,21 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     )
 
 
-def _telling(policy: Policy, asked: Array, sent: Array) -> Array:
-    """Return the steps, (T,) bool, whose commands tell policies apart: not held at their limits."""
+def _opens(policy: Policy, asked: Array, sent: Array, off: Array, size: Array) -> bool:
+    """Return whether the first commands of a policy and a log, (T, m), are alike by themselves.
+
+    In a part at rest, the noise of a later fall would excuse any difference; and commands that
+    stay at their limits are those of other policies too.
+    """
+    if len(off) < LEAST:
+        return False
     both = np.stack([asked, sent])
     inside = (both > policy.low) & (both < policy.high)
     switched = np.diff(both, axis=1, prepend=both[:, :1]) != 0
-    told: Array = (inside | switched).any(axis=(0, 2))
-    return told
+    telling = (inside | switched).any(axis=(0, 2))
+    unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
+    alike = off.mean(axis=0) <= 2 * UNLIKE * unrelated + (0.02 * size) ** 2
+    return bool(telling.sum() >= FEW and alike.all())
 
 
 def evidence(own: Following, other: Following) -> float:

@@ -142,3 +142,26 @@ def test_commands_at_the_same_limit_make_neither_of_two_policies_likelier():
         for some in (trial, trial.until(100))
     )
     assert whole == pytest.approx(part, rel=0.05)
+
+
+def test_a_hand_that_balanced_before_a_fall_is_not_said_to_be_the_candidate():
+    """`Up to 2.0 s they are alike`, it said of commands without any correlation."""
+    own, rng = candidate(4 * HAND), np.random.default_rng(0)
+    states = rng.normal(0, (0.0015, 0.01), (STEPS + 1, 2))
+    sent = states[:STEPS] @ [0, 10.0]
+    states[100:] += rng.normal(0, (0.01, 0.1), (STEPS - 99, 2))
+    sent[100:] = LIMIT * np.sign(rng.normal(size=STEPS - 100))
+    found = follows(own.policy, Trial(states, sent[:, None], DT, *NAMES))
+    assert not found.alike and found.until_s >= 1.0 and not found.opens
+
+
+@pytest.mark.parametrize("tilt", [0.5, 0.01])
+def test_an_opening_at_the_limit_is_no_opening(tilt):
+    own, t = candidate(8 * HAND), np.arange(STEPS + 1)
+    states = np.stack([0.02 * np.sin(0.09 * t), 0.18 * np.cos(0.09 * t)], axis=1)
+    if tilt == 0.5:
+        states[:100] = tilt, 0.0
+    sent = own.policy.commands(states[None, :STEPS], np.zeros(1))[0]
+    sent[100:] *= -1
+    found = follows(own.policy, Trial(states, sent, DT, *NAMES))
+    assert not found.alike and found.until_s >= 1.0 and found.opens == (tilt < 0.5)
