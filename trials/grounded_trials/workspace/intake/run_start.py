@@ -15,7 +15,7 @@ respond to where the robot was then.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -87,6 +87,7 @@ class Recording:
     changes: Array  # when a command changed in the log, seconds after the log's first sample
     late: Array  # by how much each change may appear late [s]; 0 if commands have own stamps
     interval: float  # between samples [s]
+    _cut: dict[float, Trial | None] = field(init=False, default_factory=dict)  # by start
 
     @property
     def first(self) -> float:
@@ -95,6 +96,11 @@ class Recording:
 
     def trial_from(self, start: float) -> Trial | None:
         """Return the log as a trial from `start` [s] on, or None if a state is not known there."""
+        if start not in self._cut:
+            self._cut[start] = self._trial_from(start)
+        return self._cut[start]
+
+    def _trial_from(self, start: float) -> Trial | None:
         span = Span(start=start)
         try:
             cut = to_grid(
