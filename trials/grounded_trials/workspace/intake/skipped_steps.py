@@ -38,22 +38,18 @@ def steps_skipped(workspace: Folder, trial: Trial) -> str:
     after = policy.commands(shifted, past, sent[None])[0][1:]
     size = np.maximum(np.abs(policy.feedforward).max(axis=0), np.abs(sent).max(axis=0)) + 1e-12
     moved = np.abs(np.diff(sent, axis=0))
-    finest = np.where(moved > 0, moved, np.inf).min(axis=0)  # to which the log is rounded
-    tells = np.abs(after - before) > np.maximum(
-        CHANGES * size, np.where(finest < np.inf, finest, 0)
-    )
+    finest = np.where(moved > 0, moved, size).min(axis=0)  # to which the log is rounded
+    tells = (np.abs(after - before) > np.maximum(CHANGES * size, finest)).any(axis=1)
     changed = np.flatnonzero(moved.any(axis=1))
-    held = tells.any(axis=1) & ~moved.any(axis=1)
-    if tells.any(axis=1).sum() < 2 * LEAST or len(changed) < LEAST:
-        return ""
-    if held.sum() < MOST * tells.any(axis=1).sum():
+    held = tells & ~moved.any(axis=1)
+    if min(tells.sum(), len(changed)) < LEAST or held.sum() < MOST * tells.sum():
         return ""
     every = float(np.median(np.diff(changed)))
     if every < 2:
         return ""
-    ms, dt = 1e3 * every * task.dt, 1e3 * task.dt
+    ms, dt, lost = 1e3 * every * task.dt, 1e3 * task.dt, 100 - 100 / every
     return (
-        f"its commands change every {ms:.3g} ms, dt is {dt:.3g} ms: about {1 - 1 / every:.0%} of "
+        f"its commands change every {ms:.3g} ms, dt is {dt:.3g} ms: {lost:.0f} % of "
         f"the steps of {ran} were not run, or not logged. Call the runner every {dt:.3g} ms and "
         f"log every command, and run {ran} again; if the robot can't, set [task] dt = "
         f"{every * task.dt:.3g}"
