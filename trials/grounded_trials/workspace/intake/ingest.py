@@ -143,7 +143,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     history = now.history if now else ()
     tried = next((t for t in history if t.candidate.id == trial.candidate), None)
     verdict = ASIDE if aside else _verdict(trial, tried, workspace.config.search.repeats)
-    slow = steps_skipped(workspace, trial)
+    slow = "" if read.doubted else steps_skipped(workspace, trial)
     warnings = (*filter(None, [slow]), *warnings)
     wrong = bool(slow) or any(one.again for one in elsewhere)
     if not (odd or wrong or aside):
