@@ -182,7 +182,7 @@ class Policy:
         Args:
             states: (B, T, n) states of B runs.
             past: (m,) the input held before the first step.
-            sent: (B, T, m) past inputs to use instead of the policy's own; many times faster.
+            sent: (B or 1, T, m) past inputs to use instead of the policy's own; many times faster.
         """
         T, n = states.shape[1:]
         asked: Array = np.repeat(self.feedforward[None, :T], len(states), 0)
@@ -196,7 +196,8 @@ class Policy:
         asked -= np.einsum("tij,tj->ti", memory, self.reference[:T, n:])
         if sent is not None:
             oldest = max(self.depths)
-            held = np.concatenate([np.repeat(past[None, None], oldest, 1), sent], axis=1)
+            held = np.broadcast_to(past, (len(sent), oldest, len(past)))
+            held = np.concatenate([held, sent], axis=1)
             places = [(j, oldest - i) for j, d in enumerate(self.depths) for i in range(1, d + 1)]
             for k, (j, start) in enumerate(places):
                 asked += memory[:, :, k] * held[:, start : start + T, j, None]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from facts import holds
 from grounded_trials.logs.command_steps import changes_of, phase_of
 from grounded_trials.starting.begin import begin
 from grounded_trials.starting.interval import changes_every, round_interval
@@ -88,7 +89,9 @@ def test_a_table_of_rows_more_frequent_than_commands_has_the_commands_interval(t
     assert 'seen_in = "r.csv"' in (tmp_path / "w/grounded.toml").read_text()
     assert any("0.05 s" in note for note in found.notes) == (every == 5)
     given = begin(tmp_path / "g", tmp_path / "r.csv", model=tmp_path / "m.py", dt=0.02)
-    assert given.dt == 0.02 and not any("--dt" in note for note in given.notes)
+    told = [note for note in given.notes if "--dt" in note]
+    assert given.dt == 0.02 and len(told) == (every == 1)  # else each command has its steps
+    assert all(holds(one, "10 ms", "20 ms", "one in 2", "--dt 0.01") for one in told)
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.0003])
@@ -115,6 +118,18 @@ def test_commands_with_stamps_of_their_own_are_late_by_nothing():
     at, late = changes_of(t, np.arange(50.0))
     assert not late.any()
     assert phase_of(at * 1e-9, 0.02, late * 1e-9) == (pytest.approx(0.003), 0.0)
+
+
+def test_a_command_that_stays_at_its_limits_is_not_held_between_rows():
+    """Each command of a robot that fell was said to be up to a row late."""
+    rng = np.random.default_rng(3)
+    sent = np.clip(np.cumsum(rng.normal(0, 4, 1000)), -7.4, 7.4)
+    sent[400:] = 7.4
+    sent[:100] = 0.0
+    assert np.mean(np.diff(sent) == 0) > 0.6
+    t = 10_000_000 * np.arange(1000)
+    assert not changes_of(t, sent)[1].any()
+    assert changes_of(t // 4, np.repeat(sent[::4], 4))[1].any()
 
 
 @pytest.mark.parametrize("hz", [2, 7.5, 12, 15, 24, 25, 30, 45, 50, 60, 75, 90, 100, 120, 125, 144])

@@ -8,7 +8,7 @@ at the steps that a time in milliseconds gives. What reproduces the logged comma
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -25,7 +25,34 @@ from grounded.trial import Trial
 
 SAME = 2.0  # ratio of the differences left by two misuses that explain a log equally well
 LEAVES = 0.25  # largest share of the original difference that a misuse may leave
+TELLS = 0.1  # smallest difference of two commands, relative to their size, that tells them apart
+NEARER, NEARLY_ALL = 0.5, 0.95  # a misuse must be so much nearer in that share of these steps
 TIMES = {"ms": 1e3, "us": 1e6, "minutes": 1 / 60}  # units of a time that should be in seconds
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """One way in which a program may misuse a candidate."""
+
+    policy: Policy  # as it acts on what the program passes
+    said: str  # what that means, and the remedy
+    names: tuple[str, ...] = ()  # states that are passed multiplied, or in each other's place
+    factor: float = 1.0
+    exchanged: bool = False
+
+    def passed(self, trial: Trial) -> Trial:
+        """Return a trial with its states as the program passed them."""
+        if not self.exchanged:
+            return multiplied(trial, self.names, self.factor) if self.names else trial
+        i, j = (trial.state_names.index(name) for name in self.names)
+        order = np.arange(len(trial.state_names))
+        order[[i, j]] = j, i
+        return replace(trial, states=trial.states[:, order])
+
+    @property
+    def changed(self) -> int:
+        """The number of states that it changes."""
+        return len(self.names)
 
 
 def misused(task: Task, own: Candidate, trial: Trial, plain: Following) -> str:
@@ -41,63 +68,88 @@ def misused(task: Task, own: Candidate, trial: Trial, plain: Following) -> str:
         The end of a sentence about its commands; "" if nothing reproduces them.
     """
     late, most, found = latest(task), min(LEAVES * plain.error, NEARLY), []
-    for policy, passed, said in _ways(task.model, own, trial):
-        fit = follows(policy, passed, late)
-        if fit is not None and fit.alike and fit.error < most and evidence(plain, fit) > DECISIVE:
-            changed = int((passed.states != trial.states).any(axis=0).sum())
-            found.append((fit.error, -changed, said))
-    least = min((error for error, _, _ in found), default=0.0)
-    # at the limits one state may explain as much as all, but a program passes all in one unit
-    near = [one for one in found if one[0] <= SAME * least + FINE]
-    return min(near, key=lambda one: (one[1], one[0]))[2] if near else ""
+    held = np.allclose(trial.inputs[0], own.policy.past, rtol=0, atol=1e-9)
+    for way in ways(task.model, own, unsent=held):
+        fit = follows(way.policy, way.passed(trial), late)
+        if fit is None or not (fit.alike and fit.error < most):
+            continue
+        if evidence(plain, fit) > DECISIVE and _tells(plain, fit):
+            found.append((fit.error, way))
+    least = min((error for error, _ in found), default=0.0)
+    near = [(error, way) for error, way in found if error <= SAME * least + FINE]
+    return likeliest(near).said if near else ""
 
 
-def _ways(model: Model, own: Candidate, trial: Trial) -> Iterator[tuple[Policy, Trial, str]]:
-    """Yield policies and trials as a program may have combined them, with what that means."""
+def likeliest(found: Sequence[tuple[float, Way]]) -> Way:
+    """Return the likeliest of some ways, each with the difference of the commands that it leaves.
+
+    At the limits one state may explain as much as all, but a program passes all in one unit.
+    """
+    return min(found, key=lambda one: (-one[1].changed, one[0]))[1]
+
+
+def _tells(plain: Following, fit: Following) -> bool:
+    """Return whether a policy explains nearly all commands in which it differs from the plain one.
+
+    Many policies hold an input at the same limit: such commands are no evidence for one of them.
+    """
+    size = fit.fine / FINE
+    with np.errstate(invalid="ignore"):
+        told = np.abs(plain.off - fit.off) > TELLS * size
+        nearer = np.abs(fit.off) < NEARER * np.abs(plain.off)
+    return bool(told.any() and nearer[told].mean() >= NEARLY_ALL)
+
+
+def ways(model: Model, own: Candidate, *, unsent: bool) -> Iterator[Way]:
+    """Yield the ways in which a program may have misused its candidate.
+
+    Args:
+        model: the model with the units of the states.
+        own: the candidate.
+        unsent: whether the first command is the one held before the run, so that none was sent.
+    """
     policy, name = own.policy, own.id
-    held = np.allclose(trial.inputs[0], policy.past, rtol=0, atol=1e-9)  # its first was not sent
     for unit, factor in TIMES.items():
-        if factor < 1 or not held:
-            yield (
+        if factor < 1 or not unsent:
+            yield Way(
                 _at_times(policy, factor),
-                trial,
                 f"they are what {name} sends if the time is passed to `runner.action` in {unit}: "
                 "pass t in seconds since the start of the run",
             )
-    if held:
-        yield (
+    if unsent:
+        yield Way(
             _at_times(policy, np.inf),
-            trial,
             f"all are the {_held(model, policy)} that {name} sends once its time is past the end: "
             "pass `runner.action` the seconds since the start of the run, not those of a clock",
         )
-    yield (
+    yield Way(
         _at_times(policy, 0.0),
-        trial,
         f"they are what {name} sends if the time stays at 0: pass `runner.action` the seconds "
         "since the start of the run",
     )
     if policy.gain is None:
         return
-    for names, factor in units_tried(model):
-        if set(names) <= set(model.state_names):
-            units = " and ".join(dict.fromkeys(model.states[one] for one in names))
-            yield (
-                policy,
-                multiplied(trial, names, factor),
-                f"they are what {name} sends if {listed(list(names))} "
-                f"{'is' if len(names) == 1 else 'are'} passed to `runner.action` "
-                f"{_unit(model, names, factor)}: pass {units}",
-            )
-    for i, j in combinations(range(model.n), 2):
-        order = np.arange(model.n)
-        order[[i, j]] = j, i
-        one, other = model.state_names[i], model.state_names[j]
-        yield (
+    tried = set[tuple[tuple[str, ...], float]]()
+    for group, factor in units_tried(model):
+        if (names := tuple(group), factor) in tried or not {*names} <= {*model.state_names}:
+            continue
+        tried.add((names, factor))
+        units = " and ".join(dict.fromkeys(model.states[one] for one in names))
+        yield Way(
             policy,
-            replace(trial, states=trial.states[:, order]),
+            f"they are what {name} sends if {listed(list(names))} "
+            f"{'is' if len(names) == 1 else 'are'} passed to `runner.action` "
+            f"{_unit(model, names, factor)}: pass {units}",
+            names,
+            factor,
+        )
+    for one, other in combinations(model.state_names, 2):
+        yield Way(
+            policy,
             f"they are what {name} sends if {one} and {other} are passed to `runner.action` in "
             f"each other's place: the order is {', '.join(model.state_names)}",
+            (one, other),
+            exchanged=True,
         )
 
 

@@ -21,6 +21,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 LEAST = 10  # smallest number of steps that can be judged
+FEW = 5  # smallest number of steps that are alike and not at the limits, in which others are too
 UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
 WINDOWS = 8  # parts of a trial that must each be alike (within 2x): somebody may take over
 DECISIVE = 12.0  # [nats] of evidence that another candidate ran; by chance in 1 of 10^6 runs
@@ -45,6 +46,7 @@ class Following:
     input: str  # the input that differs most
     rms: float  # its rms difference, in its unit
     until_s: float  # the commands are alike up to this time [s]
+    opens: bool  # they are alike until then, at least `LEAST` steps, not only at their limits
     late: int  # steps by which the log is late
     moved: float  # squared difference at `late`, relative to that without shift
     off: Array  # (T, m) sent minus policy's commands; NaN if not compared
@@ -109,11 +111,29 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
         input=policy.input_names[j],
         rms=float(np.sqrt(off[:, j].mean())),
         until_s=float(left) * policy.dt if sane else 0.0,
+        opens=bool(sane and _opens(policy, asked[:left], sent[:left], off[:left], size)),
         late=late,
         moved=error / unmoved if unmoved > 1e-4 else 1.0,
         off=apart,
         fine=FINE * size,
     )
+
+
+def _opens(policy: Policy, asked: Array, sent: Array, off: Array, size: Array) -> bool:
+    """Return whether the first commands of a policy and a log, (T, m), are alike by themselves.
+
+    In a part at rest, the noise of a later fall would excuse any difference; and commands that
+    stay at their limits are those of other policies too.
+    """
+    if len(off) < LEAST:
+        return False
+    both = np.stack([asked, sent])
+    inside = (both > policy.low) & (both < policy.high)
+    switched = np.diff(both, axis=1, prepend=both[:, :1]) != 0
+    telling = (inside | switched).any(axis=(0, 2))
+    unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
+    alike = off.mean(axis=0) <= 2 * UNLIKE * unrelated + (0.02 * size) ** 2
+    return bool(telling.sum() >= FEW and alike.all())
 
 
 def evidence(own: Following, other: Following) -> float:
@@ -123,9 +143,13 @@ def evidence(own: Following, other: Following) -> float:
     autocorrelation. If the own policy ran, noise gives the other more than z^2/2 nats at most as
     often as a normal variable exceeds z, however close the two are. If the robot acted on other
     samples than the log has, lower gains leave smaller differences, whichever ran: a reduction of
-    the squares by up to half does not count.
+    the squares by up to half does not count. Steps in which both send exactly what was sent, as at
+    the same limit, don't tell them apart, and make neither more exact.
     """
     known = np.isfinite(own.off + other.off).all(axis=1)
+    known &= (own.off != 0).any(axis=1) | (other.off != 0).any(axis=1)
+    if not known.any():
+        return 0.0
     a, b = own.off[known], other.off[known]
     noise = (b**2).mean(axis=0) + own.fine**2
     return float(((a**2 / 2 - b**2) / (2 * noise)).sum()) / max(
@@ -183,13 +207,14 @@ def suspicion(task: Task, trial: Trial, own: Candidate, others: Sequence[Candida
         )
         looks += "last: were the commands recorded, and did `runner.action` get the seconds since "
         looks += "the start of the run?"
-    elif found.until_s >= LEAST * trial.dt:
+    elif found.opens:
         looks = (
             f"up to {found.until_s:.1f} s they are alike: then somebody, or something, took over, "
             f"or no new states reached the policy{OR_UNITS}"
         )
     else:
-        looks = f"somebody, or another controller, drove{OR_UNITS}"
+        looks = f"somebody, or another controller (the {own.id} of another workspace?), drove"
+        looks += OR_UNITS
     name = name if nats > DECISIVE else ""
     if found.beyond:
         j = trial.input_names.index(found.beyond)

@@ -92,3 +92,39 @@ def test_a_run_that_started_elsewhere_is_discarded_or_counts(w, off, again):
     assert ("the run counts" in told[0].lower()) is not again
     assert (found.then.verb == "discard") is again
     assert ("bad luck" in out or "Run c0" in out) is not again
+
+
+def test_the_start_of_a_run_that_left_safety_is_judged_by_what_came_before(w):
+    """A robot on the floor made every start seem near: none of a run that fell was told."""
+    toml = w.folder / "grounded.toml"
+    toml.write_text(toml.read_text() + "[safety]\nx = [-3.0, 3.0]\n")
+    w = Workspace(w.folder)
+    robot, policy = Plant(w.base_model.with_values({"mass": 1.4})), w.candidate("c0002")[0].policy
+    trial = robot.run(policy, {"x": 0.6, "v": 0.0}, np.random.default_rng(0))
+    states = np.array(trial.states)
+    states[20:, 0] = 40.0
+    file = w.folder / "t.mcap"
+    sent = policy.commands(states[None, :-1], policy.past)[0]
+    fallen = replace(trial, states=states, inputs=sent, candidate="c0002")
+    write_trial(file, fallen, {"kind": "trial", "task": w.task.hash})
+    found = w.ingest(file)
+    told = [one for one in found.warnings if "started with x = 0.6" in one]
+    assert len(told) == 1 and "`discard t0002`" in told[0] and found.then.verb == "discard"
+
+
+@pytest.mark.parametrize("every", [1, 2, 3])
+def test_a_loop_slower_than_dt_is_told(w, every):
+    """At 50 Hz in place of 100, the run lost `in doubt: it may be bad luck`."""
+    robot, policy = Plant(w.base_model.with_values({"mass": 1.4})), w.candidate("c0002")[0].policy
+    runs = np.repeat(np.arange(0, policy.horizon, every), every)[: policy.horizon]
+    gain, reference = (None if x is None else x[runs] for x in (policy.gain, policy.reference))
+    slow = replace(policy, feedforward=policy.feedforward[runs], gain=gain, reference=reference)
+    trial = robot.run(slow, dict.fromkeys(("x", "v"), 0.0), np.random.default_rng(0))
+    file = w.folder / "t.mcap"
+    held = replace(trial, inputs=trial.inputs[runs], candidate="c0002")
+    write_trial(file, held, {"kind": "trial", "task": w.task.hash})
+    found = w.ingest(file)
+    dt = 1e3 * policy.dt
+    told = [one for one in found.warnings if f"dt is {dt:g} ms" in one]
+    assert len(told) == (every > 1) == (found.then.verb == "discard")
+    assert all(holds(one, f"every {every * dt:g} ms", "c0002", "[task] dt") for one in told)

@@ -265,6 +265,17 @@ def test_a_start_is_no_surer_than_its_states_are_the_controller_s(w, tmp_path):
     assert not any("known to" in one for one in w.ingest(own).warnings)
 
 
+def test_a_log_with_two_runs_says_which_is_taken(w, tmp_path):
+    """One of them was taken, and no word said."""
+    path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 1.0)
+    once = np.loadtxt(path, delimiter=",", skiprows=1)
+    length = once[-1, 0] - once[0, 0] + 1 / RATE
+    twice = np.vstack([once, once + np.array([length, 0, 0, 0])])
+    np.savetxt(path, twice, "%.5f", ",", header="t,x,v,force", comments="")
+    told = [one for one in w.ingest(path).warnings if "in doubt" in one]
+    assert len(told) == 1 and holds(told[0], "1.000 s", f"{1 + length:.3f}", "[log.span] start")
+
+
 def test_the_operator_jogged_the_cart_first(w, tmp_path):
     policy = w.candidate("c0002")[0].policy
     found = w.ingest(record(w, tmp_path / "a.csv", policy, 7.0, jog=1.5))

@@ -80,6 +80,9 @@ def changes_of(t: Ints, values: Floats) -> tuple[Ints, Ints]:
 def held_rows(t: Ints, values: Floats) -> float:
     """Return the interval of rows that repeat a held value [s], by which a change may be late.
 
+    A command that stays at its limits, or at zero before a run, repeats its value as well, however
+    often it is sent. So most values must be repeated, those at the limits aside.
+
     Args:
         t: (N,) stamps [ns].
         values: (N,) a signal stamped at each change, or one that every row repeats.
@@ -88,7 +91,13 @@ def held_rows(t: Ints, values: Floats) -> float:
         0 if rows do not repeat values.
     """
     order = np.argsort(t, kind="stable")
-    if len(t) <= 2 * FEW or np.mean(np.diff(values[order]) == 0) < HELD:
+    y = values[order]
+    if len(t) <= 2 * FEW or np.mean(np.diff(y) == 0) < HELD:
+        return 0.0
+    begins = np.flatnonzero(np.diff(y, prepend=np.nan) != 0)
+    lasts, here = np.diff(begins, append=len(y)), y[begins]
+    inside = (here > y.min()) & (here < y.max())
+    if inside.sum() >= FEW and np.mean(lasts[inside] > 1) < HELD:
         return 0.0
     return float(np.median(np.diff(t[order]))) * 1e-9
 

@@ -33,7 +33,7 @@ from grounded_trials.logs.stated_units import Stated, factor_between
 from grounded_trials.logs.unnamed import from_the_rest
 from grounded_trials.starting.examples import fresh_folder
 from grounded_trials.starting.first_toml import held_first, write_first
-from grounded_trials.starting.interval import interval_of
+from grounded_trials.starting.interval import interval_of, too_coarse
 from grounded_trials.starting.kinds import KINDS, Joints, called_input, kind_in, moving, skeleton
 from grounded_trials.starting.own_model import OwnModel, own_model
 from grounded_trials.store.store import write_atomically
@@ -217,7 +217,9 @@ def _begin(
         )
     slow = () if states_time_unit(files[0]) else _in_seconds(report)
     notes = (*notes, *slow, *wide_joints(states, units, joints, report))
-    step, whose, note = (dt, "", "") if dt else interval_of(report, inputs, states)
+    step, whose, note = (
+        (dt, "", too_coarse(report, inputs, dt)) if dt else interval_of(report, inputs, states)
+    )
     ranges = {g.name: _range(report, g) for g in (*states, *inputs)}
     if chosen != "drone":  # zero is sent after a run, so the limits must include it
         ranges |= {

@@ -84,15 +84,38 @@ def round_interval(rows: float) -> float:
     return float(f"{nearest if abs(nearest / rows - 1) < NEAR else rows:.6g}")
 
 
+def too_coarse(report: LogReport, inputs: Sequence[Guess], dt: float) -> str:
+    """Return a note if the commands of a log change more than once in a given interval; or "".
+
+    Args:
+        report: the log.
+        inputs: the paths of its commands.
+        dt: the interval that the user asked for [s].
+    """
+    gaps = _gaps(report, _commanded(inputs))
+    if len(gaps) < ENOUGH or dt < APART * (apart := float(np.median(gaps))):
+        return ""
+    usual = round_interval(apart)
+    return (
+        f"the log's commands change every {1e3 * usual:.3g} ms: with dt = {1e3 * dt:.3g} ms each "
+        f"step keeps one in {dt / usual:.2g} of them, the one at its middle. --dt {usual:g} keeps "
+        "them all"
+    )
+
+
 def _held(report: LogReport, inputs: Sequence[Guess], rows: float) -> float | None:
     """Return the interval at which commands change if they are logged more often, else None."""
+    return changes_every(_gaps(report, inputs), rows)
+
+
+def _gaps(report: LogReport, inputs: Sequence[Guess]) -> Array:
+    """Return the times between changes of a log's commands [s]; none if they can't be read."""
     specs = {g.name: SignalSpec(g.path, clock=g.clock) for g in inputs if g.path}  # type: ignore[arg-type]
     try:
         found = read_signals(report.files, specs)
     except GroundedError:  # reported later, when the run is sampled
-        return None
-    gaps = np.concatenate([_between_changes(one) for one in found.values()])
-    return changes_every(gaps, rows)
+        return np.zeros(0)
+    return np.concatenate([np.zeros(0), *map(_between_changes, found.values())])
 
 
 def _between_changes(series: Series) -> Array:

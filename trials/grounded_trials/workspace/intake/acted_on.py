@@ -64,9 +64,18 @@ class ActedOn:
         return np.isfinite(self.off)
 
     @property
+    def enough(self) -> bool:
+        """Whether enough steps are informative; few are if all are the policy's to the last digits.
+
+        An input at its limits most of the time leaves few.
+        """
+        few = self.told.sum() >= FEW and float(self.off[self.told].max()) < EXACT
+        return bool(few or self.told.sum() >= LEAST)
+
+    @property
     def exact(self) -> bool:
         """Whether at least half of the commands are the policy's to the last digits."""
-        return bool(self.told.sum() >= LEAST and self.left < EXACT)
+        return self.enough and self.left < EXACT
 
     @property
     def throughout(self) -> bool:
@@ -128,6 +137,19 @@ def acted_on(log: Recording, policy: Policy, start: float) -> ActedOn | None:
     free = ((u > policy.low) & (u < policy.high)) | ((sent > policy.low) & (sent < policy.high))
     off = np.sqrt((((u - sent) / size) ** 2).mean(axis=1))
     return ActedOn(np.where(free.any(axis=1), off, np.nan), u, size)
+
+
+def held_before(log: Recording, start: float, steps: int) -> Array:
+    """Return the last samples of the states before each command was sent, (steps, n).
+
+    Args:
+        log: the log.
+        start: the time of the first step, seconds after the log's first sample.
+        steps: the number of steps.
+    """
+    samples = _Samples.of(log, round(start * 1e9), steps)
+    now = np.zeros(1)
+    return np.stack([samples._aged(i, now, True)[0] for i in range(len(samples.states))], axis=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,8 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.search.planner import predicted
-from grounded.search.returned.who_drove import second_differences
+from grounded.search.returned.who_drove import LEAST, second_differences
+from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.wording import in_digits_apart, with_unit
 from grounded_trials.workspace.folder import Folder
@@ -46,7 +47,8 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
     A state that [reward] weighs along the way is judged by the cost of its offset relative to a
     mean step of the run, the most costly first; another state relative to its range in the run.
     Offsets within the scatter of earlier starts are unavoidable, and tolerated unless they spoil
-    the utility by the model.
+    the utility by the model. Of a run that left [safety], only the part before counts: a robot on
+    the floor makes every start seem near.
 
     Args:
         workspace: the workspace with the task, the model and the earlier runs.
@@ -58,7 +60,8 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
     if not trial.candidate or trial.finite_steps < 0:
         return []
     off = task.model.difference(trial.states[0], task.start)
-    states = trial.states[: trial.finite_steps + 1]
+    states = _inside(task, trial.states[: trial.finite_steps + 1])
+    failed = len(states) <= trial.finite_steps
     usual = np.ptp(states, axis=0)
     jumps = np.abs(second_differences(states, task.model.angle_mask))
     noise = np.median(jumps, axis=0) / WHITE if len(jumps) else np.zeros(len(usual))
@@ -73,7 +76,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
     if len(before) >= FEWEST:
         beyond = (np.abs(off) > SURE * before.std(axis=0, ddof=1)) | (share > MUCH)
     found, real = [], abs(task.utility(trial))
-    cost = real if np.isfinite(real) else -_promised(workspace, trial)
+    cost = real if np.isfinite(real) and not failed else -_promised(workspace, trial)
     for i in sorted(np.flatnonzero(told), key=lambda i: (weight[i] == 0, -share[i])):
         changes = _changes(workspace, trial, off * (np.arange(len(off)) == i))
         again = abs(changes) > SPOILT * cost
@@ -99,6 +102,13 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
             )
         )
     return found
+
+
+def _inside(task: Task, states: Array) -> Array:
+    """Return the states before they left [safety], at least a few; all if they never did."""
+    assert task.safety_low is not None and task.safety_high is not None
+    out = ((states < task.safety_low) | (states > task.safety_high)).any(axis=1)
+    return states[: max(int(np.argmax(out)), LEAST)] if out.any() else states
 
 
 def _starts_before(workspace: Folder, identity: str) -> Array:

@@ -38,10 +38,10 @@ from grounded_trials.workspace.intake.gone_wrong import gone_wrong
 from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.intake.log_faults import dead_sensors, log_faults, mistaken_in
 from grounded_trials.workspace.intake.look import Look
+from grounded_trials.workspace.intake.misused_run import exactly_misused, misused_in
 from grounded_trials.workspace.intake.odd_run import odd_run
 from grounded_trials.workspace.intake.read_otherwise import (
     misled,
-    misused_in,
     pace_of,
     rather_exchanged,
     unit_of,
@@ -61,8 +61,10 @@ from grounded_trials.workspace.intake.reading import (
 from grounded_trials.workspace.intake.run_start import (
     LOOSE,
     Recording,
+    doubtful,
     loosely,
 )
+from grounded_trials.workspace.intake.skipped_steps import steps_skipped
 from grounded_trials.workspace.intake.stored_before import (
     as_stored,
     estimated_otherwise,
@@ -141,7 +143,9 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     history = now.history if now else ()
     tried = next((t for t in history if t.candidate.id == trial.candidate), None)
     verdict = ASIDE if aside else _verdict(trial, tried, workspace.config.search.repeats)
-    wrong = any(one.again for one in elsewhere)
+    slow = "" if read.doubted else steps_skipped(workspace, trial)
+    warnings = (*filter(None, [slow]), *warnings)
+    wrong = bool(slow) or any(one.again for one in elsewhere)
     if not (odd or wrong or aside):
         asked = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
         warnings, wrong = (*filter(None, [asked]), *warnings), bool(asked)
@@ -220,8 +224,10 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     if look.read.log and look.read.cut:  # states may be unknown when the run begins
         look.read.log.refuse_late(look.read.cut)
     read, log, found, whole, seen = look.read, look.log, look.found, look.whole, look.suspicion
-    if found and found.alike and found.loose_s > LOOSE * workspace.task.dt:
-        read = replace(read, warnings=(*read.warnings, loosely(found.loose_s, ran)))
+    if found and found.alike:
+        loose = found.loose_s > LOOSE * workspace.task.dt and not look.exact
+        unsure = filter(None, [loosely(found.loose_s, ran) if loose else "", doubtful(found, ran)])
+        read = replace(read, warnings=(*read.warnings, *unsure))
     why, other = seen.why, seen.other
     fell, stored = look.fell, read.log.stored if read.log else ()
     task = workspace.task
@@ -240,6 +246,9 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         if fell:
             read = cut_short(read, fell.steps, fell.told)
         return replace(read, warnings=(*read.warnings, *told))
+    passed = exactly_misused(log, task, own) if log and why and not other else ""
+    if passed and candidate is None:
+        raise _misused(path, own, passed)
     slow = pace_of(log, task, own) if log and not other else None
     if slow:  # a recording at another rate may look like one in another unit
         units = ()
@@ -255,7 +264,9 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     )
     if candidate is not None:
         seem = f"with {listed(units)} times {by:.6g} it is its run: another unit, or sign?"
-        doubts = [seem if units else pace or misled(None if other else log, task, own) or why]
+        gone = passed and f"its commands are not what {ran} sends on the logged states: {passed}"
+        also = gone or misled(None if other else log, task, own)
+        doubts = [seem if units else pace or also or why]
         if log and not (found and found.opens_alike):
             doubts.append(
                 f"no start of {ran} was found in it: the run is assumed to begin with the first "
@@ -263,8 +274,9 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
             )
         return replace(read, warnings=(*read.warnings, *doubts), doubted=True)
     if units:
-        if log and _in_programs_unit(task.model, units, by):
-            _refuse_misused(path, log, task, own)
+        its = log and _in_programs_unit(task.model, units, by)
+        if log and its and (how := misused_in(log, task, own)):
+            raise _misused(path, own, how)
         other_unit = units_told(task.model, units, by, read.log is not None)
         raise GroundedError(f"{path} ran {ran}, {other_unit}")
     if pace:
@@ -294,8 +306,8 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         named += filter(None, [misled(log, task, own)])
     if named:
         raise GroundedError(f"{path} can't be read as a run of {ran}: {'; '.join(named)}")
-    if log and not other and whole.inputs.any():
-        _refuse_misused(path, log, task, own)
+    if log and not other and whole.inputs.any() and (how := misused_in(log, task, own)):
+        raise _misused(path, own, how)
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
     if guessed := sorted(_guessed(log)):
         said += (
@@ -329,15 +341,14 @@ def _in_programs_unit(model: Model, names: Sequence[str], by: float) -> bool:
     return bool(known) and turning <= {*names}
 
 
-def _refuse_misused(path: Path, log: Recording, task: Task, own: Candidate) -> None:
-    """Raise an error if the robot's program misused its candidate, with how and the remedy."""
-    if told := misused_in(log, task, own):
-        raise GroundedError(
-            f"{path} did not run {own.id} as it should: its commands are not what {own.id} sends "
-            f"on the logged states and times; {told}, and run {own.id} again. Ingest it with "
-            "--data for fitting and diagnosis",
-            NextCommand("ingest", (str(path), "--data")),
-        )
+def _misused(path: Path, own: Candidate, told: str) -> GroundedError:
+    """Return the error that the robot's program misused its candidate, with the remedy."""
+    return GroundedError(
+        f"{path} did not run {own.id} as it should: its commands are not what {own.id} sends "
+        f"on the logged states and times; {told}, and run {own.id} again. Ingest it with "
+        "--data for fitting and diagnosis",
+        NextCommand("ingest", (str(path), "--data")),
+    )
 
 
 def _lasting(log: Recording, task: Task) -> str:

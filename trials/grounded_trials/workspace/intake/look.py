@@ -44,7 +44,7 @@ class Look:
     ) -> None:
         ran, judged = read.trial.candidate, partial(suspicion, task, own=own, others=candidates)
         apart = None if log is read.log else log  # set if judged on other samples than stored
-        self.read, self.found = read, None
+        self.read, self.found, self.exact = read, None, False
         self.whole = interpolate_gaps(apart.cut(ran)[0] if apart else read.trial).trial
         seen = judged(self.whole)
         if read.bare and (alone := judged(self.whole, others=())).why:
@@ -57,6 +57,7 @@ class Look:
                 self._cut(read.log, apart, found, own, task)
                 seen = judged(self.whole)
             sender = sender_of(self.log, own, candidates, start_of)
+            self.exact = sender.own is not None and sender.own.exact
             if sender.sure:
                 seen = replace(seen, why="", other="")
             elif sender.other:

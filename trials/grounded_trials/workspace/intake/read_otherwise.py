@@ -16,7 +16,6 @@ from grounded.policy import Policy
 from grounded.result import listed
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart, like_predicted, multiplied
-from grounded.search.returned.misused import misused
 from grounded.search.returned.other_scale import (
     NEARLY,
     THOUSAND,
@@ -107,23 +106,6 @@ def misled(log: Recording | None, task: Task, own: Candidate) -> str:
             f"[log.{of}.{a}] and [log.{of}.{b}], or the column headers in the log"
         )
     return _off_zero(task, offset_in(log, task, own))
-
-
-def misused_in(log: Recording, task: Task, own: Candidate) -> str:
-    """Return how the robot's program misused its candidate, and the remedy; or "".
-
-    Args:
-        log: a log in which no run of the candidate was found: its commands don't tell where.
-        task: the task with the control step.
-        own: the candidate.
-    """
-    for begins in dict.fromkeys([log.first, *log.openings[:TRIED]]):
-        if trial := log.trial_from(begins):
-            run = trial.until(min(trial.finite_steps, task.horizon))
-            plain = follows(own.policy, run, latest(task))
-            if plain and not plain.beyond and (told := misused(task, own, run, plain)):
-                return told
-    return ""
 
 
 def zero_in(

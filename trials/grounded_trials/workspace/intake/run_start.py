@@ -15,7 +15,7 @@ respond to where the robot was then.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -67,6 +67,7 @@ class Start:
     loose_s: float = 0.0  # uncertainty of the start [s]
     missed: int = 0  # steps of the run before the first command, which were not sent
     exact: bool = False  # most commands are the policy's to the last digits, and no part is not
+    rival_s: float | None = None  # another start, far from it, that fits about as well
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +87,7 @@ class Recording:
     changes: Array  # when a command changed in the log, seconds after the log's first sample
     late: Array  # by how much each change may appear late [s]; 0 if commands have own stamps
     interval: float  # between samples [s]
+    _cut: dict[float, Trial | None] = field(init=False, default_factory=dict)  # by start
 
     @property
     def first(self) -> float:
@@ -94,6 +96,11 @@ class Recording:
 
     def trial_from(self, start: float) -> Trial | None:
         """Return the log as a trial from `start` [s] on, or None if a state is not known there."""
+        if start not in self._cut:
+            self._cut[start] = self._trial_from(start)
+        return self._cut[start]
+
+    def _trial_from(self, start: float) -> Trial | None:
         span = Span(start=start)
         try:
             cut = to_grid(
@@ -154,14 +161,20 @@ class Recording:
         if len(near) == 1:
             return likeliest
         fits = [(acted_on(self, policy, one.seconds), one) for one in near or [likeliest]]
-        told = [(fit, one) for fit, one in fits if fit is not None and fit.told.sum() >= LEAST]
+        told = [(fit, one) for fit, one in fits if fit is not None and fit.enough]
         fit, best = min(told, key=lambda pair: pair[0].left, default=(None, likeliest))
         if fit is not None and fit.throughout:
-            return replace(best, alike=True, opens_alike=True, exact=True)
-        usual = next((other.left for other, one in told if one is likeliest), np.inf)
+            rival = self._rival(best, [one for fit, one in told if fit.throughout])
+            return replace(best, alike=True, opens_alike=True, exact=True, rival_s=rival)
+        usual = next((other.left for other, one in told if one is likeliest), 0.0)
         if fit is not None and alike and fit.left < SAME * usual:
             return replace(best, opens_alike=True)
-        return likeliest if alike else None
+        return replace(likeliest, rival_s=self._rival(likeliest, near)) if alike else None
+
+    def _rival(self, found: Start, others: Sequence[Start]) -> float | None:
+        """Return the likeliest of the other starts far from the one found [s], or None."""
+        apart = [one for one in others if abs(one.seconds - found.seconds) > LEAST * self.dt]
+        return min(apart, key=lambda one: one.apart).seconds if apart else None
 
     def _by_its_samples(self, policy: Policy, strays: Array) -> Start | None:
         """Find where the first commands are the policy's to the last digits, on samples of any age.
@@ -219,7 +232,7 @@ class Recording:
             fit = None if trial is None else follows(policy, trial.until(policy.horizon), 0)
             if trial is not None and fit is not None:
                 alike = fit.alike and not fit.late and _close(policy, trial)
-                opens = alike or fit.until_s >= LEAST * self.dt
+                opens = alike or fit.opens
                 between = seconds < on_step
                 found.append(Start(seconds, float(apart[k]), alike, opens, between, loose))
         return found
@@ -230,6 +243,10 @@ class Recording:
         if not 0 <= k < len(self.whole.inputs):
             return np.inf
         return float(instants_apart(self.whole, self.parts, policy, range(k, k + 1))[0][k])
+
+    def on_step(self, policy: Policy, start: float) -> float:
+        """Move a start by less than a step to where commands change [s]."""
+        return self._on_step(policy, start)[0]
 
     def _on_step(self, policy: Policy, start: float) -> tuple[float, float]:
         """Move a start by less than a step to where commands change; return its uncertainty too."""
@@ -367,6 +384,17 @@ def elsewhere(log: Recording, found: Start, policy: Policy, why: str) -> bool:
     if not found.opens_alike or abs(found.seconds - log.first) <= ALIGNED * log.interval:
         return False
     return bool(why) or found.exact or found.apart < CLEARLY * log.apart_at(policy, log.first)
+
+
+def doubtful(found: Start, ran: str) -> str:
+    """Return the warning for a start beside which another one fits about as well; or ""."""
+    if found.rival_s is None:
+        return ""
+    return (
+        f"where {ran} begins is in doubt: its commands fit about as well from {found.rival_s:.3f} "
+        f"s of the log on as from {found.seconds:.3f} s, which is used. If the run began "
+        "elsewhere, or the log has several, `discard` it and set [log.span] start = SECONDS"
+    )
 
 
 def loosely(seconds: float, ran: str) -> str:
