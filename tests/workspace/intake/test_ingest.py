@@ -131,18 +131,28 @@ def test_a_start_is_no_warning_where_earlier_ones_scatter_as_far(w, tmp_path):
     assert "no need to repeat it" in told[0][0] and "`discard t0005`" in told[-1][0]
 
 
-def test_a_start_that_spoils_a_run_is_told_however_earlier_ones_scatter(w, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("part", "lost", "told"),
+    [(0.5, 0.0, True), (0.1, 0.05, True), (0.1, 0.2, False)],  # of its cost; axes lost 12 %
+)
+def test_a_start_that_spoils_a_run_is_told_however_earlier_ones_scatter(
+    w, tmp_path, monkeypatch, part, lost, told
+):
     """A balancer that began 4.5 cm away lost by "bad luck": two runs had begun as far."""
     ran, *_ = read_trial(run(w))
-    a_step = np.sqrt(-w.task.utility(ran) / len(ran.states) / 10)
+    cost = -w.task.utility(ran)
+    a_step = np.sqrt(cost / len(ran.states) / 10)
     for off in (0.7, -0.7, 0.6):
         moved = np.array(ran.states)
         moved[0, 0] += off * a_step
         write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
         if off == 0.6:  # as if the model were unstable
-            monkeypatch.setattr(begun, "_changes", lambda *_: 0.5 * w.task.utility(ran))
+            monkeypatch.setattr(begun, "_changes", lambda *_: -part * cost)
+            monkeypatch.setattr(begun, "_lost_by", lambda *_: lost * cost)
         warnings = ingest_log(w, tmp_path / "t.mcap", "c0001").warnings
-    assert any("the run started with" in one and "`discard t0003`" in one for one in warnings)
+    assert any("the run started with" in one and "`discard t0003`" in one for one in warnings) == (
+        told
+    )
 
 
 @pytest.mark.parametrize("data", [False, True])

@@ -318,14 +318,18 @@ class Check:
             )
 
     def _coasting(self) -> str:
-        """Return where the robot leaves [safety] after the run, with the input held then; or ""."""
+        """Return where the robot goes after the run, with the input held then; or ""."""
         from grounded.search.safety import coasts_out
+        from grounded_trials.workspace.intake.after_run import kicked
 
         made, planner = self.candidate, self.workspace.planner
         run = planner.lift(made.predicted_run)
         held = np.clip(made.policy.past, made.policy.low, made.policy.high)
         out = coasts_out(self.workspace.task, planner.plan, run, held)
-        return f"after {made.id} ends {out}" * bool(out)
+        if out:
+            return f"after {made.id} ends {out}"
+        kick = kicked(planner, run, held)
+        return f"{made.id}: {kick}" * bool(kick)
 
     @property
     def void(self) -> bool:

@@ -31,6 +31,7 @@ EXPORT = NextCommand("export", ("best", "--runner"))
 REPORT = NextCommand("report", ("--html",))
 TARGET = NextCommand("target", ("SHAPE",))
 SHORT = 0.1  # fraction of a control step: shorter filters and delays make no difference
+TRUE = 0.05  # of a utility: a prediction that misses by less came true
 SAME = 1e-6  # relative tolerance for values that were written with eight digits
 
 
@@ -93,9 +94,24 @@ def _follows(
     if now.phase == "propose":
         logs = follow is not None and not now.history
         return DIAGNOSE if logs or doubted(now, since, usable) else PROPOSE
-    if since.changed or since.newer:
+    if (since.changed or since.newer) and not _came_true(workspace, now, diagnosis):
         return DIAGNOSE
     return another_trial(workspace, now) if diagnosis.no_cause else EXPORT
+
+
+def _came_true(workspace: Folder, now: Standing, diagnosis: Diagnosis) -> bool:
+    """Return whether a search has ended as predicted, with all adopted that was found before.
+
+    A diagnosis of that model would then find little.
+    """
+    best, model = now.incumbent, workspace.planner.fingerprint
+    adopted = {str(effect["name"]) for effect in workspace.config.model.effects}
+    found = {*diagnosis.verdict.effects}
+    if not found or not found <= adopted or now.doubt or now.then:
+        return False
+    if best is None or best.candidate.model != model:
+        return False
+    return abs(best.promised - best.utility) <= TRUE * abs(best.utility)
 
 
 def doubted(now: Standing, since: Since | None, usable: Sequence[str]) -> bool:

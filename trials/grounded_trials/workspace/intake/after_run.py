@@ -24,6 +24,7 @@ from grounded_trials.wording import with_unit
 from grounded_trials.workspace.off_target import reaches, weighed_groups
 
 AWAY = 0.02  # drift after a run, relative to the target's extent, above which it is reported
+LAST_STEPS, AT_LIMIT = 3, 1e-3  # steps of a kick; distance from a limit, as a share of the range
 SETTLED = 5.0  # [s] for which an input is held until the memory of effects has settled
 CAUSED = 0.5  # share of the drift that the model must predict from rest, under the input held
 GROWS = 1.5  # of a push, not of a speed: the second half of the drift exceeds the first by this
@@ -38,6 +39,42 @@ def afterwards(planner: Planner, whole: Trial) -> list[str]:
         whole: the run with the seconds that follow it.
     """
     return _left_afterwards(planner.task, whole) or _moved_on(planner, whole)
+
+
+def kicked(planner: Planner, run: Trial, held: Array) -> str:
+    """Return a warning if a plan reaches its target only by a last command at its limit; or "".
+
+    Weights of the last state alone are met by a kick in the last steps, for one sample: by the
+    model, the robot leaves the target in the next second.
+
+    Args:
+        planner: the task, and the model with adopted effects.
+        run: the predicted run, with the planning model's states.
+        held: the input that is sent after it (m,).
+    """
+    task = planner.task
+    groups = weighed_groups(task) if reaches(task) else []
+    ends = np.vstack([task.low, task.high])
+    full = np.ptp(np.where(np.isfinite(ends), ends, 0.0), axis=0) * AT_LIMIT
+    at = (np.abs(run.inputs[-LAST_STEPS:] - ends[:, None]) <= full).any(axis=(0, 1))
+    at &= ~(np.abs(held - ends) <= full).any(axis=0) & (full > 0)
+    if not groups or not at.any():
+        return ""
+    names, what = groups[0]
+    states = [task.model.state_names.index(name) for name in names]
+    after = coasting(planner.plan, run, held)[: 1 + math.ceil(1.0 / task.dt), : task.model.n]
+    off = np.linalg.norm(task.model.difference(after, task.target[-1])[:, states], axis=1)
+    way = np.linalg.norm(np.ptp(np.vstack([task.start, task.target])[:, states], axis=0))
+    worst = int(np.argmax(off))
+    if not off[worst] > max(AWAY * way, 2 * off[0]):
+        return ""
+    later, then = measured_alike([off[worst], off[0]], task.model.states[names[0]])
+    sent = listed(name for name, odd in zip(task.model.input_names, at, strict=True) if odd)
+    return (
+        f"it ends with {sent} at a limit and reaches its target for one sample only: the model "
+        f"predicts {what} {later} from it {worst * task.dt:.2g} s later, {then} at the end. Let "
+        "the target rest for longer (`grounded target --hold`), or lower [reward] terminal"
+    )
 
 
 def _moved_on(planner: Planner, whole: Trial) -> list[str]:

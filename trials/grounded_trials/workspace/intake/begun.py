@@ -47,8 +47,9 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
     A state that [reward] weighs along the way is judged by the cost of its offset relative to a
     mean step of the run, the most costly first; another state relative to its range in the run.
     Offsets within the scatter of earlier starts are unavoidable, and tolerated unless they spoil
-    the utility by the model. Of a run that left [safety], only the part before counts: a robot on
-    the floor makes every start seem near.
+    the utility by the model: by much of it, or by more than the run lost to the best candidate. Of
+    a run that left [safety], only the part before counts: a robot on the floor makes every start
+    seem near.
 
     Args:
         workspace: the workspace with the task, the model and the earlier runs.
@@ -77,9 +78,10 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
         beyond = (np.abs(off) > SURE * before.std(axis=0, ddof=1)) | (share > MUCH)
     found, real = [], abs(task.utility(trial))
     cost = real if np.isfinite(real) and not failed else -_promised(workspace, trial)
+    lost = _lost_by(workspace, trial)
     for i in sorted(np.flatnonzero(told), key=lambda i: (weight[i] == 0, -share[i])):
         changes = _changes(workspace, trial, off * (np.arange(len(off)) == i))
-        again = abs(changes) > SPOILT * cost
+        again = abs(changes) > SPOILT * cost or 0 < lost < -changes
         if not (beyond[i] or again):
             continue
         name, unit = list(task.model.states.items())[i]
@@ -109,6 +111,16 @@ def _inside(task: Task, states: Array) -> Array:
     assert task.safety_low is not None and task.safety_high is not None
     out = ((states < task.safety_low) | (states > task.safety_high)).any(axis=1)
     return states[: max(int(np.argmax(out)), LEAST)] if out.any() else states
+
+
+def _lost_by(workspace: Folder, trial: Trial) -> float:
+    """Return by how much a run is worse than the best other candidate's mean; <= 0 if it is not."""
+    task, each = workspace.task, dict[str, list[float]]()
+    for one in workspace.task_trials():
+        if one.candidate and one.candidate != trial.candidate:
+            each.setdefault(one.candidate, []).append(task.utility(one))
+    best = max((sum(some) / len(some) for some in each.values()), default=-np.inf)
+    return float(best - task.utility(trial)) if np.isfinite(best) else 0.0
 
 
 def _starts_before(workspace: Folder, identity: str) -> Array:
