@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.hypotheses.attribution import USUAL_EFFECTS, attribute, grown, so_far
-from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
+from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data, prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -199,6 +199,7 @@ def diagnose(
     used = [trial for trial in trials if trial.known_steps >= 2]
     task = subject if isinstance(subject, Task) else None
     written: Writer | None = None
+    before, once_more = best, True
 
     def found_so_far() -> str:
         return so_far(search, most, written.claims.names if written else None)
@@ -226,13 +227,18 @@ def diagnose(
             )
             if written and not writer.worth_more_than(written):
                 written.most = most  # one more was sought
-                break
-            written = writer
-            if options.max_effects or not (most < MOST_EFFECTS and writer.unfinished):
-                break
+                # two effects may be needed for what neither predicts better alone
+                likelier = search.score(best) > search.score(before) + LARGE_GAIN
+                if not (once_more and likelier and most < MOST_EFFECTS):
+                    break
+                once_more = False
+            else:
+                written, once_more = writer, True
+                if options.max_effects or not (most < MOST_EFFECTS and writer.unfinished):
+                    break
             most += 1
             tick("more effects")
-            best = grown(search, best, most)
+            before, best = best, grown(search, best, most)
         groups = [k < first for k in range(data.count)]
         apart = compared(search, written.decision.fit, groups) if compare else None
         found = written.diagnosis(apart)

@@ -77,14 +77,17 @@ class Writer:
     def unfinished(self) -> bool:
         """Whether as many effects as were looked for leave more than noise, or promise another one.
 
-        Nothing need be above a floor that holds the model's own error too (`at_most`): there
-        evidence is asked.
+        That is also so if one of them was dropped: beside a further one it may be needed. Nothing
+        need be above a floor that may hold the model's own error too, as any without repeats does:
+        there evidence is asked.
         """
-        if self.known.no_cause or len(self.claims.names) < self.most:
+        likely = len(self.search.chosen(self.most).hypothesis.names)
+        if self.known.no_cause or max(likely, len(self.claims.names)) < self.most:
             return False
         if any(one.above for one in self.measured.remainders()):
-            return True
-        return self.measured.at_most and promised(self.search, self.best) > SURE
+            return bool(self.claims.names)
+        full = len(self.claims.names) >= self.most and self.measured.source == "short horizon"
+        return full and promised(self.search, self.best) > SURE
 
     def worth_more_than(self, other: Writer) -> bool:
         """Whether predictions gain by one effect more what is worth a name (`SLIGHT`)."""

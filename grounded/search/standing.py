@@ -300,8 +300,10 @@ def let_down(ended: Standing, model: str) -> Standing:
     for tried in ended.history:
         made = tried.candidate
         error, known = error_between(best, tried, ended.history)
-        short = best.utility + made.predicted_gain - tried.utility
-        if made in lost and not made.doubtful and not (known and short <= LUCK * error):
+        loss, noise = best.utility - tried.utility, LUCK * error if known else 0.0
+        short = loss + made.predicted_gain
+        luck = short <= noise or max(loss, made.predicted_gain) <= noise
+        if made in lost and not made.doubtful and not luck:
             missed.append(made.predicted_gain)
     if not missed or not max(missed) > LITTLE * -best.utility:
         return ended
