@@ -183,6 +183,20 @@ def counted(effect: Effect, acting: Sequence[Effect]) -> str:
     return f", counted {'before' if at < gains[0] else 'after'} the change of {gain}"
 
 
+def other_unit(name: str, params: Mapping[str, Estimate]) -> str:
+    """Return a clause for an input's gain of about a power of ten: its log may be in another unit.
+
+    "" for any other gain or effect.
+    """
+    if not name.startswith("input_gain:") or not params["g"].value > -1:
+        return ""
+    power = round(math.log10(1 + params["g"].value))
+    if not power or abs((1 + params["g"].value) / 10.0**power - 1) > AS_STRONG:
+        return ""
+    ratio = f"{10.0 ** abs(power):,.0f}"
+    return f" (about {ratio if power > 0 else f'1/{ratio}'}: is the log in another unit?)"
+
+
 def acts_reversed(params: Mapping[str, Estimate]) -> bool:
     """Return whether the values of an effect are a gain that reverses the sign."""
     return "g" in params and params["g"].value < -1

@@ -14,6 +14,7 @@ from grounded.diagnosis.cause_words import (
     disagreement,
     give_or_take,
     meaning,
+    other_unit,
     wider,
 )
 from grounded.diagnosis.error_report import (
@@ -200,6 +201,7 @@ def _causes(
     for one in credit:
         if one.of in effects:
             text = meaning(effects[one.of], values[one.of])
+            text += other_unit(one.of, values[one.of])
             text += counted(effects[one.of], acting)
             if one.share < BARELY and one.of in claims.held_up:
                 text += f", without which {listed(claims.held_up[one.of])} would end at a bound"

@@ -13,6 +13,7 @@ from grounded.diagnosis.cause_words import (
     counted,
     disagreement,
     meaning,
+    other_unit,
 )
 from grounded.diagnosis.report import Agreement, Estimate, TrialValue
 from grounded.diagnosis.verdict import _apart
@@ -140,3 +141,21 @@ def test_a_cause_on_which_trials_disagree_stands_alone():
     causes = [meaning(effects[n], VALUES[n]) for n in effects]
     causes[1] += f", {DISAGREE}: c = 0.1 to 0.4"
     assert len(clauses([*effects], causes, [0.4, 0.3, 0.2, 0.1], effects, VALUES)) == 4
+
+
+@pytest.mark.parametrize(
+    ("g", "said"),
+    [
+        (-0.908, "about 1/10"),
+        (8.6, "about 10"),
+        (-0.99, "1/100"),
+        (-0.8, ""),
+        (0.3, ""),
+        (-1.9, ""),
+    ],
+)
+def test_a_gain_of_a_power_of_ten_asks_for_the_unit_of_the_log(g, said):
+    """A thrust in percent was 90.8 % weaker than modelled, to be adopted."""
+    told = other_unit("input_gain:thrust", {"g": Estimate(g, 0.01)})
+    assert (said in told and "unit" in told) if said else told == ""
+    assert other_unit("delay:thrust", {"d": Estimate(g, 0.01)}) == ""
