@@ -37,6 +37,7 @@ FULL_TURNS = 4 * np.pi  # [rad] range of an angle that suggests degrees (or a wh
 SOON = 0.1  # [s] horizon: a very crude model soon diverges
 CONCORDANT, PLAINLY = 0.1, 1.5  # least concordance, and factor by which it must exceed others
 SMALL = 1.0  # [rad] angles that stay below it are not in degrees
+SEEN = 0.5  # of a motion: a prediction that misses by less sees it
 FEW, CLEAR = 120, 1.0  # samples of a trial to predict from, and gain [nats] of the calibrated model
 WHOLE = 0.3  # least concordance of each angle with the motion by its rate
 
@@ -321,4 +322,6 @@ def _calibrated_as_degrees(model: Model, trial: Trial, shown: Sequence[int], odd
     strong = (free.gains > odd.factor / LIKE) & (free.gains < odd.factor * LIKE)
     if free.score - np.log(rms).sum() < CLEAR and not strong.all():
         return False
-    return bool(gained.sum() > CLEAR and gained.max() > np.log(2.0))
+    most = int(gained.argmax())
+    predicted = rms[most] < SEEN * logged.moved[most]  # or no unit makes the log predictable
+    return bool(predicted and gained.sum() > CLEAR and gained[most] > np.log(2.0))

@@ -97,17 +97,20 @@ def test_evidence_tells_what_one_effect_more_promises():
 
 
 @pytest.mark.parametrize(
-    ("bound", "nats", "more"), [(True, 60.0, True), (True, 5.0, False), (False, 60.0, False)]
+    ("source", "nats", "more"),
+    [("short horizon", 60.0, True), ("short horizon", 5.0, False), ("repeats", 60.0, False)],
 )
-def test_evidence_is_asked_where_the_noise_floor_is_a_bound_only(monkeypatch, bound, nats, more):
+def test_evidence_is_asked_where_the_noise_floor_is_a_bound_only(monkeypatch, source, nats, more):
     """A ball's camera was 50 ms late, 119 nats: nothing stood above a floor that held the delay."""
     monkeypatch.setattr("grounded.diagnosis.writer.promised", lambda search, fit: nats)
     writer = SimpleNamespace(
         known=SimpleNamespace(no_cause=False),
         claims=SimpleNamespace(names=("a", "b", "c")),
-        measured=SimpleNamespace(remainders=tuple, at_most=bound),
+        measured=SimpleNamespace(remainders=tuple, source=source),
         most=3,
-        search=None,
+        search=SimpleNamespace(
+            chosen=lambda most: SimpleNamespace(hypothesis=SimpleNamespace(names=("a", "b", "c")))
+        ),
         best=None,
     )
     assert Writer.unfinished.fget(writer) is more

@@ -268,7 +268,7 @@ def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
     """
     values = vars(candidate) | {"task": task.hash}
     meta = {"kind": kind} | {
-        name: repr(values[name]) if of is float else _text(values[name])
+        name: repr(float(values[name])) if of is float else _text(values[name])
         for name, of in _FIELDS.items()
     }
     data, table = encoded_candidate(

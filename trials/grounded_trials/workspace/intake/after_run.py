@@ -24,6 +24,7 @@ from grounded_trials.wording import with_unit
 from grounded_trials.workspace.off_target import reaches, weighed_groups
 
 AWAY = 0.02  # drift after a run, relative to the target's extent, above which it is reported
+REACHED = 0.05  # of the target's extent: a plan that ends farther away does not reach it
 LAST_STEPS, AT_LIMIT = 3, 1e-3  # steps of a kick; distance from a limit, as a share of the range
 SETTLED = 5.0  # [s] for which an input is held until the memory of effects has settled
 CAUSED = 0.5  # share of the drift that the model must predict from rest, under the input held
@@ -66,7 +67,7 @@ def kicked(planner: Planner, run: Trial, held: Array) -> str:
     off = np.linalg.norm(task.model.difference(after, task.target[-1])[:, states], axis=1)
     way = np.linalg.norm(np.ptp(np.vstack([task.start, task.target])[:, states], axis=0))
     worst = int(np.argmax(off))
-    if not off[worst] > max(AWAY * way, 2 * off[0]):
+    if off[0] > REACHED * way or not off[worst] > max(AWAY * way, 2 * off[0]):
         return ""
     later, then = measured_alike([off[worst], off[0]], task.model.states[names[0]])
     sent = listed(name for name, odd in zip(task.model.input_names, at, strict=True) if odd)
