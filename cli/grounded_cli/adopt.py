@@ -9,7 +9,7 @@ import click
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, remark, sentence, show, show_json
-from grounded_trials.wording import ALONE, with_unit
+from grounded_trials.wording import ALONE, misread, with_unit
 
 if TYPE_CHECKING:
     from grounded_trials import Workspace
@@ -82,8 +82,8 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
         family, _, state = str(effect["name"]).partition(":")
         if family == "sensor_bias" and effect["name"] in effects:
             b = effect["b"]
-            high, low = with_unit(f"{abs(b):.3g}", units[state]), "low" if b < 0 else "high"
-            remark("note", BIASED.format(state=state, by=f"{high} too {low}", off=-b, bias=b))
+            by = misread(b, units[state])
+            remark("note", BIASED.format(state=state, by=by, off=-b, bias=b))
         if family == "sensor_scale" and effect["name"] in effects:
             more, by = "more" if effect["k"] > 0 else "less", 100 * abs(effect["k"])
             remark("note", SCALED.format(state=state, by=by, more=more))

@@ -133,13 +133,15 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
         return f"{own}, so it does not reproduce those runs"
     if not math.isfinite(candidate.base_as_run):
         return own
-    elsewhere, parts = began_elsewhere(task, best.trials, estimated), []
+    elsewhere = began_elsewhere(task, best.trials, estimated)
     start = same - candidate.base_as_run if elsewhere else 0.0
-    parts.append((start, f"its runs began away from [task] start in {listed(elsewhere)}"))
     each = [task.utility(trial) for trial in best.trials]
     mean = task.utility(mean_trial(best.trials, task.model.angle_mask)) - sum(each) / len(each)
-    parts.append((mean, "it replays their mean, without their scatter"))
-    parts = [(part, why) for part, why in parts if abs(part) > told]
+    reasons = (
+        (start, f"its runs began away from [task] start in {listed(elsewhere)}"),
+        (mean, "it replays their mean, without their scatter"),
+    )
+    parts = [(part, why) for part, why in reasons if abs(part) > told]
     rest = same - best.utility - sum(part for part, _ in parts)
     if math.isfinite(best.standard_error):
         within = abs(rest) <= LUCKY * best.standard_error

@@ -11,7 +11,7 @@ from grounded.errors import NextCommand
 from grounded.result import listed
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, remark, sentence, show, show_json
-from grounded_trials.wording import with_unit
+from grounded_trials.wording import misread, with_unit
 
 if TYPE_CHECKING:
     from grounded.frozen import Array
@@ -182,12 +182,11 @@ def command(
     for effect in workspace.config.model.effects:
         family, _, name = str(effect["name"]).partition(":")
         if family == "sensor_bias" and name in columns:
-            by = with_unit(f"{abs(effect['b']):.3g}", model.states[name])
             remark(
                 "note",
                 f"the target of {name} is in readings of its sensor, which by the adopted "
-                f"sensor_bias:{name} reads {by} too {'low' if effect['b'] < 0 else 'high'}: a true "
-                f"0 is {effect['b']:.3g} there. Draw it, and set [task] start, in readings",
+                f"sensor_bias:{name} reads {misread(effect['b'], model.states[name])}: a true 0 is "
+                f"{effect['b']:.3g} there. Draw it, and set [task] start, in readings",
             )
     if still := without_range(columns, model.states):
         at = {number(ranges[name][0]) for name in still}

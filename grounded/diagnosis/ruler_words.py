@@ -125,8 +125,9 @@ def _lost_most(rows: Sequence[RulerRow]) -> tuple[float, RulerRow | None, str]:
 
     Whole trials come first if they lose over all states, as they are what a plan is made for.
     """
-    whole = [row for row in (_whole(rows),) if row]
-    found = [_losses(some) for some in (whole, [r for r in rows if not r.whole_trial] + whole)]
+    last, ahead = _whole(rows), [row for row in rows if not row.whole_trial]
+    whole = [last] if last else []
+    found = [_losses(some) for some in (whole, ahead + whole)]
     lost, other = (max(some, key=lambda loss: loss[0], default=(0.0, None, "")) for some in found)
     return lost if lost[0] > 1 + SHOWS and lost[1] is not None and _loses(lost[1]) else other
 

@@ -201,6 +201,36 @@ def _turning_as_degrees(
     return mended > CONCORDANT and all(mended > PLAINLY * other for other in others)
 
 
+def _calibrated_as_degrees(model: Model, trial: Trial, shown: Sequence[int], odd: Odd) -> bool:
+    """Check whether a calibrated model predicts a trial far better with its angles as degrees.
+
+    A crude model of an unstable body errs by more than the body moves, in any unit. Where all is
+    linear, inputs of another strength explain the log as well as degrees do: that strength must
+    then be about 57.3 times the model's.
+    """
+    from grounded.instruments.short_runs import Ahead
+
+    units, usual = list(model.states.values()), np.ones(model.m)
+    angles = np.abs(trial.states[:, [i for i in odd.states if units[i] == "rad"]])
+    if not (angles > SMALL).any() or not np.isfinite(trial.inputs).all():
+        return False
+    with np.errstate(all="ignore"):
+        logged, mended = (Ahead(model, t, shown, FEW) for t in (trial, odd.mended(trial)))
+        if not (logged.enough and mended.enough):
+            return False
+        own, free = logged.best([usual], free=False), logged.best([usual])
+        rms = mended.best([usual], free=False).rms
+    rms[list(odd.states)] *= odd.factor  # as large as in the log
+    gained = np.log(own.rms / rms)
+    strong = (free.gains > odd.factor / LIKE) & (free.gains < odd.factor * LIKE)
+    if free.score - np.log(rms).sum() < CLEAR and not strong.all():
+        return False
+    most = int(gained.argmax())
+    if not rms[most] < SEEN * logged.moved[most]:  # no unit makes the log predictable
+        return False
+    return bool(gained.sum() > CLEAR and gained[most] > np.log(2.0))
+
+
 def _concordance(model: Model, trial: Trial, shown: Sequence[int], some: Sequence[int]) -> float:
     """Return the mean concordance (Lin 1989) of predicted and logged changes of some states."""
     if not some or (ahead := predicted(model, trial, shown, SOON)) is None:
@@ -296,32 +326,3 @@ def predicted(
         x = model.system.step(x, trial.inputs[at + j], model.values, trial.dt)
         x = np.fmax(np.fmin(x, FAR), -FAR)
     return logged[at], x, logged[at + steps]
-
-
-def _calibrated_as_degrees(model: Model, trial: Trial, shown: Sequence[int], odd: Odd) -> bool:
-    """Check whether a calibrated model predicts a trial far better with its angles as degrees.
-
-    A crude model of an unstable body errs by more than the body moves, in any unit. Where all is
-    linear, inputs of another strength explain the log as well as degrees do: that strength must
-    then be about 57.3 times the model's.
-    """
-    from grounded.instruments.short_runs import Ahead
-
-    units, usual = list(model.states.values()), np.ones(model.m)
-    angles = np.abs(trial.states[:, [i for i in odd.states if units[i] == "rad"]])
-    if not (angles > SMALL).any() or not np.isfinite(trial.inputs).all():
-        return False
-    with np.errstate(all="ignore"):
-        logged, mended = (Ahead(model, t, shown, FEW) for t in (trial, odd.mended(trial)))
-        if not (logged.enough and mended.enough):
-            return False
-        own, free = logged.best([usual], free=False), logged.best([usual])
-        rms = mended.best([usual], free=False).rms
-    rms[list(odd.states)] *= odd.factor  # as large as in the log
-    gained = np.log(own.rms / rms)
-    strong = (free.gains > odd.factor / LIKE) & (free.gains < odd.factor * LIKE)
-    if free.score - np.log(rms).sum() < CLEAR and not strong.all():
-        return False
-    most = int(gained.argmax())
-    predicted = rms[most] < SEEN * logged.moved[most]  # or no unit makes the log predictable
-    return bool(predicted and gained.sum() > CLEAR and gained[most] > np.log(2.0))

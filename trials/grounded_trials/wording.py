@@ -87,6 +87,11 @@ def labelled(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if shown(unit) else name
 
 
+def misread(bias: float, unit: str) -> str:
+    """Return by how much a biased sensor reads wrong: `0.0044 rad too high`."""
+    return f"{with_unit(f'{abs(bias):.3g}', unit)} too {'low' if bias < 0 else 'high'}"
+
+
 def per_second(unit: str) -> str:
     """Return the unit of a rate of change: rad/s for rad, m/s^2 for m/s."""
     if found := re.fullmatch(r"(.*)/s(?:\^(\d))?", unit):

@@ -26,22 +26,28 @@ def orders(predictor: Predictor, h: Hypothesis) -> list[Hypothesis]:
     """
     acting = acting_order([effect.family for effect in h.effects])
     places = [(i, at) for i in acting for at in range(len(acting))]
-    return _different(predictor, h, places)
+    return _different(predictor, h, acting, places)
 
 
 def first(predictor: Predictor, h: Hypothesis) -> list[Hypothesis]:
     """Return a hypothesis with its latest effect acting first, if that changes an input."""
     latest = len(h.effects) - 1
     acting = acting_order([effect.family for effect in h.effects])
-    return _different(predictor, h, [(latest, 0)]) if latest in acting and latest else []
+    places = [(latest, 0)] if latest in acting and latest else []
+    return _different(predictor, h, acting, places)
 
 
 def _different(
-    predictor: Predictor, h: Hypothesis, places: Sequence[tuple[int, int]]
+    predictor: Predictor,
+    h: Hypothesis,
+    acting: Sequence[int],
+    places: Sequence[tuple[int, int]],
 ) -> list[Hypothesis]:
-    """Return the hypotheses in which effect i acts at another place, if inputs then differ."""
-    acting = acting_order([effect.family for effect in h.effects])
-    if len(acting) < 2:
+    """Return the hypotheses in which effect i acts at another place, if inputs then differ.
+
+    acting: the effects on inputs, in the order in which they act.
+    """
+    if len(acting) < 2 or not places:
         return []
     u = predictor.inputs(h)
     known, least = [u], MATTERS * np.maximum(u.std(axis=(0, 1)), 1e-12)

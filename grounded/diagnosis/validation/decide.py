@@ -90,13 +90,8 @@ class Decision:
     @property
     def held_up(self) -> dict[str, tuple[str, ...]]:
         """By effect, the model's parameters that would end at their bounds without it."""
-        stopped = {*_stopped(self.search, self.fit)}
-        found = {n: _stopped(self.search, less) for n, less in self.without.items()}
-        return {
-            n: tuple(name for name in names if name not in stopped)
-            for n, names in found.items()
-            if _held_up(self.search, self.fit, self.without[n], n)
-        }
+        kept = {n: _held_up(self.search, self.fit, less, n) for n, less in self.without.items()}
+        return {n: names for n, names in kept.items() if names}
 
 
 def causes(fit: Fitted) -> tuple[str, ...]:
@@ -338,13 +333,18 @@ def _pruned(
         fit = without[name]
 
 
-def _held_up(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -> bool:
-    """Check whether a likely effect keeps the model's parameters off their bounds.
+def _held_up(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -> tuple[str, ...]:
+    """Return the model's parameters that a likely effect keeps off their bounds.
 
-    Without it, they describe the data only with values that the user excludes.
+    Without it, they describe the data only with values that the user excludes. None if as many are
+    at their bounds with it.
     """
-    sure = name in equations(fit) and search.score(fit) - search.score(less) > LARGE_GAIN
-    return sure and len(_stopped(search, less)) > len(_stopped(search, fit))
+    if name not in equations(fit) or not search.score(fit) - search.score(less) > LARGE_GAIN:
+        return ()
+    with_it, without = _stopped(search, fit), _stopped(search, less)
+    if len(without) <= len(with_it):
+        return ()
+    return tuple(one for one in without if one not in with_it)
 
 
 def _stopped(search: HypothesisSearch, fit: Fitted) -> list[str]:

@@ -283,10 +283,9 @@ def _matched(
     rest = [path for path in free if path not in used]
     if all(g.path for g in states) and not any(g.path for g in inputs) and len(rest) == len(inputs):
         why = "the only number left" if len(rest) == 1 else "the numbers left, in the log's order"
-        others = [tuple(other for other in rest if other != path) for path in rest]
         left = [
-            replace(guess, path=path, others=rivals, reasons=(why,))
-            for guess, path, rivals in zip(inputs, rest, others, strict=True)
+            replace(guess, path=path, others=tuple(p for p in rest if p != path), reasons=(why,))
+            for guess, path in zip(inputs, rest, strict=True)
         ]
         _, inputs = weigh(report, model, states, left, joints)
         inputs = tuple(replace(guess, sure=False) for guess in inputs)

@@ -62,10 +62,9 @@ def kicked(planner: Planner, run: Trial, held: Array) -> str:
     if not groups or not at.any():
         return ""
     names, what = groups[0]
-    states = [task.model.state_names.index(name) for name in names]
     after = coasting(planner.plan, run, held)[: 1 + math.ceil(1.0 / task.dt), : task.model.n]
-    off = np.linalg.norm(task.model.difference(after, task.target[-1])[:, states], axis=1)
-    way = np.linalg.norm(np.ptp(np.vstack([task.start, task.target])[:, states], axis=0))
+    errors, way = _from_target(task, after, [task.model.state_names.index(name) for name in names])
+    off = np.linalg.norm(errors, axis=1)
     worst = int(np.argmax(off))
     if off[0] > REACHED * way or not off[worst] > max(AWAY * way, 2 * off[0]):
         return ""
@@ -91,9 +90,8 @@ def _moved_on(planner: Planner, whole: Trial) -> list[str]:
         return []
     names, what = groups[0]
     states = [task.model.state_names.index(name) for name in names]
-    off = task.model.difference(whole.states[: last + 1], task.target[-1])[:, states]
+    off, way = _from_target(task, whole.states[: last + 1], states)
     far = np.linalg.norm(off, axis=1)
-    way = np.linalg.norm(np.ptp(np.vstack([task.start, task.target])[:, states], axis=0))
     worst = end + int(np.argmax(far[end:]))
     if not far[worst] > max(AWAY * way, 2 * far[end]):
         return []
@@ -108,6 +106,13 @@ def _moved_on(planner: Planner, whole: Trial) -> list[str]:
     return [
         f"{was}[reward] only judges the run. To make the robot stay there, {_to_stay(task, states)}"
     ]
+
+
+def _from_target(task: Task, run: Array, states: Sequence[int]) -> tuple[Array, float]:
+    """Return how far states (T, n) are off the end of the target, (T, k), and its extent."""
+    off = task.model.difference(run, task.target[-1])[:, states]
+    extent = np.ptp(np.vstack([task.start, task.target])[:, states], axis=0)
+    return off, float(np.linalg.norm(extent))
 
 
 def let_go(planner: Planner, whole: Trial, states: Sequence[int], steps: int, drift: Array) -> bool:

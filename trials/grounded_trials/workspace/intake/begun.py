@@ -76,6 +76,8 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
     beyond = np.full(len(off), True)
     if len(before) >= FEWEST:
         beyond = (np.abs(off) > SURE * before.std(axis=0, ddof=1)) | (share > MUCH)
+    if not told.any():
+        return []
     found, real = [], abs(task.utility(trial))
     cost = real if np.isfinite(real) and not failed else -_promised(workspace, trial)
     lost = _lost_by(workspace, trial)
