@@ -178,3 +178,45 @@ def test_what_may_as_well_be_nothing_or_lies_where_nobody_was_is_no_cause(name, 
         (fit,) = search.refined([search.fresh(h)], 8)
     found = of_no_size(search.predictor, fit, data.trial_of)
     assert found == [name] * nothing
+
+
+def rovers(crossed, shaken):
+    """A rover whose throttle u also turns its wheels by `crossed` u; `shaken`: a wave beside it."""
+    model = Model(
+        states={"v": "m/s", "d": "rad"},
+        inputs={"u": "m/s^2", "s": "rad/s"},
+        params={},
+        derivative=lambda s, a, p: {"v": a.u - s.v, "d": a.s - s.d},
+        name="rover",
+    )
+    rng, t = np.random.default_rng(5), np.arange(STEPS) * DT
+    commands = np.stack([np.sin(1.7 * t) + 0.4 * np.sin(4.1 * t), 0.3 * np.cos(1.1 * t)], axis=1)
+    x, states = np.zeros(2), [np.zeros(2)]
+    for now, (u, s) in zip(t, commands, strict=True):
+        for part in range(5):
+            wave = shaken * np.sin(OMEGA * (now + (part + 0.5) * DT / 5))
+            x = x + DT / 5 * np.array([u - x[0], s - x[1] + crossed * u + wave]) / (1 + DT / 10)
+        states.append(x)
+    trials = [
+        Trial(
+            np.array(states) + 4e-3 * rng.standard_normal((STEPS + 1, 2)),
+            commands,
+            DT,
+            ("v", "d"),
+            ("u", "s"),
+            start_inputs=np.zeros(2),
+        )
+        for _ in range(4)
+    ]
+    return model, trials
+
+
+@pytest.mark.parametrize(("shaken", "claimed"), [(0.0, ("crosstalk:d<-u",)), (0.25, ())])
+def test_one_motion_shows_a_cause_only_if_nothing_is_left_beside_it(shaken, claimed):
+    """A crosstalk of 399 nats, right to 1 %, was unconfirmed since the trials repeated one motion.
+
+    It is so still where something else, which one motion cannot tell either, is left beside it.
+    """
+    found = diagnose(*rovers(0.3, shaken))
+    assert found.effects == claimed
+    assert any(one.effect == "crosstalk:d<-u" for one in found.unconfirmed) == (not claimed)

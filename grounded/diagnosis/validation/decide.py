@@ -14,7 +14,8 @@ under every other noise structure, are compared by the `ruler`:
     3. An effect that a parameter's shift undoes is dropped; the parameter alone describes both.
        A likely effect stays without which the model's parameters would end at their bounds.
     4. An effect without a mechanism that a single motion shows is dropped, however often the motion
-       was repeated.
+       was repeated, unless its one coefficient explains all that the model lacks and nothing else
+       explains nearly as much.
     5. The remaining effects must be likelier than none.
     6. A hypothesis is not claimed if predictions hardly gain in any channel at any horizon, except
        sensors' faults with very high evidence, which need not matter for what comes next.
@@ -31,6 +32,7 @@ import numpy as np
 
 from grounded.diagnosis.hypotheses.counterpart import counterparts
 from grounded.diagnosis.hypotheses.explored import CLAIM, TIE, parametric
+from grounded.diagnosis.hypotheses.leftover import leftovers
 from grounded.diagnosis.hypotheses.plainest import plainer
 from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
@@ -312,6 +314,7 @@ def _pruned(
         least = SLIGHT * ruler.since_outset(fit)
         undone = counterparts(search.predictor, fit.hypothesis)
         repeated = {n: repeats(search, fit, without[n], n) for n in equations(fit)}
+        repeated |= {n: 0 for n, k in repeated.items() if k and _whole(search, fit, without[n], n)}
         idle = (
             undone
             or [n for n, count in repeated.items() if count]
@@ -331,6 +334,25 @@ def _pruned(
         if nats > LIKELY and name in equations(fit) and name not in undone:
             doubtful.append(Doubtful(name, nats, fit, repeated[name], gains[name].alone))
         fit = without[name]
+
+
+def _whole(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -> bool:
+    """Check whether one coefficient times a measured signal explains all that is left without it.
+
+    Along a single motion, what the model lacks may be a function of time or of any state. But no
+    other function is proportional to this signal at every step; so it counts as seen if nothing is
+    left beside it and every effect that was tried in its place is far less likely.
+    """
+    h = fit.hypothesis
+    effect = h.effects[h.names.index(name)]
+    if len(effect.free) > 1 or getattr(effect.family, "timed", False):
+        return False
+    rest, own = set(h.names) - {name}, search.score(fit)
+    rivals = [f for f in search.of_size(len(h.names)) if {*f.hypothesis.names} - rest != {name}]
+    rivals = [f for f in rivals if rest <= set(f.hypothesis.names)]
+    if own - max(search.score(f) for f in [less, *rivals]) < LARGE_GAIN:
+        return False
+    return not leftovers(search.predictor, fit)
 
 
 def _held_up(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -> tuple[str, ...]:
