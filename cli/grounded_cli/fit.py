@@ -102,10 +102,11 @@ def command(
 
 
 def _not_fitted(delays: Sequence[str]) -> str:
-    """Say that adopted delays kept their values, and how to estimate them again."""
+    """Say that the intervals take adopted delays as exact, and what estimates these too."""
     return (
-        f"not fitted: d of {listed(delays)}; `grounded diagnose` estimates it again, `--latency` "
-        "fits one delay of all inputs in its place"
+        f"{listed(delays)} kept {'its' if len(delays) == 1 else 'their'} d, which the intervals "
+        "take as exact: they are too narrow; `grounded fit --latency` fits one delay of all inputs "
+        "in its place"
     )
 
 

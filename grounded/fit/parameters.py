@@ -51,7 +51,8 @@ def fit(
         names: parameters to fit; None for all uncertain ones.
         latency: (m,) transport delay of each input [s], fixed or the start value; None for zero,
             or the task's.
-        fit_latency: "known" (fixed), "common" (fit one value for all inputs) or "each".
+        fit_latency: "known" (fixed), "common" (fit one value for all inputs), "each", or
+            {name: inputs}: each of these, for the inputs with these indices.
         measurement: what the records measure; None for the states themselves.
         filters: time constants [s] of low-pass filters in sensors by state, as
             `Preflight.filters`.

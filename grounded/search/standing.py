@@ -71,6 +71,14 @@ class Standing(Result):
     ending: Ending = ""
     then: NextCommand | None = None  # a command that helps now
     doubt: str = ""  # why a diagnosis helps more than the next trial
+    missed: str = ""  # the end of `sentence`: the ended search asks for a diagnosis, see `let_down`
+
+    def answered(self) -> Standing:
+        """Return the standing after the diagnosis that an ended search asked for."""
+        if not self.missed:
+            return self
+        sentence = self.sentence.removesuffix(self.missed)
+        return replace(self, sentence=sentence, then=None, missed="")
 
     @property
     def utilities(self) -> list[float]:
@@ -308,10 +316,11 @@ def let_down(ended: Standing, model: str) -> Standing:
     if not missed or not max(missed) > LITTLE * -best.utility:
         return ended
     why = (
-        f"{ended.sentence}. But a step that lost had promised {figure(max(missed))} more: the "
-        f"model is wrong near {own}, and a diagnosis may show what it lacks"
+        f". But a step that lost had promised {figure(max(missed))} more: the model is wrong near "
+        f"{own}, and a diagnosis may show what it lacks"
     )
-    return replace(ended, sentence=why, then=NextCommand("diagnose"))
+    then = NextCommand("diagnose")
+    return replace(ended, sentence=ended.sentence + why, then=then, missed=why)
 
 
 def _suspicion(history: tuple[Tried, ...], incumbent: Tried, model: str) -> str:

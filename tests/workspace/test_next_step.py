@@ -28,6 +28,7 @@ from grounded_trials.wording import ELSEWHERE, folded, placed, rendered
 from grounded_trials.workspace.adopting import diagnosed_again
 from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.diagnosing import _in_vain
+from grounded_trials.workspace.fitting import apply_fit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
 from grounded_trials.workspace.next_step import (
@@ -907,12 +908,23 @@ def test_a_gap_that_the_verdict_states_is_not_repeated_when_the_search_has_ended
     assert contested.contested and "To learn more" not in nothing_to_do(contested, "c0001")
 
 
-def test_an_adopted_delay_is_named_as_not_fitted(tmp_path):
+def test_an_adopted_delay_is_fitted_with_the_parameters_or_named_as_taken_for_exact(tmp_path):
     folder = make(tmp_path / "w").folder
     grounded("-C", folder, "learn", "--trials", "2")
-    late = {"name": "delay:force", "d": 0.02}
-    for effects, names in (([], []), ([late], ["delay:force"])):
+    late, bent = {"name": "delay:force", "d": 0.02}, {"name": "dead_zone:force", "c": 0.01}
+    for effects, names in (([], []), ([late, bent], ["delay:force"])):
         set_in_model(folder / "grounded.toml", effects=effects)
         assert grounded("-C", folder, "fit", "--json").json["not_fitted"] == names
     assert grounded("-C", folder, "fit", "--latency", "--json").json["not_fitted"] == []
-    assert "not fitted: d of delay:force" in grounded("-C", folder, "fit").out
+    told = " ".join(grounded("-C", folder, "fit").out.split())
+    assert "delay:force kept its d, which the intervals take as exact" in told
+    set_in_model(folder / "grounded.toml", effects=[late])
+    fitted = grounded("-C", folder, "fit", "--json").json
+    found = fitted["params"]["delay_force_d"]
+    assert fitted["not_fitted"] == [] and found["low"] < found["high"] and found["unit"] == "s"
+    assert found["start"] == late["d"]
+    alone = grounded("-C", folder, "fit", "--params", "mass", "--json").json["params"]
+    assert set(alone) == {"mass"}
+    apply_fit(Workspace(folder), Workspace(folder).fit().fit)
+    (effect,) = Workspace(folder).config.model.effects
+    assert effect["d"] == pytest.approx(found["value"], rel=1e-6)
