@@ -259,8 +259,8 @@ def _effects(found: Diagnosis, *, details: bool) -> None:
     if rows:
         show("\n" + table(rows, header))
         _note(
-            "credit: share of the improvement lost without it; evidence: log-likelihood lost "
-            "without it"
+            "without it: how much larger errors are, the mean over states and horizons; evidence: "
+            "log-likelihood lost without it"
             + tied
             + "; alone: log-likelihood gained by it alone" * ("alone [nats]" in header)
             + "; +-: one standard deviation"

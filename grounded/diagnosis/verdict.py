@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from grounded.diagnosis.cause_words import (
     ENDED,
+    OWN,
     clauses,
     comparison,
     counted,
@@ -74,7 +75,7 @@ def verdict(
         groups: effects that the data cannot tell apart.
         remainder: errors that no effect explains.
         rows: held-out prediction errors, a row per horizon.
-        credit: the share of the improvement due to each cause, largest first.
+        credit: what each cause is worth, largest first.
         seen: effects that only one trial shows.
         same: those of `groups` that are equivalent in this model.
         most: the largest number of effects that was looked for; 0 for no limit.
@@ -117,7 +118,7 @@ def verdict(
     told = clauses(
         [one.of for one in credit],
         causes,
-        [one.share for one in credit],
+        credit,
         {e.name: e for e in claims.best.hypothesis.effects},
         {row.effect: row.params for row in ranking},
     )
@@ -209,7 +210,7 @@ def _causes(
             text += UNSURE * (not has_size(effects[one.of], values[one.of], KNOWN))
             text += f", {apart[one.of]}" if one.of in apart else ""
         else:
-            text = f"the model's own parameters are off: {_moved(claims)}{OPEN * open_gap}"
+            text = f"{OWN} are off: {_moved(claims)}{OPEN * open_gap}"
             text += _others(claims, identified)
             named = parameters_off(claims)[:NAMED]
             held = dict.fromkeys(other for n in named for other in given.get(n, ()))

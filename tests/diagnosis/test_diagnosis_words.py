@@ -8,9 +8,10 @@ import numpy as np
 
 from facts import holds
 from grounded import Trial
+from grounded.diagnosis.cause_words import farther, with_worth
 from grounded.diagnosis.error_report import Credit, Region, Remainder, RulerRow, furthest, runaway
 from grounded.diagnosis.next_trial import LOG, LOST, next_trial
-from grounded.diagnosis.report import Agreement, Estimate, Ranked, Unconfirmed
+from grounded.diagnosis.report import Agreement, Diagnosis, Estimate, Ranked, Unconfirmed
 from grounded.diagnosis.ruler_words import (
     contested,
     explained,
@@ -23,7 +24,7 @@ from grounded.diagnosis.ruler_words import (
     telling,
     worsened,
 )
-from grounded.diagnosis.tables import error_table
+from grounded.diagnosis.tables import effect_table, error_table, larger
 from grounded.diagnosis.unconfirmed import another_look, unrepeatable
 from grounded.diagnosis.verdict import verdict
 from grounded.effects import Library
@@ -232,18 +233,23 @@ def test_a_leftover_within_the_noise_is_stated_by_what_tells_it_from_noise():
     assert holds(above, "0.041 m/s", "noise: 0.0040 m/s") and "may all be" not in above
 
 
-def test_a_share_in_a_sentence_is_the_share_of_the_table():
-    from grounded_trials.wording import percent
-
+def test_what_a_cause_is_worth_is_the_same_in_the_sentence_and_in_the_table():
+    """It was a share of logarithms, which nobody could know."""
     effect = Library().effect("viscous_friction:v", cart_task().model)
     k = {"k": Estimate(0.3, unit="1/s")}
     best = SimpleNamespace(hypothesis=SimpleNamespace(effects=(effect,)))
     claims = _claims(best=best, moved=(), parameters=dict, data=SimpleNamespace(model=None))
     claims.data.model = SimpleNamespace(params={}, param_names=[])
-    credit = (Credit(effect.name, 0.926), Credit("calibration", 0.074))
+    credit = (Credit(effect.name, 0.926, times=12.3), Credit("calibration", 0.074, times=1.222))
     ranked = (Ranked(effect.name, k, claimed=True),)
-    told = verdict(claims, ranked, (), (), (), credit).sentence
-    assert f"{percent(0.074)} of the improvement" in told
+    said = verdict(claims, ranked, (), (), (), credit)
+    assert "(without this, predictions miss 12 times as far)" in said.sentence
+    assert "(without this, predictions miss 22 % farther)" in said.sentence
+    rows, header = effect_table(Diagnosis(said, ranking=ranked, credit=credit))
+    assert header[1] == "without it" and [row[1] for row in rows] == ["+22 %", "12 times"]
+    assert farther(1.0003) == "hardly farther" and larger(1e5) == "over 1,000 times"
+    old = replace(credit[0], times=float("nan"))  # of an older version
+    assert with_worth("late", [old]) == "late" and larger(old.times) == ""
 
 
 def test_neither_a_crash_nor_a_log_by_hand_is_to_be_repeated():

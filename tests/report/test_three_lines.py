@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from grounded.diagnosis.report import Diagnosis, Verdict
-from grounded.result import measured, measured_alike, percent
+from grounded.result import measured, measured_alike
 from grounded_trials.report.diagnosis_words import verdict_lines
 from grounded_trials.report.three_lines import gained_most, three_lines
 from reported import DIAGNOSIS
@@ -21,9 +21,9 @@ ROW = {
     "noise_floor": {"x": 0.01, "v": 0.0003},
 }
 CREDIT = [
-    {"of": "calibration", "share": 0.7, "without_it": {"x": 0.2}},
-    {"of": "viscous_friction:v", "share": 0.28, "without_it": {"x": 0.1}},
-    {"of": "delay:force", "share": 0.02, "without_it": {"x": 0.013}},
+    {"of": "calibration", "share": 0.7, "times": 8.0, "without_it": {"x": 0.2}},
+    {"of": "viscous_friction:v", "share": 0.28, "times": 2.4, "without_it": {"x": 0.1}},
+    {"of": "delay:force", "share": 0.02, "times": 1.06, "without_it": {"x": 0.013}},
 ]
 CAUSES = (
     "the model's own parameters are off: mass should be 1.4 kg (+40%)",
@@ -49,11 +49,12 @@ def diagnosis():
 
 def test_causes_gain_and_what_is_left(diagnosis):
     wrong, gained, left = three_lines(diagnosis, cart_task())
-    assert CAUSES[0][1:] in wrong and CAUSES[1] in wrong and "smaller cause" not in wrong
+    assert CAUSES[0][1:] in wrong and CAUSES[1] in wrong and "also" not in wrong
     assert CAUSES[2] in wrong  # a delay, however small its share: it decides stability
     (*_, bias) = diagnosis.credit
     other = replace(diagnosis, credit=(*diagnosis.credit[:2], replace(bias, of="input_bias:force")))
-    assert f"1 smaller cause ({percent(bias.share)} of the" in three_lines(other, cart_task())[0]
+    small = "also input_bias:force (without this, predictions miss 6.0 % farther)"
+    assert small in three_lines(other, cart_task())[0]
     large = replace(bias, of="input_bias:force", share=0.22)  # was only counted
     other = replace(diagnosis, credit=(*diagnosis.credit[:2], large))
     assert CAUSES[2] in three_lines(other, cart_task())[0]
@@ -109,7 +110,7 @@ def test_an_error_is_given_in_a_unit_that_fits(value, unit, text):
 def test_each_of_several_causes_stands_on_a_line_of_its_own(diagnosis):
     told = replace(diagnosis.verdict, sentences=("All three.", "What is left."))
     causes, others = verdict_lines(replace(diagnosis, verdict=told))
-    assert causes[1] == f"{CAUSES[1][:1].upper()}{CAUSES[1][1:]} (28 % of the improvement)"
+    assert causes[1] == f"{CAUSES[1][:1].upper()}{CAUSES[1][1:]} (without this, predictions miss 2.4 times as far)"
     assert len(causes) == len(CAUSES) and others == ["What is left."]
     old = Verdict("effect", sentence="Friction slows v.")
     assert verdict_lines(replace(diagnosis, verdict=old)) == ([], ["Friction slows v."])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from grounded.diagnosis.cause_words import ENDED, furthest_apart, value_of, with_share
+from grounded.diagnosis.cause_words import ENDED, furthest_apart, value_of, with_worth
 from grounded.diagnosis.error_report import Correction, Gap
 from grounded.diagnosis.report import Changed, Diagnosis, Estimate
 from grounded.result import listed
@@ -199,7 +199,7 @@ def _utility_error(error: float, spread: float) -> str:
 
 
 def verdict_lines(diagnosis: Diagnosis) -> tuple[list[str], list[str]]:
-    """Return the causes with their shares if there are several, then the other sentences.
+    """Return the causes with their worth if there are several, then the other sentences.
 
     What changed between two groups of trials comes before the causes.
     """
@@ -207,7 +207,7 @@ def verdict_lines(diagnosis: Diagnosis) -> tuple[list[str], list[str]]:
     if len(causes) < 2:
         return [], told
     each = zip(causes, diagnosis.credit, strict=True)
-    clauses = diagnosis.verdict.clauses or tuple(with_share(c, one.share) for c, one in each)
+    clauses = diagnosis.verdict.clauses or tuple(with_worth(c, [one]) for c, one in each)
     first = [text for text in [diagnosis.verdict.comparison] if text]
     first += [f"{clause[:1].upper()}{clause[1:]}" for clause in clauses]
     return first, told[1 + bool(diagnosis.verdict.comparison) :]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from grounded.diagnosis.cause_words import is_late, with_share
+from grounded.diagnosis.cause_words import is_late, only_named
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.ruler_words import COMPARABLE, in_doubt, open_noise, rest, telling, worsened
 from grounded.diagnosis.verdict import told_apart
@@ -40,7 +40,7 @@ def three_lines(diagnosis: Diagnosis, task: Task) -> list[str]:
 
 
 def _wrong(diagnosis: Diagnosis) -> str:
-    """The largest causes without their shares, which the bars show; the others with one for all.
+    """The largest causes without what they are worth, which the bars show; the others by name.
 
     Delays and lags are named in any case, as they decide whether a loop is stable.
     """
@@ -49,11 +49,11 @@ def _wrong(diagnosis: Diagnosis) -> str:
     for clause, credit in zip(diagnosis.verdict.causes, diagnosis.credit, strict=True):
         many = credit.share < (LARGE if len(told) >= CAUSES else SMALL)
         if told and many and not is_late(credit.of):
-            small.append(credit.share)
+            small.append(credit)
         else:
             told.append(clause)
     if small:
-        told.append(with_share(count(len(small), "smaller cause"), sum(small)))
+        told.append(only_named(small))
     text = "; ".join(told)
     return f"{text[:1].upper()}{text[1:]}."
 
