@@ -125,7 +125,7 @@ def verdict(
     words = [sentence(told), improvement(rows, tracked), worsened(rows)]
     words += [runaway(rows), wider(claims.parameters())]
     words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed])
-    words += [f"{told_apart(group, same)}." for group in groups]
+    words += [f"{told_apart(group, same, [r.effect for r in claimed])}." for group in groups]
     words += [one.sentence() for one in claims.one_clock[:1]]
     words += _geared(claims.data.model, [row.effect for row in claimed])[:1]
     words += _level(claims.data.model, [row.effect for row in claimed])
@@ -313,13 +313,24 @@ def sentence(clauses: Iterable[str]) -> str:
     return f"{text[:1].upper()}{text[1:]}."
 
 
-def told_apart(group: Sequence[str], same: Sequence[Sequence[str]]) -> str:
-    """Return a clause: these data cannot tell the group apart, or no data can."""
+def told_apart(
+    group: Sequence[str], same: Sequence[Sequence[str]], claimed: Collection[str] = ()
+) -> str:
+    """Return a clause: these data cannot tell the group apart, or no data can.
+
+    Args:
+        group: effects that tie.
+        same: the groups that are equivalent in this model.
+        claimed: the claimed effects. If one is in the group, the clause says that it is adopted.
+    """
+    own = next((name for name in group if name in claimed), "")
     if group in same:
-        return f"{listed(group)} are equivalent in this model"
-    return f"The data can't tell {tied(group)}"
+        return f"{listed(group)} are equivalent in this model" + f"; {own} is adopted" * bool(own)
+    either = "either" if len(group) == 2 else "each"
+    adopted = f"; {own}, the claimed one, is what is adopted" * bool(own)
+    return f"The data can't tell {tied(group)}: {either} explains these trials{adopted}"
 
 
 def tied(group: Sequence[str]) -> str:
-    """Return `A from B or C`."""
-    return f"{group[0]} from {' or '.join(group[1:])}"
+    """Return `A from B`, `A, B and C apart`."""
+    return " from ".join(group) if len(group) == 2 else f"{listed(group)} apart"

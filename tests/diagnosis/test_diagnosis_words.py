@@ -174,7 +174,7 @@ def test_a_slow_plant_is_spoken_of_by_whole_trials():
     assert telling((second, whole)) is whole
     assert holds(improvement((second, whole)), "0.30 m", "5.0 m")
     quick = row({"x": 0.2}, {"x": 0.08})
-    assert telling((quick, whole)) is quick and "8.0 cm" in improvement((quick, whole))
+    assert telling((quick, whole)) is quick and "80 mm" in improvement((quick, whole))
     for rows, told in (((second, whole), True), ((quick, whole), False)):  # as in the sentence
         table, _ = error_table(SimpleNamespace(prediction_error=rows), whole_trials=False)
         assert any("whole trial" in cells[0] for cells in table) is told
@@ -185,7 +185,7 @@ def test_nothing_is_said_where_nothing_lost_or_only_within_the_noise():
     assert worsened(()) == ""
     assert worsened((row({"x": 0.2}, {"x": 0.205}),)) == ""
     slight = row({"x": 0.2, "v": 0.5}, {"x": 0.21, "v": 0.5})  # nothing gains as much
-    assert outweighed((slight,)) and holds(worsened((slight,)), "worse", "21 cm", "20 cm")
+    assert outweighed((slight,)) and holds(worsened((slight,)), "worse", "210 mm", "200 mm")
     paid = row({"x": 0.2, "v": 0.5}, {"x": 0.21, "v": 0.4})
     assert not outweighed((paid,)) and worsened((paid,)) == ""
     assert worsened((row({"x": 0.02}, {"x": 0.04}, {"x": 0.05}),)) == ""
@@ -296,12 +296,12 @@ def test_a_noise_of_which_only_a_bound_is_known_is_told_as_one():
 
     unknown, state = said(0.9, 0.89)
     assert unknown.kind == "unknown" and "at most" in unknown.sentence and state == "x"
-    assert "at most 89 cm" in unknown.sentence and "explains the data" not in unknown.sentence
+    assert "at most 890 mm" in unknown.sentence and "explains the data" not in unknown.sentence
     known, state = said(0.9, 0.89, bound=False)
-    assert known.kind == "none" and "89 cm" in known.sentence and not state
+    assert known.kind == "none" and "890 mm" in known.sentence and not state
     assert "at least 9 times" in said(0.9, 0.1)[0].sentence
     left = Remainder("x", error=0.9, floor=0.1, horizon_s=1.0, error_unit="m", floor_at_most=True)
-    assert "at most 10 cm" in left.sentence()
+    assert "at most 100 mm" in left.sentence()
 
 
 def test_repeats_are_asked_for_where_there_are_none_as_they_can_be_made():

@@ -58,7 +58,7 @@ def test_causes_gain_and_what_is_left(diagnosis):
     large = replace(bias, of="input_bias:force", share=0.22)  # was only counted
     other = replace(diagnosis, credit=(*diagnosis.credit[:2], large))
     assert CAUSES[2] in three_lines(other, cart_task())[0]
-    assert "x by 1.2 cm instead of 25 cm" in gained
+    assert "x by 12 mm instead of 250 mm" in gained
     assert "v" in left and "0.020 m/s" in left and "0.0050 m/s" in left and "x > 0.2" in left
 
 
@@ -94,7 +94,7 @@ def test_without_a_known_cause_the_verdict_speaks_for_itself(diagnosis):
 @pytest.mark.parametrize(
     ("value", "unit", "text"),
     [
-        (0.17, "m", "17 cm"),
+        (0.17, "m", "170 mm"),
         (2.0, "m", "2.0 m"),
         (4e-4, "m", "0.40 mm"),
         (3e-6, "rad", "3.0 µrad"),
@@ -110,7 +110,8 @@ def test_an_error_is_given_in_a_unit_that_fits(value, unit, text):
 def test_each_of_several_causes_stands_on_a_line_of_its_own(diagnosis):
     told = replace(diagnosis.verdict, sentences=("All three.", "What is left."))
     causes, others = verdict_lines(replace(diagnosis, verdict=told))
-    assert causes[1] == f"{CAUSES[1][:1].upper()}{CAUSES[1][1:]} (without this, predictions miss 2.4 times as far)"
+    worth = "(without this, predictions miss 2.4 times as far)"
+    assert causes[1] == f"{CAUSES[1][:1].upper()}{CAUSES[1][1:]} {worth}"
     assert len(causes) == len(CAUSES) and others == ["What is left."]
     old = Verdict("effect", sentence="Friction slows v.")
     assert verdict_lines(replace(diagnosis, verdict=old)) == ([], ["Friction slows v."])
@@ -122,12 +123,12 @@ def test_each_of_several_causes_stands_on_a_line_of_its_own(diagnosis):
         ((1.6e-4, 1.6e-3), "m", ["0.16 mm", "1.6 mm"]),  # it was 0.16 mm -> 0.16 cm
         ((1.6e-3, 9.1e-4), "m", ["1.6 mm", "0.91 mm"]),
         ((8.2e-4, 0.045), "m", ["0.82 mm", "45 mm"]),
-        ((1.75, 0.012), "m", ["175 cm", "1.2 cm"]),
-        ((0.31, 1.6e-3), "m", ["31 cm", "0.16 cm"]),
+        ((1.75, 0.012), "m", ["1,750 mm", "12 mm"]),
+        ((0.31, 1.6e-3), "m", ["310 mm", "1.6 mm"]),
         ((1.2e-3, 7.3e-4), "rad", ["1.2 mrad", "0.73 mrad"]),
         ((0.12, 5.8e-4), "rad", ["0.12 rad", "0.00058 rad"]),
-        ((0.2, 0.0), "m", ["20 cm", "0 cm"]),
-        ((0.17,), "m", ["17 cm"]),
+        ((0.2, 0.0), "m", ["200 mm", "0 mm"]),
+        ((0.17,), "m", ["170 mm"]),
     ],
 )
 def test_errors_that_are_compared_have_one_unit(values, unit, texts):

@@ -65,7 +65,15 @@ def ranges(names: Sequence[str]) -> str:
 
 def changed(name: str, old: float, new: float, unit: str) -> str:
     """Return `m 1.00 -> 1.30 kg`, with enough digits to distinguish the two values."""
-    return with_unit(f"{name} {' -> '.join(in_digits_apart(old, new))}", unit)
+    return f"{name} {moved(old, new, unit)}"
+
+
+def moved(old: float, new: float, unit: str) -> str:
+    """Return `1.00 -> 1.30 kg`, with enough digits to distinguish the two values."""
+    was, now = in_digits_apart(old, new)
+    if was == now:
+        return f"{with_unit(now, unit)}, as before"
+    return with_unit(f"{was} -> {now}", unit)
 
 
 def in_digits_apart(one: float, other: float) -> tuple[str, str]:

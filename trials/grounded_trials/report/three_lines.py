@@ -121,7 +121,8 @@ def _together(errors: Mapping[str, float], names: list[str]) -> float:
 
 def still_open(diagnosis: Diagnosis) -> str:
     """What ties, and what no known effect explains."""
-    ties = [told_apart(group, diagnosis.equivalent) for group in diagnosis.indistinguishable]
+    same, claimed = diagnosis.equivalent, diagnosis.effects
+    ties = [told_apart(group, same, claimed) for group in diagnosis.indistinguishable]
     found = [f"{text[:1].lower()}{text[1:]}" for text in ties]
     found += [one.sentence() for one in diagnosis.unconfirmed[:1]]
     if diagnosis.leftover:
