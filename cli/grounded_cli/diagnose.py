@@ -259,8 +259,8 @@ def _effects(found: Diagnosis, *, details: bool) -> None:
     if rows:
         show("\n" + table(rows, header))
         _note(
-            "without it: how much larger errors are, the mean over states and horizons; evidence: "
-            "log-likelihood lost without it"
+            "without: how much larger errors are without it, in the mean over states and "
+            "horizons; evidence: log-likelihood lost without it"
             + tied
             + "; alone: log-likelihood gained by it alone" * ("alone [nats]" in header)
             + "; +-: one standard deviation"

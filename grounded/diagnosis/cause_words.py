@@ -287,19 +287,19 @@ def is_late(cause: str) -> bool:
 
 
 def with_worth(clause: str, credit: Sequence[Credit]) -> str:
-    """Append to a clause on one or more causes how much farther predictions miss without them."""
+    """Append to a clause on one or more causes how much larger errors are without them."""
     times = math.prod(one.times for one in credit)
     if math.isnan(times):  # a document of an older version
         return clause
     these = "these" if len(credit) > 1 else "this"
-    return f"{clause} (without {these}, predictions miss {farther(times)})"
+    return f"{clause} (without {these}, errors are {as_large(times)})"
 
 
-def farther(times: float) -> str:
-    """Return `7 % farther`, or `2.4 times as far` from a factor of 2 on."""
+def as_large(times: float) -> str:
+    """Return `7 % larger`, or `2.4 times as large` from a factor of 2 on."""
     if times < HARDLY:
-        return "hardly farther"
-    return f"{percent(times - 1)} farther" if times < 2 else f"{times_of(times)} as far"
+        return "hardly larger"
+    return f"{percent(times - 1)} larger" if times < 2 else f"{times_of(times)} as large"
 
 
 def times_of(times: float) -> str:

@@ -130,7 +130,7 @@ def effect_table(diagnosis: Diagnosis, *, rivals: bool = True) -> tuple[list[Cel
         blank = ("", "")[:columns]
         rows.insert(0, ("  (calibration)", share, *blank, OWN))
     evidence = ("evidence [nats]", "alone [nats]")[:columns]
-    return rows, ("effect (*: claimed)", "without it", *evidence, "value")
+    return rows, ("effect (*: claimed)", "without", *evidence, "value")
 
 
 def weighed_beside(diagnosis: Diagnosis) -> set[str]:

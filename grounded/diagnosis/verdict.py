@@ -93,7 +93,7 @@ def verdict(
     once = [sentence([one.sentence()]) for one in rare]
     left = remainder[0].sentence() if remainder else ""
     others = len(remainder) - 1
-    left += f"; {others} more state{'s' * (others > 1)}" if others > 0 else ""
+    left += also_off(others)
     unexplained = f"{BOTH if changed else UNEXPLAINED}{left}."
     first = "" if changed is None else comparison(changed, adopted)
     claimed = [row for row in ranking if row.claimed]
@@ -156,6 +156,13 @@ def verdict(
         parameters=off,
     )
     return replace(said, look_for=more if more > most else 0)
+
+
+def also_off(others: int) -> str:
+    """Return a clause on states that are off beside the first; "" if there are none."""
+    if others < 1:
+        return ""
+    return f", and {others} more state{'s are' if others > 1 else ' is'} off"
 
 
 def with_faults(said: Verdict, findings: Iterable[Finding]) -> Verdict:
@@ -321,14 +328,14 @@ def told_apart(
     Args:
         group: effects that tie.
         same: the groups that are equivalent in this model.
-        claimed: the claimed effects. If one is in the group, the clause says that it is adopted.
+        claimed: the claimed effects. If one is in the group, the clause says that adopting writes it.
     """
     own = next((name for name in group if name in claimed), "")
+    writes = f"; adopting writes {own}, the claimed one" * bool(own)
     if group in same:
-        return f"{listed(group)} are equivalent in this model" + f"; {own} is adopted" * bool(own)
+        return f"{listed(group)} are equivalent in this model{writes}"
     either = "either" if len(group) == 2 else "each"
-    adopted = f"; {own}, the claimed one, is what is adopted" * bool(own)
-    return f"The data can't tell {tied(group)}: {either} explains these trials{adopted}"
+    return f"The data can't tell {tied(group)}: {either} explains these trials{writes}"
 
 
 def tied(group: Sequence[str]) -> str:

@@ -49,13 +49,13 @@ def test_the_friction_of_all_joints_is_told_together():
     assert len(found) == 3
     friction = next(text for text in found if "dry friction" in text)
     assert friction.startswith("the input t1 loses 0.3 N m to dry friction and 0.2 N m s/rad")
-    assert friction.endswith(", the input t2 0.1 N m and 0.05 N m s/rad (without these, predictions miss 74 % farther)")
+    assert friction.endswith(", the input t2 0.1 N m and 0.05 N m s/rad (without these, errors are 74 % larger)")
     assert "12 % weaker" in found[2]  # a percentage with its direction stands alone
 
 
 def test_three_causes_are_told_one_by_one_and_one_without_a_share():
     found = told([ONE, TWO, GAIN], [0.5, 0.3, 0.2])
-    assert len(found) == 3 and found[1].endswith("(without this, predictions miss 52 % farther)")
+    assert len(found) == 3 and found[1].endswith("(without this, errors are 52 % larger)")
     assert told([GAIN], [1.0]) == ("the input t1 acts 12 % weaker than modelled",)
 
 
@@ -78,7 +78,7 @@ def test_the_smallest_of_many_are_only_named():
     VALUES["input_bias:t2"] = {"b": Estimate(0.03, 0.001, unit="N m")}
     found = told(names, [0.5, 0.2, 0.15, 0.1, 0.03, 0.02])
     assert len(found) == 5
-    worth = "(without these, predictions miss 7.2 % farther)"
+    worth = "(without these, errors are 7.2 % larger)"
     assert found[-1] == f"also {BIAS} and input_bias:t2 {worth}"
 
 
@@ -90,7 +90,7 @@ def test_a_delay_is_named_however_small_its_share(late):
     VALUES[late] = {n: Estimate(0.06, 0.001, unit="s") for n in ("d", "tau")}
     found = told(names, [0.4, 0.2, 0.15, 0.1, 0.08, 0.05, 0.02])
     assert len(found) == 6 and "0.06 s" in found[4]
-    worth = "(without these, predictions miss 15 % farther)"
+    worth = "(without these, errors are 15 % larger)"
     assert found[-1] == f"also {BIAS} and input_bias:t2 {worth}"
 
 

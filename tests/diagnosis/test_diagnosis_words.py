@@ -8,7 +8,7 @@ import numpy as np
 
 from facts import holds
 from grounded import Trial
-from grounded.diagnosis.cause_words import farther, with_worth
+from grounded.diagnosis.cause_words import as_large, with_worth
 from grounded.diagnosis.error_report import Credit, Region, Remainder, RulerRow, furthest, runaway
 from grounded.diagnosis.next_trial import LOG, LOST, next_trial
 from grounded.diagnosis.report import Agreement, Diagnosis, Estimate, Ranked, Unconfirmed
@@ -243,11 +243,11 @@ def test_what_a_cause_is_worth_is_the_same_in_the_sentence_and_in_the_table():
     credit = (Credit(effect.name, 0.926, times=12.3), Credit("calibration", 0.074, times=1.222))
     ranked = (Ranked(effect.name, k, claimed=True),)
     said = verdict(claims, ranked, (), (), (), credit)
-    assert "(without this, predictions miss 12 times as far)" in said.sentence
-    assert "(without this, predictions miss 22 % farther)" in said.sentence
+    assert "(without this, errors are 12 times as large)" in said.sentence
+    assert "(without this, errors are 22 % larger)" in said.sentence
     rows, header = effect_table(Diagnosis(said, ranking=ranked, credit=credit))
-    assert header[1] == "without it" and [row[1] for row in rows] == ["+22 %", "12 times"]
-    assert farther(1.0003) == "hardly farther" and larger(1e5) == "over 1,000 times"
+    assert header[1] == "without" and [row[1] for row in rows] == ["+22 %", "12 times"]
+    assert as_large(1.0003) == "hardly larger" and larger(1e5) == "over 1,000 times"
     old = replace(credit[0], times=float("nan"))  # of an older version
     assert with_worth("late", [old]) == "late" and larger(old.times) == ""
 

@@ -241,7 +241,7 @@ def test_the_order_of_candidates_is_explained(cart):
 def test_numbers_that_differ_are_told_apart():
     assert changed("l", 0.5, 0.4997, "m") == "l 0.5000 -> 0.4997 m"
     assert in_digits_apart(0.99973, 1.0) == ("0.9997", "1.000")  # not 1.000 and 1.00
-    assert changed("g", 2.0, 2.0, "1") == "g 2.000 -> 2.000"
+    assert changed("g", 2.0, 2.0, "1") == "g 2.000, as before"
 
 
 def test_a_gain_needs_the_values_that_were_diagnosed(adopted):

@@ -53,7 +53,7 @@ def test_causes_gain_and_what_is_left(diagnosis):
     assert CAUSES[2] in wrong  # a delay, however small its share: it decides stability
     (*_, bias) = diagnosis.credit
     other = replace(diagnosis, credit=(*diagnosis.credit[:2], replace(bias, of="input_bias:force")))
-    small = "also input_bias:force (without this, predictions miss 6.0 % farther)"
+    small = "also input_bias:force (without this, errors are 6.0 % larger)"
     assert small in three_lines(other, cart_task())[0]
     large = replace(bias, of="input_bias:force", share=0.22)  # was only counted
     other = replace(diagnosis, credit=(*diagnosis.credit[:2], large))
@@ -110,7 +110,7 @@ def test_an_error_is_given_in_a_unit_that_fits(value, unit, text):
 def test_each_of_several_causes_stands_on_a_line_of_its_own(diagnosis):
     told = replace(diagnosis.verdict, sentences=("All three.", "What is left."))
     causes, others = verdict_lines(replace(diagnosis, verdict=told))
-    worth = "(without this, predictions miss 2.4 times as far)"
+    worth = "(without this, errors are 2.4 times as large)"
     assert causes[1] == f"{CAUSES[1][:1].upper()}{CAUSES[1][1:]} {worth}"
     assert len(causes) == len(CAUSES) and others == ["What is left."]
     old = Verdict("effect", sentence="Friction slows v.")

@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from grounded.diagnosis.cause_words import is_late, only_named
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.ruler_words import COMPARABLE, in_doubt, open_noise, rest, telling, worsened
-from grounded.diagnosis.verdict import told_apart
+from grounded.diagnosis.verdict import also_off, told_apart
 from grounded.result import listed, measured_alike
 from grounded.task import Task
-from grounded_trials.wording import count, shown
+from grounded_trials.wording import shown
 from grounded_trials.workspace.off_target import rates_among, weighed_groups
 
 CAUSES = 2  # that the first line names in any case
@@ -126,8 +126,7 @@ def still_open(diagnosis: Diagnosis) -> str:
     found = [f"{text[:1].lower()}{text[1:]}" for text in ties]
     found += [one.sentence() for one in diagnosis.unconfirmed[:1]]
     if diagnosis.leftover:
-        others = len(diagnosis.leftover) - 1
-        more = f"; {count(others, 'more state')}" * bool(others)
+        more = also_off(len(diagnosis.leftover) - 1)
         found.append(f"still unexplained: {diagnosis.leftover[0].sentence()}{more}")
     rows = diagnosis.prediction_error
     if not found and (name := open_noise(rows)):
