@@ -66,7 +66,7 @@ SEEN = 10  # calls from which on the time left is told
 
 def _range(least: float, most: float) -> str:
     """Format a range of durations: `about 10 s to 2 min`, `up to about 40 s`."""
-    low, high = _told(_round(least)), _told(_round(most))
+    low, high = (_told(_round(end)).replace(".0 ", " ") for end in (least, most))
     if low == high or most < NOW:
         return f"about {high}"
     return f"up to about {high}" if least < NOW else f"about {low} to {high}"
@@ -76,10 +76,12 @@ NOW = 1.0  # [s] durations below it are not told
 
 
 def _round(seconds: float) -> float:
-    """Return a duration in one significant digit below 100 s."""
-    return float(f"{seconds:.1g}") if seconds < 100 else seconds
+    """Return a duration in one significant digit below 100 s, else in whole minutes."""
+    return float(f"{seconds:.1g}") if seconds < 100 else 60 * round(seconds / 60)
 
 
 def _told(seconds: float) -> str:
-    """Format a duration: 40 s, 7 min."""
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+    """Format a duration: 40 s, 2.5 min, 12 min."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 600 else f"{seconds / 60:.0f} min"

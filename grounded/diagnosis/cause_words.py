@@ -306,7 +306,7 @@ def times_of(times: float) -> str:
     """Return `2.4 times` for a factor, in two significant digits."""
     if times > MOST_TIMES:
         return f"over {MOST_TIMES:,} times"
-    return f"{float(f'{times:.2g}'):,g} times"
+    return f"{times:.1f} times" if times < 9.95 else f"{float(f'{times:.2g}'):,g} times"
 
 
 def disagreement(values: Sequence[TrialValue], unit: str) -> str:

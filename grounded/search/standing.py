@@ -71,14 +71,14 @@ class Standing(Result):
     ending: Ending = ""
     then: NextCommand | None = None  # a command that helps now
     doubt: str = ""  # why a diagnosis helps more than the next trial
-    missed: str = ""  # the end of `sentence`: the ended search asks for a diagnosis, see `let_down`
+    missed: str = ""  # the end of `sentence`, if that asks for a diagnosis
 
     def answered(self) -> Standing:
-        """Return the standing after the diagnosis that an ended search asked for."""
+        """Return the standing after the diagnosis that it asked for."""
         if not self.missed:
             return self
         sentence = self.sentence.removesuffix(self.missed)
-        return replace(self, sentence=sentence, then=None, missed="")
+        return replace(self, sentence=sentence, then=None, doubt="", missed="")
 
     @property
     def utilities(self) -> list[float]:
@@ -263,8 +263,9 @@ def standing(
     lost = f", since {last.candidate.id} crashed" * (last.accepted is False and bool(last.failed))
     sentence = f"improve on {own} with {step}{lost}"
     if why := _suspicion(history, incumbent, model):
-        then, sentence = NextCommand("diagnose"), f"{sentence}; {why}"
-        return replace(now, step=step, way=way, sentence=sentence, then=then, doubt=why)
+        asked = f"; {why}"
+        now = replace(now, then=NextCommand("diagnose"), doubt=why, missed=asked)
+        return replace(now, step=step, way=way, sentence=sentence + asked)
     return replace(now, step=step, way=way, sentence=sentence)
 
 

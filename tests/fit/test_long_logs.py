@@ -82,7 +82,7 @@ def test_the_time_left_is_in_the_range_that_is_told(monkeypatch, calls, exponent
     told, left = clocked(monkeypatch, (50, 400), calls, exponent)
     inside = []
     for text, true in zip(told, left, strict=True):
-        ends = [float(n) * {"s": 1, "min": 60}[u] for n, u in re.findall(r"(\d+) (s|min)", text)]
+        ends = [float(n) * {"s": 1, "min": 60}[u] for n, u in re.findall(r"([\d.]+) (s|min)", text)]
         assert text.startswith("refine, ") and "at most" not in text
         if text.endswith("left"):
             low, high = (0.0, ends[-1]) if len(ends) < 3 else ends[1:]
@@ -94,7 +94,7 @@ def test_what_takes_longer_than_usual_says_so(monkeypatch):
     told, _ = clocked(monkeypatch, (5, 20), 30, 1.3)
     assert not any("left" in text for text in told[:10]) and "left" in told[12]
     assert all("longer than usual" in text for text in told[20:])
-    assert told[-1] == "refine, 4 min so far, longer than usual"
+    assert told[-1] == "refine, 4.0 min so far, longer than usual"
 
 
 @pytest.mark.parametrize("after", [3, 25])

@@ -167,8 +167,9 @@ def _diagnosis(findings: Findings, table: Table) -> str:
         lines += _wrapped(f"{title}: {text}", "  ")
     if diagnosis.prediction_error and not diagnosis.no_cause:
         lines += ["", table(*error_table(diagnosis, whole_trials=False))]
-    if diagnosis.ranking and not diagnosis.no_cause:
-        lines += ["", table(*effect_table(diagnosis, rivals=False))]
+    rows, header = effect_table(diagnosis, rivals=False)
+    if rows and not diagnosis.no_cause:
+        lines += ["", table(rows, header)]
     return "\n".join(lines)
 
 

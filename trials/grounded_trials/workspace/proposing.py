@@ -309,7 +309,7 @@ def standing_in(
 
 
 def _answered(workspace: Folder, now: Standing) -> Standing:
-    """Return the standing; a search that asks for a diagnosis does not after one of all trials."""
+    """Return the standing; a search that asks for a diagnosis does not once there is a newer one."""
     if not now.missed:
         return now
     from grounded_trials.workspace.last_diagnosis import read_diagnosis
@@ -322,7 +322,7 @@ def _answered(workspace: Folder, now: Standing) -> Standing:
     if found is None:
         return now
     since = since_diagnosis(workspace, found, usable_ids(workspace))
-    return now if since.changed or since.used < since.usable else now.answered()
+    return now if since.changed or since.newer else now.answered()
 
 
 def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()) -> Status:
