@@ -328,7 +328,7 @@ def told_apart(
     Args:
         group: effects that tie.
         same: the groups that are equivalent in this model.
-        claimed: the claimed effects. If one is in the group, the clause says that adopting writes it.
+        claimed: the claimed effects. Of one in the group the clause says that adopting writes it.
     """
     own = next((name for name in group if name in claimed), "")
     writes = f"; adopting writes {own}, the claimed one" * bool(own)

@@ -49,7 +49,9 @@ def test_the_friction_of_all_joints_is_told_together():
     assert len(found) == 3
     friction = next(text for text in found if "dry friction" in text)
     assert friction.startswith("the input t1 loses 0.3 N m to dry friction and 0.2 N m s/rad")
-    assert friction.endswith(", the input t2 0.1 N m and 0.05 N m s/rad (without these, errors are 74 % larger)")
+    assert friction.endswith(
+        ", the input t2 0.1 N m and 0.05 N m s/rad (without these, errors are 74 % larger)"
+    )
     assert "12 % weaker" in found[2]  # a percentage with its direction stands alone
 
 
@@ -144,7 +146,9 @@ def test_a_cause_on_which_trials_disagree_stands_alone():
     effects = {n: Library().effect(n, arm) for n in (INERTIA, ONE, GAIN, TWO)}
     causes = [meaning(effects[n], VALUES[n]) for n in effects]
     causes[1] += f", {DISAGREE}: c = 0.1 to 0.4"
-    assert len(clauses([*effects], causes, [Credit(n, 0.25) for n in effects], effects, VALUES)) == 4
+    assert (
+        len(clauses([*effects], causes, [Credit(n, 0.25) for n in effects], effects, VALUES)) == 4
+    )
 
 
 @pytest.mark.parametrize(

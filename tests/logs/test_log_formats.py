@@ -246,7 +246,9 @@ def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path
     path.write_text("Time [ms],x\n0,1.5\n20,2.5\n4")
     found = read_signals(path, {"x": SignalSpec("/csv.x")})["x"]
     assert found.values.tolist() == [1.5, 2.5] and found.t.tolist() == [0, 20_000_000]
-    assert "'4'" in table_remarks(path)[0] and any("'4'" in one for one in inspect_log(path).remarks)
+    assert "'4'" in table_remarks(path)[0] and any(
+        "'4'" in one for one in inspect_log(path).remarks
+    )
     for whole in ("t,x\n0,1.5\n20,2.5", "t,x\n0,1.5\n20,2.5\n", "t,x\n0,1.5\n\n\n"):
         path.write_text(whole)
         assert not table_remarks(path)

@@ -105,8 +105,10 @@ def states_time_unit(path: Path) -> bool:
 
 
 def table_remarks(path: Path) -> list[str]:
-    """Return what is odd in a text table: an incomplete last row, which is left out; a column whose
-    name may be one too many.
+    """Return what is odd in a text table, as sentences.
+
+    The last row may be incomplete; it is left out. The last column may be empty in every row, so
+    that one name may be too many.
     """
     if path.suffix.lower() not in (".csv", ".tsv", ".txt"):
         return []

@@ -309,7 +309,7 @@ def standing_in(
 
 
 def _answered(workspace: Folder, now: Standing) -> Standing:
-    """Return the standing; a search that asks for a diagnosis does not once there is a newer one."""
+    """Return the standing, which asks for no diagnosis if there is one of all that it knows."""
     if not now.missed:
         return now
     from grounded_trials.workspace.last_diagnosis import read_diagnosis
