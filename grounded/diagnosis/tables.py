@@ -20,6 +20,7 @@ Cells = tuple[str, ...]
 WIDEST = 1e4  # an interval wider than this times the value, and than UNBOUNDED, says nothing
 UNBOUNDED = 1e6
 INTERVAL = 2 * 1.96  # width of a 95 % interval in standard deviations
+WITHOUT = "without: how much larger errors are without it, in the mean over states and horizons"
 EFFECTS = 8  # rows of the table of effects, more if more are claimed or tied
 
 
@@ -49,6 +50,8 @@ def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[lis
     for key in ("outset", "calibrated"):
         if not any(getattr(row, key) for row in ahead):
             del columns[key]
+    if ahead and not diagnosis.verdict.causes and all(r.with_effects == r.crude for r in ahead):
+        del columns["with_effects"]  # nothing was found: the same numbers once more
     rows: list[Cells] = []
     for row in (*ahead, *(whole if whole_trials or not ahead else ())):
         when = "whole trial" if row.whole_trial else f"{row.horizon_s:.3g} s ahead"

@@ -64,7 +64,8 @@ def correction_line(correction: Correction) -> str:
     gain = f"removes {percent(correction.held_out_gain)} of the held-out squared error"
     if not correction.adoptable:
         return f"a curve of {correction.channel} over {over} does not improve held-out predictions"
-    return f"correction:{correction.channel}, a curve over {over}, {gain}; it explains no cause"
+    name = f"correction:{correction.channel}, a curve over {over},"
+    return f"{name} {gain}; it is no cause, but can be adopted"
 
 
 def in_vain(diagnosis: Diagnosis) -> list[str]:
