@@ -16,7 +16,7 @@ from grounded_trials.workspace.off_target import rates_among, weighed_groups
 
 CAUSES = 2  # that the first line names in any case
 LARGE = 0.15  # of the improvement: a further cause above it is named too
-SMALL = 0.05  # of the improvement: a cause below it is only counted
+SMALL = 0.05  # of the improvement: a cause below it is only named
 FEW = 2  # states in the second line
 
 
