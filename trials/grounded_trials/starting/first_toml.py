@@ -83,7 +83,7 @@ def write_first(
         "# terminal: weights of the last step only. If the run must END at rest on its target",
         "# (docking, parking) but overshoots, use 10 to 100 times `state`, also for the speeds",
         f"# terminal = {_inline({name: OFFERED * weight for name, weight in weights.items()})}",
-        "# input_change: weights of (a_t - a_{t-1})^2; larger ones make commands smoother. Until",
+        "# input_change: weights of (a_t - a_{t-1})^2; larger ones make inputs smoother. Until",
         "# you change them, `target` sets them to 0.04 / (range in [limits])^2. To know whether",
         "# you did, it compares them with the next line: leave that one as it is",
         f"# input_change = {_inline(changes)}",
