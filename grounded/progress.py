@@ -1,8 +1,7 @@
-"""Progress of long computations: stage, share done, time left; partial results on Ctrl-C."""
+"""Progress of long computations: stage, time taken and left; partial results on Ctrl-C."""
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -30,21 +29,20 @@ def interruptible(so_far: Callable[[], str]) -> Iterator[None]:
 
 @dataclass
 class Stages:
-    """Reports each stage with the share done and the time left, from the usual number of calls.
+    """Reports each stage with the time taken and the time that is left, from the number of calls.
 
-    The number of calls varies by a factor of two either way, and later ones take longer (`LATER`).
-    So the time left is told as if there were twice as many calls: "at most".
+    The number of calls is known within wide limits only: whether a diagnosis looks for one more
+    effect depends on what the last one left. So the time left is told as a range.
 
     Args:
         tell: shows a line; None for no output.
-        usual: usual number of calls until the end.
+        usual: fewest and most calls of nearly all computations of this kind.
     """
 
     tell: Callable[[str], None] | None
-    usual: int
+    usual: tuple[int, int]
     began: float = field(default_factory=time.monotonic)
     count: int = 0
-    left: float = math.inf  # last estimate of the time left [s]
     so_far: str = "nothing was found yet"  # the result so far, for Ctrl-C
 
     def __call__(self, stage: str) -> None:
@@ -53,20 +51,37 @@ class Stages:
         if self.tell is None:
             return
         taken = time.monotonic() - self.began
-        least, share = ((self.count / (by * self.usual)) ** LATER for by in (2.0, 1.0))
-        if least > NEARLY:
-            return self.tell(f"{stage}, {_told(taken)} so far, longer than usual")
-        done = f"about {100 * share:.0f} % done" if share < NEARLY else f"{_told(taken)} so far"
-        left = taken * (1 - least) / least
-        shrinks, self.left = left < self.left, left  # no estimate is shown if the end recedes
-        about = f", at most {_told(left)} left" if self.count > 10 and shrinks else ""
-        self.tell(f"{stage}, {done}{about}")
+        text = f"{stage}, {_told(taken)} so far"
+        if self.count > self.usual[1]:
+            text += ", longer than usual"
+        elif self.count > SEEN:
+            least, most = (taken * ((n / self.count) ** LATER - 1) for n in self.usual)
+            text += f", {_range(max(least, 0.0), most)} left"
+        self.tell(text)
 
 
-LATER = 1.3  # exponent of the share of calls that gives the share of time (three diagnoses)
-NEARLY = 0.9  # share from which on its number says nothing: there may be twice as many calls
+LATER = 1.3  # exponent of the share of calls that gives the share of time (eight diagnoses)
+SEEN = 10  # calls from which on the time left is told
+
+
+def _range(least: float, most: float) -> str:
+    """Format a range of durations: `about 10 s to 2 min`, `up to about 40 s`."""
+    low, high = (_told(_round(end)).replace(".0 ", " ") for end in (least, most))
+    if low == high or most < NOW:
+        return f"about {high}"
+    return f"up to about {high}" if least < NOW else f"about {low} to {high}"
+
+
+NOW = 1.0  # [s] durations below it are not told
+
+
+def _round(seconds: float) -> float:
+    """Return a duration in one significant digit below 100 s, else in whole minutes."""
+    return float(f"{seconds:.1g}") if seconds < 100 else 60 * round(seconds / 60)
 
 
 def _told(seconds: float) -> str:
-    """Format a duration: 40 s, 7 min."""
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+    """Format a duration: 40 s, 2.5 min, 12 min."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 600 else f"{seconds / 60:.0f} min"

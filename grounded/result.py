@@ -87,7 +87,7 @@ def with_unit(text: str, unit: str) -> str:
 
 
 def measured(value: float, unit: str) -> str:
-    """Format an error in two digits, in cm, mm, mrad ... where it is small in its own unit."""
+    """Format an error in two digits, in mm, mrad ... where it is small in its own unit."""
     return _told(value, *_scale(value, unit))
 
 
@@ -95,15 +95,16 @@ def measured_alike(values: Sequence[float], unit: str) -> list[str]:
     """Format errors that are compared, like `measured`, in the unit of their geometric mean."""
     known = [v for v in values if 0 < v < math.inf]
     middle = math.exp(sum(map(math.log, known)) / len(known)) if known else 0.0
-    in_mm = unit == "m" and known and min(known) < SMALL and max(known) < 1.0
-    scale = (1e3, "mm") if in_mm and middle >= SMALL else _scale(middle, unit)
-    return [_told(value, *scale, FIXED) for value in values]
+    return [_told(value, *_scale(middle, unit), FIXED) for value in values]
 
 
 def _scale(value: float, unit: str) -> tuple[float, str]:
-    """Return the factor and the scaled unit for values of this size."""
+    """Return the factor and the scaled unit for values of this size; lengths below 1 m are in mm.
+
+    With cm between mm and m, two lines on one motion were in two units.
+    """
     if unit == "m" and SMALL <= value < 1.0:
-        return 100.0, "cm"
+        return 1e3, "mm"
     if unit.startswith(SCALED) and 0 < value < SMALL:
         step = 1 if value >= 1e-5 else 2
         return 1e3**step, "-mµ"[step] + unit

@@ -9,11 +9,12 @@ import click
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, remark, sentence, show, show_json
-from grounded_trials.wording import ALONE, misread, with_unit
+from grounded_trials.wording import ALONE, misread, moved, with_unit
 
 if TYPE_CHECKING:
     from grounded_trials import Workspace
 
+DIGITS = 4  # of a parameter, at least
 UNCLAIMED = (
     "was not claimed by the last diagnosis: its values were fitted on their own, instead of what "
     "was claimed; the model's own parameters are unchanged"
@@ -96,7 +97,7 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
     if done.params:
         show("written to [model] params, calibrated beside the effects:")
     for name, value in done.params.items():
-        text = with_unit(f"{number(before[name].value)} -> {number(value)}", before[name].unit)
+        text = moved(before[name].value, value, before[name].unit, DIGITS)
         text += ALONE * (name in done.jointly)
         show(field(name, text, "  "))
     for one in done.left.values():
@@ -123,8 +124,7 @@ def _undo(workspace: Workspace, json_: bool) -> None:
     now = workspace.base_model.params
     for name, was in before.items():
         if was.value != now[name].value:
-            text = with_unit(f"{number(was.value)} -> {number(now[name].value)}", was.unit)
-            show(field(name, text, "  "))
+            show(field(name, moved(was.value, now[name].value, was.unit, DIGITS), "  "))
     rest = ", ".join(str(effect["name"]) for effect in done.effects)
     sentence(f"still part of the model: {rest}" if rest else "no effect is adopted now")
     show(f"\n{next_line(done.then)}")

@@ -252,15 +252,14 @@ def _places(found: Diagnosis, *, details: bool) -> None:
 
 def _effects(found: Diagnosis, *, details: bool) -> None:
     """Print the claimed effects and what ties with them, or with `details` all rivals."""
-    from grounded.diagnosis.tables import effect_table
+    from grounded.diagnosis.tables import WITHOUT, effect_table
 
     rows, header = effect_table(found, rivals=details)
     tied = " (a tied effect: in place of the claimed one)" * bool(found.indistinguishable)
     if rows:
         show("\n" + table(rows, header))
         _note(
-            "credit: share of the improvement lost without it; evidence: log-likelihood lost "
-            "without it"
+            f"{WITHOUT}; evidence: log-likelihood lost without it"
             + tied
             + "; alone: log-likelihood gained by it alone" * ("alone [nats]" in header)
             + "; +-: one standard deviation"

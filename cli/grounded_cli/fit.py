@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,7 @@ from grounded_trials.wording import count, shown
 if TYPE_CHECKING:
     from grounded.engine import Engine
     from grounded.fit import Fit
+    from grounded.fit.result import FittedValue
     from grounded.model import Model
 
 STANDS_IN = (
@@ -102,10 +104,11 @@ def command(
 
 
 def _not_fitted(delays: Sequence[str]) -> str:
-    """Say that adopted delays kept their values, and how to estimate them again."""
+    """Say that the intervals take adopted delays as exact, and what estimates these too."""
     return (
-        f"not fitted: d of {listed(delays)}; `grounded diagnose` estimates it again, `--latency` "
-        "fits one delay of all inputs in its place"
+        f"{listed(delays)} kept {'its' if len(delays) == 1 else 'their'} d, which the intervals "
+        "take as exact: they are too narrow; `grounded fit --latency` fits one delay of all inputs "
+        "in its place"
     )
 
 
@@ -122,10 +125,23 @@ def _stopped(names: Sequence[str]) -> str:
 def _parameters(found: Fit) -> str:
     rows = []
     for name, e in found.params.items():
-        interval = f"{number(e.low)} .. {number(e.high)}" if e.identified else "not identified"
+        digits = _digits(e) if e.identified else DIGITS
+        low, high, start, value = (number(v, digits) for v in (e.low, e.high, e.start, e.value))
+        interval = f"{low} .. {high}" if e.identified else "not identified"
         interval = "at its bound" if name in found.at_bounds else interval
-        rows.append((name, number(e.start), number(e.value), interval, shown(e.unit)))
+        rows.append((name, start, value, interval, shown(e.unit)))
     return table(rows, ("parameter", "before", "fitted", "95 % interval", "unit"))
+
+
+def _digits(e: FittedValue) -> int:
+    """Return how many significant digits show two of the width of an interval."""
+    width, size = e.high - e.low, max(abs(e.low), abs(e.high))
+    if not 0 < width < size < math.inf:
+        return DIGITS
+    return min(max(math.floor(math.log10(size)) - math.floor(math.log10(width)) + 2, DIGITS), MOST)
+
+
+DIGITS, MOST = 4, 7  # significant digits of a value, usually and at most
 
 
 def _errors(found: Fit, model: Model) -> str:

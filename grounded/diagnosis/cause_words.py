@@ -13,6 +13,7 @@ from grounded.model import Model
 from grounded.result import listed, number, percent, spread, with_unit
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
+    from grounded.diagnosis.error_report import Credit
     from grounded.effects import Effect
 
 AS_STRONG = 0.2  # a gain this close to -1 is a wrong sign and nothing else
@@ -24,6 +25,9 @@ MOST_DIGITS = 6  # significant digits of a value
 DISAGREE = "but the trials disagree"
 KNOWN = 2.0  # standard deviations from zero that a value needs to be worded
 RESCALE = ("input_gain", "input_curve", "input_fade")  # they change what a volt of an input does
+OWN = "the model's own parameters"
+MOST_TIMES = 1000  # a larger ratio of errors says no more
+HARDLY = 1.001  # ratio of errors below which they count as the same
 FEW = 3  # up to so many causes get a clause each
 LATE = ("delay", "sensor_delay", "first_order_lag", "sensor_lag")  # they decide if a loop is stable
 TOLD = 4  # clauses otherwise: one per kind of effect, the smallest causes only counted
@@ -230,26 +234,26 @@ def _turned(effect: Effect, params: Mapping[str, Estimate]) -> str:
 def clauses(
     names: Sequence[str],
     causes: Sequence[str],
-    shares: Sequence[float],
+    credit: Sequence[Credit],
     effects: Mapping[str, Effect],
     values: Mapping[str, Mapping[str, Estimate]],
 ) -> tuple[str, ...]:
-    """Return the clauses of the verdict's first sentence, each with its share, largest first.
+    """Return the clauses of the verdict's first sentence, each with its worth, largest first.
 
-    More than FEW causes are grouped by kind: the friction of every joint in one clause. Delays and
-    lags are never only counted.
+    More than FEW causes are grouped by kind: the friction of every joint in one clause. Those of
+    the smallest groups are only named, but delays and lags never.
 
     Args:
         names: names of the causes, largest first.
         causes: one clause per cause.
-        shares: the share of the improvement due to each cause, 0 to 1.
+        credit: what each cause is worth.
         effects: the causes that are effects, by name.
         values: the estimates of each effect, by name.
     """
     if len(names) < 2:
         return tuple(causes)
     if len(names) <= FEW:
-        return tuple(map(with_share, causes, shares))
+        return tuple(with_worth(text, [one]) for text, one in zip(causes, credit, strict=True))
     kinds: dict[tuple[str, ...], list[int]] = {}
     for i, name in enumerate(names):
         own = effects.get(name)
@@ -257,17 +261,24 @@ def clauses(
         alike = alike and DISAGREE not in causes[names.index(name)]
         key = (own.family.name, *_told(values[name])) if own is not None and alike else (name,)
         kinds.setdefault(key, []).append(i)
-    groups = sorted(kinds.values(), key=lambda group: -sum(shares[i] for i in group))
+    groups = sorted(kinds.values(), key=lambda group: -sum(credit[i].share for i in group))
     told = [group for group in groups if group in groups[:TOLD] or is_late(names[group[0]])]
     told = groups if len(groups) <= len(told) + 1 else told
     found = []
     for first, *others in told:
         same = [f", {_beside(effects[names[i]], values[names[i]])}" for i in others]
-        together = sum(shares[i] for i in (first, *others))
-        found.append(with_share(f"{causes[first]}{''.join(same)}", together))
-    if rest := [i for group in groups if group not in told for i in group]:
-        found.append(with_share(f"{len(rest)} smaller causes", sum(shares[i] for i in rest)))
+        together = [credit[i] for i in (first, *others)]
+        found.append(with_worth(f"{causes[first]}{''.join(same)}", together))
+    if rest := [credit[i] for group in groups if group not in told for i in group]:
+        found.append(only_named(rest))
     return tuple(found)
+
+
+def only_named(rest: Sequence[Credit]) -> str:
+    """Return a clause that names causes, as the table of effects does, with what they are worth."""
+    names = (one.of.removeprefix("parameter:") for one in rest)
+    told = listed(OWN if name == "calibration" else name for name in names)
+    return with_worth(f"also {told}", rest)
 
 
 def is_late(cause: str) -> bool:
@@ -275,9 +286,27 @@ def is_late(cause: str) -> bool:
     return cause.partition(":")[0] in LATE
 
 
-def with_share(clause: str, share: float) -> str:
-    """Append a cause's share of the improvement to its clause."""
-    return f"{clause} ({percent(share)} of the improvement)"
+def with_worth(clause: str, credit: Sequence[Credit]) -> str:
+    """Append to a clause on one or more causes how much larger errors are without them."""
+    times = math.prod(one.times for one in credit)
+    if math.isnan(times):  # a document of an older version
+        return clause
+    these = "these" if len(credit) > 1 else "this"
+    return f"{clause} (without {these}, errors are {as_large(times)})"
+
+
+def as_large(times: float) -> str:
+    """Return `7 % larger`, or `2.4 times as large` from a factor of 2 on."""
+    if times < HARDLY:
+        return "hardly larger"
+    return f"{percent(times - 1)} larger" if times < 2 else f"{times_of(times)} as large"
+
+
+def times_of(times: float) -> str:
+    """Return `2.4 times` for a factor, in two significant digits."""
+    if times > MOST_TIMES:
+        return f"over {MOST_TIMES:,} times"
+    return f"{times:.1f} times" if times < 9.95 else f"{float(f'{times:.2g}'):,g} times"
 
 
 def disagreement(values: Sequence[TrialValue], unit: str) -> str:

@@ -115,7 +115,7 @@ def diagnose(
         compare: a second group of trials. Both groups are diagnosed together, and `changed` lists
             the values that differ between them.
         engine: workers that fit hypotheses; the result does not depend on their number.
-        progress: called with the stage, the fraction done and the time left, for a display.
+        progress: called with the stage, the time taken and the time left, for a display.
 
     Returns:
         The diagnosis, with its verdict, ranking of effects and prediction errors.
@@ -253,4 +253,4 @@ def _again(effect: Effect, known: float, data: Data) -> Effect:
 
 
 MOST_NAMES = 50  # 36 states and 12 inputs already give 1,649 effects, each of which is filtered
-USUAL = 350  # typical number of progress ticks: stages, and blocks of hypotheses refined
+USUAL = (150, 1700)  # fewest and most progress ticks: stages, and blocks of hypotheses refined

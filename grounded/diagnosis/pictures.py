@@ -9,6 +9,7 @@ import numpy as np
 
 from grounded.diagnosis.error_report import Credit, RulerRow, furthest
 from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.tables import larger
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
 from grounded.result import figure, measured, measured_alike, number, percent, shown
 
@@ -132,7 +133,7 @@ def _in_unit(bars: Sequence[tuple[str, float, str]], unit: str) -> tuple[Bar, ..
 
 
 def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
-    """Return the share of the improvement due to each effect and to calibration.
+    """Return how much larger errors are without each effect and without calibration.
 
     Args:
         diagnosis: the diagnosis.
@@ -142,8 +143,8 @@ def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
     credit, known = diagnosis.credit, _second_ahead(diagnosis)
     if not credit:
         return None
-    bars = tuple(Bar(c.of, c.share, percent(c.share)) for c in credit[:MOST])
-    panels = [Bars("Share of the improvement in predictions", bars)]
+    bars = tuple(Bar(c.of, c.share, larger(c.times) or percent(c.share)) for c in credit[:MOST])
+    panels = [Bars("Errors without each, mean of all (logarithmic)", bars)]
     for name in _improved(known)[:channels] if known else ():
         panels += worth_of([name], name, diagnosis)
     return Figure("credit", "What each is worth", "", tuple(panels))

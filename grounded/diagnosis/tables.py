@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from html import escape
 from typing import TYPE_CHECKING
 
+from grounded.diagnosis.cause_words import OWN, times_of
 from grounded.diagnosis.error_report import RulerRow, furthest
 from grounded.diagnosis.ruler_words import told_row
 from grounded.result import figure, html_table, percent, shown, spread, with_unit
@@ -19,6 +20,7 @@ Cells = tuple[str, ...]
 WIDEST = 1e4  # an interval wider than this times the value, and than UNBOUNDED, says nothing
 UNBOUNDED = 1e6
 INTERVAL = 2 * 1.96  # width of a 95 % interval in standard deviations
+WITHOUT = "without: how much larger errors are without it, in the mean over states and horizons"
 EFFECTS = 8  # rows of the table of effects, more if more are claimed or tied
 
 
@@ -48,6 +50,8 @@ def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[lis
     for key in ("outset", "calibrated"):
         if not any(getattr(row, key) for row in ahead):
             del columns[key]
+    if ahead and not diagnosis.verdict.causes and all(r.with_effects == r.crude for r in ahead):
+        del columns["with_effects"]  # nothing was found: the same numbers once more
     rows: list[Cells] = []
     for row in (*ahead, *(whole if whole_trials or not ahead else ())):
         when = "whole trial" if row.whole_trial else f"{row.horizon_s:.3g} s ahead"
@@ -69,8 +73,15 @@ def _cell(row: RulerRow, column: str, name: str) -> str:
 
 
 def credit_of(diagnosis: Diagnosis, effect: str) -> str:
-    """Return the share of the improvement that is lost without a cause, in percent; or ""."""
-    return next((percent(c.share) for c in diagnosis.credit if c.of == effect), "")
+    """Return how much larger errors are without a cause, `+7 %` or `2.4 times`; "" if unknown."""
+    return next((larger(c.times) for c in diagnosis.credit if c.of == effect), "")
+
+
+def larger(times: float) -> str:
+    """Return `+7 %`, or `2.4 times` from a factor of 2 on; "" for NaN."""
+    if math.isnan(times):  # a document of an older version
+        return ""
+    return f"+{percent(times - 1)}" if times < 2 else times_of(times)
 
 
 def instrument_lines(findings: Iterable[Finding]) -> list[str]:
@@ -120,9 +131,9 @@ def effect_table(diagnosis: Diagnosis, *, rivals: bool = True) -> tuple[list[Cel
     ]
     if rows and (share := credit_of(diagnosis, "calibration")):
         blank = ("", "")[:columns]
-        rows.insert(0, ("  (calibration)", share, *blank, "the model's own parameters"))
+        rows.insert(0, ("  (calibration)", share, *blank, OWN))
     evidence = ("evidence [nats]", "alone [nats]")[:columns]
-    return rows, ("effect (*: claimed)", "credit", *evidence, "value")
+    return rows, ("effect (*: claimed)", "without", *evidence, "value")
 
 
 def weighed_beside(diagnosis: Diagnosis) -> set[str]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from grounded.diagnosis.cause_words import (
     ENDED,
+    OWN,
     clauses,
     comparison,
     counted,
@@ -74,7 +75,7 @@ def verdict(
         groups: effects that the data cannot tell apart.
         remainder: errors that no effect explains.
         rows: held-out prediction errors, a row per horizon.
-        credit: the share of the improvement due to each cause, largest first.
+        credit: what each cause is worth, largest first.
         seen: effects that only one trial shows.
         same: those of `groups` that are equivalent in this model.
         most: the largest number of effects that was looked for; 0 for no limit.
@@ -92,7 +93,7 @@ def verdict(
     once = [sentence([one.sentence()]) for one in rare]
     left = remainder[0].sentence() if remainder else ""
     others = len(remainder) - 1
-    left += f"; {others} more state{'s' * (others > 1)}" if others > 0 else ""
+    left += also_off(others)
     unexplained = f"{BOTH if changed else UNEXPLAINED}{left}."
     first = "" if changed is None else comparison(changed, adopted)
     claimed = [row for row in ranking if row.claimed]
@@ -117,14 +118,14 @@ def verdict(
     told = clauses(
         [one.of for one in credit],
         causes,
-        [one.share for one in credit],
+        credit,
         {e.name: e for e in claims.best.hypothesis.effects},
         {row.effect: row.params for row in ranking},
     )
     words = [sentence(told), improvement(rows, tracked), worsened(rows)]
     words += [runaway(rows), wider(claims.parameters())]
     words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed])
-    words += [f"{told_apart(group, same)}." for group in groups]
+    words += [f"{told_apart(group, same, [r.effect for r in claimed])}." for group in groups]
     words += [one.sentence() for one in claims.one_clock[:1]]
     words += _geared(claims.data.model, [row.effect for row in claimed])[:1]
     words += _level(claims.data.model, [row.effect for row in claimed])
@@ -155,6 +156,13 @@ def verdict(
         parameters=off,
     )
     return replace(said, look_for=more if more > most else 0)
+
+
+def also_off(others: int) -> str:
+    """Return a clause on states that are off beside the first; "" if there are none."""
+    if others < 1:
+        return ""
+    return f", and {others} more state{'s are' if others > 1 else ' is'} off"
 
 
 def with_faults(said: Verdict, findings: Iterable[Finding]) -> Verdict:
@@ -209,7 +217,7 @@ def _causes(
             text += UNSURE * (not has_size(effects[one.of], values[one.of], KNOWN))
             text += f", {apart[one.of]}" if one.of in apart else ""
         else:
-            text = f"the model's own parameters are off: {_moved(claims)}{OPEN * open_gap}"
+            text = f"{OWN} are off: {_moved(claims)}{OPEN * open_gap}"
             text += _others(claims, identified)
             named = parameters_off(claims)[:NAMED]
             held = dict.fromkeys(other for n in named for other in given.get(n, ()))
@@ -312,13 +320,24 @@ def sentence(clauses: Iterable[str]) -> str:
     return f"{text[:1].upper()}{text[1:]}."
 
 
-def told_apart(group: Sequence[str], same: Sequence[Sequence[str]]) -> str:
-    """Return a clause: these data cannot tell the group apart, or no data can."""
+def told_apart(
+    group: Sequence[str], same: Sequence[Sequence[str]], claimed: Collection[str] = ()
+) -> str:
+    """Return a clause: these data cannot tell the group apart, or no data can.
+
+    Args:
+        group: effects that tie.
+        same: the groups that are equivalent in this model.
+        claimed: the claimed effects. Of one in the group the clause says that adopting writes it.
+    """
+    own = next((name for name in group if name in claimed), "")
+    writes = f"; adopting writes {own}, the claimed one" * bool(own)
     if group in same:
-        return f"{listed(group)} are equivalent in this model"
-    return f"The data can't tell {tied(group)}"
+        return f"{listed(group)} are equivalent in this model{writes}"
+    either = "either" if len(group) == 2 else "each"
+    return f"The data can't tell {tied(group)}: {either} explains these trials{writes}"
 
 
 def tied(group: Sequence[str]) -> str:
-    """Return `A from B or C`."""
-    return f"{group[0]} from {' or '.join(group[1:])}"
+    """Return `A from B`, `A, B and C apart`."""
+    return " from ".join(group) if len(group) == 2 else f"{listed(group)} apart"

@@ -65,7 +65,7 @@ odometry_scale = RateFamily(
 sensor_bias = SensorFamily(
     name="sensor_bias",
     equation="y = s + b",
-    sentence="the log of {target} is off by {b}",
+    sentence="the log of {target} reads {b} {b>too high|too low}",
     targets=places.but_position,
     quantities=lambda site: (Quantity("b", site.unit(site.target)),),
     lookalikes=("offset", "input_bias", "drift_body"),

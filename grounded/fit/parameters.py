@@ -51,7 +51,8 @@ def fit(
         names: parameters to fit; None for all uncertain ones.
         latency: (m,) transport delay of each input [s], fixed or the start value; None for zero,
             or the task's.
-        fit_latency: "known" (fixed), "common" (fit one value for all inputs) or "each".
+        fit_latency: "known" (fixed), "common" (fit one value for all inputs), "each", or
+            {name: inputs}: each of these, for the inputs with these indices.
         measurement: what the records measure; None for the states themselves.
         filters: time constants [s] of low-pass filters in sensors by state, as
             `Preflight.filters`.
@@ -59,7 +60,7 @@ def fit(
         horizon_s: prediction horizon on held-out time [s].
         rng: draws the records used to estimate the noise if there are very many.
         engine: workers for the records' likelihoods; the result does not depend on them.
-        progress: called with a line on the stage, the share done and the time left.
+        progress: called with a line on the stage, the time taken and the time left.
 
     Returns:
         A `Fit`: values with intervals, the model with these values, and prediction errors on
@@ -115,7 +116,7 @@ def _of(found: Fit, model: Model) -> Fit:
     return replace(found, model=model.with_values(values))
 
 
-USUAL = 25  # usual number of rounds and scans of a fit
+USUAL = (3, 50)  # fewest and most rounds and scans of a fit
 MOST_STATES = 50  # with twice as many, 200 steps take minutes
 
 

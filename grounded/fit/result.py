@@ -48,7 +48,8 @@ class FittedValue:
 class Fit(Result):
     """The result of a fit.
 
-    `params` holds the model's parameters and, if fitted, `latency` or `latency:<input>` [s].
+    `params` holds the model's parameters and, if fitted, `latency`, `latency:<input>` or the
+    latencies named in `fit_latency` [s].
     """
 
     params: Mapping[str, FittedValue]

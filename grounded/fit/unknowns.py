@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -12,7 +12,7 @@ from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
 from grounded.model import BELIEVED, Model
 
-Latency = Literal["known", "common", "each"]
+Latency = Literal["known", "common", "each"] | Mapping[str, tuple[int, ...]]
 LONGEST = 0.5  # [s] largest latency that is fitted
 BOUNDS = (
     "to fit a parameter, give bounds, Param(value, unit, low, high), or a prior, "
@@ -75,7 +75,8 @@ def unknowns_of(
         model: has the values and bounds.
         names: parameters to fit; None for all uncertain ones.
         latency: latency of each input [s], fixed or the start value, (m,).
-        fit_latency: "known" (not fitted), "common" (one for all inputs), or "each".
+        fit_latency: "known" (not fitted), "common" (one for all inputs), "each", or the inputs of
+            each latency that is fitted, by the name that it gets.
 
     Raises:
         GroundedError: for a name that is not an uncertain parameter, or nothing to fit.
@@ -89,18 +90,16 @@ def unknowns_of(
             )
         if not model.params[name].uncertain:
             raise GroundedError(f"'{name}' is a constant of model '{model.name}': {BOUNDS}")
-    if fit_latency not in ("known", "common", "each"):
+    choices: dict[str, dict[str, tuple[int, ...]]] = {
+        "known": {},
+        "common": {"latency": tuple(range(model.m))},
+        "each": {f"latency:{name}": (j,) for j, name in enumerate(model.input_names)},
+    }
+    if isinstance(fit_latency, str) and fit_latency not in choices:
         raise GroundedError(f"fit_latency must be known, common or each, got '{fit_latency}'")
     params = [model.params[name] for name in names]
-    choices: dict[str, list[tuple[int, ...]]] = {
-        "known": [],
-        "common": [tuple(range(model.m))],
-        "each": [(j,) for j in range(model.m)],
-    }
-    delayed = choices[fit_latency]
-    labels = ["latency"] if fit_latency == "common" else []
-    if fit_latency == "each":
-        labels = [f"latency:{name}" for name in model.input_names]
+    chosen = choices[fit_latency] if isinstance(fit_latency, str) else dict(fit_latency)
+    labels, delayed = list(chosen), list(chosen.values())
     if not names and not labels:
         raise GroundedError(f"model '{model.name}' has no uncertain parameter to fit: {BOUNDS}")
     far = [np.inf if p.std is None else BELIEVED * p.std for p in params]  # if there is no bound

@@ -213,7 +213,7 @@ def _below_noise(
         sentence += f" (it takes {runs} runs of each candidate to show such a gain)"
     sentence += f": {own} is the result"
     ended = replace(make.now, phase="converged", step=None, ending="below the noise", doubt="")
-    return let_down(replace(ended, sentence=sentence, then=None), make.fingerprint)
+    return let_down(replace(ended, sentence=sentence, then=None, missed=""), make.fingerprint)
 
 
 def _surer(about: About, step: Step, corrected: Proposal) -> Proposal | None:
@@ -289,5 +289,6 @@ def _ended(
             f"the model promises less than {100 * tolerance:g} % more from any step "
             f"([search] tolerance): {own} is the result"
         )
-    now = replace(make.now, phase=phase, step=None, sentence=sentence, ending=ending, then=then)
+    ended = replace(make.now, phase=phase, step=None, missed="")
+    now = replace(ended, sentence=sentence, ending=ending, then=then)
     return let_down(now, make.fingerprint) if phase == "converged" else now

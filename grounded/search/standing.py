@@ -71,6 +71,14 @@ class Standing(Result):
     ending: Ending = ""
     then: NextCommand | None = None  # a command that helps now
     doubt: str = ""  # why a diagnosis helps more than the next trial
+    missed: str = ""  # the end of `sentence`, if that asks for a diagnosis
+
+    def answered(self) -> Standing:
+        """Return the standing after the diagnosis that it asked for."""
+        if not self.missed:
+            return self
+        sentence = self.sentence.removesuffix(self.missed)
+        return replace(self, sentence=sentence, then=None, doubt="", missed="")
 
     @property
     def utilities(self) -> list[float]:
@@ -255,8 +263,9 @@ def standing(
     lost = f", since {last.candidate.id} crashed" * (last.accepted is False and bool(last.failed))
     sentence = f"improve on {own} with {step}{lost}"
     if why := _suspicion(history, incumbent, model):
-        then, sentence = NextCommand("diagnose"), f"{sentence}; {why}"
-        return replace(now, step=step, way=way, sentence=sentence, then=then, doubt=why)
+        asked = f"; {why}"
+        now = replace(now, then=NextCommand("diagnose"), doubt=why, missed=asked)
+        return replace(now, step=step, way=way, sentence=sentence + asked)
     return replace(now, step=step, way=way, sentence=sentence)
 
 
@@ -308,10 +317,11 @@ def let_down(ended: Standing, model: str) -> Standing:
     if not missed or not max(missed) > LITTLE * -best.utility:
         return ended
     why = (
-        f"{ended.sentence}. But a step that lost had promised {figure(max(missed))} more: the "
-        f"model is wrong near {own}, and a diagnosis may show what it lacks"
+        f". But a step that lost had promised {figure(max(missed))} more: the model is wrong near "
+        f"{own}, and a diagnosis may show what it lacks"
     )
-    return replace(ended, sentence=why, then=NextCommand("diagnose"))
+    then = NextCommand("diagnose")
+    return replace(ended, sentence=ended.sentence + why, then=then, missed=why)
 
 
 def _suspicion(history: tuple[Tried, ...], incumbent: Tried, model: str) -> str:

@@ -1,4 +1,4 @@
-"""Many causes in few words: those of one kind together, the smallest counted."""
+"""Many causes in few words: those of one kind together, the smallest only named."""
 
 from dataclasses import replace
 
@@ -15,6 +15,7 @@ from grounded.diagnosis.cause_words import (
     meaning,
     other_unit,
 )
+from grounded.diagnosis.error_report import Credit
 from grounded.diagnosis.report import Agreement, Estimate, TrialValue
 from grounded.diagnosis.verdict import _apart
 from grounded.effects import Library
@@ -39,7 +40,8 @@ def told(names, shares):
         meaning(effects[name], VALUES[name]) if name in effects else "the parameters are off"
         for name in names
     ]
-    return clauses(names, causes, shares, effects, VALUES)
+    credit = [Credit(n, share, times=4.0**share) for n, share in zip(names, shares, strict=True)]
+    return clauses(names, causes, credit, effects, VALUES)
 
 
 def test_the_friction_of_all_joints_is_told_together():
@@ -47,13 +49,15 @@ def test_the_friction_of_all_joints_is_told_together():
     assert len(found) == 3
     friction = next(text for text in found if "dry friction" in text)
     assert friction.startswith("the input t1 loses 0.3 N m to dry friction and 0.2 N m s/rad")
-    assert friction.endswith(", the input t2 0.1 N m and 0.05 N m s/rad (40 % of the improvement)")
+    assert friction.endswith(
+        ", the input t2 0.1 N m and 0.05 N m s/rad (without these, errors are 74 % larger)"
+    )
     assert "12 % weaker" in found[2]  # a percentage with its direction stands alone
 
 
 def test_three_causes_are_told_one_by_one_and_one_without_a_share():
     found = told([ONE, TWO, GAIN], [0.5, 0.3, 0.2])
-    assert len(found) == 3 and found[1].endswith("(30 % of the improvement)")
+    assert len(found) == 3 and found[1].endswith("(without this, errors are 52 % larger)")
     assert told([GAIN], [1.0]) == ("the input t1 acts 12 % weaker than modelled",)
 
 
@@ -71,12 +75,13 @@ def test_volts_are_said_to_be_counted_before_or_after_a_gain_of_their_input():
     assert not any(counted(one, [gain, one]) for one in (known[TWO], late, known[BIAS], fade))
 
 
-def test_the_smallest_of_many_are_counted():
+def test_the_smallest_of_many_are_only_named():
     names = [INERTIA, ONE, "calibration", GAIN, BIAS, "input_bias:t2"]
     VALUES["input_bias:t2"] = {"b": Estimate(0.03, 0.001, unit="N m")}
     found = told(names, [0.5, 0.2, 0.15, 0.1, 0.03, 0.02])
     assert len(found) == 5
-    assert found[-1] == "2 smaller causes (5.0 % of the improvement)"
+    worth = "(without these, errors are 7.2 % larger)"
+    assert found[-1] == f"also {BIAS} and input_bias:t2 {worth}"
 
 
 @pytest.mark.parametrize("late", ["delay:t1+t2", "first_order_lag:t2"])
@@ -87,7 +92,8 @@ def test_a_delay_is_named_however_small_its_share(late):
     VALUES[late] = {n: Estimate(0.06, 0.001, unit="s") for n in ("d", "tau")}
     found = told(names, [0.4, 0.2, 0.15, 0.1, 0.08, 0.05, 0.02])
     assert len(found) == 6 and "0.06 s" in found[4]
-    assert found[-1] == "2 smaller causes (10 % of the improvement)"
+    worth = "(without these, errors are 15 % larger)"
+    assert found[-1] == f"also {BIAS} and input_bias:t2 {worth}"
 
 
 def test_a_joint_with_dry_friction_is_not_told_beside_one_with_viscous_friction():
@@ -140,7 +146,9 @@ def test_a_cause_on_which_trials_disagree_stands_alone():
     effects = {n: Library().effect(n, arm) for n in (INERTIA, ONE, GAIN, TWO)}
     causes = [meaning(effects[n], VALUES[n]) for n in effects]
     causes[1] += f", {DISAGREE}: c = 0.1 to 0.4"
-    assert len(clauses([*effects], causes, [0.4, 0.3, 0.2, 0.1], effects, VALUES)) == 4
+    assert (
+        len(clauses([*effects], causes, [Credit(n, 0.25) for n in effects], effects, VALUES)) == 4
+    )
 
 
 @pytest.mark.parametrize(

@@ -332,7 +332,7 @@ def test_leftovers_that_are_not_named_are_counted():
     off = tuple(Remainder(name, 0.1, "m/s", 9.0, None) for name in "abcd")
     said = {k: verdict(claims, (), (), off[:k], (), ()).sentence for k in (1, 3)}
     assert said[1].endswith("a is off by 0.1 m/s rms.")
-    assert said[3].endswith("a is off by 0.1 m/s rms; 2 more states.")
+    assert said[3].endswith("a is off by 0.1 m/s rms, and 2 more states are off.")
     assert verdict(claims, (), (), off[:1], (), ()).kind == "unknown"
     assert verdict(claims, (), (), (), (errors(0.1),), ()).kind == "none"
 

@@ -15,7 +15,7 @@ from grounded.diagnosis.report import Diagnosis, Ranked, Unconfirmed, Verdict
 from grounded.diagnosis.unconfirmed import marked, unconfirmed
 from grounded.diagnosis.validation import decide as decide_module
 from grounded.diagnosis.validation.claims import Claims
-from grounded.diagnosis.validation.credit import shares
+from grounded.diagnosis.validation.credit import losses, shares
 from grounded.diagnosis.validation.decide import Decision, _likelier, causes, decide
 from grounded.diagnosis.validation.gain import Gain
 from grounded.diagnosis.validation.limits import limits
@@ -103,7 +103,7 @@ def test_what_predicts_better_is_claimed_with_its_worth(wavy, ruler):
     assert ruler.gain(decision.crude, decision.fit).mean > 1
     for less in decision.without.values():
         assert ruler.gain(less, decision.fit).beyond(1.0, 0.01)
-    worth = shares(ruler, decision)
+    worth = shares(ruler, decision, losses(ruler, decision))
     assert max(worth.values()) > 0.2 and sum(worth.values()) <= 1 + 1e-9
 
 

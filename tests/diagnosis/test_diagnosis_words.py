@@ -8,9 +8,10 @@ import numpy as np
 
 from facts import holds
 from grounded import Trial
+from grounded.diagnosis.cause_words import as_large, with_worth
 from grounded.diagnosis.error_report import Credit, Region, Remainder, RulerRow, furthest, runaway
 from grounded.diagnosis.next_trial import LOG, LOST, next_trial
-from grounded.diagnosis.report import Agreement, Estimate, Ranked, Unconfirmed
+from grounded.diagnosis.report import Agreement, Diagnosis, Estimate, Ranked, Unconfirmed
 from grounded.diagnosis.ruler_words import (
     contested,
     explained,
@@ -23,7 +24,7 @@ from grounded.diagnosis.ruler_words import (
     telling,
     worsened,
 )
-from grounded.diagnosis.tables import error_table
+from grounded.diagnosis.tables import effect_table, error_table, larger
 from grounded.diagnosis.unconfirmed import another_look, unrepeatable
 from grounded.diagnosis.verdict import verdict
 from grounded.effects import Library
@@ -173,7 +174,7 @@ def test_a_slow_plant_is_spoken_of_by_whole_trials():
     assert telling((second, whole)) is whole
     assert holds(improvement((second, whole)), "0.30 m", "5.0 m")
     quick = row({"x": 0.2}, {"x": 0.08})
-    assert telling((quick, whole)) is quick and "8.0 cm" in improvement((quick, whole))
+    assert telling((quick, whole)) is quick and "80 mm" in improvement((quick, whole))
     for rows, told in (((second, whole), True), ((quick, whole), False)):  # as in the sentence
         table, _ = error_table(SimpleNamespace(prediction_error=rows), whole_trials=False)
         assert any("whole trial" in cells[0] for cells in table) is told
@@ -184,7 +185,7 @@ def test_nothing_is_said_where_nothing_lost_or_only_within_the_noise():
     assert worsened(()) == ""
     assert worsened((row({"x": 0.2}, {"x": 0.205}),)) == ""
     slight = row({"x": 0.2, "v": 0.5}, {"x": 0.21, "v": 0.5})  # nothing gains as much
-    assert outweighed((slight,)) and holds(worsened((slight,)), "worse", "21 cm", "20 cm")
+    assert outweighed((slight,)) and holds(worsened((slight,)), "worse", "210 mm", "200 mm")
     paid = row({"x": 0.2, "v": 0.5}, {"x": 0.21, "v": 0.4})
     assert not outweighed((paid,)) and worsened((paid,)) == ""
     assert worsened((row({"x": 0.02}, {"x": 0.04}, {"x": 0.05}),)) == ""
@@ -232,18 +233,23 @@ def test_a_leftover_within_the_noise_is_stated_by_what_tells_it_from_noise():
     assert holds(above, "0.041 m/s", "noise: 0.0040 m/s") and "may all be" not in above
 
 
-def test_a_share_in_a_sentence_is_the_share_of_the_table():
-    from grounded_trials.wording import percent
-
+def test_what_a_cause_is_worth_is_the_same_in_the_sentence_and_in_the_table():
+    """It was a share of logarithms, which nobody could know."""
     effect = Library().effect("viscous_friction:v", cart_task().model)
     k = {"k": Estimate(0.3, unit="1/s")}
     best = SimpleNamespace(hypothesis=SimpleNamespace(effects=(effect,)))
     claims = _claims(best=best, moved=(), parameters=dict, data=SimpleNamespace(model=None))
     claims.data.model = SimpleNamespace(params={}, param_names=[])
-    credit = (Credit(effect.name, 0.926), Credit("calibration", 0.074))
+    credit = (Credit(effect.name, 0.926, times=12.3), Credit("calibration", 0.074, times=1.222))
     ranked = (Ranked(effect.name, k, claimed=True),)
-    told = verdict(claims, ranked, (), (), (), credit).sentence
-    assert f"{percent(0.074)} of the improvement" in told
+    said = verdict(claims, ranked, (), (), (), credit)
+    assert "(without this, errors are 12 times as large)" in said.sentence
+    assert "(without this, errors are 22 % larger)" in said.sentence
+    rows, header = effect_table(Diagnosis(said, ranking=ranked, credit=credit))
+    assert header[1] == "without" and [row[1] for row in rows] == ["+22 %", "12 times"]
+    assert as_large(1.0003) == "hardly larger" and larger(1e5) == "over 1,000 times"
+    old = replace(credit[0], times=float("nan"))  # of an older version
+    assert with_worth("late", [old]) == "late" and larger(old.times) == ""
 
 
 def test_neither_a_crash_nor_a_log_by_hand_is_to_be_repeated():
@@ -290,12 +296,12 @@ def test_a_noise_of_which_only_a_bound_is_known_is_told_as_one():
 
     unknown, state = said(0.9, 0.89)
     assert unknown.kind == "unknown" and "at most" in unknown.sentence and state == "x"
-    assert "at most 89 cm" in unknown.sentence and "explains the data" not in unknown.sentence
+    assert "at most 890 mm" in unknown.sentence and "explains the data" not in unknown.sentence
     known, state = said(0.9, 0.89, bound=False)
-    assert known.kind == "none" and "89 cm" in known.sentence and not state
+    assert known.kind == "none" and "890 mm" in known.sentence and not state
     assert "at least 9 times" in said(0.9, 0.1)[0].sentence
     left = Remainder("x", error=0.9, floor=0.1, horizon_s=1.0, error_unit="m", floor_at_most=True)
-    assert "at most 10 cm" in left.sentence()
+    assert "at most 100 mm" in left.sentence()
 
 
 def test_repeats_are_asked_for_where_there_are_none_as_they_can_be_made():

@@ -20,6 +20,7 @@ from grounded_trials import Workspace
 from grounded_trials.logs.inspect_pairs import velocities
 from grounded_trials.logs.joint_names import from_base
 from grounded_trials.starting.begin import begin
+from grounded_trials.starting.first_toml import held_first
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, hinges, path_target, swing_up
 from grounded_trials.workspace.exporting import void_exports
@@ -954,3 +955,28 @@ def test_a_target_beyond_safety_is_told_when_it_is_drawn(tmp_path):
     far = grounded("-C", made.folder, "target", "step", "--to", "x=60")
     assert near.code == far.code == 0
     assert "[safety]" not in near.err and "[safety]" in far.err and "60" in far.err
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_hover_that_trembles_within_its_noise_is_a_rest(seed):
+    """Two of four hovers gave no start: commands scattered by a twentieth of their range."""
+    rng, t = np.random.default_rng(seed), 0.02 * np.arange(500)
+    moves = np.clip(t - 1, 0, None)
+    columns = {
+        "z": 0.8 + 0.3 * np.sin(moves) + rng.normal(0, 1e-3, 500),
+        "vz": 0.3 * np.cos(moves) * (t > 1) + rng.normal(0, 0.012, 500),
+    }
+    sent = {"thrust": 5.33 + 1.5 * np.sin(2 * moves) + rng.normal(0, 0.07, 500)}
+
+    def v(s, a, p):
+        return {"z": s.vz, "vz": a.thrust - 5.33}
+
+    model = Model({"z": "m", "vz": "m/s"}, {"thrust": "N"}, {}, derivative=v)
+    ranges = {n: (x.min(), x.max()) for n, x in {**columns, **sent}.items()}
+    found = held_first(model, columns, sent, 0.02, ranges)
+    assert found["z"] == pytest.approx(0.8, abs=0.002)
+    assert found["thrust"] == pytest.approx(5.33, abs=0.1)
+    ramp = {"thrust": sent["thrust"] + np.clip(1 - 2 * t, 0, None)}  # it is still settling
+    assert not held_first(model, columns, ramp, 0.02, ranges)
+    sinks = {**columns, "z": columns["z"] - 0.3 * t}
+    assert not held_first(model, sinks, sent, 0.02, ranges)

@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 from cli import grounded
 from facts import holds
 from grounded.errors import GroundedError
-from grounded_trials.formats.text_tables import column_units, cut_off
+from grounded_trials.formats.text_tables import column_units, table_remarks
 from grounded_trials.logs.inspect_log import inspect_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
 
@@ -206,16 +206,52 @@ def test_empty_cells_at_the_end_of_rows_are_passed_over(tmp_path):
     assert read_signals(path, {"x": SignalSpec("/csv.x")})["x"].values.tolist() == [1.5, 2.5]
 
 
+@pytest.mark.parametrize(
+    "names, row, found",
+    [
+        ("t;x;v", "{};{};{};", True),  # separators at the ends of lines
+        ("t;x;v;", "{};{};{}", True),
+        ("t;x;v;;", "{};{};{};", True),
+        (";t;x;v", "9;{};{};{}", True),  # an index without a name
+        ("t;x;v;w", "{};{};{}", "line 3 has 3 cells, but line 2 names 4"),
+        ("t;x", "{};{};{};", "line 3 has 4 cells, but line 2 names 2"),
+        ("t;x;v;", "9;{};{};{}", "line 3 has 4 cells, but line 2 names 3"),  # x was read as t
+        (";t;x;v", "{};{};{};", "'v' is empty in every row"),  # and here v as x
+    ],
+)
+@pytest.mark.parametrize("comma", [True, False])
+def test_one_name_more_or_less_than_cells_is_no_shift(tmp_path, names, row, found, comma):
+    path = tmp_path / "log.csv"
+    text = "\n".join(["Trace;B", names, *(row.format(0.1 * k, 5.5, 7.5) for k in range(4)), ""])
+    path.write_text(text.replace(".", ",") if comma else text)
+    specs = {name: SignalSpec(f"/csv.{name}") for name in ("x", "v")}
+    if found is not True:
+        with pytest.raises(GroundedError, match=found):
+            read_signals(path, specs)
+        return
+    signals = read_signals(path, specs)
+    assert [signals[n].values.tolist() for n in specs] == [[5.5] * 4, [7.5] * 4]
+    assert not table_remarks(path)
+
+
+def test_a_last_column_that_is_never_filled_may_be_a_name_too_many(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,extra,x,v\n0,1.5,2.5,\n0.1,1.5,2.5,\n")
+    assert holds(inspect_log(path).remarks[0], "'v'", "one column too far to the left", "line 1")
+
+
 def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path):
     """A logger that was stopped; `Time [ms]` was read as seconds."""
     path = tmp_path / "log.csv"
     path.write_text("Time [ms],x\n0,1.5\n20,2.5\n4")
     found = read_signals(path, {"x": SignalSpec("/csv.x")})["x"]
     assert found.values.tolist() == [1.5, 2.5] and found.t.tolist() == [0, 20_000_000]
-    assert "'4'" in cut_off(path) and any("'4'" in one for one in inspect_log(path).remarks)
+    assert "'4'" in table_remarks(path)[0] and any(
+        "'4'" in one for one in inspect_log(path).remarks
+    )
     for whole in ("t,x\n0,1.5\n20,2.5", "t,x\n0,1.5\n20,2.5\n", "t,x\n0,1.5\n\n\n"):
         path.write_text(whole)
-        assert not cut_off(path)
+        assert not table_remarks(path)
     rows = [f"{0.1 * k:.2f},{k}.25,{k}.125" for k in range(30)]
     mangled = {
         "2.90,29.2": "2.90,29.2",
@@ -228,10 +264,10 @@ def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path
         path.write_text("\n".join(["t,x,v", *rows[:29], tail]))
         seen = read_signals(path, {"v": SignalSpec("/csv.v")})["v"].values
         assert seen.tolist() == [k + 0.125 for k in range(29)], tail
-        assert holds(cut_off(path), "line 31", shown), tail
+        assert holds(table_remarks(path)[0], "line 31", shown), tail
     path.write_text("\n".join(["t,x,v", *rows]) + "\n" + "\0" * 40)
     assert len(read_signals(path, {"v": SignalSpec("/csv.v")})["v"].values) == 30
-    assert holds(cut_off(path), "line 32", "zero bytes")
+    assert holds(table_remarks(path)[0], "line 32", "zero bytes")
     path.write_text("\n".join(["t,x,v", *rows[:9], "0.90,9.25", *rows[10:]]) + "\n")
     with pytest.raises(GroundedError) as broken:  # not at the end: something else went wrong
         read_signals(path, {"v": SignalSpec("/csv.v")})

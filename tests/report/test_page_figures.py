@@ -345,12 +345,13 @@ def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
         with_effects={"x": 0.1, "v": 0.05},
         noise_floor={"x": 0.05, "v": 0.04},
     )
-    credit = (Credit("delay:u", share=0.9, without_it={"x": 0.15, "v": 0.4}),)
+    credit = (Credit("delay:u", share=0.9, times=2.43, without_it={"x": 0.15, "v": 0.4}),)
     found = Diagnosis(Verdict("effect"), credit=credit, prediction_error=(row,))
     figure = credit_figure(found)
     assert figure is not None
     share, worth = figure.panels
     assert [bar.label for bar in share.bars] == ["delay:u"] and share.bars[0].value == 0.9
+    assert share.bars[0].text == "2.4 times"
     assert worth.title == "v: error 1 s ahead"  # what predictions improved most
     assert [bar.value for bar in worth.bars] == [0.5, 0.4, 0.05, 0.04]
     assert worth.bars[1].label == "without delay:u" and worth.bars[1].text == "0.40 m/s"

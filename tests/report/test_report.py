@@ -72,13 +72,13 @@ def test_text_shows_the_ruler(cart, tmp_path):
         "with_effects": {"v": 0.08},
         "noise_floor": {"v": None},
     }
-    credit = [{"of": "viscous_friction:v", "share": 0.62}]
+    credit = [{"of": "viscous_friction:v", "share": 0.62, "times": 1.83}]
     document = DIAGNOSIS | {"prediction_error": [row], "credit": credit}
     write_document(folder / "reports" / "diagnosis.json", document)
     lines = grounded("-C", folder, "report").out.splitlines()
     (line,) = [x for x in lines if x.startswith("v, 1 s ahead")]
     assert line.split()[4:] == ["0.310", "0.120", "0.0800", "-", "m/s"]
-    assert any("viscous_friction:v" in x and "62 %" in x for x in lines)
+    assert any("viscous_friction:v" in x and "+83 %" in x for x in lines)
 
 
 def test_text_says_how_utilities_are_predicted_and_what_acts_alike(cart):

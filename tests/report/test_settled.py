@@ -55,10 +55,10 @@ def words(*command) -> str:
 def test_what_was_adopted_is_told_everywhere_with_what_it_gained(adopted):
     found = grounded("-C", adopted, "report", "--html", "--json").json["adopted"]
     assert "0.3 1/s" in found["clauses"][0] and found["clauses"][1] == "mass 1.00 -> 1.40 kg"
-    assert "x by 1.2 cm instead of 25 cm" in found["gained"] and "v" in found["left"]
+    assert "x by 12 mm instead of 250 mm" in found["gained"] and "v" in found["left"]
     page = (adopted / "reports" / "report.html").read_text().replace("\xa0", " ")
     for text in (words(adopted, "report"), words(adopted, "status"), re.sub(r"<[^>]+>", "", page)):
-        assert "Found and adopted: " in text and "1.2 cm instead of 25 cm" in text
+        assert "Found and adopted: " in text and "12 mm instead of 250 mm" in text
     assert "2 trials, t0001 to t0002" in page
 
 
@@ -72,7 +72,7 @@ def test_a_parameter_that_stays_behind_is_told_and_no_gain_is_claimed(cart, tmp_
     again = grounded("-C", folder, "adopt", "viscous_friction:v", "--json").json
     assert again["left"] == {"mass": 1.4} and "mass" not in again["params"]
     adopted = grounded("-C", folder, "report", "--json").json["adopted"]
-    assert not adopted["gained"] and "instead of 25 cm" not in words(folder, "status")
+    assert not adopted["gained"] and "instead of 250 mm" not in words(folder, "status")
 
 
 def test_a_parameter_known_only_with_the_others_is_adopted_and_marked(cart, tmp_path):
@@ -161,7 +161,7 @@ def test_what_was_measured_holds_with_a_filter_that_was_adopted_too(cart, tmp_pa
     folder = written(copied(cart, tmp_path / "w"), preflight=[lagging])
     assert grounded("-C", folder, "adopt", "viscous_friction:v", "sensor_lag:v").code == 0
     found = grounded("-C", folder, "report", "--json").json["adopted"]
-    assert len(found["clauses"]) == 3 and "1.2 cm instead of 25 cm" in found["gained"]
+    assert len(found["clauses"]) == 3 and "12 mm instead of 250 mm" in found["gained"]
 
 
 def test_a_parameter_that_was_adopted_by_name_is_not_missing(cart, tmp_path):
@@ -189,7 +189,7 @@ def test_a_new_diagnosis_measures_model_py_beside_what_plans_now(adopted):
     diagnosis = findings.diagnosis
     assert isinstance(diagnosis, Diagnosis) and not findings.since.changed
     lines = told(diagnosis, findings.task, findings.since, findings.settled)
-    assert lines[0].startswith("Found and adopted") and "1.2 cm instead of 25 cm" in lines[1]
+    assert lines[0].startswith("Found and adopted") and "12 mm instead of 250 mm" in lines[1]
     assert lines[-1] == "Down to the noise." and lines.count("Down to the noise.") == 1
     assert "model.py" in words(adopted, "report") and "now" in words(adopted, "report")
 
@@ -241,7 +241,7 @@ def test_the_order_of_candidates_is_explained(cart):
 def test_numbers_that_differ_are_told_apart():
     assert changed("l", 0.5, 0.4997, "m") == "l 0.5000 -> 0.4997 m"
     assert in_digits_apart(0.99973, 1.0) == ("0.9997", "1.000")  # not 1.000 and 1.00
-    assert changed("g", 2.0, 2.0, "1") == "g 2.000 -> 2.000"
+    assert changed("g", 2.0, 2.0, "1") == "g 2.000, as before"
 
 
 def test_a_gain_needs_the_values_that_were_diagnosed(adopted):

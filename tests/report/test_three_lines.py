@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from grounded.diagnosis.report import Diagnosis, Verdict
-from grounded.result import measured, measured_alike, percent
+from grounded.result import measured, measured_alike
 from grounded_trials.report.diagnosis_words import verdict_lines
 from grounded_trials.report.three_lines import gained_most, three_lines
 from reported import DIAGNOSIS
@@ -21,9 +21,9 @@ ROW = {
     "noise_floor": {"x": 0.01, "v": 0.0003},
 }
 CREDIT = [
-    {"of": "calibration", "share": 0.7, "without_it": {"x": 0.2}},
-    {"of": "viscous_friction:v", "share": 0.28, "without_it": {"x": 0.1}},
-    {"of": "delay:force", "share": 0.02, "without_it": {"x": 0.013}},
+    {"of": "calibration", "share": 0.7, "times": 8.0, "without_it": {"x": 0.2}},
+    {"of": "viscous_friction:v", "share": 0.28, "times": 2.4, "without_it": {"x": 0.1}},
+    {"of": "delay:force", "share": 0.02, "times": 1.06, "without_it": {"x": 0.013}},
 ]
 CAUSES = (
     "the model's own parameters are off: mass should be 1.4 kg (+40%)",
@@ -49,15 +49,16 @@ def diagnosis():
 
 def test_causes_gain_and_what_is_left(diagnosis):
     wrong, gained, left = three_lines(diagnosis, cart_task())
-    assert CAUSES[0][1:] in wrong and CAUSES[1] in wrong and "smaller cause" not in wrong
+    assert CAUSES[0][1:] in wrong and CAUSES[1] in wrong and "also" not in wrong
     assert CAUSES[2] in wrong  # a delay, however small its share: it decides stability
     (*_, bias) = diagnosis.credit
     other = replace(diagnosis, credit=(*diagnosis.credit[:2], replace(bias, of="input_bias:force")))
-    assert f"1 smaller cause ({percent(bias.share)} of the" in three_lines(other, cart_task())[0]
+    small = "also input_bias:force (without this, errors are 6.0 % larger)"
+    assert small in three_lines(other, cart_task())[0]
     large = replace(bias, of="input_bias:force", share=0.22)  # was only counted
     other = replace(diagnosis, credit=(*diagnosis.credit[:2], large))
     assert CAUSES[2] in three_lines(other, cart_task())[0]
-    assert "x by 1.2 cm instead of 25 cm" in gained
+    assert "x by 12 mm instead of 250 mm" in gained
     assert "v" in left and "0.020 m/s" in left and "0.0050 m/s" in left and "x > 0.2" in left
 
 
@@ -93,7 +94,7 @@ def test_without_a_known_cause_the_verdict_speaks_for_itself(diagnosis):
 @pytest.mark.parametrize(
     ("value", "unit", "text"),
     [
-        (0.17, "m", "17 cm"),
+        (0.17, "m", "170 mm"),
         (2.0, "m", "2.0 m"),
         (4e-4, "m", "0.40 mm"),
         (3e-6, "rad", "3.0 µrad"),
@@ -109,7 +110,8 @@ def test_an_error_is_given_in_a_unit_that_fits(value, unit, text):
 def test_each_of_several_causes_stands_on_a_line_of_its_own(diagnosis):
     told = replace(diagnosis.verdict, sentences=("All three.", "What is left."))
     causes, others = verdict_lines(replace(diagnosis, verdict=told))
-    assert causes[1] == f"{CAUSES[1][:1].upper()}{CAUSES[1][1:]} (28 % of the improvement)"
+    worth = "(without this, errors are 2.4 times as large)"
+    assert causes[1] == f"{CAUSES[1][:1].upper()}{CAUSES[1][1:]} {worth}"
     assert len(causes) == len(CAUSES) and others == ["What is left."]
     old = Verdict("effect", sentence="Friction slows v.")
     assert verdict_lines(replace(diagnosis, verdict=old)) == ([], ["Friction slows v."])
@@ -121,12 +123,12 @@ def test_each_of_several_causes_stands_on_a_line_of_its_own(diagnosis):
         ((1.6e-4, 1.6e-3), "m", ["0.16 mm", "1.6 mm"]),  # it was 0.16 mm -> 0.16 cm
         ((1.6e-3, 9.1e-4), "m", ["1.6 mm", "0.91 mm"]),
         ((8.2e-4, 0.045), "m", ["0.82 mm", "45 mm"]),
-        ((1.75, 0.012), "m", ["175 cm", "1.2 cm"]),
-        ((0.31, 1.6e-3), "m", ["31 cm", "0.16 cm"]),
+        ((1.75, 0.012), "m", ["1,750 mm", "12 mm"]),
+        ((0.31, 1.6e-3), "m", ["310 mm", "1.6 mm"]),
         ((1.2e-3, 7.3e-4), "rad", ["1.2 mrad", "0.73 mrad"]),
         ((0.12, 5.8e-4), "rad", ["0.12 rad", "0.00058 rad"]),
-        ((0.2, 0.0), "m", ["20 cm", "0 cm"]),
-        ((0.17,), "m", ["17 cm"]),
+        ((0.2, 0.0), "m", ["200 mm", "0 mm"]),
+        ((0.17,), "m", ["170 mm"]),
     ],
 )
 def test_errors_that_are_compared_have_one_unit(values, unit, texts):

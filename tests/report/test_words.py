@@ -27,7 +27,7 @@ def test_the_unit_one_is_not_printed():
 
 
 @pytest.mark.parametrize(
-    "whole", ["v > 1.02", "0.5 N m s", "m +30 %", "a4 -1.5 %", "27 cm", "0.35 mrad", "2 ± 0.1 rad"]
+    "whole", ["v > 1.02", "0.5 N m s", "m +30 %", "a4 -1.5 %", "270 mm", "0.35 mrad", "2 ± 0.1 rad"]
 )
 def test_no_line_is_broken_inside_a_quantity(whole):
     assert " " not in glued(whole)

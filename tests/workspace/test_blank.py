@@ -130,7 +130,7 @@ def test_a_plan_that_stays_far_from_where_its_target_ends_is_told(blank):
     dear = "input_change = { force = 2000 }"
     config.write_text(re.sub(r"(?m)^input_change = .*$", dear, config.read_text()))
     (note,) = (one for one in blank.propose().proposal.notes if "the plan ends" in one)
-    assert holds(note, "x", "100 cm", "[reward]")
+    assert holds(note, "x", "1,000 mm", "[reward]")
 
 
 @pytest.mark.parametrize(("noise", "told"), [(1e-5, False), (0.3, True)])

@@ -395,7 +395,9 @@ def test_a_plan_off_its_path_says_which_weights_would_bring_it_closer(tmp_path, 
     assert len(found) == (heading > 0)
     if heading:
         assert (
-            off > 0.05 and f"{100 * off:.2g} cm" in found[0] and f"{100 * closer:.2g}" in found[0]
+            off > 0.05
+            and f"{1e3 * off:.0f} mm" in found[0]
+            and f"{1e3 * closer:.0f} mm" in found[0]
         )
 
 

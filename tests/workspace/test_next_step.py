@@ -28,8 +28,9 @@ from grounded_trials.wording import ELSEWHERE, folded, placed, rendered
 from grounded_trials.workspace.adopting import diagnosed_again
 from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.diagnosing import _in_vain
+from grounded_trials.workspace.fitting import apply_fit
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.last_diagnosis import read_diagnosis
+from grounded_trials.workspace.last_diagnosis import diagnosable, read_diagnosis
 from grounded_trials.workspace.next_step import (
     DIAGNOSE,
     EXPORT,
@@ -555,7 +556,7 @@ def test_adopt_prints_every_parameter_that_it_writes(cart, tmp_path):
     same = {"value": 0.2, "std": 0.02, "unit": "N s/m"}
     diagnosed(folder, parameters=DIAGNOSIS["parameters"] | {"drag": same})
     out = grounded("-C", folder, "adopt", "viscous_friction:v").out
-    assert "mass       1.000 -> 1.400 kg" in out and "drag       0.2000 -> 0.2000 N s/m" in out
+    assert "mass       1.000 -> 1.400 kg" in out and "drag       0.2000 N s/m, as before" in out
     assert "[model] params" in " ".join(grounded("adopt", "-h").out.split())
 
 
@@ -673,6 +674,34 @@ def test_after_a_verdict_of_none_a_search_that_has_ended_is_exported(cart, tmp_p
     made = replace(Made(), params=dict(w.config.model.params))
     ended = w.status().standing.phase in ("converged", "stopped")
     assert ended and after_diagnosis(w, replace(found, made=made)).verb == "export"
+
+
+def test_an_ended_search_asks_for_a_diagnosis_until_a_newer_one_is_made(
+    cart, tmp_path, monkeypatch
+):
+    """`But a step that lost had promised ... more` stayed after a diagnosis that said `none`."""
+    lost = ". But a step lost, and a diagnosis may show why"
+
+    def let_down(ended, model):
+        told = ended.sentence + lost
+        return replace(ended, sentence=told, then=NextCommand("diagnose"), missed=lost)
+
+    monkeypatch.setattr("grounded.search.improve.let_down", let_down)
+    monkeypatch.setattr(standing_of_a_search, "let_down", let_down)
+    folder = copied(cart, tmp_path / "w")
+    w = Workspace(folder)
+    (folder / "reports" / "diagnosis.json").unlink()
+    now = w.status()
+    assert now.standing.sentence.endswith(lost) and now.then == DIAGNOSE
+    usable = [trial.id for trial in diagnosable(w)]
+    nothing = {"kind": "none", "effects": [], "sentence": "Nothing."}
+    for made, asks in ((usable[:-1], True), (usable, False)):
+        params = dict(w.config.model.params)
+        diagnosed(folder, verdict=nothing, diagnosed={"trials": made, "params": params})
+        now = Workspace(folder).status()
+        assert (lost in now.standing.sentence) == asks and (now.then == EXPORT) == (not asks)
+        assert (lost in Workspace(folder).propose().proposal.standing.sentence) == asks
+        assert ("a step lost" in " ".join(grounded("-C", folder, "report").out.split())) == asks
 
 
 def test_after_an_unknown_verdict_a_search_that_has_ended_says_so(cart, tmp_path, monkeypatch):
@@ -907,12 +936,23 @@ def test_a_gap_that_the_verdict_states_is_not_repeated_when_the_search_has_ended
     assert contested.contested and "To learn more" not in nothing_to_do(contested, "c0001")
 
 
-def test_an_adopted_delay_is_named_as_not_fitted(tmp_path):
+def test_an_adopted_delay_is_fitted_with_the_parameters_or_named_as_taken_for_exact(tmp_path):
     folder = make(tmp_path / "w").folder
     grounded("-C", folder, "learn", "--trials", "2")
-    late = {"name": "delay:force", "d": 0.02}
-    for effects, names in (([], []), ([late], ["delay:force"])):
+    late, bent = {"name": "delay:force", "d": 0.02}, {"name": "dead_zone:force", "c": 0.01}
+    for effects, names in (([], []), ([late, bent], ["delay:force"])):
         set_in_model(folder / "grounded.toml", effects=effects)
         assert grounded("-C", folder, "fit", "--json").json["not_fitted"] == names
     assert grounded("-C", folder, "fit", "--latency", "--json").json["not_fitted"] == []
-    assert "not fitted: d of delay:force" in grounded("-C", folder, "fit").out
+    told = " ".join(grounded("-C", folder, "fit").out.split())
+    assert "delay:force kept its d, which the intervals take as exact" in told
+    set_in_model(folder / "grounded.toml", effects=[late])
+    fitted = grounded("-C", folder, "fit", "--json").json
+    found = fitted["params"]["delay_force_d"]
+    assert fitted["not_fitted"] == [] and found["low"] < found["high"] and found["unit"] == "s"
+    assert found["start"] == late["d"]
+    alone = grounded("-C", folder, "fit", "--params", "mass", "--json").json["params"]
+    assert set(alone) == {"mass"}
+    apply_fit(Workspace(folder), Workspace(folder).fit().fit)
+    (effect,) = Workspace(folder).config.model.effects
+    assert effect["d"] == pytest.approx(found["value"], rel=1e-6)

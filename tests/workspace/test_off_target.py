@@ -88,7 +88,7 @@ def test_the_position_is_one_distance_and_angles_are_wrapped():
     assert position.rms == pytest.approx(math.sqrt((20 * 0.005**2 + 0.05**2) / 21))
     assert math.isnan(position.end)
     assert (psi.what, psi.most) == ("psi", pytest.approx(0.01))
-    assert holds(position.summary(), "position", "1.2 cm rms", "5.0 cm at most", "at 1.5 s")
+    assert holds(position.summary(), "position", "12 mm rms", "50 mm at most", "at 1.5 s")
 
 
 def test_repeats_count_together_and_the_worst_of_all_is_told():
@@ -103,7 +103,7 @@ def test_what_only_the_end_weighs_is_told_there():
     states[-1, 0] = 0.002
     (position,) = off_target_of(task(terminal=np.array([1.0, 1.0, 0.0, 0.0])), [run(states)])
     assert math.isnan(position.rms) and position.end == pytest.approx(0.002)
-    assert holds(position.summary(), "0.20 cm at the end")
+    assert holds(position.summary(), "2.0 mm at the end")
     both = off_target_of(task(terminal=np.array([1.0, 1.0, 0.1, 0.0]), **ALONG), [run(states)])[0]
     assert both.rms > 0.4 and both.end == pytest.approx(0.002)
 
@@ -227,5 +227,5 @@ def test_a_better_candidate_that_is_farther_off_says_what_it_gained_by():
 
     before, best = tried("c0001", 0.01, rough), tried("c0002", 0.02, 0 * rough)
     assert best.utility > before.utility
-    assert holds(traded(here, best, before), "c0002", "c0001", "inputs cost less", "2.0 cm")
+    assert holds(traded(here, best, before), "c0002", "c0001", "inputs cost less", "20 mm")
     assert traded(here, tried("c0003", 0.01, 0 * rough), before) == ""

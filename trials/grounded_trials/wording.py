@@ -65,12 +65,20 @@ def ranges(names: Sequence[str]) -> str:
 
 def changed(name: str, old: float, new: float, unit: str) -> str:
     """Return `m 1.00 -> 1.30 kg`, with enough digits to distinguish the two values."""
-    return with_unit(f"{name} {' -> '.join(in_digits_apart(old, new))}", unit)
+    return f"{name} {moved(old, new, unit)}"
 
 
-def in_digits_apart(one: float, other: float) -> tuple[str, str]:
-    """Format two numbers with enough digits to distinguish them, at least three."""
-    for digits in range(3, 9):
+def moved(old: float, new: float, unit: str, least: int = 3) -> str:
+    """Return `1.00 -> 1.30 kg`, with enough digits to distinguish the two values."""
+    was, now = in_digits_apart(old, new, least)
+    if was == now:
+        return f"{with_unit(now, unit)}, as before"
+    return with_unit(f"{was} -> {now}", unit)
+
+
+def in_digits_apart(one: float, other: float, least: int = 3) -> tuple[str, str]:
+    """Format two numbers with enough digits to distinguish them, at least `least`."""
+    for digits in range(least, 9):
         if float(f"{one:.{digits}g}") != float(f"{other:.{digits}g}"):
             return figure(one, digits), figure(other, digits)
     return figure(one), figure(other)

@@ -7,6 +7,7 @@ floor is lowered to what it reaches.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -26,7 +27,7 @@ from grounded.diagnosis.error_report import (
 from grounded.diagnosis.hypotheses.leftover import Leftover, leftovers, whiteness
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.validation.credit import ordered, shares
+from grounded.diagnosis.validation.credit import losses, ordered, shares
 from grounded.diagnosis.validation.decide import Decision, plain
 from grounded.diagnosis.validation.gain import Errors
 from grounded.diagnosis.validation.prediction_error import by_region, horizon
@@ -37,6 +38,7 @@ from grounded.trial import Trial
 
 FAR = 3.0  # times the noise floor, above which a leftover is stated despite any uncertainty
 WHITE = 0.01  # p-value below which the innovations are not white
+MOST_LOST = 20.0  # log of a ratio of errors beyond which a model diverges
 AWAY = 30.0  # times a state's measured range, above which a prediction has diverged
 COUNTS = (2.0, 0.03)  # scatters and log gain of a flexible correction that is stated
 
@@ -58,7 +60,8 @@ class Measured:
         self.search, self.best = decision.search, decision.fit
         self.predictor, self.data = self.search.predictor, self.search.data
         self.units = {n: self.data.model.states[n] for n in ruler.names}
-        self.credit = shares(ruler, decision)
+        self.lost = losses(ruler, decision)
+        self.credit = shares(ruler, decision, self.lost)
         self.left = leftovers(self.predictor, self.best)
         self.flexible = self.corrections()
         self.whiteness = self.white()
@@ -212,6 +215,7 @@ class Measured:
                         strict=True,
                     )
                 ),
+                math.exp(min(self.lost[name], MOST_LOST)),
             )
             for name in ordered(self.credit, list(self.credit))
         )

@@ -144,7 +144,7 @@ def test_a_robot_that_moves_on_after_its_run_did_not_come_to_rest(tmp_path, roll
     np.savetxt(file, table, "%.5f", ",", header="t,x,v,force", comments="")
     told = [one for one in Workspace(w.folder).ingest(file).warnings if "after the run" in one]
     assert len(told) == (rolls > 0)
-    assert not told or holds(told[0], "60 cm from its target", "--hold")
+    assert not told or holds(told[0], " mm from its target", "--hold")
 
 
 @pytest.mark.parametrize("knows", [True, False])

@@ -2,8 +2,9 @@
 
 The line with the column names is the first one with rows of numbers below it. Lines above it, as a
 PLC or a logger writes them, are skipped; a line of units below it belongs to the names. Columns are
-separated by tabs, semicolons or commas; if not by commas, 0,5 is a number. Times are numbers, or
-texts with a date, a time of day, or both, in one column or two.
+separated by tabs, semicolons or commas; if not by commas, 0,5 is a number. Separators at the end of
+a line don't count, in the names as in the rows. Times are numbers, or texts with a date, a time of
+day, or both, in one column or two.
 """
 
 from __future__ import annotations
@@ -103,31 +104,43 @@ def states_time_unit(path: Path) -> bool:
     return bool(SECONDS.search(head.cells[at].lower())) or ":" in "".join(row[at : at + 1])
 
 
-def cut_off(path: Path) -> str:
-    """Return a warning if the last row of a text table is incomplete and left out, else ""."""
+def table_remarks(path: Path) -> list[str]:
+    """Return what is odd in a text table, as sentences.
+
+    The last row may be incomplete; it is left out. The last column may be empty in every row, so
+    that one name may be too many.
+    """
     if path.suffix.lower() not in (".csv", ".tsv", ".txt"):
-        return ""
+        return []
     with _opened(path) as stream:
         head = _head([stream.readline(LOOK) for _ in range(PREAMBLE + 2)], path)
-        cut = _cut_in(stream, head)
-    if cut is None:
-        return ""
-    if not cut.text:
-        return (
+        cut, empty = _cut_in(stream, head), _empty_last(stream, head)
+    found = []
+    if empty:
+        found.append(
+            f"'{head.cells[-1]}', its last column, is empty in every row: if line {head.line} has "
+            "one name more than the rows have numbers, the numbers are read one column too far to "
+            "the left; delete that name there"
+        )
+    if cut is not None and not cut.text:
+        found.append(
             f"from line {cut.line} on it holds only zero bytes, as after a power loss: what was "
             "recorded after that is lost"
         )
-    return (
-        f"its last row, line {cut.line} ({cut.text[:80]!r}), is incomplete and is left out: "
-        "everything after that is lost"
-    )
+    elif cut is not None:
+        found.append(
+            f"its last row, line {cut.line} ({cut.text[:80]!r}), is incomplete and is left out: "
+            "everything after that is lost"
+        )
+    return found
 
 
 def _check_widths(stream: TextIO, head: _Head, path: Path) -> None:
     """Check that no row has more cells than there are names; empty ones at its end don't count.
 
     Raises:
-        GroundedError: if one has, so that it is unclear which cell belongs to which name.
+        GroundedError: if one has, or if a column without a name has the numbers that the last one
+            lacks, so that it is unclear which cell belongs to which name.
     """
     _pass_over(stream, head)
     for number, line in enumerate(stream, start=head.rows + 1):
@@ -135,6 +148,19 @@ def _check_widths(stream: TextIO, head: _Head, path: Path) -> None:
             cells = _cells(line, head.mark)
             if any(cells[len(head.names) :]):
                 raise _misfit(path, number, cells, head)
+    if "" in head.names and _empty_last(stream, head):
+        raise GroundedError(
+            f"{path}, line {head.line}: '{head.cells[-1]}' is empty in every row, while column "
+            f"{head.names.index('') + 1} has numbers but no name, so the names seem to be one "
+            "column too far to the right: correct that line"
+        )
+
+
+def _empty_last(stream: TextIO, head: _Head) -> bool:
+    """Return whether the last column is empty in every row, which then ends with a separator."""
+    _pass_over(stream, head)
+    rows = (line.strip(" \r\n") for line in stream if line.strip())
+    return all(row.endswith(head.mark) and row.count(head.mark) < len(head.names) for row in rows)
 
 
 def _misfit(path: Path, line: int, cells: Sequence[str], head: _Head) -> GroundedError:
@@ -213,13 +239,21 @@ def _pass_over(stream: TextIO, head: _Head) -> None:
 
 
 def _head(lines: Sequence[str], path: Path) -> _Head:
-    """Find the line with the column names: the first one above a row of numbers, else line 1."""
+    """Find the line with the column names: the first one above a row of numbers, else line 1.
+
+    A line with as many names as that row has cells comes before any other.
+    """
+    others: list[tuple[int, str]] = []
     for i, line in enumerate(lines[:PREAMBLE]):
         below = next((row for row in lines[i + 1 :] if row.strip()), "")
         for mark in (m for m in "\t;," if m in line):
             cells, row = _cells(line, mark), _cells(below, mark)
-            if len(cells) == len(row) > 1 and _share(cells) == 0 and _share(row) > 0.5:
-                return _named(lines, i, mark)
+            if len(row) > 1 and _share(cells) == 0 and _share(row) > 0.5:
+                if len(cells) == len(row) or len(_filled(cells)) == len(_filled(row)):
+                    return _named(lines, i, mark)
+                others.append((i, mark))
+    if others:
+        return _named(lines, *others[0])
     mark = next((m for m in "\t;," if m in lines[0]), ",")
     cells = _cells(lines[0], mark)
     if not any(map(column_name, cells)) or _share(cells) == 1:
@@ -232,8 +266,8 @@ def _head(lines: Sequence[str], path: Path) -> _Head:
 
 def _named(lines: Sequence[str], at: int, mark: str) -> _Head:
     """Return the head at a line; if the line above names a time, this one holds the units."""
-    cells, units, rows = _cells(lines[at], mark), [], at + 1
-    above = _cells(lines[at - 1], mark) if at else []
+    cells, units, rows = _filled(_cells(lines[at], mark)), [], at + 1
+    above = _filled(_cells(lines[at - 1], mark)) if at else []
     if len(above) == len(cells) and _any_time(above) and not _any_time(cells):
         cells, units, at = above, cells, at - 1
         units = [re.sub(r"^[\[(](.*)[\])]$", r"\1", unit.strip()) for unit in units]
@@ -244,6 +278,13 @@ def _named(lines: Sequence[str], at: int, mark: str) -> _Head:
 
 def _cells(line: str, mark: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=mark), [])]
+
+
+def _filled(cells: list[str]) -> list[str]:
+    """Return cells without empty ones at the end: the line ended with separators."""
+    while cells and not cells[-1]:
+        cells = cells[:-1]
+    return cells
 
 
 def _any_time(cells: Sequence[str]) -> bool:
@@ -290,6 +331,8 @@ def _with_texts(lines: Iterable[str], head: _Head, times: str, path: Path) -> tu
     for number, row in enumerate(csv.reader(lines, delimiter=head.mark), start=head.rows + 1):
         if not any(cell.strip() for cell in row):
             continue
+        if not any(row[width:]):
+            row = row[:width]
         if len(row) != width:
             raise _misfit(path, number, row, head)
         texts.append((number, row[at], "" if date is None else row[date]))

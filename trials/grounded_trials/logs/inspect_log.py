@@ -34,7 +34,7 @@ from grounded_trials.formats.path_walk import (
     evaluate,
     number_paths,
 )
-from grounded_trials.formats.text_tables import cut_off
+from grounded_trials.formats.text_tables import table_remarks
 from grounded_trials.logs.log_files import log_records, reading
 from grounded_trials.logs.signals import Decoder, decoder_of
 from grounded_trials.logs.twins import Twins, find_twins, measured_kind
@@ -99,7 +99,7 @@ class LogReport:
 
 def _remarks(log: LogReport) -> tuple[str, ...]:
     found = [log.damage] if log.damage else []
-    found += [f"{file}: {lost}" for file in log.files if (lost := cut_off(file))]
+    found += [f"{file}: {odd}" for file in log.files for odd in table_remarks(file)]
     for topic in log.topics:
         if topic.problem:
             found.append(f"{topic.topic} ({topic.type}) can't be read: {topic.problem}")

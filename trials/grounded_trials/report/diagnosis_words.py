@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from grounded.diagnosis.cause_words import ENDED, furthest_apart, value_of, with_share
+from grounded.diagnosis.cause_words import ENDED, furthest_apart, value_of, with_worth
 from grounded.diagnosis.error_report import Correction, Gap
 from grounded.diagnosis.report import Changed, Diagnosis, Estimate
 from grounded.result import listed
@@ -64,7 +64,8 @@ def correction_line(correction: Correction) -> str:
     gain = f"removes {percent(correction.held_out_gain)} of the held-out squared error"
     if not correction.adoptable:
         return f"a curve of {correction.channel} over {over} does not improve held-out predictions"
-    return f"correction:{correction.channel}, a curve over {over}, {gain}; it explains no cause"
+    name = f"correction:{correction.channel}, a curve over {over},"
+    return f"{name} {gain}; it is no cause, but can be adopted"
 
 
 def in_vain(diagnosis: Diagnosis) -> list[str]:
@@ -199,7 +200,7 @@ def _utility_error(error: float, spread: float) -> str:
 
 
 def verdict_lines(diagnosis: Diagnosis) -> tuple[list[str], list[str]]:
-    """Return the causes with their shares if there are several, then the other sentences.
+    """Return the causes with their worth if there are several, then the other sentences.
 
     What changed between two groups of trials comes before the causes.
     """
@@ -207,7 +208,7 @@ def verdict_lines(diagnosis: Diagnosis) -> tuple[list[str], list[str]]:
     if len(causes) < 2:
         return [], told
     each = zip(causes, diagnosis.credit, strict=True)
-    clauses = diagnosis.verdict.clauses or tuple(with_share(c, one.share) for c, one in each)
+    clauses = diagnosis.verdict.clauses or tuple(with_worth(c, [one]) for c, one in each)
     first = [text for text in [diagnosis.verdict.comparison] if text]
     first += [f"{clause[:1].upper()}{clause[1:]}" for clause in clauses]
     return first, told[1 + bool(diagnosis.verdict.comparison) :]

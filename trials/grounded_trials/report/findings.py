@@ -217,7 +217,7 @@ class Improved:
 
     @property
     def text(self) -> str:
-        """`17 cm → 0.5 cm`: lengths in mm or cm where they are small, both in one unit."""
+        """`170 mm → 5.0 mm`: both in one unit, lengths below 1 m in mm."""
         return " → ".join(measured_alike(self._known, self.unit))
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from grounded.diagnosis.tables import effect_table, error_table
+from grounded.diagnosis.tables import WITHOUT, effect_table, error_table
 from grounded.errors import NextCommand
 from grounded.result import percent
 from grounded.search.candidate import SURE, Tried
@@ -167,8 +167,10 @@ def _diagnosis(findings: Findings, table: Table) -> str:
         lines += _wrapped(f"{title}: {text}", "  ")
     if diagnosis.prediction_error and not diagnosis.no_cause:
         lines += ["", table(*error_table(diagnosis, whole_trials=False))]
-    if diagnosis.ranking and not diagnosis.no_cause:
-        lines += ["", table(*effect_table(diagnosis, rivals=False))]
+    rows, header = effect_table(diagnosis, rivals=False)
+    if rows and not diagnosis.no_cause:
+        known = any(row[1] for row in rows)
+        lines += ["", table(rows, header), *(_wrapped(WITHOUT, "  ") if known else ())]
     return "\n".join(lines)
 
 

@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from grounded.diagnosis.cause_words import is_late, with_share
+from grounded.diagnosis.cause_words import is_late, only_named
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.ruler_words import COMPARABLE, in_doubt, open_noise, rest, telling, worsened
-from grounded.diagnosis.verdict import told_apart
+from grounded.diagnosis.verdict import also_off, told_apart
 from grounded.result import listed, measured_alike
 from grounded.task import Task
-from grounded_trials.wording import count, shown
+from grounded_trials.wording import shown
 from grounded_trials.workspace.off_target import rates_among, weighed_groups
 
 CAUSES = 2  # that the first line names in any case
 LARGE = 0.15  # of the improvement: a further cause above it is named too
-SMALL = 0.05  # of the improvement: a cause below it is only counted
+SMALL = 0.05  # of the improvement: a cause below it is only named
 FEW = 2  # states in the second line
 
 
@@ -40,7 +40,7 @@ def three_lines(diagnosis: Diagnosis, task: Task) -> list[str]:
 
 
 def _wrong(diagnosis: Diagnosis) -> str:
-    """The largest causes without their shares, which the bars show; the others with one for all.
+    """The largest causes without what they are worth, which the bars show; the others by name.
 
     Delays and lags are named in any case, as they decide whether a loop is stable.
     """
@@ -49,11 +49,11 @@ def _wrong(diagnosis: Diagnosis) -> str:
     for clause, credit in zip(diagnosis.verdict.causes, diagnosis.credit, strict=True):
         many = credit.share < (LARGE if len(told) >= CAUSES else SMALL)
         if told and many and not is_late(credit.of):
-            small.append(credit.share)
+            small.append(credit)
         else:
             told.append(clause)
     if small:
-        told.append(with_share(count(len(small), "smaller cause"), sum(small)))
+        told.append(only_named(small))
     text = "; ".join(told)
     return f"{text[:1].upper()}{text[1:]}."
 
@@ -121,12 +121,12 @@ def _together(errors: Mapping[str, float], names: list[str]) -> float:
 
 def still_open(diagnosis: Diagnosis) -> str:
     """What ties, and what no known effect explains."""
-    ties = [told_apart(group, diagnosis.equivalent) for group in diagnosis.indistinguishable]
+    same, claimed = diagnosis.equivalent, diagnosis.effects
+    ties = [told_apart(group, same, claimed) for group in diagnosis.indistinguishable]
     found = [f"{text[:1].lower()}{text[1:]}" for text in ties]
     found += [one.sentence() for one in diagnosis.unconfirmed[:1]]
     if diagnosis.leftover:
-        others = len(diagnosis.leftover) - 1
-        more = f"; {count(others, 'more state')}" * bool(others)
+        more = also_off(len(diagnosis.leftover) - 1)
         found.append(f"still unexplained: {diagnosis.leftover[0].sentence()}{more}")
     rows = diagnosis.prediction_error
     if not found and (name := open_noise(rows)):

@@ -15,11 +15,10 @@ from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import key
 from grounded_trials.workspace.config import FILE, OFFERED
 from grounded_trials.workspace.off_target import usual_weights
+from grounded_trials.workspace.rests_at import STILL, STOOD, drift, steady
 from grounded_trials.workspace.task_file import change_weight, write_target
 
-STOOD = 0.5  # [s] at the start of a log in which the robot may stand still
 BEGAN = 0.1  # [s] at its start in which one may stand still that nothing has to hold
-STILL = 0.05  # fraction of a state's range (or a rate's maximum) that counts as standing still
 
 
 def write_first(
@@ -84,8 +83,9 @@ def write_first(
         "# terminal: weights of the last step only. If the run must END at rest on its target",
         "# (docking, parking) but overshoots, use 10 to 100 times `state`, also for the speeds",
         f"# terminal = {_inline({name: OFFERED * weight for name, weight in weights.items()})}",
-        "# input_change: weights of (a_t - a_{t-1})^2, 0.04 / (range in [limits])^2. While they",
-        "# are as in the next line, which `init` wrote, `target` adapts them to your [limits]",
+        "# input_change: weights of (a_t - a_{t-1})^2; larger ones make inputs smoother. Until",
+        "# you change them, `target` sets them to 0.04 / (range in [limits])^2. To know whether",
+        "# you did, it compares them with the next line: leave that one as it is",
         f"# input_change = {_inline(changes)}",
         f"input_change = {_inline(changes)}",
         "",
@@ -115,8 +115,8 @@ def held_first(
 ) -> dict[str, float]:
     """Return the states in which a robot stands at the start of a log, and the inputs holding it.
 
-    A controller may sag at first and its commands may jitter, so inputs only need to stay nearly
-    constant in the second half of the first `STOOD` seconds. If none has to hold it, none is named:
+    A controller may sag at first and its commands may tremble, so inputs only need to be `steady`
+    in the second half of the first `STOOD` seconds. If none has to hold it, none is named:
     inputs then count as 0 before a run, which is also what is sent after it; it may then stand for
     a moment only (`BEGAN`). A robot that drives in a plane may start anywhere, so that no state is
     named without such an input. Returns {} if the robot moves or an input changes. Also returns {}
@@ -157,7 +157,7 @@ def _stood(
     for name in columns:
         low, high = spans[name]
         most = max(abs(low), abs(high)) if name in speeds else high - low
-        off = first[name].mean() if name in speeds else first[name][-1] - first[name][0]
+        off = first[name].mean() if name in speeds else drift(first[name])
         if abs(off) > STILL * most:
             return {}, {}
         at = float(first[name][steps // 2 :].mean())
@@ -167,7 +167,7 @@ def _stood(
     for name in sent:
         low, high = spans[name]
         later = first[name][steps // 2 :]
-        if np.ptp(later) > STILL * (high - low):
+        if not steady(later, high - low):
             return {}, {}
         held[name] = float(later.mean() if np.ptp(later) else later[0])
         needed |= held[name] != 0 and (not np.ptp(later) or abs(held[name]) > STILL * (high - low))

@@ -41,7 +41,7 @@ class Fitted(Result):
     applied: bool
     preflight: tuple[Finding, ...]  # findings about the instruments
     then: NextCommand  # the command to type next
-    not_fitted: tuple[str, ...] = ()  # adopted delays, unless the latency is fitted
+    not_fitted: tuple[str, ...] = ()  # adopted delays that the intervals take as exact
     trials: tuple[str, ...] = ()  # the trials that were fitted
 
     def summary(self) -> str:
@@ -80,9 +80,7 @@ def fit_in(
     found, seen = fit_trials(
         workspace, used, names, latency=latency, engine=engine, progress=progress
     )
-    delays = [str(e["name"]) for e in workspace.config.model.effects]
-    delays = [name for name in delays if name.startswith("delay:")]
-    kept = () if names or latency else tuple(delays)
+    kept = () if names or latency else _taken_as_exact(workspace, found)
     if not (names or latency):
         _keep(workspace, used, found)
     asked: tuple[str, ...] = ("--params", ",".join(names)) if names else ()
@@ -100,6 +98,35 @@ def fit_in(
         return fitted(applied=False, then=NextCommand("fit", (*asked, "--apply")))
     apply_fit(workspace, found)
     return fitted(applied=True, then=to_plan(workspace))
+
+
+def _adopted_delays(workspace: Folder) -> dict[str, tuple[int, ...]]:
+    """Return the inputs of each adopted delay that is all the latency that they have, by its name.
+
+    Another delay of the same input can't be told from it, and a delay before a nonlinear effect is
+    only partly latency (`planner_with`).
+    """
+    from grounded.effects import param_name
+
+    plan, found = workspace.planner.plan, dict[str, tuple[int, ...]]()
+    assert plan.latency is not None
+    for effect in workspace.config.model.effects:
+        family, _, target = str(effect["name"]).partition(":")
+        if family != "delay":
+            continue
+        inputs = tuple(plan.model.input_names.index(name) for name in target.split("+"))
+        if np.allclose(plan.latency[list(inputs)], effect["d"], rtol=0.0, atol=1e-9):
+            found[param_name(str(effect["name"]), "d")] = inputs
+    return found
+
+
+def _taken_as_exact(workspace: Folder, found: Fit) -> tuple[str, ...]:
+    """Return the adopted delays that were not fitted."""
+    from grounded.effects import param_name
+
+    names = (str(e["name"]) for e in workspace.config.model.effects)
+    delays = (name for name in names if name.startswith("delay:"))
+    return tuple(name for name in delays if param_name(name, "d") not in found.params)
 
 
 def _worse(found: Fit) -> str:
@@ -211,7 +238,7 @@ def fit_trials(
         planner.plan,
         records,
         names,
-        fit_latency="common" if latency else "known",
+        fit_latency="common" if latency else "known" if names else _adopted_delays(workspace),
         measurement=of_states(model, [model.state_names[i] for i in shown]),
         filters=looked.filters,
         rng=np.random.default_rng(0),

@@ -114,6 +114,7 @@ def propose_in(workspace: Folder) -> Proposed:
         )
     before = workspace.candidate_ids()
     proposal, void = _handed_over(workspace)
+    proposal = replace(proposal, standing=_answered(workspace, proposal.standing))
     candidate = proposal.candidate
     notes = [f"{name} was not run and is void: {why}" for name, why in void.items()]
     if candidate is not None and proposal.is_new:
@@ -303,8 +304,25 @@ def standing_in(
     if ahead and now.phase == "propose" and now.incumbent is not None:
         from grounded.search.improve import propose
 
-        return propose(task, contents.candidates, trials, options, planner=planner).standing
-    return now
+        now = propose(task, contents.candidates, trials, options, planner=planner).standing
+    return _answered(workspace, now)
+
+
+def _answered(workspace: Folder, now: Standing) -> Standing:
+    """Return the standing, which asks for no diagnosis if there is one of all that it knows."""
+    if not now.missed:
+        return now
+    from grounded_trials.workspace.last_diagnosis import read_diagnosis
+    from grounded_trials.workspace.next_step import since_diagnosis, usable_ids
+
+    try:
+        found = read_diagnosis(workspace.reports)
+    except GroundedError:  # a damaged one counts as none
+        return now
+    if found is None:
+        return now
+    since = since_diagnosis(workspace, found, usable_ids(workspace))
+    return now if since.changed or since.newer else now.answered()
 
 
 def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()) -> Status:

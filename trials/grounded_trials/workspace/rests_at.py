@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from grounded.errors import GroundedError
+from grounded.frozen import Array
 from grounded.model import Model
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
@@ -51,9 +52,9 @@ def resting(model: Model, trial: Trial) -> dict[str, float]:
     whole, sent = np.nan_to_num(np.ptp(trial.states, axis=0)), np.ptp(trial.inputs, axis=0)
     rates = np.array([unit.endswith("/s") for unit in model.states.values()])
     fastest = np.abs(trial.states).max(axis=0)
-    off = np.where(rates, np.abs(x.mean(axis=0)), np.abs(x[-1] - x[0]))
+    off = np.where(rates, np.abs(x.mean(axis=0)), np.abs(drift(x)))
     most = np.where(rates, fastest, whole)
-    if (off > STILL * most).any() or (np.ptp(u, axis=0) > STILL * sent).any():
+    if (off > STILL * most).any() or not steady(u, sent).all():
         return {}
     at, held = np.median(x, axis=0), np.median(u, axis=0)
     a = model.system.linearise(at[None], held[None], model.values, trial.dt)[0][0]
@@ -62,3 +63,26 @@ def resting(model: Model, trial: Trial) -> dict[str, float]:
     found = {n: float(f"{at[i]:.4g}") for i, n in enumerate(model.state_names) if told[i]}
     inputs = {n: float(f"{held[j]:.4g}") for j, n in enumerate(model.input_names)}
     return found | {n: v for n, v in inputs.items() if found and v}
+
+
+def steady(sent: Array, span: Array | float) -> Array:
+    """Return whether inputs (T,) or (T, m) neither drift nor scatter by more than `STILL`.
+
+    The scatter is judged by its rms: a controller that holds a robot answers the noise of its
+    sensors, so that commands tremble by several times that around what holds it.
+
+    Args:
+        sent: the inputs.
+        span: their range in the whole log.
+    """
+    most = STILL * np.asarray(span)
+    return np.asarray((np.abs(drift(sent)) <= most) & (sent.std(axis=0) <= most))
+
+
+def drift(values: Array) -> Array:
+    """Return the change from first to last of the straight line through values (T,) or (T, n)."""
+    steps = len(values)
+    if steps < 2:
+        return np.zeros(values.shape[1:])
+    t = np.arange(steps) - (steps - 1) / 2
+    return np.asarray(np.tensordot(t, values, axes=1) / (t**2).sum() * (steps - 1))

@@ -109,7 +109,7 @@ def _unit(diagnosis: Diagnosis, value: TrialValue) -> str:
 def _alike(diagnosis: Diagnosis) -> list[Block]:
     """Ties, and effects that would do nearly the same as one that is claimed."""
     found = [
-        Block("text", f"{told_apart(group, diagnosis.equivalent)}.")
+        Block("text", f"{told_apart(group, diagnosis.equivalent, diagnosis.effects)}.")
         for group in diagnosis.indistinguishable
     ]
     if diagnosis.lookalikes:

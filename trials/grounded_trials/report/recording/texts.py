@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 
+from grounded.diagnosis.tables import larger
 from grounded.figures.figure import typeset
 from grounded_trials.report.figures.paths import crash
 from grounded_trials.report.findings import Findings
@@ -27,14 +28,14 @@ def verdict(findings: Findings) -> str:
 
 
 def credit(findings: Findings) -> str:
-    """Return the share of each cause as a table with bars (Markdown); "" if there is none."""
+    """Return what each cause is worth as a table with bars (Markdown); "" if there is none."""
     diagnosis = findings.diagnosis
     if diagnosis is None or not diagnosis.credit:
         return ""
-    lines = ["| cause | share of the improvement | |", "|---|---|---|"]
+    lines = ["| cause | errors without it | |", "|---|---|---|"]
     for one in diagnosis.credit:
         bar = "█" * max(1, round(BAR * one.share)) if one.share > 0 else ""
-        lines.append(f"| {one.of} | {percent(one.share)} | {bar} |")
+        lines.append(f"| {one.of} | {larger(one.times) or percent(one.share)} | {bar} |")
     return "\n".join(lines)
 
 

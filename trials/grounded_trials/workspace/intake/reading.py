@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.trial import Trial
-from grounded_trials.formats.text_tables import cut_off
+from grounded_trials.formats.text_tables import table_remarks
 from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.resample import Gridded
 from grounded_trials.logs.signal_report import SignalReport
@@ -204,7 +204,7 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
         trial,
         encoded,
         (
-            *filter(None, map(cut_off, log_files(log.path))),
+            *(text for file in log_files(log.path) for text in table_remarks(file)),
             *misread(log),
             *log.unlike_units,
             *log.unread,
