@@ -7,7 +7,9 @@ import pytest
 
 from cli import grounded
 from facts import holds
+from grounded.errors import GroundedError
 from grounded.plant import Plant
+from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
 from workspaces import REAL, make
@@ -128,3 +130,46 @@ def test_a_loop_slower_than_dt_is_told(w, every):
     told = [one for one in found.warnings if f"dt is {dt:g} ms" in one]
     assert len(told) == (every > 1) == (found.then.verb == "discard")
     assert all(holds(one, f"every {every * dt:g} ms", "c0002", "[task] dt") for one in told)
+
+
+def by_hand(w, wired, drag=6.0):
+    """Drive the cart by hand, with a motor wired right or wrong and a drag the model lacks."""
+    rng, (x, v) = np.random.default_rng(5), (0.0, 0.0)
+    states, inputs, goals = [(x, v)], [], rng.uniform(-1.0, 1.0, 10)
+    for k in range(120):
+        force = np.clip(4.0 * (goals[k // 15] - x) + 0.5 * rng.normal(), -5.0, 5.0)
+        for _ in range(20):
+            v += 0.0025 * (wired * force - drag * v) / 1.4
+            x += 0.0025 * v
+        states.append((x, v))
+        inputs.append((force,))
+    noisy = np.array(states) + 1e-4 * rng.normal(size=(121, 2))
+    trial = Trial(noisy, np.array(inputs), 0.05, w.task.model.state_names, ("force",))
+    file = w.folder / f"hand{wired:g}.mcap"
+    write_trial(file, trial, {"kind": "trial", "task": w.task.hash})
+    return w.ingest(file, data=True)
+
+
+def test_a_motor_wired_wrongly_in_the_first_run_is_told_by_a_crude_model(tmp_path):
+    """A run away under a drag unmodelled is badly predicted with either sign: it was `first`."""
+    w = Workspace(make(tmp_path / "w").folder)
+    assert by_hand(w, 1.0).warnings == ()
+    assert w.propose().candidate.id == "c0001"
+    (w.folder / "real.py").write_text(TURNED.replace("FORCE", "-a.force - 6.0 * s.v"))
+    found = w.ingest(w.run("c0001").trial_file)
+    told = found.warnings[0]
+    assert holds(told, "force", "the other way round", "otherwise than in t0001", "`discard t0002`")
+    assert found.then.arguments == ("t0002",)
+    with pytest.raises(GroundedError, match="trial t0002") as raised:
+        w.diagnose()
+    assert raised.value.then.arguments == ("t0002",)
+
+
+def test_a_log_that_contradicts_the_model_is_told_and_the_next_contradicts_it(tmp_path):
+    w = Workspace(make(tmp_path / "w").folder)
+    first = by_hand(w, -1.0)
+    assert holds(first.warnings[0], "force", "the other way round", "in the model", "`diagnose`")
+    assert first.then.verb == "diagnose"
+    by_hand(w, 1.0)
+    with pytest.raises(GroundedError, match="trial t0001"):
+        w.diagnose()

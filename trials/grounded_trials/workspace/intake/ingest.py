@@ -148,7 +148,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     wrong = bool(slow) or any(one.again for one in elsewhere)
     if not (odd or wrong or aside):
         asked = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
-        warnings, wrong = (*filter(None, [asked]), *warnings), bool(asked)
+        if asked:
+            warnings, wrong = (asked.said, *warnings), asked.aside
     if trial.candidate and not wrong and (whole := _whole(read, workspace.task)):
         warnings = (*warnings, *afterwards(workspace.planner, whole))
     if ahead and verdict == "run again":
