@@ -58,8 +58,39 @@ def test_a_motor_wired_wrongly_is_told_before_the_next_plan(w, tmp_path, steps):
     assert (done.taken.then.verb, done.taken.then.arguments) == ("discard", ("t0002",))
     told = done.taken.warnings[0]
     assert holds(told, "force", "the other way round", "`discard t0002`", "c0002", "`propose`")
+    now = w.status()
+    assert now.then == done.taken.then and now.notes[0] == f"t0002: {told}"
+    w.discard("t0002")
+    assert w.status().then.verb != "discard"
+    assert w.propose().candidate.id == "c0002"
+
+
+def test_the_question_about_a_run_is_answered_by_going_on(w):
+    """Or by restoring the run: `status` does not ask again."""
+    w.ingest(run(w, "-a.force"))
+    w.discard("t0002")
+    w.restore("t0002")
+    assert w.status().then.verb != "discard"
     w.discard("t0002")
     assert w.propose().candidate.id == "c0002"
+    w.ingest(run(w, "-a.force + 0.01"))
+    assert w.status().then.arguments == ("t0003",)
+    assert w.propose().candidate is not None
+    assert w.status().then.verb != "discard"
+
+
+def test_a_step_that_is_only_planned_has_the_name_of_the_next_candidate(w):
+    """`status` called it c0003 in a workspace with six candidates, four of an earlier task."""
+    toml = w.folder / "grounded.toml"
+    toml.write_text(toml.read_text().replace("x = 10.0", "x = 20.0"))
+    w = Workspace(w.folder)
+    w.ingest(w.run(w.propose().candidate.id).trial_file)  # c0003, the first of this task
+    with pytest.MonkeyPatch.context() as patch:
+        names = []
+        patch.setattr("grounded.search.improve.Maker", lambda *made: names.append(made[2]) or 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            w.status()
+    assert names == ["c0004"]
 
 
 def test_a_run_that_missed_by_hundreds_of_times_what_runs_miss_is_asked_about(w):

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.result import listed
 from grounded.search.mispredictions import STRAYED
+from grounded_trials.wording import ranges
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import diagnosable
 
@@ -92,7 +92,7 @@ def _is_it_wired(workspace: Folder, trial: Trial, found: Reversed) -> Asked:
     right, wrong = ([name for name, sign in each if sign == s] for s in (1, -1))
     again = f"mend it and run {trial.candidate} again" if trial.candidate else "mend it"
     if right:
-        wired = f"Is it wired, or its sign switched, otherwise than in {listed(right)}?"
+        wired = f"Is it wired, or its sign switched, otherwise than in {ranges(right)}?"
         if not trial.candidate:
             return Asked(f"{found.said}. {wired} Then `discard {trial.id}` and {again}")
     elif trial.candidate:
@@ -100,7 +100,7 @@ def _is_it_wired(workspace: Folder, trial: Trial, found: Reversed) -> Asked:
     else:
         told = "Is its sign in the log or in the model wrong? `diagnose` says what to change"
         return Asked(f"{found.said}. {told}", aside=False)
-    like = f", as in {listed(wrong)}" * bool(wrong and not right)
+    like = f", as in {ranges(wrong)}" if wrong and not right else ""
     return Asked(
         f"{found.said}{like}. {wired} Then `discard {trial.id}`, {again}; if not, `propose` goes on"
     )
