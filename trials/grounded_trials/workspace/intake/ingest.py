@@ -278,7 +278,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         its = log and _in_programs_unit(task.model, units, by)
         if log and its and (how := misused_in(log, task, own)):
             raise _misused(path, own, how)
-        other_unit = units_told(task.model, units, by, read.log is not None)
+        other_unit = units_told(task, units, by, read.log is not None)
         raise GroundedError(f"{path} ran {ran}, {other_unit}")
     if pace:
         raise GroundedError(f"{path} ran {ran}, but {pace}")
