@@ -21,6 +21,7 @@ from grounded.model import Model
 from grounded.result import listed
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.returned.as_predicted import odd_columns
+from grounded.search.returned.misused import WITHOUT, without_feedback
 from grounded.search.returned.other_scale import other_units, unit_named, units_tried
 from grounded.search.returned.who_drove import OTHERS, Following
 from grounded.search.safety import COASTS
@@ -243,7 +244,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     if not why and not units:
         if candidate is None and log and (off := zero_in(log, task, own, whole, seen.ran)):
             raise GroundedError(f"{path} ran {ran}, but {off}")
-        told = _like(read, ran, seen.ran)
+        told = _unfed(own, whole, seen.ran) or _like(read, ran, seen.ran)
         if fell:
             read = cut_short(read, fell.steps, fell.told)
         return replace(read, warnings=(*read.warnings, *told))
@@ -396,6 +397,13 @@ def _like(read: Read, ran: str, found: Following | None) -> tuple[str, ...]:
         f"it ran: if that was the {ran} of another workspace, `discard` it. To be sure, write "
         "trials with TrialWriter(..., policy=Path(candidate).read_bytes())",
     )
+
+
+def _unfed(own: Candidate, run: Trial, found: Following | None) -> tuple[str, ...]:
+    """Return a warning if a run, little disturbed, was driven without its candidate's feedback."""
+    if found is None or not without_feedback(own, run, found):
+        return ()
+    return (f"its commands are the feed-forward of {own.id} alone, {WITHOUT}",)
 
 
 def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart
-from grounded.search.returned.misused import NEARLY_ALL, TELLS, Way, likeliest, misused, ways
+from grounded.search.returned.misused import NEARLY_ALL, Way, likeliest, misused, ways
 from grounded.search.returned.who_drove import follows, latest
 from grounded.task import Task
 from grounded.trial import Trial
@@ -23,6 +23,7 @@ from grounded_trials.workspace.intake.acted_on import EXACT, FEW, acted_on, held
 from grounded_trials.workspace.intake.instants import BATCH, least_of
 from grounded_trials.workspace.intake.run_start import TRIED, Recording
 
+APART = 10 * EXACT  # smallest difference of two commands that exact ones tell apart
 NEAR = 0.02  # largest difference of a command, relative to its size, that is no stray
 MANY = 1_000_000  # largest number of commands that are computed for a misuse, roughly
 EACH, ALL = 2, 24  # numbers of instants that are examined for a misuse, and in all
@@ -106,7 +107,7 @@ def _left(log: Recording, own: Candidate, way: Way, at: float) -> float:
     fit, plain = acted_on(_as_passed(log, way), way.policy, at), acted_on(log, own.policy, at)
     if fit is None or plain is None or plain.exact or not fit.throughout:
         return np.inf
-    differs = np.abs(fit.asked - plain.asked) > TELLS * fit.size
+    differs = np.abs(fit.asked - plain.asked) > APART * fit.size
     tells = np.isfinite(fit.off) & differs.any(axis=1)
     moves = np.abs(np.diff(fit.asked[tells], axis=0)) > EXACT * fit.size
     if moves.any(axis=1).sum() < FEW:  # many a program holds an input
