@@ -35,6 +35,7 @@ from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.intake.after_run import afterwards
 from grounded_trials.workspace.intake.begun import begun_elsewhere
 from grounded_trials.workspace.intake.earlier_task import OfEarlierTask, of_earlier_task
+from grounded_trials.workspace.intake.ended_early import ended_early
 from grounded_trials.workspace.intake.gone_wrong import gone_wrong
 from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.intake.log_faults import dead_sensors, log_faults, mistaken_in
@@ -151,6 +152,9 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         asked = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
         if asked:
             warnings, wrong = (asked.said, *warnings), asked.aside
+    early = None if read.fell or aside or wrong else ended_early(workspace, trial)
+    if early:
+        warnings, wrong = (early.said, *warnings), early.aside
     if trial.candidate and not wrong and (whole := _whole(read, workspace.task)):
         warnings = (*warnings, *afterwards(workspace.planner, whole))
     if ahead and verdict == "run again":

@@ -11,6 +11,7 @@ from grounded.trial import interpolate_gaps
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial
 from grounded_trials.workspace.intake.begun import begun_elsewhere
+from grounded_trials.workspace.intake.ended_early import ended_early
 from grounded_trials.workspace.intake.gone_wrong import gone_wrong
 from grounded_trials.workspace.intake.log_faults import log_faults
 from grounded_trials.workspace.intake.skipped_steps import steps_skipped
@@ -37,8 +38,9 @@ def unanswered(workspace: Folder) -> tuple[tuple[str, ...], NextCommand | None]:
 
         history = standing_in(workspace).history
         tried = next((t for t in history if t.candidate.id == trial.candidate), None)
-        asked = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
-        told = [asked.said] if asked and asked.aside else []
+        wrong = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
+        early = ended_early(workspace, last.measured)
+        told = [one.said for one in (wrong, early) if one and one.aside][:1]
     name = last.stored.id
     then = NextCommand("discard", (name,)) if told else None
     return tuple(f"{name}: {one}" for one in told), then
