@@ -34,18 +34,19 @@ def ended_early(workspace: Folder, trial: Trial) -> Asked | None:
         return None
     own, _ = workspace.candidate(run.candidate)
     name, ends = own.id, f"after {run.steps} of {task.horizon} steps ({run.steps * run.dt:.2f} s)"
-    before = _complete(workspace, run)
+    complete = _complete(workspace, run)
+    before = f"{name} ran to the end before ({complete}). " if complete else ""
     if as_before(task, own, run):
         return Asked(
-            f"the log ends {ends}, with the robot as near to its prediction as before: was the "
-            f"recording cut off, or the robot stopped? Then `discard {run.id}`, run {name} again "
-            f"and record it to its end. If it crashed there, `propose` goes on: {name} counts as "
-            "failed"
+            f"the log ends {ends}, with the robot as near to its prediction as until then. {before}"
+            f"Was the recording cut off, or the robot stopped? Then `discard {run.id}`, run {name} "
+            f"again and record it to its end. If it crashed there, `propose` goes on: {name} "
+            "counts as failed"
         )
     return Asked(
         f"the run ended {ends}: a failed candidate; its data stay usable for fit and diagnose. "
-        f"{f'{name} ran to the end before ({before}). ' * bool(before)}Use `discard {run.id}` if "
-        "you stopped it for another reason, or if only the recording was cut off",
+        f"{before}Use `discard {run.id}` if you stopped it for another reason, or if only the "
+        "recording was cut off",
         aside=False,
     )
 
