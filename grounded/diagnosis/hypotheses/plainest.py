@@ -1,14 +1,10 @@
-"""Plain forms of effects, fitted as rivals of those with more parameters.
+"""Plain dry friction of a joint, fitted as a rival of frictions with more parameters.
 
 A load-dependent friction, a Coulomb friction beside a stiction, and a joint friction whose viscous
 part is zero all contain the plain friction of the joint as a special case with a lower price. If
 the joint's inertia is constant, the candidate for that friction is `coulomb_friction`. It is an
 added rate and can't hold a joint at rest, so any richer friction that can would win for that reason
 alone. Therefore the joint's own friction is fitted as well.
-
-An input of the wrong sign has a gain of any size below -1 if the model's parameters, such as a mass
-that it accelerates, take up the rest: the data know their ratio alone. With the gain held at the
-modelled strength, the parameters stay near what the user knows of them.
 """
 
 from __future__ import annotations
@@ -25,7 +21,6 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.effects import Effect
-from grounded.effects.actuator import input_gain
 from grounded.effects.family import coupled
 from grounded.effects.joint import joint_friction, load_friction
 
@@ -55,11 +50,7 @@ def _key(fit: Fitted) -> tuple[Structure, float, tuple[str, ...]]:
 
 
 def plain_forms(search: HypothesisSearch, h: Hypothesis) -> Iterator[Hypothesis]:
-    """Yield the hypothesis with each dry friction, and each reversed gain, in its plain form."""
-    for effect, values in h.pairs if h.spread > 0 else ():
-        if effect.family is input_gain and effect.free and values["g"] < -1:
-            held = replace(effect, quantities=tuple(replace(q, fixed=True) for q in effect.free))
-            yield h.minus(effect.name).plus(held, {"g": -2.0})
+    """Yield the hypothesis with each dry friction replaced by its plain form."""
     by_family = {(e.family.name, _motion(e)): (e, v) for e, v in h.pairs}
     for (family, motion), (effect, values) in by_family.items():
         joint = search.joints.get(motion)
