@@ -168,7 +168,7 @@ class Ahead:
         """Sum rows (N, k) over stretches of the trial whose errors count as independent."""
         block = np.arange(len(each)) * BLOCKS // len(each)
         sums = [np.bincount(block, column, minlength=BLOCKS) for column in each.T]
-        return np.array(sums).T * np.sqrt(BLOCKS / (BLOCKS - 1))
+        return np.asarray(np.array(sums).T * np.sqrt(BLOCKS / (BLOCKS - 1)))
 
     def still(self) -> Fit:
         """Return the calibrated fit with every command at its mean: the commands have no effect."""
