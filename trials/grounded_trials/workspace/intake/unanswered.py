@@ -24,10 +24,11 @@ def unanswered(workspace: Folder) -> tuple[tuple[str, ...], NextCommand | None]:
         workspace: the workspace with the trials.
 
     Returns:
-        (), None if nothing is wrong with it, or if the user has decided.
+        (), None if nothing is wrong with it, if it ran another policy of a candidate's name, or if
+        the user has decided.
     """
     last = next((one for one in reversed(workspace.trials()) if workspace.fits(one.trial)), None)
-    if last is None or _decided(workspace, last):
+    if last is None or "~" in last.trial.candidate or _decided(workspace, last):
         return (), None
     trial, own = last.trial, "source" not in last.meta
     told = [one.told(trial, own=own) for one in log_faults(workspace, trial)]
