@@ -129,6 +129,8 @@ def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
         if passed and one.verdict in BEST:
             meaning = " than those before it"
         text = f"utility {number(one.utility)}, {one.verdict}{_earlier(one) or meaning}"
+        if one.verdict == "crashed" and one.then.verb == "discard":
+            text = f"no utility: it ended early{meaning}"
         if passed and best is not None:
             text += f"; the best is now {best.candidate.id}, {number(best.utility)}"
         show(field(one.candidate, text, "  "))

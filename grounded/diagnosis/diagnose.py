@@ -153,7 +153,8 @@ def diagnose(
     copies += more
     exact = bool(copies) and not (scattered(trials) or scattered(compare))
     first = sum(trial.known_steps >= 2 for trial in trials)
-    looked = sound_trials(subject, [*trials, *compare], options.hidden)
+    group = len(trials) if compare else None
+    looked = sound_trials(subject, [*trials, *compare], options.hidden, group)
     trials, model = looked.trials, with_measured_filters(model, looked.findings)
     data = prepare(model, trials, latency, past, options.hidden)
     filters = {model.state_names.index(name): tau for name, tau in looked.filters.items()}

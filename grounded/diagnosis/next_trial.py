@@ -22,6 +22,12 @@ AT_BOUNDS = (  # the same if every parameter that moved is at its bound
     "bounds in the model file if the true value may lie beyond; otherwise a parameter that the "
     "model holds constant may be off, so give it bounds. Then diagnose again."
 )
+AS_A_RATIO = (  # the same if an input acts the other way round as well
+    "None is needed yet: {flip} acts the other way round. Its strength and the parameters that "
+    "stopped at their bounds are known as a ratio only: flip its sign in model.py, or, if only the "
+    "log has it so, set [log] scale = -1, discard the trials and ingest their logs again. Then "
+    "diagnose again."
+)
 
 
 def next_trial(
@@ -50,7 +56,8 @@ def next_trial(
         adopted: adopted effects, whose values are parameters of the model.
         further: whether more effects should be looked for first (`Verdict.look_for`).
         ended: whether all parameters that moved stopped at their bounds (`at_bounds`).
-        flip: an input whose sign is to be flipped before anything is adopted; "" for none.
+        flip: an input whose sign is to be flipped before anything is adopted, also one of another
+            strength if parameters `ended`; "" for none.
     """
     from grounded import places
     from grounded.effects import like_a_load
@@ -85,7 +92,7 @@ def next_trial(
     if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names):
         return "None is needed yet: give the model a parameter for a load and diagnose again."
     if ended:
-        return AT_BOUNDS
+        return AS_A_RATIO.format(flip=flip) if flip else AT_BOUNDS
     if flip:
         return f"None is needed yet: flip the sign of {flip}, as said above, and diagnose again."
     fit = _own_numbers(claims, adopted)

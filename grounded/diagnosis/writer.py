@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.cause_words import sign_only
+from grounded.diagnosis.cause_words import acts_reversed, sign_only
 from grounded.diagnosis.error_report import (
     Change,
     ChannelShare,
@@ -126,7 +126,7 @@ class Writer:
         ranking = marked(ranking, {one.name for one in self.decision.doubtful} - told)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         worse = objection(rows, agreement, named)
-        lost = self.unrepeatable()
+        lost, ended = self.unrepeatable(), at_bounds(self.claims)
         moved, parameters = how_many(predictor), self.claims.parameters()
         identified = tuple(_identified(self.uncertain, self.best, parameters))
         if not self.ruler.held_out:  # what predicts no other trial is adopted only if it is known
@@ -194,8 +194,8 @@ class Writer:
                 worse,
                 self.adopted,
                 further=further,
-                ended=at_bounds(self.claims),
-                flip=next((n for n in named if _sign_only(n, ranking)), "").partition(":")[2],
+                ended=ended,
+                flip=next((n for n in named if _to_flip(n, ranking, ended)), "").partition(":")[2],
             ),
             unknowable=(*self.known.sentences, *joints_without_input(data.model, named)),
             noise=self.noise(),
@@ -274,8 +274,14 @@ def _tracked(task: Task) -> tuple[str, ...]:
     return tuple(sorted(names, key=lambda n: (n not in first, n in rates)))
 
 
-def _sign_only(name: str, ranking: Sequence[Ranked]) -> bool:
-    return any(row.effect == name and sign_only(name, row.params) for row in ranking)
+def _to_flip(name: str, ranking: Sequence[Ranked], ended: bool) -> bool:
+    """Return whether an input's sign is to be flipped before anything is adopted.
+
+    If parameters ended at their bounds, the strength of a reversed input is not known.
+    """
+    own = [row.params for row in ranking if row.effect == name]
+    gain = name.startswith("input_gain:")
+    return any(sign_only(name, one) or (ended and gain and acts_reversed(one)) for one in own)
 
 
 def _identified(

@@ -26,6 +26,7 @@ LITTLE, TINY = 1e-3, 1e-12  # smallest error that counts: of a state's spread, a
 ROUNDS, DAMPING, SLOPE = 5, (1.0, 0.3, 0.1), 0.02  # iterations, step sizes, difference step
 SAME = 1e-6  # singular values below this share of the largest count as zero
 ENOUGH = 0.01  # [nats] smallest gain of an iteration: below it the fit stops
+BLOCKS = 12  # stretches of a trial whose scatter gives a standard error
 
 Steps = NDArray[np.intp]
 
@@ -46,6 +47,22 @@ class Fit:
     def score(self) -> float:
         """Sum of the logarithms of the errors [nats]; it is invariant to exchanged columns."""
         return float(np.log(self.rms).sum())
+
+
+@dataclass(frozen=True)
+class Strengths:
+    """How strongly the inputs act in one trial.
+
+    Args:
+        factors: 1 as in the model, below 0 the other way round (m,); NaN if the log does not show
+            it.
+        errors: their standard errors (m,).
+        score: sum of the logarithms of the errors that are left [nats].
+    """
+
+    factors: Array
+    errors: Array
+    score: float
 
 
 class Ahead:
@@ -124,6 +141,34 @@ class Ahead:
     def plain(self, gains: Array) -> Fit:
         """Return the fit of the uncalibrated model with given gains (m,) of its inputs."""
         return self._fit(self._size(self._off(gains, self.model.values, 0)[0]), gains)
+
+    def strengths(self, late: int = 0) -> Strengths:
+        """Fit how strongly each input acts, with its commands `late` steps late."""
+        m, found, error = self.model.m, np.full(self.model.m, np.nan), np.full(self.model.m, np.nan)
+        signs = np.vstack([np.ones(m), 1.0 - 2.0 * np.eye(m)])
+        off = self._off(signs, self.model.values, late)
+        by = np.moveaxis(off[0] - off[1:], 0, -1) / 2  # (N, shown, m): what each input does
+        left, size = off[0], self._size(off[0])
+        acts = np.asarray((np.sqrt((by**2).mean(axis=0)) > self.least[:, None]).any(axis=0))
+        if not (acts.any() and np.isfinite(off).all()):
+            return Strengths(found, error, float(np.log(size).sum()))
+        by = by[:, :, acts]
+        for _ in range(ROUNDS):
+            slopes = by / size[:, None]
+            inverse = np.linalg.pinv(np.einsum("nki,nkj->ij", slopes, slopes), SAME, hermitian=True)
+            change = -inverse @ np.einsum("nki,nk->i", slopes, off[0] / size)
+            left = off[0] + by @ change
+            size = self._size(left)
+        pulls = self._in_blocks(np.einsum("nki,nk->ni", slopes, left / size))
+        found[acts] = 1.0 + change
+        error[acts] = np.sqrt(np.diag(inverse @ (pulls.T @ pulls) @ inverse))
+        return Strengths(found, error, float(np.log(size).sum()))
+
+    def _in_blocks(self, each: Array) -> Array:
+        """Sum rows (N, k) over stretches of the trial whose errors count as independent."""
+        block = np.arange(len(each)) * BLOCKS // len(each)
+        sums = [np.bincount(block, column, minlength=BLOCKS) for column in each.T]
+        return np.asarray(np.array(sums).T * np.sqrt(BLOCKS / (BLOCKS - 1)))
 
     def still(self) -> Fit:
         """Return the calibrated fit with every command at its mean: the commands have no effect."""

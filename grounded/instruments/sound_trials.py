@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from grounded.instruments.clocks import judge_clocks
 from grounded.instruments.exchanged_states import judge_exchanged
 from grounded.instruments.finding import Preflight
+from grounded.instruments.input_signs import judge_signs
 from grounded.instruments.mistaken import judge_commands
 from grounded.instruments.plane_units import judge_positions
 from grounded.instruments.preflight import preflight
@@ -16,7 +17,10 @@ from grounded.trial import Trial
 
 
 def sound_trials(
-    subject: Task | Model, trials: Sequence[Trial], hidden: Sequence[str] = ()
+    subject: Task | Model,
+    trials: Sequence[Trial],
+    hidden: Sequence[str] = (),
+    first: int | None = None,
 ) -> Preflight:
     """Run all instrument checks, and correct the trials where that is certain.
 
@@ -24,13 +28,15 @@ def sound_trials(
         subject: the model, whose kinematics relate the sensors; a task adds the input limits.
         trials: real ones, of one time grid; unchanged if they don't fit the model.
         hidden: states without a sensor.
+        first: number of trials in the first of two groups, between which inputs may change their
+            signs; None: one group.
 
     Returns:
         The findings and the corrected trials.
 
     Raises:
         GroundedError: for logs that can't be used, with the correction: states that respond before
-            their commands are sent, exchanged columns, other units.
+            their commands are sent, exchanged columns, other units, inputs with two signs.
     """
     model = subject.model if isinstance(subject, Task) else subject
     names = (model.state_names, model.input_names)
@@ -42,4 +48,6 @@ def sound_trials(
         judge_positions(model, looked.trials, hidden)
         judge_clocks(model, looked.trials, hidden)
         judge_commands(model, looked.trials, hidden, looked.findings)
+        for group in (looked.trials[:first], looked.trials[first:] if first else ()):
+            judge_signs(model, group, hidden)
     return looked

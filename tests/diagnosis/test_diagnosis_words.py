@@ -117,6 +117,10 @@ def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt
     assert why in next_trial(claims, "", (pair,), same=(pair,), worse=why)
     said = next_trial(claims, "", (pair,), same=(pair,), flip="force")
     assert holds(said, "flip the sign of force", "diagnose again") and "adopt" not in said
+    assert "Widen the bounds" in next_trial(claims, "", (), ended=True)
+    said = next_trial(claims, "", (), ended=True, flip="force")  # `diagnose` asked for wider ones
+    assert holds(said, "force acts the other way round", "ratio", "model.py", "scale = -1")
+    assert "bounds in the model file" not in said
 
 
 def test_whole_trials_that_get_worse_are_contested_whatever_one_state_loses_sooner():

@@ -41,6 +41,7 @@ WAYS = {
     "ms": ({"times": lambda t: 1e3 * t}, ("in ms", "seconds")),
     "minutes": ({"times": lambda t: t / 60}, ("in minutes", "seconds")),
     "clock": ({"times": lambda t: 1.7e9 + t}, ("speed = 0.5 m/s", "a clock")),
+    "nothing": ({"states": lambda x: x * np.nan}, ("feed-forward of c0001 alone", "runner.blind")),
     "zero": ({"times": lambda t: 0 * t}, ("stays at 0", "seconds")),
 }
 

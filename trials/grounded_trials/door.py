@@ -191,9 +191,9 @@ class Workspace(Folder):
 
     def status(self) -> Status:
         """Return the state of the search; writes nothing."""
-        from grounded_trials.workspace.proposing import standing_in, status_of
+        from grounded_trials.workspace.proposing import status_in
 
-        return status_of(self.forget(), standing_in(self, ahead=True))
+        return status_in(self.forget())
 
     def fit(
         self,

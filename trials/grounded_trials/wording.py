@@ -26,7 +26,7 @@ NARROW, WIDE = 60, 80  # columns: smallest and largest line width
 MARKS = "\ufdd0\ufdd1\ufdd2\ufdd3\ufdd4"  # colour marks in a text, of zero width
 # commands that use no workspace: they are printed without -C
 ELSEWHERE = frozenset({"init", "recover", "demo", "experiment", "challenge", "completion"})
-_NAMED = re.compile(r"`grounded ([a-z][^`]*)`")
+_NAMED = re.compile(r"`(?:grounded ([a-z][^`]*)|((?:discard|restore) [^`]*))`")
 _WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")  # a word of a command; quotes stay together
 _GLUE = re.compile(
     r"(?<=[<>]) (?=[\d.-])| (?=[<>] )| (?=-> )| (?=%)"
@@ -131,11 +131,14 @@ def rendered(then: NextCommand, folder: str | None = None) -> str:
 
 
 def placed(text: str, folder: str | None) -> str:
-    """Add -C DIR to the commands in a text (`grounded VERB ...`) if a folder is given."""
+    """Add -C DIR to the commands in a text if a folder is given.
+
+    These are `grounded VERB ...`, and those that name a trial (`discard t0007`) without `grounded`.
+    """
 
     def as_typed(found: re.Match[str]) -> str:
         try:
-            verb, *arguments = shlex.split(found[1])
+            verb, *arguments = shlex.split(found[1] or found[2])
         except ValueError:  # an unbalanced quote, in text from an untrusted file
             return found[0]
         there = None if verb in ELSEWHERE else folder

@@ -27,6 +27,12 @@ SAME = 2.0  # ratio of the differences left by two misuses that explain a log eq
 LEAVES = 0.25  # largest share of the original difference that a misuse may leave
 TELLS = 0.1  # smallest difference of two commands, relative to their size, that tells them apart
 NEARER, NEARLY_ALL = 0.5, 0.95  # a misuse must be so much nearer in that share of these steps
+WITHOUT = (
+    "without its feedback: send what `runner.action(t, state)` returns, not "
+    "`runner.policy.feedforward`, for a state that holds numbers only (`runner.blind` counts the "
+    "calls without)"
+)
+DIGITS = 1e-4  # largest difference of commands, relative to their size, that rounding makes
 TIMES = {"ms": 1e3, "us": 1e6, "minutes": 1 / 60}  # units of a time that should be in seconds
 
 
@@ -80,6 +86,25 @@ def misused(task: Task, own: Candidate, trial: Trial, plain: Following) -> str:
     return likeliest(near).said if near else ""
 
 
+def without_feedback(own: Candidate, trial: Trial, ran: Following) -> bool:
+    """Return whether a run's commands are the feed-forward to the last digits, unlike the policy's.
+
+    Args:
+        own: the candidate.
+        trial: the run.
+        ran: the comparison of its commands with the policy's.
+    """
+    policy, T = own.policy, min(trial.finite_steps, own.policy.horizon)
+    if policy.gain is None:
+        return False
+    size = ran.fine / FINE
+    asked = np.clip(policy.feedforward[:T], policy.low, policy.high)
+    alone = np.abs(trial.inputs[:T] - asked) / size
+    off = np.abs(ran.off[np.isfinite(ran.off).all(axis=1)]) / size
+    apart = float(np.sqrt((off**2).mean())) if len(off) else 0.0
+    return bool(alone.max(initial=0.0) < DIGITS and apart > 10 * DIGITS)
+
+
 def likeliest(found: Sequence[tuple[float, Way]]) -> Way:
     """Return the likeliest of some ways, each with the difference of the commands that it leaves.
 
@@ -129,6 +154,10 @@ def ways(model: Model, own: Candidate, *, unsent: bool) -> Iterator[Way]:
     )
     if policy.gain is None:
         return
+    yield Way(
+        replace(policy, gain=None, reference=None),
+        f"they are the feed-forward of {name} alone, {WITHOUT}",
+    )
     tried = set[tuple[tuple[str, ...], float]]()
     for group, factor in units_tried(model):
         if (names := tuple(group), factor) in tried or not {*names} <= {*model.state_names}:

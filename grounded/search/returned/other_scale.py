@@ -17,6 +17,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
+from grounded.result import with_unit
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart, multiplied
 from grounded.search.returned.who_drove import (
@@ -73,7 +74,7 @@ def other_units(
     if plain.alike and plain.error < NEARLY:  # only a factor that explains all of it counts
         return _any_factor(task.model, own, trial, plain, late, ALL * _left(plain), ONE)
     least, best = np.inf, (tuple[str, ...](), 1.0, np.inf, np.inf)
-    for names, factor in units_tried(task.model):
+    for names, factor in (*full_scales(task, trial.inputs), *units_tried(task.model)):
         found = follows(own.policy, mended := multiplied(trial, names, factor), late)
         if found is None or not found.alike or found.error >= NEARLY:
             continue
@@ -253,6 +254,33 @@ def units_tried(model: Model) -> Iterator[tuple[Sequence[str], float]]:
     lengths = [[n for n, u in model.states.items() if u in units] for units in LENGTHS]
     yield from ((names, f) for f in THOUSAND for names in lengths if len(names) > 1)
     yield from ((names, CENTI) for names in lengths if names)
+
+
+def full_scales(task: Task, inputs: Array) -> Iterator[tuple[Sequence[str], float]]:
+    """Yield inputs that exceed their limits, with the factors from percent and thousandths of them.
+
+    Args:
+        task: with the limits, whose larger one is taken as 100 % or 1000.
+        inputs: the commands (T, m) of a log.
+    """
+    for j, (name, unit) in enumerate(task.model.inputs.items()):
+        low, high = task.low[j], task.high[j]
+        full = max(abs(low), abs(high))
+        most = np.nanmax(np.abs(inputs[:, j]), initial=0.0)
+        known = full == 1 and unit == "1"  # tried anyway
+        if np.isfinite(full) and not known and most > full:
+            yield from (([name], float(full * by)) for by in (PERCENT[0], THOUSAND[0]))
+
+
+def of_full_scale(task: Task, names: Sequence[str], by: float) -> str:
+    """Return `percent of 10 N` if a factor converts an input from that; "" otherwise."""
+    if len(names) != 1 or names[0] not in task.model.inputs:
+        return ""
+    j = task.model.input_names.index(names[0])
+    full = float(max(abs(task.low[j]), abs(task.high[j])))
+    parts = {PERCENT[0]: "percent", THOUSAND[0]: "thousandths"}
+    part = next((name for one, name in parts.items() if np.isclose(by, full * one)), "")
+    return part and f"{part} of {with_unit(f'{full:g}', task.model.inputs[names[0]])}"
 
 
 def unit_named(model: Model, names: Sequence[str], by: float) -> str:

@@ -3,7 +3,8 @@
 Its commands are the candidate's, so nothing is wrong with the log. But the model, with the effects
 that were adopted, predicts a quarter of a second ahead from each sample far better if the sign of
 that input is flipped. The memory of effects follows from the flipped commands. No constant rate is
-removed: feedback with a wrong sign soon holds the input at its limit.
+removed: feedback with a wrong sign soon holds the input at its limit. A crude model predicts such a
+run badly with either sign: then what its inputs do beside its friction tells, see `input_signs`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from grounded.instruments.input_signs import Acts, how_inputs_act
 from grounded.instruments.short_runs import Ahead
 from grounded.search.planner import Planner
 from grounded.search.returned.as_predicted import multiplied
@@ -21,6 +23,7 @@ STARTS = 120  # samples to predict from
 CLEAR = 2.0  # [nats] by which the flipped sign must lower the errors
 MUCH = 0.3  # the error of at least one state must fall to this share
 PLAIN = 0.5  # and to this share of how far the state moves: else the model explains neither
+TURNED = "acted the other way round"
 
 
 @dataclass(frozen=True)
@@ -29,13 +32,11 @@ class Reversed:
 
     Args:
         input: its name.
-        state: the state whose prediction the flipped sign improves most.
-        share: the error of that prediction, as a share of the one with the model's sign.
+        said: that it did, and what shows it: one clause.
     """
 
     input: str
-    state: str
-    share: float
+    said: str
 
 
 def reversed_input(planner: Planner, trial: Trial) -> Reversed | None:
@@ -61,9 +62,45 @@ def reversed_input(planner: Planner, trial: Trial) -> Reversed | None:
             shares[after.rms[:own] > PLAIN * far] = 1.0
             i = int(np.argmin(shares))
             if after.score < least and shares[i] < MUCH:
-                state = planner.task.model.state_names[i]
-                found, least = Reversed(name, state, float(shares[i])), after.score
-    return found
+                state, times = planner.task.model.state_names[i], 1 / shares[i]
+                said = (
+                    f"with its sign flipped, the model predicts {state} {times:.2g} times as well"
+                )
+                found = Reversed(name, f"{name} {TURNED}: {said}")
+                least = after.score
+    return found or beside_friction(planner, known)
+
+
+def beside_friction(planner: Planner, trial: Trial) -> Reversed | None:
+    """Return the input that acted the other way round by all that is not linear in the states.
+
+    Args:
+        planner: plans with the model, and the effects adopted.
+        trial: a trial; only its part without gaps is used.
+    """
+    acts = _acts(planner, trial)
+    wrong = {name: one for name, one in acts.items() if one.sign < 0}
+    if not wrong:
+        return None
+    name = min(wrong, key=lambda one: wrong[one].share / wrong[one].error)
+    share = f"{-100 * wrong[name].share:.0f} %"
+    return Reversed(name, f"{name} {TURNED}, with {share} of its modelled effect")
+
+
+def signs_of(planner: Planner, trial: Trial) -> dict[str, int]:
+    """Return the sign with which each input acts: 1 as in the model, -1 reversed, 0 unknown.
+
+    Args:
+        planner: plans with the model, and the effects adopted.
+        trial: a trial; only its part without gaps is used.
+    """
+    return {name: one.sign for name, one in _acts(planner, trial).items()}
+
+
+def _acts(planner: Planner, trial: Trial) -> dict[str, Acts]:
+    model = planner.plan.model
+    acts = how_inputs_act(model, planner.lift(trial), range(planner.task.model.n))
+    return dict(zip(model.input_names, acts, strict=True))
 
 
 def _ahead(planner: Planner, trial: Trial) -> Ahead:

@@ -7,7 +7,9 @@ import pytest
 
 from cli import grounded
 from facts import holds
+from grounded.errors import GroundedError
 from grounded.plant import Plant
+from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
 from workspaces import REAL, make
@@ -56,8 +58,39 @@ def test_a_motor_wired_wrongly_is_told_before_the_next_plan(w, tmp_path, steps):
     assert (done.taken.then.verb, done.taken.then.arguments) == ("discard", ("t0002",))
     told = done.taken.warnings[0]
     assert holds(told, "force", "the other way round", "`discard t0002`", "c0002", "`propose`")
+    now = w.status()
+    assert now.then == done.taken.then and now.notes[0] == f"t0002: {told}"
+    w.discard("t0002")
+    assert w.status().then.verb != "discard"
+    assert w.propose().candidate.id == "c0002"
+
+
+def test_the_question_about_a_run_is_answered_by_going_on(w):
+    """Or by restoring the run: `status` does not ask again."""
+    w.ingest(run(w, "-a.force"))
+    w.discard("t0002")
+    w.restore("t0002")
+    assert w.status().then.verb != "discard"
     w.discard("t0002")
     assert w.propose().candidate.id == "c0002"
+    w.ingest(run(w, "-a.force + 0.01"))
+    assert w.status().then.arguments == ("t0003",)
+    assert w.propose().candidate is not None
+    assert w.status().then.verb != "discard"
+
+
+def test_a_step_that_is_only_planned_has_the_name_of_the_next_candidate(w):
+    """`status` called it c0003 in a workspace with six candidates, four of an earlier task."""
+    toml = w.folder / "grounded.toml"
+    toml.write_text(toml.read_text().replace("x = 10.0", "x = 20.0"))
+    w = Workspace(w.folder)
+    w.ingest(w.run(w.propose().candidate.id).trial_file)  # c0003, the first of this task
+    with pytest.MonkeyPatch.context() as patch:
+        names = []
+        patch.setattr("grounded.search.improve.Maker", lambda *made: names.append(made[2]) or 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            w.status()
+    assert names == ["c0004"]
 
 
 def test_a_run_that_missed_by_hundreds_of_times_what_runs_miss_is_asked_about(w):
@@ -128,3 +161,46 @@ def test_a_loop_slower_than_dt_is_told(w, every):
     told = [one for one in found.warnings if f"dt is {dt:g} ms" in one]
     assert len(told) == (every > 1) == (found.then.verb == "discard")
     assert all(holds(one, f"every {every * dt:g} ms", "c0002", "[task] dt") for one in told)
+
+
+def by_hand(w, wired, drag=6.0):
+    """Drive the cart by hand, with a motor wired right or wrong and a drag the model lacks."""
+    rng, (x, v) = np.random.default_rng(5), (0.0, 0.0)
+    states, inputs, goals = [(x, v)], [], rng.uniform(-1.0, 1.0, 10)
+    for k in range(120):
+        force = np.clip(4.0 * (goals[k // 15] - x) + 0.5 * rng.normal(), -5.0, 5.0)
+        for _ in range(20):
+            v += 0.0025 * (wired * force - drag * v) / 1.4
+            x += 0.0025 * v
+        states.append((x, v))
+        inputs.append((force,))
+    noisy = np.array(states) + 1e-4 * rng.normal(size=(121, 2))
+    trial = Trial(noisy, np.array(inputs), 0.05, w.task.model.state_names, ("force",))
+    file = w.folder / f"hand{wired:g}.mcap"
+    write_trial(file, trial, {"kind": "trial", "task": w.task.hash})
+    return w.ingest(file, data=True)
+
+
+def test_a_motor_wired_wrongly_in_the_first_run_is_told_by_a_crude_model(tmp_path):
+    """A run away under a drag unmodelled is badly predicted with either sign: it was `first`."""
+    w = Workspace(make(tmp_path / "w").folder)
+    assert by_hand(w, 1.0).warnings == ()
+    assert w.propose().candidate.id == "c0001"
+    (w.folder / "real.py").write_text(TURNED.replace("FORCE", "-a.force - 6.0 * s.v"))
+    found = w.ingest(w.run("c0001").trial_file)
+    told = found.warnings[0]
+    assert holds(told, "force", "the other way round", "otherwise than in t0001", "`discard t0002`")
+    assert found.then.arguments == ("t0002",)
+    with pytest.raises(GroundedError, match="trial t0002") as raised:
+        w.diagnose()
+    assert raised.value.then.arguments == ("t0002",)
+
+
+def test_a_log_that_contradicts_the_model_is_told_and_the_next_contradicts_it(tmp_path):
+    w = Workspace(make(tmp_path / "w").folder)
+    first = by_hand(w, -1.0)
+    assert holds(first.warnings[0], "force", "the other way round", "in the model", "`diagnose`")
+    assert first.then.verb == "diagnose"
+    by_hand(w, 1.0)
+    with pytest.raises(GroundedError, match="trial t0001"):
+        w.diagnose()

@@ -15,6 +15,7 @@ from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.intake.read_otherwise import units_told
 from recorded import LOGGED, record, waiting
+from small_tasks import cart_task
 from workspaces import MODEL, make
 
 ROVER = """import numpy as np
@@ -119,7 +120,7 @@ def test_centimetres_are_tried_and_are_no_percent():
     assert unit_named(cart, ("x", "v"), 1e-2) == "cm"
     assert unit_named(cart, ("throttle",), 1e-2) == "percent"
     assert unit_named(cart, ("x", "throttle"), 1e-2) == ""
-    assert holds(units_told(cart, ("x", "v"), 1e-2, mapped=True), "100 times", "cm", "0.01")
+    assert holds(units_told(cart_task(), ("x", "v"), 1e-2, mapped=True), "100 times", "cm", "0.01")
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -163,3 +164,18 @@ def test_a_rate_that_is_logged_in_radians_for_a_model_in_degrees_is_told(tmp_pat
     with pytest.raises(GroundedError) as refused:
         w.ingest(log)
     assert holds(str(refused.value), "ran c0001", "force", "57.2958", "in radians")
+
+
+@pytest.mark.parametrize("before", [0.0, 0.7])
+@pytest.mark.parametrize(("by", "named"), [(20.0, "percent of 5 N"), (200.0, "thousandths of 5 N")])
+def test_a_command_in_percent_of_its_limit_is_told(tmp_path, before, by, named):
+    """That it is beyond its limits was said, that somebody drove, and to ingest it with --data."""
+    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
+    log = record(w, tmp_path / "a.csv", w.propose().candidate.policy, before)
+    rows = np.loadtxt(log, delimiter=",", skiprows=1)
+    rows[:, 3] *= by
+    np.savetxt(log, rows, "%.6f", ",", header="t,x,v,force", comments="")
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(log)
+    assert holds(str(refused.value), "ran c0001", "force", named, f"by {1 / by:g}", "[log]")
+    assert refused.value.then is None

@@ -14,6 +14,7 @@ import pytest
 from cli import grounded
 from facts import holding, holds
 from grounded.errors import GroundedError, NextCommand
+from grounded.plant import Plant
 from grounded.search.returned.who_drove import suspicion
 from grounded.trial import Trial
 from grounded_trials import Workspace
@@ -21,6 +22,8 @@ from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.intake.ingest import ingest_log
 from grounded_trials.workspace.proposing import propose_in, standing_in
 from grounded_trials.workspace.running import run_candidate
+from recorded import LOGGED as AS_TABLE
+from recorded import record
 from workspaces import CONFIG, make
 
 NOISY = CONFIG + "[system.noise.measurement]\nx = 0.002\nv = 0.01\n"
@@ -182,7 +185,7 @@ def test_a_run_that_ended_early_says_how_to_take_it_back(waiting, tmp_path):
     for candidate in ("c0001", "c0002"):
         short = said_to_have_run("", ran, tmp_path / f"{candidate}.mcap", 20, nudge=1e-9)
         found = w.ingest(short, candidate=candidate)
-        (said,) = [one for one in found.warnings if "ended after 20" in one]
+        (said,) = [one for one in found.warnings if "after 20 of 40 steps" in one]
         assert f"`discard {found.trial}`" in said
         assert ("ran to the end before" in said) == (candidate == "c0001")
         assert found.verdict == "crashed" or candidate == "c0001"
@@ -425,3 +428,26 @@ def test_a_run_of_another_workspace_s_candidate_is_told(tmp_path):
     assert any("another workspace" in warning for warning in told.warnings)
     assert not there.ingest(tmp_path / "bare.mcap").warnings
     assert not there.ingest(log.trial_file, data=True).notes
+
+
+@pytest.mark.parametrize("before", [0.0, 0.7])
+def test_a_run_without_its_feedback_is_named(tmp_path, before):
+    """`Somebody, or another controller, drove, or no new states reached the policy`, it was."""
+    w = Workspace(make(tmp_path / "w", config=AS_TABLE).folder)
+    alone = replace(w.propose().candidate.policy, gain=None, reference=None)
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(record(w, tmp_path / "a.csv", alone, before))
+    assert holds(str(refused.value), "feed-forward of c0001 alone", "without its feedback")
+
+
+@pytest.mark.parametrize(("mass", "told"), [(1.0, False), (1.02, True)])
+def test_a_run_without_feedback_that_changes_little_counts_with_a_warning(tmp_path, mass, told):
+    w = Workspace(make(tmp_path / "w").folder)
+    alone = replace(w.propose().candidate.policy, gain=None, reference=None)
+    robot = Plant(w.base_model.with_values({"mass": mass}))
+    trial = robot.run(alone, dict.fromkeys(("x", "v"), 0.0), np.random.default_rng(0))
+    file = tmp_path / "t.mcap"
+    write_trial(file, replace(trial, candidate="c0001"), {"kind": "trial", "task": w.task.hash})
+    found = w.ingest(file)
+    assert found.verdict == "first"
+    assert any("feed-forward" in one for one in found.warnings) is told

@@ -119,6 +119,7 @@ class Noted:
     """The contents of a folder's notes; trials are named by hash, or by file if copies exist."""
 
     aside: dict[str, str] = field(default_factory=dict)  # discarded trial -> reason
+    kept: set[str] = field(default_factory=set)  # trials that were discarded and restored
     handed: dict[str, set[str]] = field(default_factory=dict)  # candidate -> SHA-256 of its files
     ran: dict[str, str] = field(default_factory=dict)  # trial without a policy -> SHA-256 of it
     last: set[str] = field(default_factory=set)  # the last trial file at each hand-out, or ""
@@ -149,6 +150,7 @@ def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
             found.aside[note["trial"]] = note["why"]
         elif kind == "restore":
             found.aside.pop(note["trial"], None)
+            found.kept.add(note["trial"])
         elif kind == "hand-out":
             found.handed.setdefault(note["candidate"], set()).add(note["sha256"])
             found.last.add(note["after"])

@@ -130,6 +130,7 @@ def propose_in(workspace: Folder) -> Proposed:
 
         held = held_before(workspace, _other_model(workspace, before))
         notes += left_open(workspace, proposal, held)
+    from grounded_trials.workspace.intake.unanswered import unanswered
     from grounded_trials.workspace.next_step import doubted, not_adopted, usable_ids
 
     status = status_of(workspace, proposal.standing)
@@ -141,10 +142,9 @@ def propose_in(workspace: Folder) -> Proposed:
             notes.append(f"{doubt}: `{rendered(NextCommand('diagnose'), workspace.address)}`")
     proposal = replace(proposal, notes=(*proposal.notes, *notes))
     if candidate is None:
-        then = status.then
-        if held:
-            then = PROPOSE  # after [task] start was changed as the note says
-        return Proposed(proposal, None, then)
+        asked, then = unanswered(workspace)
+        then = PROPOSE if held else then or status.then  # after [task] start is changed, as noted
+        return Proposed(replace(proposal, notes=(*proposal.notes, *asked)), None, then)
     path = workspace.candidate_path(candidate.id)
     # the user should first correct the held input; a second `propose` hands the candidate out
     then = PROPOSE if held else to_run(workspace, candidate.id)
@@ -304,7 +304,9 @@ def standing_in(
     if ahead and now.phase == "propose" and now.incumbent is not None:
         from grounded.search.improve import propose
 
-        now = propose(task, contents.candidates, trials, options, planner=planner).standing
+        name = workspace.next_id()
+        made = propose(task, contents.candidates, trials, options, identity=name, planner=planner)
+        now = made.standing
     return _answered(workspace, now)
 
 
@@ -356,6 +358,16 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
         found,
         since,
     )
+
+
+def status_in(workspace: Folder) -> Status:
+    """Return where the search stands; if its last trial should be discarded, say that first."""
+    from grounded_trials.workspace.intake.unanswered import unanswered
+
+    asked, then = unanswered(workspace)
+    if then is None:
+        return status_of(workspace, standing_in(workspace, ahead=True))
+    return replace(status_of(workspace, standing_in(workspace), asked), then=then)
 
 
 def again_best(workspace: Folder, now: Standing) -> NextCommand:

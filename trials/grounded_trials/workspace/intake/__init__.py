@@ -10,7 +10,9 @@ whether it ran an older one, `grounded.search.returned.other_scale` whether it d
 multiplied, `crossed.py` whether signals are read from each other's columns, `log_faults.py` whether
 columns are in other units, negated or exchanged, `misused_run.py` whether the robot's program
 passed its candidate the wrong things, and `skipped_steps.py` whether it ran all of its steps.
-`odd_run.py` reports what a run that does not belong did to its candidate, `trial_check.py` what the
-user should know about a trial, `where_to_mend.py` which key of [log] corrects a sensor fault, and
-`stored_before.py` whether a log is stored already.
+`gone_wrong.py` asks whether a run went as it should, `ended_early.py` whether it crashed or was cut
+off, and `unanswered.py` repeats in `status` what they ask. `odd_run.py` reports what a run that
+does not belong did to its candidate, `trial_check.py` what the user should know about a trial,
+`where_to_mend.py` which key of [log] corrects a sensor fault, and `stored_before.py` whether a log
+is stored already.
 """

@@ -21,6 +21,7 @@ from grounded.model import Model
 from grounded.result import listed
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.returned.as_predicted import odd_columns
+from grounded.search.returned.misused import WITHOUT, without_feedback
 from grounded.search.returned.other_scale import other_units, unit_named, units_tried
 from grounded.search.returned.who_drove import OTHERS, Following
 from grounded.search.safety import COASTS
@@ -34,6 +35,7 @@ from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.intake.after_run import afterwards
 from grounded_trials.workspace.intake.begun import begun_elsewhere
 from grounded_trials.workspace.intake.earlier_task import OfEarlierTask, of_earlier_task
+from grounded_trials.workspace.intake.ended_early import ended_early
 from grounded_trials.workspace.intake.gone_wrong import gone_wrong
 from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.intake.log_faults import dead_sensors, log_faults, mistaken_in
@@ -148,7 +150,11 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     wrong = bool(slow) or any(one.again for one in elsewhere)
     if not (odd or wrong or aside):
         asked = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
-        warnings, wrong = (*filter(None, [asked]), *warnings), bool(asked)
+        if asked:
+            warnings, wrong = (asked.said, *warnings), asked.aside
+    early = None if read.fell or aside or wrong else ended_early(workspace, trial)
+    if early:
+        warnings, wrong = (early.said, *warnings), early.aside
     if trial.candidate and not wrong and (whole := _whole(read, workspace.task)):
         warnings = (*warnings, *afterwards(workspace.planner, whole))
     if ahead and verdict == "run again":
@@ -242,7 +248,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
     if not why and not units:
         if candidate is None and log and (off := zero_in(log, task, own, whole, seen.ran)):
             raise GroundedError(f"{path} ran {ran}, but {off}")
-        told = _like(read, ran, seen.ran)
+        told = _unfed(own, whole, seen.ran) or _like(read, ran, seen.ran)
         if fell:
             read = cut_short(read, fell.steps, fell.told)
         return replace(read, warnings=(*read.warnings, *told))
@@ -277,7 +283,7 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         its = log and _in_programs_unit(task.model, units, by)
         if log and its and (how := misused_in(log, task, own)):
             raise _misused(path, own, how)
-        other_unit = units_told(task.model, units, by, read.log is not None)
+        other_unit = units_told(task, units, by, read.log is not None)
         raise GroundedError(f"{path} ran {ran}, {other_unit}")
     if pace:
         raise GroundedError(f"{path} ran {ran}, but {pace}")
@@ -395,6 +401,13 @@ def _like(read: Read, ran: str, found: Following | None) -> tuple[str, ...]:
         f"it ran: if that was the {ran} of another workspace, `discard` it. To be sure, write "
         "trials with TrialWriter(..., policy=Path(candidate).read_bytes())",
     )
+
+
+def _unfed(own: Candidate, run: Trial, found: Following | None) -> tuple[str, ...]:
+    """Return a warning if a run, little disturbed, was driven without its candidate's feedback."""
+    if found is None or not without_feedback(own, run, found):
+        return ()
+    return (f"its commands are the feed-forward of {own.id} alone, {WITHOUT}",)
 
 
 def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:

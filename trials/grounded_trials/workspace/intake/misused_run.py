@@ -15,7 +15,8 @@ import numpy as np
 
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart
-from grounded.search.returned.misused import NEARLY_ALL, TELLS, Way, likeliest, misused, ways
+from grounded.search.returned.misused import NEARLY_ALL, Way, likeliest, misused, ways
+from grounded.search.returned.other_scale import other_units
 from grounded.search.returned.who_drove import follows, latest
 from grounded.task import Task
 from grounded.trial import Trial
@@ -23,6 +24,7 @@ from grounded_trials.workspace.intake.acted_on import EXACT, FEW, acted_on, held
 from grounded_trials.workspace.intake.instants import BATCH, least_of
 from grounded_trials.workspace.intake.run_start import TRIED, Recording
 
+APART = 10 * EXACT  # smallest difference of two commands that exact ones tell apart
 NEAR = 0.02  # largest difference of a command, relative to its size, that is no stray
 MANY = 1_000_000  # largest number of commands that are computed for a misuse, roughly
 EACH, ALL = 2, 24  # numbers of instants that are examined for a misuse, and in all
@@ -46,7 +48,7 @@ def exactly_misused(log: Recording, task: Task, own: Candidate) -> str:
     for _, k, way in sorted(tried, key=lambda one: one[0])[:ALL]:
         at = first + k * log.dt
         left = _left(log, own, way, at)
-        if left < EXACT and not _rather_logged(log, own, way, at):
+        if left < EXACT and not _rather_logged(log, task, own, way, at):
             found.append((left, way))
     return likeliest(found).said if found else ""
 
@@ -106,7 +108,7 @@ def _left(log: Recording, own: Candidate, way: Way, at: float) -> float:
     fit, plain = acted_on(_as_passed(log, way), way.policy, at), acted_on(log, own.policy, at)
     if fit is None or plain is None or plain.exact or not fit.throughout:
         return np.inf
-    differs = np.abs(fit.asked - plain.asked) > TELLS * fit.size
+    differs = np.abs(fit.asked - plain.asked) > APART * fit.size
     tells = np.isfinite(fit.off) & differs.any(axis=1)
     moves = np.abs(np.diff(fit.asked[tells], axis=0)) > EXACT * fit.size
     if moves.any(axis=1).sum() < FEW:  # many a program holds an input
@@ -128,8 +130,15 @@ def _as_passed(log: Recording, way: Way) -> Recording:
     return replace(log, series=series)
 
 
-def _rather_logged(log: Recording, own: Candidate, way: Way, at: float) -> bool:
-    """Return whether the log is rather wrong than the program: mended, it is as predicted."""
-    if not way.names or (trial := log.trial_from(at)) is None:
+def _rather_logged(log: Recording, task: Task, own: Candidate, way: Way, at: float) -> bool:
+    """Return whether the log is rather wrong than the program.
+
+    With its states mended, it is as predicted; or, if no feedback is seen in it, it is in its
+    place, with states in another unit.
+    """
+    if (trial := log.trial_from(at)) is None:
         return False
-    return apart(own, way.passed(trial)) < apart(own, trial)
+    if way.policy.gain is None and own.policy.gain is not None:
+        plain = follows(own.policy, trial.until(task.horizon), latest(task))
+        return other_units(task, trial, own, plain) != ((), 1.0)
+    return bool(way.names) and apart(own, way.passed(trial)) < apart(own, trial)

@@ -11,16 +11,18 @@ from itertools import combinations
 
 import numpy as np
 
-from grounded.model import Model
 from grounded.policy import Policy
 from grounded.result import listed
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart, like_predicted, multiplied
 from grounded.search.returned.other_scale import (
+    EXACT,
     NEARLY,
     THOUSAND,
     any_factor,
     any_offset,
+    full_scales,
+    of_full_scale,
     unit_named,
     units_tried,
 )
@@ -65,7 +67,8 @@ def unit_of(log: Recording, task: Task, own: Candidate) -> tuple[tuple[str, ...]
     """
     policy, best, least = own.policy, (tuple[str, ...](), 1.0), np.inf
     tried = set[tuple[tuple[str, ...], float]]()
-    for group, by in units_tried(task.model):
+    scales = list(full_scales(task, log.whole.inputs))
+    for group, by in (*scales, *units_tried(task.model)):
         names = tuple(name for name in group if name in log.logged)
         if not names or (names, by) in tried:
             continue
@@ -77,6 +80,8 @@ def unit_of(log: Recording, task: Task, own: Candidate) -> tuple[tuple[str, ...]
             continue
         if (away := apart(own, run) - apart(own, multiplied(run, names, 1 / by))) > 0:
             continue  # farther from the prediction than as it is logged
+        if (group, by) in scales and fit.error < EXACT:
+            return names, by
         if (left := away + np.log(fit.error + FINE)) < least:
             best, least = (names, by), left
     if best[0]:
@@ -222,11 +227,11 @@ def _paced(series: Series, pace: float) -> Series:
     return replace(series, t=t, log_times=log)
 
 
-def units_told(model: Model, names: Sequence[str], by: float, mapped: bool) -> str:
+def units_told(task: Task, names: Sequence[str], by: float, mapped: bool) -> str:
     """Describe a wrong unit or sign in a log and how to correct it.
 
     Args:
-        model: with the units of the signals.
+        task: with the units of the signals, and the limits of the inputs.
         names: the signals.
         by: the factor that corrects them.
         mapped: whether the log is read through a [log] table.
@@ -239,7 +244,7 @@ def units_told(model: Model, names: Sequence[str], by: float, mapped: bool) -> s
         return f"with {which} of the other sign: {mend if mapped else alone}"
     size = f"{max(abs(by), 1 / abs(by)):.4g} times too {'large' if abs(by) < 1 else 'small'}"
     size += " and of the other sign" * (by < 0)
-    unit = unit_named(model, names, by)
+    unit = unit_named(task.model, names, by) or of_full_scale(task, names, by)
     mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (a missing scale is 1)"
     if not unit and by not in THOUSAND:
         mend += "; if the log is right, the robot's program measures it wrong"

@@ -55,14 +55,11 @@ def warnings_about(
         )
     if not trial.candidate:
         return (*found, *_still(whole), *_beyond(task, whole, scaled))
-    if whole.steps < task.horizon and not fell:
+    if whole.steps < task.horizon and whole.whole(task.horizon) is not whole:
         ends = f"after {whole.steps} of {task.horizon} steps ({whole.steps * trial.dt:.2f} s)"
         found.append(
-            f"the run ended {ends}: a failed candidate; its data stay usable for fit and diagnose"
-            f". {_if_stopped(workspace, trial)}"
-            if whole.whole(task.horizon) is whole
-            else f"the log ends {ends}{_lacking(task, last_s)}: the rest is extrapolated from the "
-            "last steps. Log at least one more row after the last command"
+            f"the log ends {ends}{_lacking(task, last_s)}: the rest is extrapolated from the last "
+            "steps. Log at least one more row after the last command"
         )
     if whole.steps > task.horizon:
         found.append(
@@ -83,23 +80,6 @@ def warnings_about(
             f"if it is, [log.span] start is {by} too {'early' if ran.late > 0 else 'late'}"
         )
     return tuple(found)
-
-
-def _if_stopped(workspace: Folder, trial: Trial) -> str:
-    """Return how to discard a run that ended early for a reason other than its candidate."""
-    horizon = workspace.task.horizon
-    ran = [
-        one.id
-        for one in workspace.task_trials()
-        if one.candidate == trial.candidate and one.whole(horizon).finite_steps >= horizon
-    ]
-    stopped = f"Use `discard {trial.id}`"
-    if not ran:
-        return f"{stopped} if you stopped it for another reason"
-    return (
-        f"{trial.candidate} ran to the end before ({', '.join(ran)}). {stopped} if you stopped it "
-        "for another reason, or if only the log was cut"
-    )
 
 
 def _first_bad(trial: Trial) -> tuple[str, int]:

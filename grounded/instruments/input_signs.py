@@ -1,0 +1,128 @@
+"""Find inputs that act the other way round in a trial: a motor wired wrongly, a sign switched.
+
+How strongly an input acts is fitted to predictions a quarter of a second ahead, after everything
+linear in the states is removed from them. Friction, springs and the feedback itself are linear, and
+would make a right input seem to act the wrong way round. A model may be crude, but its signs are
+right in most cases: if trials contradict each other, the fewer are wrong, and of equally many those
+that contradict the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.errors import NextCommand
+from grounded.instruments.other_units import UnusableTrials
+from grounded.instruments.short_runs import Ahead
+from grounded.model import Model
+from grounded.result import listed
+from grounded.trial import Trial
+
+STARTS = 120  # samples to predict from
+# standard errors from 0 from which on an input acts the other way round, or as in the model
+SURE, USUAL = 6.0, 3.0
+LEAST = 0.2  # least share of its modelled effect with which an input acts the other way round
+
+
+@dataclass(frozen=True)
+class Acts:
+    """How an input acts in a trial.
+
+    Args:
+        sign: 1 as in the model, -1 the other way round, 0 if the trial does not show it.
+        share: its effect as a share of the modelled one, below 0 the other way round.
+        error: standard error of the share.
+    """
+
+    sign: int
+    share: float
+    error: float
+
+    @property
+    def told(self) -> str:
+        """The share in percent."""
+        return f"{100 * self.share:.0f} %"
+
+
+def how_inputs_act(model: Model, trial: Trial, shown: Sequence[int]) -> tuple[Acts, ...]:
+    """Return how each input acts in a trial.
+
+    Args:
+        model: however crude, with the effects adopted.
+        trial: of its states and inputs; only its part without gaps is used.
+        shown: indices of the states with a sensor.
+    """
+    known = trial.until(max(trial.known_steps, 0))
+    some = [i for i in shown if np.isfinite(known.states[:, i]).any()]
+    unknown = Acts(0, float("nan"), float("nan"))
+    if not some or not np.isfinite(known.inputs).all():
+        return (unknown,) * model.m
+    ahead = Ahead(model, known, some, STARTS, (0.0,), linear=True)
+    if not ahead.enough:
+        return (unknown,) * model.m
+    with np.errstate(all="ignore"):
+        fit = ahead.strengths()
+        found = tuple(map(_acts, fit.factors, fit.errors))
+        if any(one.sign < 0 for one in found):  # commands that act late may look like that
+            late = Ahead(model, known, some, STARTS, linear=True)
+            fits = [late.strengths(steps) for steps in late.delays] if late.enough else []
+            best = min(fits, key=lambda one: one.score, default=fit)
+            if fits and best is not fits[0]:
+                found = tuple(map(_acts, best.factors, best.errors))
+    return found
+
+
+def _acts(share: float, error: float) -> Acts:
+    wrong = share < min(-LEAST, -SURE * error)
+    return Acts(-1 if wrong else int(share > USUAL * error), share, error)
+
+
+def judge_signs(model: Model, trials: Sequence[Trial], hidden: Sequence[str] = ()) -> None:
+    """Raise an error if an input acts the other way round in some trials than in others.
+
+    Args:
+        model: however crude, with the effects adopted.
+        trials: already corrected for other faults, see `preflight`.
+        hidden: states without a sensor.
+
+    Raises:
+        GroundedError: naming the trials and the input, and what to do.
+    """
+    if len(trials) < 2:
+        return
+    shown = [i for i, name in enumerate(model.state_names) if name not in hidden]
+    acts = [how_inputs_act(model, trial, shown) for trial in trials]
+    for name, every in zip(model.input_names, zip(*acts, strict=True), strict=True):
+        right, wrong = ([k for k, one in enumerate(every) if one.sign == s] for s in (1, -1))
+        if right and wrong:
+            odd, rest = (wrong, right) if len(wrong) <= len(right) else (right, wrong)
+            raise _contradiction(trials, name, odd, rest, every)
+
+
+def _contradiction(
+    trials: Sequence[Trial],
+    name: str,
+    odd: Sequence[int],
+    rest: Sequence[int],
+    acts: Sequence[Acts],
+) -> UnusableTrials:
+    """Return the error that an input acts the other way round in the trials `odd`."""
+    ids, others = ([trials[k].id or f"number {k + 1}" for k in some] for some in (odd, rest))
+    against = acts[odd[0]].sign < 0
+    said = (
+        f"{name} acts the other way round than in {listed(others)}"
+        f"{' and in the model' if against else ', though as in the model'} "
+        f"({acts[odd[0]].told} of its modelled effect, in {others[0]} {acts[rest[0]].told}): no "
+        "model explains both"
+    )
+    these = "this trial" if len(odd) == 1 else "these trials"
+    mend = (
+        f"Was a motor wired otherwise, or a sign switched? Then discard {these}, mend it and run "
+        "again. If only the log has the other sign, correct the log and ingest it again"
+    )
+    where = f"in trial{'s' * (len(odd) > 1)} {listed(ids)}"
+    then = NextCommand("discard", tuple(ids)) if trials[0].id else None
+    return UnusableTrials(f"{where} {said}. {mend}", said, mend, said, then)
