@@ -2,7 +2,7 @@
 
 One control step of the wrapped model, for commands held over the step:
 
-    u_eff  = effect(u, z, t)                      input and memory families (and their `lead`)
+    u_eff  = effect(u, z, t)                      input and memory families (and a lag's `lead`)
     f      = f(s, u_eff - loss(s, f))             losses to a joint's friction, solved (`joint`)
     own    = (f(s, u_eff) - s) / dt               the model's own mean rate over the step
     s1     = f(s + dt/2 rate(s), u_eff)           half of an added rate before the step ...
@@ -187,7 +187,8 @@ def _memory_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[s
     model, family = effect.site.model, effect.family
     assert isinstance(family, MemoryFamily)
     base, depth, lead = plain_step(model), family.depth(whole, dt), family.lead
-    positions = integrated(model) if lead is not None else {}
+    # a rate limit's lead has kinks that would hinder plans, and changes its estimate by 1e-4
+    positions = integrated(model) if lead is not None and family.linear else {}
     inner = model  # without added rates and losses, which leads of inputs hardly change
     for around in ("joined", "losing"):
         inner = getattr(inner.step, around, (inner, ()))[0]
