@@ -11,6 +11,10 @@ what the actuator delivers over the step, so fractions of a step matter:
                                       u_eff = u + (z - u) (1 - e) tau / dt
     rate limit |z'| <= r:             z+ = z + clip(u - z, -r dt, r dt), ramp then hold
     backlash   width b:               z+ = clip(z, u - b/2, u + b/2)
+
+The mean gives the correct speeds at the end of the step, but what arrives early moves positions
+farther. A diagnosis adds this, with the first moment of u_eff within the step (`lead`). Without it,
+a delay of two fifths of a step, estimated from an arm's encoders, is 30 % too long.
 """
 
 from __future__ import annotations
@@ -248,6 +252,12 @@ def _advance_lag(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tupl
     return u + behind * (1 - e) * tau / dt, (u + behind * e,)
 
 
+def _lead_of_lag(u: Any, z: Any, c: Any, dt: Any) -> Any:
+    steps = np.maximum(c["tau"], 1e-6) / dt
+    e = np.exp(-1 / steps)
+    return (z - u) * steps * (0.5 * (1 + e) - (1 - e) * steps)
+
+
 def along_lag(u: Any, z: Any, c: Any, dt: float) -> Any:
     """Return the output (S, T) of a first-order lag of signals u (S, T), starting at z (S,).
 
@@ -265,6 +275,12 @@ def _advance_rate(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tup
     most = np.maximum(c["r"] * dt, LEAST_LIMIT)
     part = np.minimum(np.maximum((u - z[0]) / most, -1.0), 1.0)  # fraction of the step on the ramp
     return z[0] + most * part * (1 - 0.5 * np.abs(part)), (z[0] + most * part,)
+
+
+def _lead_of_rate(u: Any, z: Any, c: Any, dt: Any) -> Any:
+    most = np.maximum(c["r"] * dt, LEAST_LIMIT)
+    part = np.minimum(np.maximum((u - z) / most, -1.0), 1.0)
+    return most * part * np.abs(part) * (np.abs(part) / 6 - 0.25)
 
 
 def _along_rate(u: Any, z: Any, c: Any, dt: float) -> Any:
@@ -320,6 +336,7 @@ first_order_lag = MemoryFamily(
     advance=_advance_lag,
     along=along_lag,
     linear=True,
+    lead=_lead_of_lag,
 )
 
 rate_limit = MemoryFamily(
@@ -331,6 +348,7 @@ rate_limit = MemoryFamily(
     lookalikes=("slew_limit", "first_order_lag", "delay", "saturation"),
     advance=_advance_rate,
     along=_along_rate,
+    lead=_lead_of_rate,
 )
 
 backlash = MemoryFamily(

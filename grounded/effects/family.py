@@ -228,7 +228,8 @@ class MemoryFamily(Family):
     `depth(values, dt)`: number of memory states, all starting at the input held before t = 0.
     `transport`: a pure delay, which acts after all others. `along(u, z, c, dt)`: for a depth of
     one, z before each step of the commands u (S, T), starting at z (S,). `linear`: as in
-    `InputFamily`.
+    `InputFamily`. `lead(u, z, c, dt)`: by how much of a step's mean more arrives early in it,
+    the mean of (1/2 - t/dt) u_eff(t) over the step; None: u_eff is constant within a step.
     """
 
     advance: Callable[[Any, tuple[Any, ...], Any, Any], tuple[Any, tuple[Any, ...]]] = (
@@ -238,6 +239,7 @@ class MemoryFamily(Family):
     transport: bool = False
     linear: bool = False
     along: Callable[[Any, Any, Mapping[str, float], float], Any] = lambda u, z, c, dt: z[:, None]
+    lead: Callable[[Any, Any, Any, Any], Any] | None = None
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,23 @@ def shifted(signal: Array, held: Array, steps: float) -> Array:
     return (1 - part) * line[:, 1 : T + 1] + part * line[:, :T]
 
 
+def lead_of_shift(signal: Array, held: Array, steps: float, lead: Array) -> Array:
+    """Return how much more of a delayed signal (S, T) arrives early in each step than late.
+
+    That is the mean of (1/2 - t/dt) u(t) over a step, 0 for one that is constant.
+
+    Args:
+        signal: zero-order-hold means of each step (S, T).
+        held: the value before them (S,).
+        steps: the delay, in steps.
+        lead: the same of the signal itself (S, T).
+    """
+    part = max(0.0, steps - int(np.floor(steps + 1e-9)))
+    whole = np.floor(steps + 1e-9)
+    now, before = (shifted(signal, held, whole + more) for more in (0, 1))
+    return 0.5 * part * (1 - part) * (before - now) + shifted(lead, 0 * held, steps)
+
+
 def late_inputs(inputs: Array, held: Array, latency: Array, dt: float) -> Array:
     """Return inputs (S, T, m) after a latency (m,) [s], with `held` (S, m) before them."""
     if not latency.any():

@@ -2,7 +2,7 @@
 
 One control step of the wrapped model, for commands held over the step:
 
-    u_eff  = effect(u, z, t)                      input and memory families
+    u_eff  = effect(u, z, t)                      input and memory families (and a lag's `lead`)
     f      = f(s, u_eff - loss(s, f))             losses to a joint's friction, solved (`joint`)
     own    = (f(s, u_eff) - s) / dt               the model's own mean rate over the step
     s1     = f(s + dt/2 rate(s), u_eff)           half of an added rate before the step ...
@@ -186,7 +186,13 @@ def _input_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[st
 def _memory_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
     model, family = effect.site.model, effect.family
     assert isinstance(family, MemoryFamily)
-    base, depth = plain_step(model), family.depth(whole, dt)
+    base, depth, lead = plain_step(model), family.depth(whole, dt), family.lead
+    # a rate limit's lead has kinks that would hinder plans, and changes its estimate by 1e-4
+    positions = integrated(model) if lead is not None and family.linear else {}
+    inner = model  # without added rates and losses, which leads of inputs hardly change
+    for around in ("joined", "losing"):
+        inner = getattr(inner.step, around, (inner, ()))[0]
+    bare = plain_step(inner)
     names = {n: [f"{n}_{family.name}_{i + 1}" for i in range(depth)] for n in effect.site.targets}
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
@@ -195,7 +201,14 @@ def _memory_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[s
         for n, memory in names.items():
             u[n], later = family.advance(a[n], tuple(s[z] for z in memory), c, dt)
             kept.update(zip(memory, later, strict=True))
-        return {**base(own_state(model, s), _replaced(model, a, u), p, dt), **kept}
+        start = own_state(model, s)
+        after = base(start, _replaced(model, a, u), p, dt)
+        if positions and lead is not None:
+            led = {n: u[n] + lead(a[n], s[memory[0]], c, dt) for n, memory in names.items()}
+            less, more = (bare(start, _replaced(model, a, one), p, dt) for one in (u, led))
+            by = {q: k * dt * (more[w] - less[w]) for q, (w, k) in positions.items()}
+            after = after | {q: after[q] + by[q] for q in by}
+        return {**after, **kept}
 
     return step, {z: model.inputs[n] for n, memory in names.items() for z in memory}
 

@@ -19,7 +19,13 @@ from typing import Any
 import numpy as np
 
 from grounded.compile import Named
-from grounded.diagnosis.likelihood.arriving import Acting, arriving, memories_moved
+from grounded.diagnosis.likelihood.arriving import (
+    Acting,
+    arriving,
+    leading,
+    memories_moved,
+    within_steps,
+)
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import filter_lag, sensor_offset
 from grounded.diagnosis.likelihood.hypothesis import (
@@ -82,17 +88,24 @@ class Predictor(SentOnce):
         return replace(self, _taken=self.taken.following(), _loads={})
 
     def inputs(self, h: Hypothesis) -> Array:
-        """Return the inputs that the actuators receive under a hypothesis, by run (L, B, m)."""
-        acting = self.acting(h)
-        return np.stack([self._input(acting, j) for j in range(self.data.model.m)], axis=-1)
+        """Return the inputs that the actuators receive under a hypothesis, by run (L, B, m).
 
-    def _input(self, acting: Acting, j: int) -> Array:
+        If they may change within a step, in a model with positions, m more columns say by how much
+        they lead (`MemoryFamily.lead`); single steps then add what that moves positions (`moved`).
+        """
+        acting, each = self.acting(h), range(self.data.model.m)
+        found = [self._input(acting, j, "input", arriving) for j in each]
+        if within_steps(acting, self.data) and self.positions:
+            found += [self._input(acting, j, "lead", leading) for j in each]
+        return np.stack(found, axis=-1)
+
+    def _input(
+        self, acting: Acting, j: int, what: str, made: Callable[[Acting, Data, int], Array]
+    ) -> Array:
         """Return one of `inputs`, (L, B); cached, since most effects act on few inputs."""
-        name = self.data.model.input_names[j]
+        name, data = self.data.model.input_names[j], self.data
         on_it = [one for one in acting if name in one[0].site.targets]
-
-        data = self.data
-        return self._kept(f"input {j}", on_it, lambda: data.runs_in_use(arriving(on_it, data, j)))
+        return self._kept(f"{what} {j}", on_it, lambda: data.runs_in_use(made(on_it, data, j)))
 
     def received(self, h: Hypothesis) -> Array:
         """Return the received inputs of whole trials, (S, T_max, m); zero if no run is kept."""
@@ -178,6 +191,7 @@ class Predictor(SentOnce):
     def flat(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Return states (..., n) and inputs (..., m) as rows."""
         n, m = self.data.model.n, self.data.model.m
+        u = u[..., :m]  # without leads
         return np.ascontiguousarray(x.reshape(-1, n)), np.ascontiguousarray(u.reshape(-1, m))
 
     def next(self, h: Hypothesis, x: Array) -> Array:
@@ -235,9 +249,23 @@ class Predictor(SentOnce):
             return medium.over(self.moved(medium.still, x, u, dt), dt or self.data.dt)
         left, more = self.left(h, x, u, dt)
         after = self.step(x, left, self.params(h), dt)
+        if dt is None and u.shape[-1] > self.data.model.m:
+            self._led(after, x, left, self.params(h))
         for q in more:
             after[..., self.seen.index(q)] += more[q]
         return after
+
+    def _led(self, after: Array, x: Array, u: Array, p: Array) -> None:
+        """Add to positions after a step what inputs that arrive early in it move them.
+
+        A position q' = c w gains c dt B l, with B l what the leads l, held over a step, add to w.
+        """
+        m, dt = self.data.model.m, self.data.dt
+        lead = u[..., m:]
+        if lead.any():
+            by = self.step(x, u[..., :m] + lead, p) - after
+            for q, (w, c) in self.positions.items():
+                after[..., self.seen.index(q)] += c * dt * by[..., self.seen.index(w)]
 
     def left(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Left:
         """Return inputs u (..., m) less the losses at x (..., n), and position terms (`ahead`)."""
@@ -261,7 +289,7 @@ class Predictor(SentOnce):
         def step(a: Named) -> Named:
             return self.named(self.step(x, np.stack([a[n] for n in names], axis=-1), p, dt))
 
-        a = Named("input", names, list(np.moveaxis(u, -1, 0)))
+        a = Named("input", names, [u[..., j] for j in range(len(names))])
         slopes = self.taken.about(self.flat(x, u)[0]) if dt is None and self._taken else None
         if slopes is None:
             found = loads(losses_of(h), self.named(x), a, step)

@@ -31,7 +31,8 @@ class Tangent(Predictor):
         if dt is not None or x.shape != self.x.shape or not np.array_equal(p, self.p):
             return super().step(x, u, p, dt)
         f_x, f_u = self.slopes_there
-        by_state, by_input = f_x @ (x - self.x)[..., None], f_u @ (u - self.u)[..., None]
+        moved = u[..., : f_u.shape[-1]] - self.u  # without leads
+        by_state, by_input = f_x @ (x - self.x)[..., None], f_u @ moved[..., None]
         return np.asarray(self.after + (by_state + by_input)[..., 0])
 
 
@@ -42,5 +43,6 @@ def tangent(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Predicto
     if medium := moving(h, predictor.seen):
         return tangent(predictor, medium.still, medium.through(x), u)
     left, p, kept = predictor.left(h, x, u)[0], predictor.params(h), predictor._inputs
+    left = left[..., : predictor.data.model.m]
     after, slopes = predictor.step(x, left, p), predictor.slopes(x, left, p)
     return Tangent(predictor.data, kept, x=x, u=left, p=p, after=after, slopes_there=slopes)

@@ -99,7 +99,7 @@ def errors(predictor: Predictor, h: Hypothesis, track: Array, where: Horizon) ->
     """Return measurement minus prediction at the horizon, (M, n); NaN where not measured."""
     data = predictor.data
     x = track[where.at, where.run]
-    u, t = predictor.inputs(h), data.time
+    u, t = predictor.inputs(h)[..., : data.model.m], data.time
     delays = delays_of(h, data)
     oldest = 0 if delays is None else delays.oldest  # oldest state that delayed sensors may show
     path = [track[np.maximum(where.at - j, 0), where.run] for j in range(oldest, -1, -1)]
