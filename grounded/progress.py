@@ -36,7 +36,7 @@ class Stages:
 
     Args:
         tell: shows a line; None for no output.
-        usual: fewest and most calls of nearly all computations of this kind.
+        usual: fewest and most calls of most computations of this kind.
     """
 
     tell: Callable[[str], None] | None
@@ -55,12 +55,11 @@ class Stages:
         if self.count > self.usual[1]:
             text += ", longer than usual"
         elif self.count > SEEN:
-            least, most = (taken * ((n / self.count) ** LATER - 1) for n in self.usual)
+            least, most = (taken * (n / self.count - 1) for n in self.usual)
             text += f", {_range(max(least, 0.0), most)} left"
         self.tell(text)
 
 
-LATER = 1.3  # exponent of the share of calls that gives the share of time (eight diagnoses)
 SEEN = 10  # calls from which on the time left is told
 
 

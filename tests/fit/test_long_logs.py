@@ -76,7 +76,7 @@ def clocked(monkeypatch, usual, calls, exponent):
 
 
 @pytest.mark.parametrize("calls", [60, 200, 390])
-@pytest.mark.parametrize("exponent", [1.1, 1.3, 1.5])
+@pytest.mark.parametrize("exponent", [0.9, 1.0, 1.1])
 def test_the_time_left_is_in_the_range_that_is_told(monkeypatch, calls, exponent):
     """A diagnosis had `at most 45 s left`, and took three minutes more."""
     told, left = clocked(monkeypatch, (50, 400), calls, exponent)

@@ -341,7 +341,7 @@ def _whole(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -> bo
 
     Along a single motion, what the model lacks may be a function of time or of any state. But no
     other function is proportional to this signal at every step; so it counts as seen if nothing is
-    left beside it and every effect that was tried in its place is far less likely.
+    left beside it and every effect that was tried in its place is clearly less likely.
     """
     h = fit.hypothesis
     effect = h.effects[h.names.index(name)]
@@ -350,7 +350,7 @@ def _whole(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -> bo
     rest, own = set(h.names) - {name}, search.score(fit)
     rivals = [f for f in search.of_size(len(h.names)) if {*f.hypothesis.names} - rest != {name}]
     rivals = [f for f in rivals if rest <= set(f.hypothesis.names)]
-    if own - max(search.score(f) for f in [less, *rivals]) < LARGE_GAIN:
+    if own - search.score(less) < LARGE_GAIN or any(own - search.score(f) < SURE for f in rivals):
         return False
     return not leftovers(search.predictor, fit)
 
