@@ -191,7 +191,10 @@ def rewritten(trial, path, change):
 
 
 RUNS = {
-    "short": (lambda s, u: (s[:21], u[:20]), ["ended after 20 of 40 steps", "failed candidate"]),
+    "short": (
+        lambda s, u: (s[:21], u[:20]),
+        ["ends after 20 of 40 steps", "`discard t000", "failed"],
+    ),
     "nothing": (lambda s, u: (s[:1], u[:0]), ["ended after 0 of 40 steps"]),
     "nan": (
         lambda s, u: (np.where(np.arange(41)[:, None] >= 10, np.nan, s), u),

@@ -166,7 +166,8 @@ def test_predictions_that_run_away_are_compared_with_nothing():
     assert rest((second, whole)) == "" and telling((second, whole)) is second
     assert worsened((second, replace(whole, with_effects={"x": 9e5, "v": 0.4}))) == ""
     assert "x" in runaway((second, whole)) and not runaway((second,))
-    table, _ = error_table(SimpleNamespace(prediction_error=(second, whole)))
+    named = SimpleNamespace(causes=("parameter:k",))
+    table, _ = error_table(SimpleNamespace(prediction_error=(second, whole), verdict=named))
     assert next(cells[1:-1] for cells in table if "whole" in cells[0]) == ("diverges",) * 3
     assert holds(rest((second, replace(whole, runs_away={}))), "x", "100 times", "whole trials")
 
@@ -180,7 +181,8 @@ def test_a_slow_plant_is_spoken_of_by_whole_trials():
     quick = row({"x": 0.2}, {"x": 0.08})
     assert telling((quick, whole)) is quick and "80 mm" in improvement((quick, whole))
     for rows, told in (((second, whole), True), ((quick, whole), False)):  # as in the sentence
-        table, _ = error_table(SimpleNamespace(prediction_error=rows), whole_trials=False)
+        found = SimpleNamespace(prediction_error=rows, verdict=SimpleNamespace(causes=("b",)))
+        table, _ = error_table(found, whole_trials=False)
         assert any("whole trial" in cells[0] for cells in table) is told
     assert telling((whole,)) is None and telling(()) is None
 

@@ -154,7 +154,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
             warnings, wrong = (asked.said, *warnings), asked.aside
     early = None if read.fell or aside or wrong else ended_early(workspace, trial)
     if early:
-        warnings, wrong = (early.said, *warnings), early.aside
+        said = (early.said,)  # after what is doubtful about the log, which may be why
+        warnings, wrong = (*warnings, *said) if read.doubted else (*said, *warnings), early.aside
     if trial.candidate and not wrong and (whole := _whole(read, workspace.task)):
         warnings = (*warnings, *afterwards(workspace.planner, whole))
     if ahead and verdict == "run again":
