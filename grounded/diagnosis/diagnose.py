@@ -254,4 +254,4 @@ def _again(effect: Effect, known: float, data: Data) -> Effect:
 
 
 MOST_NAMES = 50  # 36 states and 12 inputs already give 1,649 effects, each of which is filtered
-USUAL = (120, 600)  # progress ticks of most diagnoses: stages, and blocks of hypotheses refined
+USUAL = (120, 1000)  # progress ticks of most diagnoses: stages, and blocks of hypotheses refined

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from itertools import islice
 from typing import Any
@@ -125,28 +125,29 @@ class Claims:
         """Return the loss of evidence without each claimed effect, parameters as free as with it.
 
         If another effect becomes invalid without it (a delay too short to count), both are left
-        out.
+        out. Noise of another structure can absorb an effect, and be likelier than the claim that
+        predictions chose; then the noise keeps its structure. NaN if that is likelier, too.
         """
-        search, found = self.search, {}
-        whole = search.score(self.best)
+        found = {}
         for name in self.names:
-            rest = {n for n in self.names if n != name}
-            scores: list[float] = []
-            for size in range(len(rest), 0, -1):
-                fits = [f for f in self.as_free(size) if set(f.hypothesis.names) <= rest]
-                scores = scores or [s for f in fits if math.isfinite(s := search.score(f))]
-            found[name] = whole - max(scores or [self.base])
+            lost = self._lost(name, self.search.fits.values())
+            if lost < CLAIM:
+                own = self.best.noise.structure
+                alike = [f for f in self.search.fits.values() if f.noise.structure == own]
+                lost = self._lost(name, alike)
+            found[name] = lost if lost > 0 else math.nan
         return found
 
-    def as_free(self, size: int) -> list[Fitted]:
-        """Return fits of `size` effects, best first, calibrated if and only if the claim is."""
-        free = self.best.hypothesis.spread > 0
-        fits = self.search.fits.values()
-        return [
-            f
-            for f in sorted(fits, key=lambda f: -self.search.score(f))
-            if len(f.hypothesis.names) == size and (f.hypothesis.spread > 0) == free
-        ]
+    def _lost(self, name: str, fits: Iterable[Fitted]) -> float:
+        """Return the loss of evidence without a claimed effect, beside the most of the others."""
+        rest, score = {n for n in self.names if n != name}, self.search.score
+        free, scores = self.best.hypothesis.spread > 0, dict[int, float]()
+        for f in fits:
+            names, value = set(f.hypothesis.names), score(f)
+            as_free = (f.hypothesis.spread > 0) == free
+            if names and names <= rest and as_free and math.isfinite(value):
+                scores[len(names)] = max(value, scores.get(len(names), -math.inf))
+        return score(self.best) - (scores[max(scores)] if scores else self.base)
 
     def _row(
         self, fit: Fitted, name: str, evidence: float, gap: float, before: float, *, claimed: bool
@@ -264,8 +265,9 @@ class Claims:
         (mainly those of the parameters) differ by less than TIE.
         """
         score, best = self.search.score, self.best
-        if score(best) - score(fit) < TIE:
-            return True
+        if score(best) - score(fit) < TIE:  # predictions may have refused one that is likelier
+            likelier = score(fit) - score(best) > TIE and self.ruler.held_out
+            return not (likelier and self.ruler.gain(fit, best).beyond(*BETTER))
         if not self.ruler.held_out or not self._one_thing(name, other):
             return False
         b = self.search.tempering.factor
