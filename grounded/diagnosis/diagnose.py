@@ -71,6 +71,7 @@ class DiagnosisOptions:
         hidden: names of states without a sensor, such as the memory of adopted effects.
         but: names of effects that are not blamed, such as adopted ones, whose values are now
             parameters of the model.
+        ruled_out: names of effects that are not blamed since the log rules them out.
         delays: adopted delays [s], {effect: delay}. They are part of the task's latency, and may
             turn out longer or shorter.
         origin: the task before anything was adopted. Improvements are measured relative to the
@@ -85,6 +86,7 @@ class DiagnosisOptions:
     horizon: float = 1.0
     hidden: tuple[str, ...] = ()
     but: Collection[str] = ()
+    ruled_out: Collection[str] = ()
     delays: Mapping[str, float] = field(default_factory=dict)
     origin: Task | None = None
 
@@ -172,7 +174,7 @@ def diagnose(
             data = replace(data, model=held(uncertain, null[0]))
             model = without_others(Predictor(data), null[0].track, options.but, options.library)
             data = replace(data, model=model)
-    settled, late = {*options.but, *looked.settled}, options.delays
+    settled, late = {*options.but, *options.ruled_out, *looked.settled}, options.delays
     offered = list(options.library.candidates(data.model, data.scales))
     names = {effect.name for effect in offered}
     if delay in options.library.families:  # those of the inputs that moved in earlier trials

@@ -134,7 +134,7 @@ def probe(
     ways = [_Way(task, noise, first, second, again[0]), _Way(task, noise, second, first, again[1])]
     told = ways[0].known * len(trials) / max(len(again[0]), 1)
     rows = [diagnosis.ranked(name) for name in group[:2]]
-    apart = [row.evidence for row in rows if row is not None]
+    apart = [row.evidence for row in rows if row is not None and np.isfinite(row.evidence)] or [0.0]
     trust = min(1.0, max(TIE, float(np.ptp(apart))) / max(told, 1e-12))
     best: tuple[float, Policy, str] | None = None
     for words, candidate in probes(policy, task.model, _inputs_of(task.model, group[:2])):

@@ -91,7 +91,7 @@ class Predictor(SentOnce):
         """Return the inputs that the actuators receive under a hypothesis, by run (L, B, m).
 
         If they may change within a step, in a model with positions, m more columns say by how much
-        they lead (`MemoryFamily.lead`); single steps then add what that moves positions (`moved`).
+        they lead (`MemoryFamily.lead`); single steps then add what that changes (`_led`).
         """
         acting, each = self.acting(h), range(self.data.model.m)
         found = [self._input(acting, j, "input", arriving) for j in each]
@@ -256,16 +256,15 @@ class Predictor(SentOnce):
         return after
 
     def _led(self, after: Array, x: Array, u: Array, p: Array) -> None:
-        """Add to positions after a step what inputs that arrive early in it move them.
+        """Add to the states after a step what inputs that arrive early in it change.
 
-        A position q' = c w gains c dt B l, with B l what the leads l, held over a step, add to w.
+        It is (F - 1) B l, with B l what the leads l, held over a step, add: dt B l of a position.
         """
-        m, dt = self.data.model.m, self.data.dt
+        m = self.data.model.m
         lead = u[..., m:]
         if lead.any():
             by = self.step(x, u[..., :m] + lead, p) - after
-            for q, (w, c) in self.positions.items():
-                after[..., self.seen.index(q)] += c * dt * by[..., self.seen.index(w)]
+            after += self.step(x + by, u, p) - after - by
 
     def left(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Left:
         """Return inputs u (..., m) less the losses at x (..., n), and position terms (`ahead`)."""

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.instruments.finding import Finding, late_effects
+from grounded.places import heading, position
 from grounded_trials.logs.log_table import log_mapping
 from grounded_trials.workspace.identity import READ_BY
 from grounded_trials.workspace.task_file import seen_in
@@ -77,6 +78,20 @@ def where_to_mend(
         else one
         for one in findings
     )
+
+
+def late_alone(workspace: Folder) -> set[str]:
+    """Return delays of sensors that can't be: of one part of a pose that one message holds.
+
+    A message has one stamp, so its position and its heading are late together or not at all.
+    """
+    model = workspace.base_model
+    mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
+    pose = [*position(model), *filter(None, [heading(model)])]
+    if mapping is None or len(pose) < 2 or not set(pose) <= set(mapping.states):
+        return set()
+    topics = {mapping.states[name].path.partition(".")[0] for name in pose}
+    return {f"sensor_delay:{name}" for name in pose} if len(topics) == 1 else set()
 
 
 def in_time_now(workspace: Folder, findings: Sequence[Finding]) -> dict[str, float]:
