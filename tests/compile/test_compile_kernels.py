@@ -276,3 +276,50 @@ def test_steps_one_after_the_other_are_those_steps():
         x = model.system.step(x, u[t], model.values, 0.02)
         assert (found[t + 1] == x).all()
     assert model.system.march(x, u[:0], model.values, 0.02).shape == (1, 7, model.n)
+
+
+def test_functions_agree_with_numpy_where_they_branch():
+    """Small angles and others, steep, behind and at the origin share vectors, or do not."""
+
+    def step(s, a, p, dt):
+        angle = np.arctan2(s.y, s.x)
+        ratio = s.y / np.sqrt(1.0 + s.x**2 + s.y**2)
+        return {
+            "x": angle,
+            "y": np.sin(angle) + np.cos(angle),
+            "z": np.arcsin(ratio),
+            "w": np.exp(s.x * p.c),
+        }
+
+    names = {"states": ("x", "y", "z", "w"), "inputs": ("u",), "params": ("c",)}
+    fast, slow = (make(step, kind="step", **names) for make in (system_of, traced))
+    edge = np.tan(np.pi / 8)
+    some = np.array([0.0, 1e-300, 0.1, edge, np.nextafter(edge, 1), 0.5, 0.6, 1.0, 3.0, 700.0])
+    x, y = (v.ravel() for v in np.meshgrid(np.r_[-some, some], np.r_[-some, some]))
+    rng, p = np.random.default_rng(0), np.array([1.02])
+    for order in (np.arange(len(x)), rng.permutation(len(x))):
+        states = np.column_stack([x[order], y[order], x[order], y[order]])
+        u = np.zeros((len(x), 1))
+        mine, theirs = (system.step(states, u, p, 0.1) for system in (fast, slow))
+        assert np.allclose(mine, theirs, rtol=1e-14, atol=1e-15)
+
+
+@pytest.mark.parametrize("delays", [(0.0,) * 5, (0.0, 0.4, 2.7, 1.0, 0.0)])
+def test_a_run_by_itself_is_the_run_beside_others(delays):
+    """Of a long model, whose entries are taken four at once, with and without some left over."""
+    for n in (8, 10):
+        fast, slow = (
+            replace(
+                wide(n, 5, True, make, np.inf), delay=np.array(delays), angles=np.arange(n) == 1
+            )
+            for make in (system_of, traced)
+        )
+        u = np.random.default_rng(n).normal(size=(12, 5))
+        start = slow.system.rollout(slow, u)
+        gains = slow.system.backward(slow, start.z[0], u, np.zeros(5))
+        policy = (u, gains.K, start.z[0], gains.k)
+        one = fast.system.rollout(fast, *policy, np.array([0.7]))
+        some = fast.system.rollout(fast, *policy, np.array([0.7, 0.2]))
+        reference = slow.system.rollout(slow, *policy, np.array([0.7]))
+        for a, b, c in zip(*(vars(run).values() for run in (one, some, reference)), strict=True):
+            assert np.allclose(a[0], b[0], **TIGHT) and np.allclose(a[0], c[0], **TIGHT)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 
 from grounded.compile.emit.llvm_step import Dynamics, StepWriter
 from grounded.compile.emit.llvm_text import Writer
+from grounded.compile.emit.llvm_transpose import columns_of
 from grounded.compile.kernel_words import BATCH
 
 
@@ -59,15 +60,15 @@ def gather_rows(
         count: number of rows.
         width: W.
     """
-    last = f.integer("sub", count, 1)
-    with f.loop(width) as lane:
+    last, index = f.integer("sub", count, 1), list[str]()
+    for lane in range(width):
         i = f.integer("add", first, lane)
         beyond = f.emit(f"icmp sgt i64 {i}, {last}")
-        row = f.emit(f"select i1 {beyond}, i64 {last}, i64 {i}")
-        for base, size, out in arrays:
-            source, to = f.at(base, f.integer("mul", row, size)), f.at(out, lane)
-            for j in range(size):
-                f.store(f.load(source, j), to, j * width)
+        index.append(f.emit(f"select i1 {beyond}, i64 {last}, i64 {i}"))
+    for base, size, out in arrays:
+        rows = [f.at(base, f.integer("mul", i, size)) for i in index]
+        for j, column in enumerate(columns_of(f, rows, size)):
+            f.store(column, out, j * width, width)
 
 
 def _each_sample(

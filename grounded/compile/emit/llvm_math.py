@@ -70,11 +70,11 @@ class Lanes:
     def __init__(self, f: Writer, width: int) -> None:
         self.f, self.width = f, width
         self.whole = "i64" if width == 1 else f"<{width} x i64>"  # W integers
-        self._angles: dict[str, tuple[str, str]] = {}
+        self.angles: dict[str, tuple[str, str]] = {}
 
     def const(self, value: float) -> str:
         """A constant in every lane."""
-        return splat(value, self.width)
+        return self.f.constant(value, self.width) if value else splat(value, self.width)
 
     def polynomial(self, x: str, coefficients: tuple[float, ...]) -> str:
         """c0 + c1 x + c2 x^2 ... by Estrin's scheme, which shortens the chain of dependences."""
@@ -88,6 +88,14 @@ class Lanes:
             if len(terms) > 1:
                 x = f.mul(x, x, w)
         return terms[0]
+
+    def series(self, first: str, factor: str, x: str, coefficients: tuple[float, ...]) -> str:
+        """Sum first + factor (c0 + c1 x + c2 x^2 ...) of 5 to 12 terms, by a shorter chain."""
+        f, w = self.f, self.width
+        square = f.mul(x, x, w)
+        fourth = f.mul(square, square, w)
+        low = f.fma(factor, self.polynomial(x, coefficients[:4]), first, w)
+        return f.fma(f.mul(factor, fourth, w), self.polynomial(x, coefficients[4:]), low, w)
 
     def _bits(self, value: str) -> str:
         return self.f.emit(f"bitcast {vector(self.width)} {value} to {self.whole}")
@@ -112,20 +120,23 @@ class Lanes:
 
     def sincos(self, x: str) -> tuple[str, str]:
         """Sine and cosine, one reduction for both."""
-        if x in self._angles:
-            return self._angles[x]
+        if x not in self.angles:
+            f, w = self.f, self.width
+            shifted = self._rounding(x, 2 / math.pi)
+            turns = f.emit(f"fsub {vector(w)} {shifted}, {self.const(MAGIC)}")
+            r = x
+            for part in HALF_PI:
+                r = f.sub(r, f.mul(turns, self.const(part), w), w)
+            self.angles[x] = self._quadrant(shifted, *self._sincos_within(r))
+        return self.angles[x]
+
+    def _sincos_within(self, r: str) -> tuple[str, str]:
+        """Sine and cosine of an angle in [-pi/4, pi/4]."""
         f, w = self.f, self.width
-        shifted = self._rounding(x, 2 / math.pi)
-        turns = f.emit(f"fsub {vector(w)} {shifted}, {self.const(MAGIC)}")
-        r = x
-        for part in HALF_PI:
-            r = f.sub(r, f.mul(turns, self.const(part), w), w)
         z = f.mul(r, r, w)
         sine = f.fma(f.mul(z, r, w), self.polynomial(z, SIN), r, w)
         half = f.fma(z, self.const(-0.5), self.const(1.0), w)
-        cosine = f.fma(f.mul(z, z, w), self.polynomial(z, COS), half, w)
-        self._angles[x] = self._quadrant(shifted, sine, cosine)
-        return self._angles[x]
+        return sine, f.fma(f.mul(z, z, w), self.polynomial(z, COS), half, w)
 
     def _quadrant(self, shifted: str, sine: str, cosine: str) -> tuple[str, str]:
         f, w = self.f, self.width
@@ -144,8 +155,9 @@ class Lanes:
         f, w = self.f, self.width
         low = f.compare("olt", x, self.const(-708.0), w)
         high = f.compare("ogt", x, self.const(709.78), w)
-        scaled = f.select(high, self.const(math.inf), self.exp_within(x), w)  # or what it may be
-        return f.select(low, self.const(0.0), scaled, w)
+        bits = "i1" if w == 1 else f"<{w} x i1>"
+        beyond = f.select(high, self.const(math.inf), self.const(0.0), w)
+        return f.select(f.emit(f"or {bits} {low}, {high}"), beyond, self.exp_within(x), w)
 
     def exp_within(self, x: str) -> str:
         """e^x for x in [-708, 709.78]."""
@@ -155,7 +167,7 @@ class Lanes:
         r = f.sub(x, f.mul(n, self.const(LN2[0]), w), w)
         r = f.sub(r, f.mul(n, self.const(LN2[1]), w), w)
         start = f.add(r, self.const(1.0), w)
-        mantissa = f.fma(f.mul(r, r, w), self.polynomial(r, EXP), start, w)
+        mantissa = self.series(start, f.mul(r, r, w), r, EXP)
         exponent = self._bitwise("shl", self._bits(shifted), 52)
         return self._from_bits(f.emit(f"add {self.whole} {self._bits(mantissa)}, {exponent}"))
 
@@ -167,8 +179,33 @@ class Lanes:
         size = f.div(f.sub(one, e, w), f.add(one, e, w), w)
         return f.select(f.compare("olt", x, self.const(0.0), w), f.neg(size, w), size, w)
 
-    def atan2(self, y: str, x: str) -> str:
-        """The angle of (x, y) in (-pi, pi]."""
+    def atan2(self, y: str, x: str, turned: bool = False) -> str:
+        """The angle of (x, y) in (-pi, pi].
+
+        Mostly it is a small one in every lane, and what the others need is left out.
+
+        Args:
+            y: the numerator.
+            x: the denominator.
+            turned: whether its sine and cosine are wanted too, see `sincos`.
+        """
+        f, w = self.f, self.width
+
+        def small() -> list[str]:
+            angle = self._arctangent(f.div(y, x, w))
+            return [angle, *(self._sincos_within(angle) if turned else ())]
+
+        def any_angle() -> list[str]:
+            angle = self._any_angle(y, x)
+            return [angle, *(self.sincos(angle) if turned else ())]
+
+        near = f.compare("olt", f.call("fabs", [y], w), self._eighth(x), w)
+        angle, *others = f.either(f.all(near, w), small, any_angle, w)
+        if turned:
+            self.angles[angle] = others[0], others[1]
+        return angle
+
+    def _any_angle(self, y: str, x: str) -> str:
         f, w = self.f, self.width
         ax, ay = f.call("fabs", [x], w), f.call("fabs", [y], w)
         steep = f.compare("ogt", ay, ax, w)
@@ -186,8 +223,11 @@ class Lanes:
 
     def _beyond_eighth(self, y: str, x: str) -> str:
         """Whether y / x is above tan(pi / 8)."""
-        f, w = self.f, self.width
-        return f.compare("ogt", y, f.mul(x, self.const(math.tan(math.pi / 8)), w), w)
+        return self.f.compare("ogt", y, self._eighth(x), self.width)
+
+    def _eighth(self, x: str) -> str:
+        """The y at which the angle of (x, y) is pi / 8."""
+        return self.f.mul(x, self.const(math.tan(math.pi / 8)), self.width)
 
     def _small_angle(self, y: str, x: str, steep: str, far: str) -> str:
         """The angle of (x, y) to the nearer axis, less pi/4 if it is far from it; one division.
@@ -200,8 +240,13 @@ class Lanes:
         small, large = f.select(steep, x, y, w), f.select(steep, y, x, w)
         large = f.select(nowhere, self.const(1.0), large, w)
         t = f.div(f.select(far, less, small, w), f.select(far, total, large, w), w)
+        return self._arctangent(t)
+
+    def _arctangent(self, t: str) -> str:
+        """The arctangent of t in [-tan(pi / 8), tan(pi / 8)]."""
+        f, w = self.f, self.width
         z = f.mul(t, t, w)
-        return f.fma(f.mul(t, z, w), self.polynomial(z, ATAN), t, w)
+        return self.series(t, f.mul(t, z, w), z, ATAN)
 
     def _octant(self, far: str, steep: str, left: str) -> tuple[str, str]:
         """(base, turn): the whole angle is base + turn * small angle."""
@@ -217,12 +262,28 @@ class Lanes:
     def asin(self, x: str) -> str:
         """The arcsine, NaN outside [-1, 1]; beyond 1/2 by the root of half of what is left to 1."""
         f, w = self.f, self.width
+        small = f.compare("ole", f.call("fabs", [x], w), self.const(0.5), w)
+        (angle,) = f.either(
+            f.all(small, w),
+            lambda: [self._arcsine(x, f.mul(x, x, w))],
+            lambda: [self._any_arcsine(x)],
+            w,
+        )
+        return angle
+
+    def _arcsine(self, x: str, z: str) -> str:
+        """The arcsine of x in [-1/2, 1/2], z its square."""
+        f, w = self.f, self.width
+        return f.fma(f.mul(z, self.polynomial(z, ASIN), w), x, x, w)
+
+    def _any_arcsine(self, x: str) -> str:
+        f, w = self.f, self.width
         size, half = f.call("fabs", [x], w), self.const(0.5)
         large = f.compare("ogt", size, half, w)
         rest = f.fma(size, self.const(-0.5), half, w)
         z = f.select(large, rest, f.mul(x, x, w), w)
         base = f.select(large, f.call("sqrt", [rest], w), size, w)
-        angle = f.fma(f.mul(z, self.polynomial(z, ASIN), w), base, base, w)
+        angle = self._arcsine(base, z)
         folded = f.fma(angle, self.const(-2.0), self.const(math.pi / 2), w)
         angle = f.select(large, folded, angle, w)
         sign = self._bitwise("and", self._bits(x), -(1 << 63))

@@ -14,6 +14,7 @@ from grounded.compile.emit.llvm_batch import Words, gather_rows, start_table
 from grounded.compile.emit.llvm_rollout import received
 from grounded.compile.emit.llvm_step import Dynamics
 from grounded.compile.emit.llvm_text import Writer, integers, number, splat, vector
+from grounded.compile.emit.llvm_transpose import transposed
 from grounded.compile.kernel_words import Layout
 
 Row = Callable[[int | str], list[str]]  # row r of a matrix, or some of its pieces: vectors
@@ -38,30 +39,6 @@ def pieces_of(f: Writer, base: str, stride: int, cut: Sequence[int], size: int) 
         return [f.load(start, at, size) for at in cut]
 
     return row
-
-
-def transposed(f: Writer, a: list[str]) -> list[str]:
-    """Columns of W rows of W, in registers; W is 4 or 8."""
-    size = len(a)
-    if size == 4:
-        return _transpose_block(f, a)
-    kind = vector(size)
-
-    def shuffled(a: str, b: str, lanes: tuple[int, ...]) -> str:
-        inside = ", ".join(f"i32 {i}" for i in lanes)
-        return f.emit(f"shufflevector {kind} {a}, {kind} {b}, <8 x i32> <{inside}>")
-
-    # Pairs of rows, then pairs of pairs: what moves is pairs of neighbours.
-    even = [shuffled(a[i], a[i + 1], (0, 8, 2, 10, 4, 12, 6, 14)) for i in (0, 2, 4, 6)]
-    odd = [shuffled(a[i], a[i + 1], (1, 9, 3, 11, 5, 13, 7, 15)) for i in (0, 2, 4, 6)]
-    first, second = (0, 1, 4, 5, 8, 9, 12, 13), (2, 3, 6, 7, 10, 11, 14, 15)
-    columns = [""] * 8
-    for parity, rows in enumerate((even, odd)):
-        for half, lanes in enumerate((first, second)):
-            upper, lower = (shuffled(rows[i], rows[i + 1], lanes) for i in (0, 2))
-            columns[2 * half + parity] = shuffled(upper, lower, first)
-            columns[2 * half + parity + 4] = shuffled(upper, lower, second)
-    return columns
 
 
 def chosen(f: Writer, row: list[str], places: list[int | None], size: int) -> str:
@@ -94,33 +71,14 @@ def symmetric(f: Writer, V: str, P: int) -> None:
         first, second = f.integer("mul", i, 4), f.integer("mul", j, 4)
         below = f.at(V, f.integer("add", f.integer("mul", first, P), second))
         above = f.at(V, f.integer("add", f.integer("mul", second, P), first))
-        mirrored = _transpose_block(f, [f.load(above, r * P, 4) for r in range(4)])
+        mirrored = transposed(f, [f.load(above, r * P, 4) for r in range(4)])
         mean = [
             f.mul(f.add(f.load(below, r * P, 4), row, 4), half, 4) for r, row in enumerate(mirrored)
         ]
         for r, row in enumerate(mean):
             f.store(row, below, r * P, 4)
-        for r, row in enumerate(_transpose_block(f, mean)):
+        for r, row in enumerate(transposed(f, mean)):
             f.store(row, above, r * P, 4)
-
-
-def _transpose_block(f: Writer, a: list[str]) -> list[str]:
-    """Columns of four rows of four."""
-    kind = vector(4)
-
-    def shuffled(a: str, b: str, *lanes: int) -> str:
-        """Lanes of a, from 4 on of b."""
-        inside = ", ".join(f"i32 {i}" for i in lanes)
-        return f.emit(f"shufflevector {kind} {a}, {kind} {b}, <4 x i32> <{inside}>")
-
-    lo = [shuffled(a[i], a[i + 1], 0, 4, 2, 6) for i in (0, 2)]
-    hi = [shuffled(a[i], a[i + 1], 1, 5, 3, 7) for i in (0, 2)]
-    return [
-        shuffled(lo[0], lo[1], 0, 1, 4, 5),
-        shuffled(hi[0], hi[1], 0, 1, 4, 5),
-        shuffled(lo[0], lo[1], 2, 3, 6, 7),
-        shuffled(hi[0], hi[1], 2, 3, 6, 7),
-    ]
 
 
 def placed(f: Writer, value: str, lane: int, row: str, size: int) -> str:

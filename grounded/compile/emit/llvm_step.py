@@ -1,7 +1,7 @@
 """Writes one control step: the next state, and its sparse Jacobian, of W lanes at once.
 
-The stages of Runge-Kutta are a loop around one copy of the model, so that the code stays small. The
-Jacobian's stages are those of `traced.py`,
+The stages of Runge-Kutta are a loop around one copy of the model, so that the code stays small; so
+is the Jacobian's chain rule around one column. Its stages are those of `traced.py`,
 
     K_i = f_x T_i + [0 f_u f_p],    T_i = I + c_i dt K_{i-1},    A = I + dt sum_i b_i K_i,
 
@@ -10,6 +10,7 @@ kept as the values of a pattern: the places that can be non-zero after any numbe
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,6 +24,8 @@ from grounded.compile.trace.tracing import Variant
 Place = tuple[int, int]  # row, column of a Jacobian
 FLAT = 120  # operations of a model whose stages are written out: nothing waits for memory then
 UNROLLED = 2000  # products of the chain rule that are written out; more are a loop over indices
+Rows = tuple[int, ...]
+Group = tuple[Rows, list[int]]  # rows, and the columns that are non-zero in them
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,23 +45,41 @@ class Dynamics:
         return Uniforms(self.graph, [*self.outputs, *self.entries.values()])
 
     @cached_property
-    def rates(self) -> dict[Place, tuple[int, ...]]:
-        """The pattern of K: for each place, the s with f_x[r, s] K[s, c] to be summed."""
+    def short(self) -> bool:
+        """Whether a step is written out: its values wait for each other, not for room."""
+        return bool(self.stages) and len(self.graph.live(self.outputs)) <= FLAT
+
+    @cached_property
+    def groups(self) -> list[Group]:
+        """The pattern of K: columns that are non-zero in the same rows; they share their code."""
         pattern = set(self.entries)
         for _ in self.stages[1:]:
             rows: dict[int, set[int]] = {}
             for s, c in pattern:
                 rows.setdefault(s, set()).add(c)
             pattern |= {(r, c) for r, s in self.entries if s < self.n for c in rows.get(s, ())}
+        columns, alike = defaultdict[int, list[int]](list), defaultdict[Rows, list[int]](list)
+        for r, c in sorted(pattern):
+            columns[c].append(r)
+        for c in sorted(columns):
+            alike[tuple(columns[c])].append(c)
+        return list(alike.items())
+
+    @cached_property
+    def rates(self) -> dict[Place, tuple[int, ...]]:
+        """The places of K, group by group: for each, the s with f_x[r, s] K[s, c] to be summed."""
         return {
-            (r, c): tuple(s for s in range(self.n) if (r, s) in self.entries and (s, c) in pattern)
-            for (r, c) in sorted(pattern)
+            (r, c): tuple(s for s in rows if (r, s) in self.entries)
+            for rows, some in self.groups
+            for c in some
+            for r in rows
         }
 
     @cached_property
     def products(self) -> int:
-        """Multiplications in a stage of the chain rule."""
-        return sum(len(sums) for sums in self.rates.values()) if len(self.stages) > 1 else 0
+        """Multiplications of the chain rule that are written out."""
+        sums = sum(len(self.rates[r, some[0]]) for rows, some in self.groups for r in rows)
+        return max(len(self.stages) - 1, 0) * sums
 
     @cached_property
     def places(self) -> list[Place]:
@@ -101,14 +122,14 @@ class StepWriter:
                 return f.load_all(self.table, DT, w)
             return state(index) if letter == "x" else f.load(self.u, index * w, w)
 
-        return Body(f, w, d.graph, leaf, self.table, d.uniforms.slot, self.held)
+        return Body(f, w, d.graph, leaf, self.table, d.uniforms.slot, self.held, packed=not d.short)
 
     def step(self) -> list[str]:
         """From x and u to next, whose values are returned too."""
         f, d, w = self.f, self.d, self.width
         if not d.stages:
             following = self._body(lambda i: f.load(self.x, i * w, w)).values(d.outputs)
-        elif len(d.graph.live(d.outputs)) <= FLAT:
+        elif d.short:
             following = self._flat()
         else:
             self._start(d.outputs)
@@ -182,23 +203,39 @@ class StepWriter:
             for e, value in enumerate(body.values([d.entries[p] for p in d.places])):
                 f.store(value, out, e * w, w)
             return
-        looped, size = d.products > UNROLLED, len(d.rates) * w
-        rates = f.room((2 if looped else 1) * size)  # K of the stage, and of the one before
         self._start([*d.outputs, *d.entries.values()])
-        if looped:
-            self._begin_loops(rates, out)
-        with f.loop(len(d.stages)) as stage:
-            body, c_dt, b_dt = self._rates(stage)
-            if looped:
-                odd = f.integer("and", stage, 1)
-                old = f.at(rates, f.integer("mul", odd, size))
-                new = f.at(rates, f.integer("mul", f.integer("xor", odd, 1), size))
-                self._looped_chain(body, (c_dt, b_dt), (old, new), out)
-            else:
-                self._chain(body, (c_dt, b_dt), stage, rates, out)
+        if d.products > UNROLLED:
+            self._looped_stages(out)
+        else:
+            self._written_stages(out)
         self._finish()
         for e in range(len(d.rates), len(d.places)):
             f.store(splat(1.0, w), out, e * w, w)
+
+    def _written_stages(self, out: str) -> None:
+        """The derivatives of every stage to memory, a zero after them; then the chain."""
+        f, d, w = self.f, self.d, self.width
+        size = (len(d.entries) + 1) * w
+        kept = f.room(len(d.stages) * size)
+        with f.loop(len(d.stages)) as stage:
+            body, _, _ = self._rates(stage)
+            to = f.at(kept, f.integer("mul", stage, size))
+            for e, node in enumerate(d.entries.values()):
+                f.store(body.value(node), to, e * w, w)
+            f.store(splat(0.0, w), to, len(d.entries) * w, w)
+        self._chain(kept, out)
+
+    def _looped_stages(self, out: str) -> None:
+        """Each stage and its part of the chain, in small code."""
+        f, d, size = self.f, self.d, len(self.d.rates) * self.width
+        rates = f.room(2 * size)  # K of the stage, and of the one before
+        self._begin_loops(rates, out)
+        with f.loop(len(d.stages)) as stage:
+            body, c_dt, b_dt = self._rates(stage)
+            odd = f.integer("and", stage, 1)
+            old = f.at(rates, f.integer("mul", odd, size))
+            new = f.at(rates, f.integer("mul", f.integer("xor", odd, 1), size))
+            self._looped_chain(body, (c_dt, b_dt), (old, new), out)
 
     def _begin_loops(self, rates: str, out: str) -> None:
         """No K yet, and A = I."""
@@ -209,44 +246,38 @@ class StepWriter:
                 f.store(splat(0.0, w), rates, at, w)
                 f.store(f.load_all("@chain_diagonal", rate, w), out, at, w)
 
-    def _chain(self, body: Body, steps: tuple[str, str], stage: str, rates: str, out: str) -> None:
-        """K = f_x T + own takes the place of the K before, some columns at a time; A += b dt K.
+    def _chain(self, kept: str, out: str) -> None:
+        """K = f_x T + own and A += b dt K of all stages, one column of K after the other.
 
-        What a column becomes depends on that column alone. Two at once share what is read of f_x.
+        What a column becomes depends on that column alone: it stays in registers.
         """
-        f, d, w = self.f, self.d, self.width
-        c_dt, b_dt = steps
-        own = dict(zip(d.entries, body.values(list(d.entries.values())), strict=True))
-        slot = {at: e * w for e, at in enumerate(d.rates)}
-        read = {s for _, s in d.entries}  # rows of K that another stage needs
-        with f.when(f.emit(f"icmp eq i64 {stage}, 0")):  # nothing to chain with yet
-            for (r, c), e in slot.items():
-                value = own.get((r, c), splat(0.0, w))
-                if r in read:
-                    f.store(value, rates, e, w)
-                f.store(f.fma(b_dt, value, splat(float(r == c), w), w), out, e, w)
-        if len(d.stages) == 1:
-            return
-        with f.when(f.emit(f"icmp ne i64 {stage}, 0")):
-            scaled = f.room(len(own) * w)
-            for e, ((_, c), value) in enumerate(own.items()):
-                if c < d.n:
-                    f.store(f.mul(c_dt, value, w), scaled, e * w, w)
-            place = {at: e * w for e, at in enumerate(own)}
-            columns = _columns(d)
-            for first in range(0, len(columns), 2):
-                some = columns[first : first + 2]
-                before = {at: f.load(rates, slot[at], w) for c in some for at in c if at[0] in read}
-                factors: dict[Place, str] = {}
-                for at in sorted(at for column in some for at in column):
-                    value, row = own.get(at, ""), [(at[0], s) for s in d.rates[at]]
-                    factors |= {to: f.load(scaled, place[to], w) for to in row if to not in factors}
-                    for to in row:
-                        term = factors[to], before[to[1], at[1]]
-                        value = f.fma(*term, value, w) if value else f.mul(*term, w)
-                    if at[0] in read:
-                        f.store(value, rates, slot[at], w)
-                    f.store(f.fma(b_dt, value, f.load(out, slot[at], w), w), out, slot[at], w)
+        f, first = self.f, 0
+        for rows, some in self.d.groups:
+            with f.loop(len(some)) as i:
+                at = f.integer("add", first, f.integer("mul", i, len(rows)))
+                self._column(kept, out, rows, some[0], at)
+            first += len(rows) * len(some)
+
+    def _column(self, kept: str, out: str, rows: Sequence[int], c: int, first: str) -> None:
+        """A column of a group, of which `c` is one; `first` is its own first place."""
+        f, d, w, dt = self.f, self.d, self.width, self.f.load(self.table, DT)
+        size, place = (len(d.entries) + 1) * w, {at: e * w for e, at in enumerate(d.entries)}
+        places = {r: f.integer("add", first, i) for i, r in enumerate(rows)}
+        own = {r: f.integer("mul", f.index("@chain_own", e), w) for r, e in places.items()}
+        total = {r: f.load_all("@chain_diagonal", e, w) for r, e in places.items()}
+        before = dict[int, str]()  # K of the stage before
+        for i, stage in enumerate(d.stages):
+            at = f.at(kept, i * size)
+            c_dt, b_dt = (f.spread(f.mul(dt, number(value)), w) for value in stage)
+            scaled = {r: f.mul(c_dt, value, w) for r, value in before.items()}
+            for r in rows:
+                value = f.load(at, own[r], w)
+                for s in d.rates[r, c] if i else ():
+                    value = f.fma(f.load(at, place[r, s], w), scaled[s], value, w)
+                before[r] = value
+                total[r] = f.fma(b_dt, value, total[r], w)
+        for r, e in places.items():
+            f.store(total[r], out, f.integer("mul", e, w), w)
 
     def _looped_chain(
         self, body: Body, steps: tuple[str, str], buffers: tuple[str, str], out: str
@@ -272,14 +303,6 @@ class StepWriter:
             f.store(f.fma(b_dt, value, f.load(out, at, w), w), out, at, w)
 
 
-def _columns(d: Dynamics) -> list[list[Place]]:
-    """Places column by column: what a column of K becomes depends on that column alone."""
-    columns: dict[int, list[Place]] = {}
-    for r, c in d.rates:
-        columns.setdefault(c, []).append((r, c))
-    return list(columns.values())
-
-
 def _chain_tables(d: Dynamics) -> str:
     """For `_looped_chain`: sums of products by index, at least one a place."""
     own = {place: e for e, place in enumerate(d.entries)}
@@ -289,21 +312,19 @@ def _chain_tables(d: Dynamics) -> str:
         left += [own[r, s] for s in sums] or [len(own)]
         right += [slot[s, c] for s in sums] or [0]
         first.append(len(left))
-    return (
-        integers("chain_own", [own.get(at, len(own)) for at in d.rates])
-        + integers("chain_first", first)
-        + integers("chain_left", left)
-        + integers("chain_right", right)
-    )
+    tables = {"chain_first": first, "chain_left": left, "chain_right": right}
+    return "".join(integers(name, values) for name, values in tables.items())
 
 
 def stage_tables(d: Dynamics) -> str:
-    """The stages' c and b as global constants, and the chain's indices where it is a loop."""
+    """The stages' c and b as global constants, and of the places of K their own derivatives."""
     if not d.stages:
         return ""
     columns = {"stage_c": [c for c, _ in d.stages], "stage_b": [b for _, b in d.stages]}
     columns["chain_diagonal"] = [float(r == c) for r, c in d.rates]
     tables = "".join(doubles(name, values) for name, values in columns.items())
+    own = {place: e for e, place in enumerate(d.entries)}
+    tables += integers("chain_own", [own.get(at, len(own)) for at in d.rates])
     return tables + (_chain_tables(d) if d.products > UNROLLED else "")
 
 

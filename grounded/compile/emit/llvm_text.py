@@ -10,7 +10,7 @@ that LLVM has only to choose instructions and registers.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 F = "double"
@@ -52,6 +52,7 @@ class Writer:
         self.lines = [f"define {signature} {{", "entry:"]
         self._count = 0
         self._allocas = len(self.lines)
+        self._constants: dict[str, str] = {}
 
     def name(self) -> str:
         """A fresh value name."""
@@ -81,6 +82,18 @@ class Writer:
         self.lines.insert(self._allocas, line)
         self._allocas += 1
         return result
+
+    def constant(self, value: float, width: int) -> str:
+        """A constant in every lane, read from the stack.
+
+        An instruction reads it there by itself; where the code itself holds it, an address that can
+        be anywhere comes first.
+        """
+        bits = number(value)
+        if bits not in self._constants:
+            self._constants[bits] = place = self.room(1, align=8)
+            self.lines.insert(self._allocas, f"  store double {bits}, ptr {place}, align 8")
+        return self.load_all(self._constants[bits], 0, width)
 
     def at(self, base: str, index: int | str, kind: str = F) -> str:
         """The address of an element."""
@@ -113,6 +126,13 @@ class Writer:
         return self.emit(
             f"shufflevector {kind} {one}, {kind} poison, <{width} x i32> zeroinitializer"
         )
+
+    def vector_of(self, values: list[str]) -> str:
+        """Numbers as the lanes of a vector."""
+        row = "poison"
+        for i, value in enumerate(values):
+            row = self.emit(f"insertelement {vector(len(values))} {row}, double {value}, i64 {i}")
+        return row
 
     def lane(self, value: str, i: int | str, width: int) -> str:
         """One lane of a vector."""
@@ -200,11 +220,11 @@ class Writer:
         """A loop that carries W lanes from turn to turn; its body must `set` the next value."""
         with self.loop(count) as i:
             carried = Fold(i, self.name())
-            self.lines.append("")
-            line = len(self.lines) - 1
+            mark = f"  ; {carried.value}"  # rooms are allocated before: its number may change
+            self.lines.append(mark)
             yield carried
         tag = i.removeprefix("%i")
-        self.lines[line] = (
+        self.lines[self.lines.index(mark)] = (
             f"  {carried.value} = phi {vector(width)} "
             f"[ {start}, %before{tag} ], [ {carried.result}, %latch{tag} ]"
         )
@@ -240,6 +260,37 @@ class Writer:
             after = self._block()
         for i, (a, b) in enumerate(zip(usual, list(values), strict=True)):
             values[i] = self.emit(f"phi double [ {a}, %{before} ], [ {b}, %{after} ]")
+
+    def either(
+        self,
+        condition: str,
+        yes: Callable[[], list[str]],
+        no: Callable[[], list[str]],
+        width: int = 1,
+    ) -> list[str]:
+        """Values of W lanes: those that `yes` writes where the i1 is true, else those of `no`."""
+        self._count += 1
+        tag = self._count
+        self.do(f"br i1 {condition}, label %yes{tag}, label %no{tag}")
+        ends = list[tuple[list[str], str]]()
+        for name, write in (("yes", yes), ("no", no)):
+            self.lines.append(f"{name}{tag}:")
+            ends.append((write(), self._block()))
+            self.do(f"br label %both{tag}")
+        self.lines.append(f"both{tag}:")
+        (a, first), (b, second) = ends
+        kind = vector(width)
+        return [
+            self.emit(f"phi {kind} [ {x}, %{first} ], [ {y}, %{second} ]")
+            for x, y in zip(a, b, strict=True)
+        ]
+
+    def all(self, condition: str, width: int) -> str:
+        """Whether a condition holds in every lane."""
+        if width == 1:
+            return condition
+        bits = self.emit(f"bitcast <{width} x i1> {condition} to i{width}")
+        return self.emit(f"icmp eq i{width} {bits}, -1")
 
     def _block(self) -> str:
         """The label of the block that is being written."""

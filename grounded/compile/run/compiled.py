@@ -85,7 +85,7 @@ class Kernels:
     def search(self, layout: Layout) -> jit.Library:
         """Rollout and, for few enough inputs, sweep and descent; about a layout of z."""
         small = layout.m <= MAX_INPUTS and self._derivatives
-        names = ("rollout", "sweep", "descent") if small else ("rollout",)
+        names = ("rollouts", "rollout", *(("sweep", "descent") if small else ()))
         return self._library(layout, names)
 
     def full(self) -> jit.Library:
@@ -219,7 +219,7 @@ class CompiledSystem(TracedSystem):
         z, u, cost = empty((runs, H + 1, nz)), empty((runs, H, self.m)), np.empty(runs)
         known, lanes = packed(problem), np.empty(LANES)
         values = _policy(ubar, K, zbar, k) | {"alphas": lanes}
-        kernel = self._search(problem)[0]["rollout"]
+        kernel = self._search(problem)[0]["rollout" if runs == 1 else "rollouts"]
         for at in range(0, runs, LANES):
             some = min(LANES, runs - at)
             lanes[:some], lanes[some:] = steps[at : at + some], steps[at]
