@@ -2,6 +2,7 @@
 
 from copy import copy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -170,6 +171,28 @@ def test_without_a_calibration_effects_are_weighed_against_effects_without_one(w
     claims = Claims(decision, dict.fromkeys(h.names, 0.5), known, ruler)
     assert min(claims.parts().values()) > 0
     assert all(f.hypothesis.spread == 0 for n in h.names for _, f in claims.rivals(n))
+
+
+def test_noise_that_absorbs_an_effect_is_no_evidence_against_it(wavy, ruler):
+    """Strangers read claims of -57 and -100 nats, tied with effects that predictions had refused."""
+    search, best = copy(wavy[0]), wavy[1]
+    search.fits = dict(search.fits)
+    h = replace(best.hypothesis, shift=None, spread=0.0)
+    claimed = search.refined([(h, best.noise, best.track)], 12)[0]
+    search.refined([(h.minus(n), best.noise, best.track) for n in h.names], 12)
+    other = Structure(0.1 if claimed.noise.structure.tau != 0.1 else 0.3)
+    for f in [f for f in search.of_size(len(h.names) - 1) if not f.hypothesis.spread]:
+        noise = replace(f.noise, structure=other)
+        likelier = replace(f, noise=noise, evidence=claimed.evidence + 300.0)
+        search.fits[other, 0.0, tuple(sorted(f.hypothesis.names))] = likelier
+    decision = Decision(search, search, claimed, search.exact_null(), {})
+    claims = Claims(decision, dict.fromkeys(h.names, 0.5), limits(search.data), ruler)
+    assert min(claims.parts().values()) > 3
+    rival = replace(claimed, evidence=claimed.evidence + 100.0)
+    for refused in (True, False):
+        gain = SimpleNamespace(beyond=lambda *bar, by=refused: by)
+        claims.ruler = SimpleNamespace(held_out=True, gain=lambda a, b, found=gain: found)
+        assert claims._ties(h.names[0], "slope:v", rival) is not refused
 
 
 def test_what_is_as_likely_with_free_parameters_ties(wavy, ruler):

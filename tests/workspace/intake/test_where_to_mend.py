@@ -16,7 +16,7 @@ from grounded_trials.workspace.config import read_config
 from grounded_trials.workspace.diagnosing import instruments_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.intake.where_to_mend import where_to_mend
+from grounded_trials.workspace.intake.where_to_mend import late_alone, where_to_mend
 from workspaces import make
 
 LOG = """
@@ -72,6 +72,21 @@ def test_a_late_sensor_of_a_foreign_log_is_mended_in_its_table(tmp_path):
     toml = w.folder / "grounded.toml"
     toml.write_text(toml.read_text().replace("[task]\n", "[task]\nfeedback = false\n"))
     assert not found_in(w).advice
+
+
+@pytest.mark.parametrize(("topic", "alone"), [("/mocap", False), ("/imu", True)])
+def test_one_message_is_late_as_a_whole(tmp_path, topic, alone):
+    """A car's heading was called 137 ms late beside its position, from the same stamps."""
+    w = make(tmp_path / "w", "car-turn")
+    table = LOG.split("[log.input]")[0].replace("v =", "# v =").replace("x =", "# x =")
+    table += """x = { path = "/mocap.pose.position.x" }
+y = { path = "/mocap.pose.position.y" }
+psi = { path = "TOPIC.pose.orientation.@rpy.yaw" }
+""".replace("TOPIC", topic)
+    toml = w.folder / "grounded.toml"
+    toml.write_text(toml.read_text() + table)
+    names = {f"sensor_delay:{name}" for name in ("x", "y", "psi")}
+    assert late_alone(Folder(w.folder)) == (set() if alone else names)
 
 
 def test_sensors_that_nothing_is_held_against_are_named_and_not_called_right(tmp_path):
