@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded.result import listed, measured_alike
-from grounded.search.candidate import LITTLE, UNLIKE
+from grounded.search.candidate import BY_STEP, LITTLE, UNLIKE
 from grounded.search.step_size import Step
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import LABEL, field, number, progress, remark, show, show_json
@@ -177,6 +177,7 @@ def _what(candidate: Candidate, standing: Standing, task: Task) -> str:
     if candidate.base:
         step = Step(candidate.damping, candidate.alpha)
         by = ", with derivatives corrected by the trials" * candidate.of_corrected
+        by += ", with derivatives corrected step by step" * (candidate.way == BY_STEP)
         if candidate.of_original:
             by += ", by the model without the adopted effects, which broke their promises"
         return f"iteration {candidate.iteration}: {step} from {candidate.base}{by}, {seconds}"

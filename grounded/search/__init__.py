@@ -13,6 +13,7 @@ limit_cycle     detects feedback that makes the inputs oscillate
 margin          checks gains under noise and with old samples
 mispredictions  corrects the model's derivatives from earlier trials (`corrected`), and compares
                 gains in several models that explain the trials
+by_step         corrects the derivatives of each step of the run by themselves, after two losses
 original        steps with the model as it was, if adopted effects broke their promises
 planner         the model used for planning, with adopted effects
 safety          checks a candidate before it is handed out

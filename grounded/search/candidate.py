@@ -17,9 +17,12 @@ from grounded.trial import Trial
 Way = Literal[
     "",  # a step along the direction of the model that replays the incumbent's trial
     "recorded inputs",  # the same with the paper's bias alone (`bias`: no matched inputs)
+    "slopes by step",  # with derivatives corrected step by step (`by_step`)
     "gentler gains",  # the incumbent's plan with lower gains (`Maker.gentler`)
     "own plan",  # the plan of a model changed since the incumbent was planned (`About.own_plan`)
 ]
+
+BY_STEP: Way = "slopes by step"
 
 Slopes = Literal[
     "",  # the model's own
@@ -71,7 +74,7 @@ class Candidate(Result):
     @property
     def grounded(self) -> bool:
         """Whether it is a step along a direction, predicted by a model that replays a trial."""
-        return bool(self.base) and self.way in ("", "recorded inputs")
+        return bool(self.base) and self.way in ("", "recorded inputs", BY_STEP)
 
     @property
     def expected_gain(self) -> float:
@@ -131,8 +134,8 @@ class Candidate(Result):
 
     @property
     def of_corrected(self) -> bool:
-        """Whether it was planned with derivatives corrected by trials."""
-        return self.slopes in ("corrected", "original, corrected")
+        """Whether it was planned with derivatives corrected by laws of the whole run."""
+        return self.slopes in ("corrected", "original, corrected") and self.way != BY_STEP
 
     def summary(self) -> str:
         """Return the id, the step and the predicted utility."""

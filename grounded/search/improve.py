@@ -31,7 +31,7 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand, list_of, type_of
 from grounded.model import Model
 from grounded.result import figure
-from grounded.search.candidate import Candidate, Tried
+from grounded.search.candidate import BY_STEP, Candidate, Tried
 from grounded.search.certainty import one_trial_error, runs_to_show
 from grounded.search.making import About, Maker
 from grounded.search.original import keeping_promises
@@ -160,6 +160,8 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
     ruinous: Candidate | None = None
     doubted: Candidate | None = None
     least = 0.0
+    base = incumbent.candidate
+    goes_on = base.way == BY_STEP and base.model == make.fingerprint
     for way in ways[ways.index(now.way) :]:
         step = now.step
         if way != now.way:
@@ -168,11 +170,14 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
             continue
         about = About(make, incumbent, options, way)
         stepping = keeping_promises(about)
-        found = stepping.step_from(step, promised)
+        by_step = _by_step(stepping) if way == now.way and goes_on else None
+        found = by_step or stepping.step_from(step, promised)
         if stepping is not about and found and found.candidate and about.ruined_by(found.candidate):
             stepping, found = about, about.step_from(step, promised)
-        if stepping.corrected and found and found.candidate:
+        if stepping.corrected and found and found.candidate and not by_step:
             found = _surer(stepping, step, found)
+        if way == now.way and not goes_on and (by_step := _by_step(stepping)) is not None:
+            found = _promising(found, by_step)
         least = options.tolerance * abs(stepping.already)
         if way == ways[0] and (own := about.own_plan(found)) is not None:
             found = own
@@ -234,6 +239,26 @@ def _surer(about: About, step: Step, corrected: Proposal) -> Proposal | None:
     if found is None or found.candidate is None:
         return corrected
     return found if found.candidate.expected_gain > made.expected_gain else corrected
+
+
+def _by_step(about: About) -> Proposal | None:
+    """Return a step by derivatives corrected step by step; None if none is due or worth a trial."""
+    make, options = about.make, about.options
+    step = options.due(make.now.history, about.incumbent, make.fingerprint, BY_STEP)
+    if step is None:
+        return None
+    stepping = About(make, about.incumbent, options, BY_STEP, about.original)
+    found = stepping.step_from(step, []) if stepping.corrected else None
+    return found if found and found.candidate else None
+
+
+def _promising(found: Proposal | None, other: Proposal) -> Proposal:
+    """Return the step that promises more, each promise less its likely error."""
+    if found is None or found.candidate is None:
+        return other
+    assert other.candidate is not None
+    better = other.candidate.expected_gain > found.candidate.expected_gain
+    return other if better else found
 
 
 def _ended(

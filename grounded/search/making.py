@@ -12,7 +12,7 @@ import numpy as np
 from grounded.compile import Problem
 from grounded.policy import Policy
 from grounded.rollout import Rollout, Run, apart
-from grounded.search.candidate import LITTLE, Candidate, Slopes, Tried, Way
+from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Slopes, Tried, Way
 from grounded.search.directions import base_columns, direction
 from grounded.search.limit_cycle import between_limits, limit_cycle
 from grounded.search.margin import steadied
@@ -35,6 +35,7 @@ HALF, FINE = 0.5, 12  # share of the mean gain to fall below; parts of a unit of
 NEAR = 0.2  # relative distance to a run that lost within which a step counts as the same
 WITNESS = 3.0  # factor on a model's largest miss, below which its prediction of a ruin says nothing
 REFUTED = 2  # bad losses of steps with corrected derivatives before those are given up
+MISTAKEN = 0.5  # share of its predictions that the plain model may miss
 FORETOLD = 0.2  # largest error of the plain model at the incumbent, as a fraction of its cost
 
 
@@ -86,7 +87,13 @@ class About:
         self.corrected: Corrected | None = None
         self.missed = 0.0  # likely error of the model's movements, as a share of them
         self.alternatives: tuple[Alternative, ...] = ()
-        if options.damps and len(make.now.history) > 1 and not self._kept():
+        if way == BY_STEP:
+            from grounded.search.by_step import believed_by_step
+
+            if found := believed_by_step(planner, incumbent, make.now.history, self.real):
+                self.real, self.corrected = found.problem, found.corrected
+                self.missed = found.missed
+        elif options.damps and len(make.now.history) > 1 and not self._kept():
             from grounded.search.mispredictions import believed
 
             trusted = not plainly and self._refuted() < REFUTED
@@ -257,7 +264,8 @@ class About:
         if self.alternatives:
             cost = sum(a.cost(made.policy) for a in self.alternatives)
             gains.append(self._disturbed - cost)
-        if (plainly := self._plain_gain(made)) is not None and plainly + self._plain_off < 0:
+        plainly = self._plain_gain(made)
+        if plainly is not None and plainly + self._plain_off < 0 and not self._plain_refuted:
             gains.append(plainly + self._plain_off)
         return replace(made, likely_off=made.predicted_gain - min(gains))
 
@@ -296,6 +304,24 @@ class About:
     def _plain_off(self) -> float:
         """Error of the plain model, without a bias, at the incumbent's utility."""
         return abs(self.plainly - self.incumbent.utility)
+
+    @cached_property
+    def _plain_refuted(self) -> bool:
+        """Return whether the plain model mispredicted what came of steps that lost.
+
+        It did if it missed half of the changes that it predicted. Where trials scatter, small
+        changes say nothing.
+        """
+        told, missed = 0.0, 0.0
+        if self.incumbent.standard_error > 0:
+            return False
+        for tried in self.make.now.history:
+            own = tried.candidate.base == self.incumbent.candidate.id
+            if own and tried.lost and np.isfinite(tried.utility):
+                change = predicted(self.plain, tried.candidate.policy).utility - self.plainly
+                told += abs(change)
+                missed += abs(change - (tried.utility - self.incumbent.utility))
+        return missed > MISTAKEN * told
 
     def _plain_gain(self, made: Candidate) -> float | None:
         """Return the gain predicted by the plain model; None if it mispredicts the incumbent."""

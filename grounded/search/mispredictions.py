@@ -137,16 +137,10 @@ def believed(
         trusted: whether corrected derivatives may be chosen; if not, they only serve as an
             alternative.
     """
-    own = seen(planner, incumbent, grounded)
-    if own is None:
+    known = neighbours(planner, incumbent, history, grounded)
+    if known is None:
         return Believed(grounded)
-    told = [t for t in history[-LATEST:] if t is not incumbent and np.isfinite(t.utility)]
-    told = [t for t in told if not strayed(t, incumbent)]
-    ran = [(o, t) for t in told if (o := seen(planner, t, grounded)) is not None]
-    moved = [apart(grounded, o.run, own.run) for o, _ in ran]
-    nearest = [ran[j] for j in np.argsort(moved, kind="stable") if moved[j] > 0]
-    if not nearest:
-        return Believed(grounded)
+    own, nearest = known
     others = [o for o, _ in nearest]
     refuting = [o for o, t in nearest[ASKED:] if t.candidate.of_corrected and t.lost]
 
@@ -155,10 +149,10 @@ def believed(
         rest = [o for o in others if o is not other]
         law, left = laws(own, rest or others, grounded)
         crude.append(unforetold(grounded, own, other))
-        share = 1.0 if law is None else unforetold(_with(law, own, grounded).problem, own, other)
+        share = 1.0 if law is None else unforetold(with_law(law, own, grounded).problem, own, other)
         corrected.append(share if rest else max(share, left))
     law, _ = laws(own, others, grounded)
-    made, near = _with(law, own, grounded), others[:ASKED]
+    made, near = with_law(law, own, grounded), others[:ASKED]
     off = unexplained = tuple(o.y for o in near)
     if law is not None:
         unexplained = tuple(
@@ -177,6 +171,21 @@ def believed(
     return replace(model, missed=missed, alternatives=both)
 
 
+def neighbours(
+    planner: Planner, incumbent: Tried, history: Sequence[Tried], grounded: Problem
+) -> tuple[Seen, list[tuple[Seen, Tried]]] | None:
+    """Return the incumbent's trial and the other ones, nearest first; None if there are none."""
+    own = seen(planner, incumbent, grounded)
+    if own is None:
+        return None
+    told = [t for t in history[-LATEST:] if t is not incumbent and np.isfinite(t.utility)]
+    told = [t for t in told if not strayed(t, incumbent)]
+    ran = [(o, t) for t in told if (o := seen(planner, t, grounded)) is not None]
+    moved = [apart(grounded, o.run, own.run) for o, _ in ran]
+    nearest = [ran[j] for j in np.argsort(moved, kind="stable") if moved[j] > 0]
+    return (own, nearest) if nearest else None
+
+
 def strayed(tried: Tried, best: Tried) -> bool:
     """Return whether runs left the neighbourhood in which mispredictions correct derivatives.
 
@@ -193,7 +202,8 @@ def _replays(problem: Problem, incumbent: Tried, grounded: Problem) -> bool:
     return -predicted(problem, policy).utility <= ASTRAY * cost
 
 
-def _with(law: Array | None, own: Seen, grounded: Problem) -> Believed:
+def with_law(law: Array | None, own: Seen, grounded: Problem) -> Believed:
+    """Return the grounded model with a law (H, n, 2 n + 2 m) added; None for no law."""
     if law is None:
         return Believed(grounded)
     made = Corrected(grounded.system, law, own.x, own.u, own.before)
@@ -218,13 +228,14 @@ def seen(planner: Planner, tried: Tried, grounded: Problem) -> Seen | None:
     z = augmented(grounded, trial.states, trial.inputs, past)
     u = grounded.queue.effective(z[:-1], trial.inputs)
     x = np.ascontiguousarray(trial.states[:-1])
-    moved = grounded.system.step(x, _sent(grounded, u), grounded.p, grounded.dt)
+    moved = grounded.system.step(x, received(grounded, u), grounded.p, grounded.dt)
     y = wrapped(trial.states[1:] - moved - grounded.bias, grounded.angles)
     run = (trial.states, trial.inputs)
     return Seen(x, u, np.vstack([u[:1], u[:-1]]), y, run, tried.candidate.policy)
 
 
-def _sent(problem: Problem, u: Array) -> Array:
+def received(problem: Problem, u: Array) -> Array:
+    """Return the inputs of the model for what the actuators received, u (H, m)."""
     return np.ascontiguousarray(u if problem.input_shift is None else u - problem.input_shift)
 
 
@@ -240,16 +251,11 @@ def laws(own: Seen, others: Sequence[Seen], grounded: Problem) -> tuple[Array | 
         The sum of the laws (H, n, 2 n + 2 m), or None if no trial differs from the incumbent's; and
         the share of the mispredictions that law 1 leaves in held-out parts of the run.
     """
-    span = input_span(grounded, own.u)
-    reach = np.ptp(own.x, axis=0) + 1e-9
-    moves = [_features(own, other, grounded) for other in others]
-    n, m = own.x.shape[1], own.u.shape[1]
-    far = np.array([_rms(d[:, :n] / reach) + _rms(d[:, n : n + m] / span) for d in moves])
-    near = [int(j) for j in np.argsort(far, kind="stable")[:NEAREST] if far[j] > 1e-9]
-    if not near:
+    d, y, far = moved_near(own, others, grounded)
+    if not len(far):
         return None, 1.0
-    d, y, far = np.array([moves[j] for j in near]), np.array([others[j].y for j in near]), far[near]
-    f_u, by_input = _matching(own, y / far[:, None, None], grounded, span)
+    n, m = own.x.shape[1], own.u.shape[1]
+    f_u, by_input = _matching(own, y / far[:, None, None], grounded, input_span(grounded, own.u))
     v = np.einsum("tmn,jtn->jtm", by_input, y)
     v_before = np.concatenate([np.zeros_like(v[:, :1]), v[:, :-1]], axis=1)
     D, missed = shared(np.concatenate([d[:, :, : n + 2 * m], v_before], axis=2), v, far)
@@ -259,6 +265,22 @@ def laws(own: Seen, others: Sequence[Seen], grounded: Problem) -> tuple[Array | 
     now = d[:, :, : n + m]
     law[:, :, : n + m] += shared(now, y - np.einsum("tnq,jtq->jtn", law, d), far)[0]
     return law, missed
+
+
+def moved_near(own: Seen, others: Sequence[Seen], grounded: Problem) -> tuple[Array, Array, Array]:
+    """Return what the nearest trials (j) that differ from the incumbent's show of the derivatives.
+
+    Returns:
+        Their differences in [x, u, u before, y before] (j, H, 2 n + 2 m), mispredictions (j, H, n),
+        and distances (j,), the nearest first.
+    """
+    span = input_span(grounded, own.u)
+    reach = np.ptp(own.x, axis=0) + 1e-9
+    moves = [_features(own, other, grounded) for other in others]
+    n, m = own.x.shape[1], own.u.shape[1]
+    far = np.array([_rms(d[:, :n] / reach) + _rms(d[:, n : n + m] / span) for d in moves])
+    near = [int(j) for j in np.argsort(far, kind="stable")[:NEAREST] if far[j] > 1e-9]
+    return np.array([moves[j] for j in near]), np.array([others[j].y for j in near]), far[near]
 
 
 def _features(own: Seen, other: Seen, grounded: Problem) -> Array:
@@ -276,7 +298,7 @@ def _matching(own: Seen, y: Array, grounded: Problem, span: Array) -> tuple[Arra
     """Return f_u (H, n, m) along the incumbent, and its weighted pseudo-inverse (H, m, n)."""
     scale = np.sqrt(np.mean(y**2, axis=(0, 1)))
     scale = np.maximum(scale, 1e-6 * scale.max()) + 1e-300
-    _, f_u = grounded.system.linearise(own.x, _sent(grounded, own.u), grounded.p, grounded.dt)
+    _, f_u = grounded.system.linearise(own.x, received(grounded, own.u), grounded.p, grounded.dt)
     B = f_u * span / scale[:, None]
     gram = np.einsum("tni,tnj->tij", B, B)
     dead = DEAD * float(np.trace(gram, axis1=1, axis2=2).mean()) / len(span) + 1e-300

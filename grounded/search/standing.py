@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from grounded.errors import NextCommand
 from grounded.result import Result, document, figure, html_table, spread
-from grounded.search.candidate import LITTLE, Candidate, Tried, Way
+from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Tried, Way
 from grounded.search.certainty import LUCK, error_between, judged, last_improvement
 from grounded.search.scatter import Repeats
 from grounded.search.step_size import SearchOptions, Step, losers_of
@@ -284,6 +284,8 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
     gained = best.utility - old.utility
     if gained == 0.0:
         return "no step improved", f"the last {PATIENCE} candidates did not improve"
+    if any(t.candidate.way == BY_STEP for t in last) and before[-1].candidate.way != BY_STEP:
+        return None  # the others say nothing about steps with these derivatives
     told = f"the last {PATIENCE} candidates gained {gained:.3g} in total, less than"
     if gained < PATIENCE * tolerance * abs(best.utility):
         return (

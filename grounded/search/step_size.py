@@ -42,7 +42,7 @@ import numpy as np
 from grounded.errors import GroundedError, nearest
 from grounded.frozen import whole_number
 from grounded.result import figure
-from grounded.search.candidate import Candidate, Slopes, Tried, Way
+from grounded.search.candidate import BY_STEP, Candidate, Slopes, Tried, Way
 
 KEPT, BROKEN = 0.9, 0.25
 EASED, RAISED = 30.0, 10.0
@@ -51,6 +51,7 @@ BOLDER = 3  # factors of 10 below the due damping, tried if the due step and all
 Method = Literal["ddp", "policy-gradient"]
 Stepping = Literal["damped", "full"]
 METHODS, STEPS = get_args(Method), get_args(Stepping)
+OTHERS = 2  # losses from a candidate before its derivatives are corrected step by step
 OTHER_WAY = 2  # losses of the way that comes second, before it is given up
 
 
@@ -109,6 +110,8 @@ class SearchOptions:
             bias; False for the paper's bias alone.
         max_halvings: smallest step size is alpha = 2^-max_halvings, 0 to 30.
         repeats: trials of each candidate, 1 to 100.
+        slopes_by_step: after two losses, also correct the derivatives of each step of the run by
+            themselves (`by_step`); False for laws of the whole run only.
         rerun_incumbent: run the best candidate again if a loss to it may be due to noise.
         max_trials: the search stops after this many trials.
         tolerance: the search ends when the model predicts a smaller relative gain, 0 to below 1.
@@ -121,6 +124,7 @@ class SearchOptions:
     step: Stepping = "damped"
     refit: bool = False
     match_inputs: bool = True
+    slopes_by_step: bool = True
     max_halvings: int = 6
     repeats: int = 1
     rerun_incumbent: bool = True
@@ -134,7 +138,7 @@ class SearchOptions:
                     f"[search] {name}: {given!r} is not one of the choices: "
                     + nearest(str(given), valid)
                 )
-        for name in ("refit", "match_inputs", "rerun_incumbent"):
+        for name in ("refit", "match_inputs", "slopes_by_step", "rerun_incumbent"):
             if not isinstance(given := getattr(self, name), bool | np.bool_):
                 raise GroundedError(f"[search] {name} must be True or False, got {given!r:.60}")
         bounds = {"max_halvings": (0, 30), "repeats": (1, 100), "max_trials": (1, 100_000)}
@@ -183,15 +187,23 @@ class SearchOptions:
         """
         made = incumbent.candidate
         losers = losers_of(history, made.id, model, way)
+        goes_on = made.way == way and made.model == model
+        if way == BY_STEP:
+            enough = goes_on or len(losers_of(history, made.id, model)) >= OTHERS
+            if not (self.damps and self.slopes_by_step and enough):
+                return None
         if slopes is not None:
             losers = [candidate for candidate in losers if candidate.slopes == slopes]
-        if way != self.ways(made)[0] and (incumbent.standard_error > 0 or len(losers) >= OTHER_WAY):
+        if way != self.ways(made)[0] and (
+            incumbent.standard_error > 0 or (len(losers) >= OTHER_WAY and not goes_on)
+        ):
             return None  # where trials scatter, one way is enough to be told from luck
         if losers:
             return self.next_step(Step(losers[-1].damping, losers[-1].alpha))
         base = next((t for t in history if t.candidate.id == made.base), None)
-        if base is None or made.model != model or made.way != way or not self.damps:
-            return self.first_step()
+        if base is None or not goes_on or not self.damps:
+            first = self.first_step()
+            return self.next_step(first) if way == BY_STEP else first
         real = incumbent.utility - base.utility
         return after_success(Step(made.damping, made.alpha), made.predicted_gain, real)
 

@@ -24,7 +24,7 @@ from grounded.search.standing import _hardly
 
 def tried(*utilities, accepted=True, base="c0001"):
     nothing = {"expected_of_base": np.nan, "base_as_run": np.nan}
-    candidate = SimpleNamespace(id="c", base=base, model="m", **nothing)
+    candidate = SimpleNamespace(id="c", base=base, model="m", way="", **nothing)
     return Tried(candidate=candidate, trials=(), utilities=utilities, accepted=accepted)
 
 
