@@ -12,6 +12,7 @@ from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.hypotheses.attribution import attribute
 from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.report import Diagnosis, Ranked, Unconfirmed, Verdict
 from grounded.diagnosis.unconfirmed import marked, unconfirmed
 from grounded.diagnosis.validation import decide as decide_module
@@ -174,7 +175,7 @@ def test_without_a_calibration_effects_are_weighed_against_effects_without_one(w
 
 
 def test_noise_that_absorbs_an_effect_is_no_evidence_against_it(wavy, ruler):
-    """Strangers read claims of -57 and -100 nats, tied with effects that predictions had refused."""
+    """Strangers read claims of -57 nats, tied with effects that predictions had refused."""
     search, best = copy(wavy[0]), wavy[1]
     search.fits = dict(search.fits)
     h = replace(best.hypothesis, shift=None, spread=0.0)
