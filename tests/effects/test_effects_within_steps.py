@@ -7,6 +7,8 @@ from grounded import Model, Trial
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.validation.ahead import missed
 from grounded.effects import Library, wrap
 from grounded.effects.actuator import first_order_lag, rate_limit
 from grounded.effects.memory import lead_of_shift
@@ -46,7 +48,7 @@ def commands_of(seed, count=150):
     return np.repeat(rng.uniform(-1, 1, count // 3), 3) + 0.2 * rng.standard_normal(count)
 
 
-def trial(name, value, seed):
+def trial(name, value, seed, noise=1.0):
     """A joint simulated in fine parts, with an encoder of 1e-5 rad."""
     u, x, states = commands_of(seed), np.zeros(2), [np.zeros(2)]
     for row in received(name, value, u):
@@ -56,7 +58,7 @@ def trial(name, value, seed):
             x = x + h * np.array([x[1] + 0.5 * h * rate, rate * (1 - 0.2 * h)])
         states.append(x)
     rng = np.random.default_rng(seed + 100)
-    y = np.array(states) + np.array([1e-5, 2e-4]) * rng.standard_normal((len(u) + 1, 2))
+    y = np.array(states) + noise * np.array([1e-5, 2e-4]) * rng.standard_normal((len(u) + 1, 2))
     return Trial(y, u[:, None], DT, ("q", "w"), ("torque",), start_inputs=u[:1])
 
 
@@ -103,3 +105,14 @@ def test_an_adopted_lag_moves_positions_as_the_actuator_does():
         path.append(x)
     off = np.diff(np.array(path)[:, 0] - data.y[:, 0, 0])
     assert off.std() < 2.5e-5  # of which encoders make 1.4e-5
+
+
+def test_predictions_a_second_ahead_know_what_arrives_within_a_step():
+    name, value = CASES[1]
+    data = prepare(joint, [trial(name, value, 1, noise=0.0)], np.zeros(1))
+    effect = LIBRARY.effect(f"{name}:torque", joint, data.scales)
+    h = Hypothesis().plus(effect, {"d": value})
+    moments = np.arange(0, 90, 10)
+    one = np.zeros(len(moments), int)
+    off = missed(Predictor(data), [h], one, data.y, moments, one, 50)[-1]
+    assert np.abs(off[:, 0]).max() < 3e-5  # 3e-4 from means alone

@@ -40,7 +40,13 @@ def stepper(predictor: Predictor, h: Hypothesis) -> Callable[[Array, Array, Arra
     p = predictor.params(h)
     if p.ndim > 1 or adds_to_steps(h):
         return lambda x, u, t: predictor.advance(h, x, u, t)
-    return lambda x, u, t: model.system.step(x, u, p, dt)
+
+    def plainly(x: Array, u: Array, t: Array) -> Array:
+        if u.shape[-1] > model.m:
+            return predictor.advance(h, x, u, t)
+        return model.system.step(x, u, p, dt)
+
+    return plainly
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -55,6 +61,7 @@ class Carried(Predictor):
         if dt is not None or not pairs or moving(h, self.seen):
             return super().moved(h, x, u, dt)
         inputs, seen, p = self.data.model.input_names, self.seen, self.params(h)
+        u = u[..., : len(inputs)]  # leads would take two more calls of the simulator
         drives = [inputs.index(coupled(effect.site)[0]) for effect, _ in pairs]
         lost = self.memory.get("lost", np.zeros((*x.shape[:-1], len(inputs))))
         before = u - lost

@@ -95,7 +95,7 @@ class Predictor(SentOnce):
         """
         acting, each = self.acting(h), range(self.data.model.m)
         found = [self._input(acting, j, "input", arriving) for j in each]
-        if within_steps(acting, self.data) and self.positions:
+        if self._led_by(acting):
             found += [self._input(acting, j, "lead", leading) for j in each]
         return np.stack(found, axis=-1)
 
@@ -107,17 +107,26 @@ class Predictor(SentOnce):
         on_it = [one for one in acting if name in one[0].site.targets]
         return self._kept(f"{what} {j}", on_it, lambda: data.runs_in_use(made(on_it, data, j)))
 
-    def received(self, h: Hypothesis) -> Array:
-        """Return the received inputs of whole trials, (S, T_max, m); zero if no run is kept."""
-        acting = self.acting(h)
+    def received(self, h: Hypothesis, *, leads: bool = False) -> Array:
+        """Return the received inputs of whole trials, (S, T_max, m); zero if no run is kept.
+
+        leads: add the m columns that `inputs` adds, if there are any.
+        """
+        acting, data = self.acting(h), self.data
+        makers = [arriving, leading] if leads and self._led_by(acting) else [arriving]
 
         def make() -> Array:
-            data, whole = self.data, np.zeros_like(self.data.commands)
-            for j in range(data.model.m):
-                whole[data.used, :, j] = arriving(acting, data, j)
+            whole = np.zeros((*data.commands.shape[:2], len(makers) * data.model.m))
+            for k, made in enumerate(makers):
+                for j in range(data.model.m):
+                    whole[data.used, :, k * data.model.m + j] = made(acting, data, j)
             return whole
 
-        return self._kept("trials", acting, make)
+        return self._kept(f"trials {len(makers)}", acting, make)
+
+    def _led_by(self, acting: Acting) -> bool:
+        """Check whether inputs may change within a step, in a model with positions."""
+        return within_steps(acting, self.data) and bool(self.positions)
 
     def begun(self, h: Hypothesis) -> Array | None:
         """Return what effects on inputs add to the initial memory states, by run (B, n).

@@ -14,7 +14,7 @@ import numpy as np
 from grounded.diagnosis.likelihood.carried import stepper
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, by_row
-from grounded.diagnosis.likelihood.marching import marched
+from grounded.diagnosis.likelihood.marching import LONG, marched
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.frozen import Array
 
@@ -53,9 +53,12 @@ def missed(
     t = np.minimum(step + np.arange(steps)[:, None], last - 1)
     each = [(h, np.flatnonzero(which == i)) for i, h in enumerate(hypotheses)]
     each = [(h, own) for h, own in each if len(own)]
-    sent, begin = np.empty((*t.shape, data.model.m)), dict[int, int]()
+    sent, begin = np.empty((*t.shape, 0)), dict[int, int]()
     for h, own in each:
-        sent[:, own] = predictor.received(h)[trial[own], t[:, own]]
+        by_trial = predictor.received(h, leads=steps < LONG)  # longer ones are compiled, without
+        if not sent.shape[-1]:
+            sent = np.empty((*t.shape, by_trial.shape[-1]))
+        sent[:, own] = by_trial[trial[own], t[:, own]]
         delays = delays_of(h, data)  # sensors may show states from before the start
         begin[id(h)] = 0 if delays is None else delays.oldest
     oldest = max(begin.values())
@@ -86,6 +89,8 @@ def _marched(
     predictor: Predictor, each: Sequence[tuple[Hypothesis, Any]], x: Array, sent: Array
 ) -> Array | None:
     """Return compiled rollouts (steps + 1, M, n); None if not compiled, or one diverges."""
+    if sent.shape[-1] > predictor.data.model.m:
+        return None
     found = np.empty((len(sent) + 1, *x.shape))
     for h, own in each:
         z = predictor.marched(h, x[own], sent[:, own])
