@@ -31,8 +31,9 @@ def interruptible(so_far: Callable[[], str]) -> Iterator[None]:
 class Stages:
     """Reports each stage with the time taken and the time that is left, from the number of calls.
 
-    The number of calls is known within wide limits only: whether a diagnosis looks for one more
-    effect depends on what the last one left. So the time left is told as a range.
+    The number of calls is known within wide limits only: it grows with the data, and whether a
+    diagnosis looks for one more effect depends on what the last one left. So the time left is told
+    as a range, and not at all after more calls than most computations take.
 
     Args:
         tell: shows a line; None for no output.
@@ -52,9 +53,7 @@ class Stages:
             return
         taken = time.monotonic() - self.began
         text = f"{stage}, {_told(taken)} so far"
-        if self.count > self.usual[1]:
-            text += ", longer than usual"
-        elif self.count > SEEN:
+        if SEEN < self.count <= self.usual[1]:  # beyond, nothing is known of what is left
             least, most = (taken * (n / self.count - 1) for n in self.usual)
             text += f", {_range(max(least, 0.0), most)} left"
         self.tell(text)
