@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded.errors import NextCommand
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, names_in, show, show_json
@@ -55,4 +54,4 @@ def _tell(done: SetAside, json_: bool) -> None:
             show(f"{name} was not set aside; nothing was changed")
     for name, why in done.discarded.items():
         show(field("discarded", f"{name}{why and ': ' + why}"))
-    show(f"\n{next_line(NextCommand('status'))}")
+    show(f"\n{next_line(done.then)}")

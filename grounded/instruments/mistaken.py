@@ -178,8 +178,10 @@ def mended_by(model: Model, told: Told) -> str:
         return SWAP_BACK
     tables = listed(f"[log.input.{model.input_names[j]}]" for j in told.mistake.inputs)
     by = f"{1 / told.mistake.factor:.6g}"
-    limits = "as well" if told.mistake.factor > 1 else "if they were taken from the log"
-    return f"Multiply the scale in {tables} by {by} (a missing scale is 1), and [limits] {limits}"
+    return (
+        f"Multiply the scale in {tables} by {by} (a missing scale is 1), and [limits] if they were "
+        "taken from the log"
+    )
 
 
 def described(model: Model, told: Told) -> str:

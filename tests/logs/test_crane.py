@@ -7,6 +7,7 @@ from cli import grounded
 from grounded_trials import Workspace
 from grounded_trials.logs.joint_names import joint_units, slides
 from grounded_trials.starting.begin import begin
+from grounded_trials.workspace.next_step import to_plan
 from grounded_trials.workspace.off_target import logged_target
 from ros_bags import crane_bag
 
@@ -101,6 +102,8 @@ def test_a_crane_from_its_log_to_its_target(tmp_path):
     taken = grounded("-C", w, "ingest", "--data", log).out
     assert all(unit in taken for unit in (" m/s\n", " rad\n", " V\n", "header stamps"))
     assert logged_target(Workspace(w)) == "t0001"
+    grounded("-C", w, "discard", "t0001")  # to read it in another unit: the target is the old run
+    assert logged_target(Workspace(w)) == "t0001" and to_plan(Workspace(w)).verb == "target"
     drawn = grounded("-C", w, "target", "line", "--to", "x=1", "--seconds", "3").out
     assert "--to th=0" in drawn
     assert logged_target(Workspace(w)) == ""

@@ -64,6 +64,7 @@ def test_discard_and_restore_report_what_they_did_not_change(ran):
     assert ran.discard("t0001", why="a dog").unchanged == ()
     assert ran.discard("t0001").unchanged == ("t0001",)
     again = ran.discard("t0001", why="a cat")
+    assert again.then == ran.status().then and again.then.verb != "status"
     assert again.unchanged == () and again.discarded == {"t0001": "a cat"}
     with pytest.raises(GroundedError, match="set aside") as refused:
         ran.export("t0001")

@@ -378,9 +378,9 @@ class Workspace(Folder):
             trials: short names such as t0004.
             why: the reason, stored with the note.
         """
-        from grounded_trials.workspace.identity import set_aside
+        from grounded_trials.workspace.discarding import discard_in
 
-        return set_aside(self.forget(), "discard", trials, why)
+        return discard_in(self.forget(), trials, why)
 
     def restore(self, *trials: str) -> SetAside:
         """Undo `discard` for some trials."""

@@ -89,6 +89,18 @@ def test_logs_are_not_said_to_be_at_limits_that_were_read_off_one(tmp_path):
     assert at_limits()["force"] > 0.5
 
 
+@pytest.mark.parametrize(("most", "far"), [(0.0204, True), (0.9, False)])
+def test_limits_far_beyond_all_that_was_sent_are_not_the_range_of_a_log(tmp_path, most, far):
+    """Limits in degrees were `only the range used in drive.mcap`, which was corrected to rad."""
+    seen = NARROW.replace("force = [0.0, 1.17]", 'force = [0.0, 1.17]\nseen_in = "a.csv"')
+    w = Workspace(make(tmp_path / "w", config=seen).folder)
+    write_trial(tmp_path / "d.mcap", driven(most), {"kind": "data"})
+    w.ingest(tmp_path / "d.mcap", data=True)
+    (note,) = (one for one in w.propose().proposal.notes if "seen_in" in one)
+    assert holds(note, "57.4 times", "(0.0204 N)", "unit") is far
+    assert ("only the range used in a.csv" in note) is not far
+
+
 def test_a_side_without_a_limit_has_no_beyond(w):
     free = replace(w.task, low=np.array([-np.inf]), high=np.array([np.inf]))
     assert not beyond_limits(free, driven(1e6).inputs).any()

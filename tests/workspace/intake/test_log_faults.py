@@ -74,5 +74,6 @@ def test_a_command_in_degrees_is_named_with_its_own_table():
     y = np.array(x) + 1e-3 * np.random.default_rng(1).standard_normal((401, 2))
     trial = Trial(y, np.degrees(rudder), 0.1, ("psi", "r"), ("rudder",))
     (fault,) = _degrees(boat, trial)
+    assert (fault.inputs, fault.factor) == (("rudder",), pytest.approx(57.29578))
     assert fault.said.startswith("rudder ")
     assert holds(fault.mend, "[log.input.rudder]", "0.017453293") and "rad" in fault.program

@@ -5,7 +5,7 @@ import pytest
 
 from cli import grounded
 from facts import holds
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.intake.foreign import mapping_of, read_foreign
@@ -97,6 +97,38 @@ def test_a_yaw_in_degrees_beside_its_rate_is_told_at_once(w, tmp_path):
     np.savetxt(path, rows, "%.6f", ",", header="t,v,r,psi,port,starboard", comments="")
     (warning,) = w.ingest(path, data=True).warnings
     assert holds(warning, "psi", "degrees", "[log.state.psi]", "0.017453293")
+
+
+@pytest.mark.parametrize(("most", "wrong"), [(100.0, True), (1.0, False)])
+def test_limits_in_the_wrong_unit_of_a_log_are_told_with_the_right_ones(tmp_path, most, wrong):
+    """Once the scale was corrected, limits from the log in degrees allowed a steer of 22.9 rad."""
+    config = CONFIG.replace("[-1.0, 1.0]", f"[-{most}, {most}]")
+    w = Workspace(make(tmp_path / "w", config=config, model=MODEL, target=TARGET).folder)
+    (warning,) = w.ingest(log(w, tmp_path / "a.csv", scale=100.0), data=True).warnings
+    assert ("write port = [-1, 1], starboard = [-1, 1] there, then discard" in warning) is wrong
+
+
+@pytest.mark.parametrize("here", [True, False])
+def test_a_log_in_a_wrong_unit_is_to_be_ingested_again_once_it_is_discarded(
+    w, tmp_path, monkeypatch, here
+):
+    """`next: status`, it said, after a warning to ingest the log again."""
+    path = log(w, tmp_path / "a.csv", scale=100.0)
+    w.ingest(path, data=True)
+    (tmp_path / "b").mkdir()
+    monkeypatch.chdir(tmp_path / "b")
+    if not here:
+        path = path.rename(tmp_path / "b" / "elsewhere.csv")
+    done = w.discard("t0001")
+    assert done.then == NextCommand("ingest", ("../a.csv" if here else "LOG", "--data"))
+    said = grounded("-C", w.folder, "discard", "t0001").out.replace("\\\n", "").split()
+    assert said[-3:] == ["ingest", *done.then.arguments]
+    toml = w.folder / "grounded.toml"
+    toml.write_text(toml.read_text().replace('port" }', 'port", scale = 0.01 }'))
+    toml.write_text(toml.read_text().replace('starboard" }', 'starboard", scale = 0.01 }'))
+    again = Workspace(w.folder).ingest(path, data=True)
+    assert (again.trial, again.warnings) == ("t0002", ())
+    assert Workspace(w.folder).discard("t0002").then == NextCommand("status")
 
 
 def test_percent_is_told_with_the_scale_and_a_scale_mends_it(w, tmp_path):

@@ -45,6 +45,7 @@ CLOSER, ENOUGH = 10.0, 0.6  # factor tried on the position's weights; share of t
 PIECES = 10  # pieces of the plan in which the effect of noise is computed
 OFTEN = 4  # jumps over half the range of an input; a quick manoeuvre has two or three
 SOMEWHERE = 1.5  # ratio of the noise in one piece to the whole above which its time is reported
+FAR = 5.0  # times the largest command in any stored log: limits beyond it may be in another unit
 OTHER = 1.5  # ratio of weights above which a weight was made for other [limits]
 
 
@@ -77,8 +78,8 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
         )
     if log := seen_in(workspace.config):
         found.append(
-            f"[limits] are only the range used in {log}: enter the robot's real limits"
-            + ", then delete seen_in there"
+            f"{_never_sent(workspace) or f'[limits] are only the range used in {log}'}: enter the "
+            "robot's real limits, then delete seen_in there"
             + "; and draw the manoeuvre (`target`): target.csv is the run in that log"
             * still_logged(workspace)
         )
@@ -113,6 +114,20 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
             f"{task.horizon + 1}: the plan ends after {task.horizon * task.dt:g} s"
         )
     return found
+
+
+def _never_sent(workspace: Folder) -> str:
+    """Return which [limits] are FAR beyond all that was sent, as if in another unit; or ""."""
+    task = workspace.task
+    logs = [one.trial for one in workspace.whole_trials() if workspace.fits(one.trial)]
+    told = []
+    for j, (name, unit) in enumerate(task.model.inputs.items() if logs else ()):
+        sent = max(float(np.abs(t.inputs[: t.known_steps, j]).max(initial=0.0)) for t in logs)
+        most = max(abs(float(task.low[j])), abs(float(task.high[j])))
+        if np.isfinite(most) and 0 < FAR * sent < most:
+            times, size = f"{most / sent:.3g} times", with_unit(f"{sent:.4g}", unit)
+            told.append(f"of {name} reach {times} as far as it was ever sent ({size})")
+    return f"[limits] {' and '.join(told)}, so check their unit" if told else ""
 
 
 def _chosen(workspace: Folder) -> bool:

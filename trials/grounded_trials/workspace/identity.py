@@ -54,6 +54,7 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "likely_off": float,
     "seen": lambda text: tuple(filter(None, text.split(","))),
 }
+STATUS = NextCommand("status")
 T = TypeVar("T")
 MOST_KNOWN = 4  # files of candidates about which something is kept
 _ABSENT = {
@@ -166,6 +167,7 @@ class SetAside(Result):
     trials: tuple[str, ...]
     discarded: dict[str, str]  # t0004 -> why
     unchanged: tuple[str, ...] = ()  # those of `trials` that were in this state before
+    then: NextCommand = STATUS
 
     def summary(self) -> str:
         """Return all trials that are set aside."""

@@ -234,20 +234,22 @@ def began_elsewhere(
 def logged_target(workspace: Folder) -> str:
     """Return the trial whose states target.csv still repeats, as `init --from` wrote it; or "".
 
-    Only trials that ran no candidate count; the target must equal their states row by row.
+    Only trials that ran no candidate count, also those that are set aside: a log in a wrong unit is
+    ingested again, but target.csv is the run as it was first read. The target must equal their
+    states row by row.
     """
     if not workspace.config.task.target:
         return ""
     task = workspace.task
     asked = np.isfinite(task.target).any(axis=0)
-    for stored in workspace.whole_trials():
-        trial, rows = stored.trial, len(task.target)
-        if trial.candidate or trial.steps + 1 < rows or trial.dt != task.dt:
+    for trial in (*(one.trial for one in workspace.whole_trials()), *workspace.aside_trials()):
+        rows = len(task.target)
+        if trial.candidate or trial.steps + 1 < rows or not workspace.fits(trial):
             continue
         off = np.abs(trial.states[:rows, asked] - task.target[:, asked])
         moved = np.ptp(task.target[:, asked], axis=0).max(initial=0.0)
         if moved > 0 and off.size and np.nanmax(off) < WRITTEN * moved:
-            return trial.id or stored.stored.id
+            return trial.id
     return ""
 
 

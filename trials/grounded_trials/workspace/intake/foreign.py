@@ -262,7 +262,7 @@ def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignL
     missing += [i for i in model.input_names if i not in mapping.inputs]
     if missing:
         raise _unmapped(model, mapping, missing[0], path, estimated=estimate is not None)
-    source = {"source": path.name, "source_sha256": _hashed(files)}
+    source = {"source": path.name, "source_sha256": hashed(files)}
     source |= read_by(mapping)
     if guessed := [name for name in model.state_names if name not in states]:
         source["estimated"] = ",".join(guessed)
@@ -305,7 +305,7 @@ def _numbers(path: Path) -> str:
     return f". {path.name} has {', '.join(found)}" if 0 < len(found) <= FEW else ""
 
 
-def _hashed(files: Sequence[Path]) -> str:
+def hashed(files: Sequence[Path]) -> str:
     """Return the SHA-256 of a log's file, or of the hashes if it has several files."""
     hashes = [hash_file(file) for file in files]
     return hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode())

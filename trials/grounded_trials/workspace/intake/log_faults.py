@@ -25,6 +25,7 @@ ABOUT = {"x": "roll", "y": "pitch", "z": "yaw", "w": "yaw"}  # the angle closest
 SMALL = 2.0  # a scale of 2 is intended: 2 sin(a / 2) is a for small angles
 # multiples of [safety]: an angle beyond TURNS as radians, but inside WIDER as degrees, is suspect
 TURNS, WIDER = 5.0, 2.0
+COVER = 0.9  # share of the largest command in a log that [limits] in its unit must reach
 
 
 @dataclass(frozen=True)
@@ -36,12 +37,14 @@ class Fault:
         mend: what to change in [log], an imperative; "" if `said` includes it.
         program: what the program that writes trials should do instead; "" if `said` includes it.
         inputs: the inputs that are in another unit.
+        factor: how many times too large these are, below 1 too small.
     """
 
     said: str
     mend: str = ""
     program: str = ""
     inputs: tuple[str, ...] = ()
+    factor: float = 1.0
 
     def told(self, trial: Trial, *, own: bool) -> str:
         """Return the warning; `own` is for a trial that was written by grounded, not a log."""
@@ -73,7 +76,27 @@ def log_faults(workspace: Folder, trial: Trial) -> tuple[Fault, ...]:
     found += degrees or _beyond_safety(workspace.task, trial)
     found += _clocks_apart(workspace, trial)
     found += mistaken_in(model, known)
-    return tuple(found)
+    return tuple(_with_limits(workspace.task, known, one) for one in found)
+
+
+def _with_limits(task: Task, known: Trial, fault: Fault) -> Fault:
+    """Add the values to write for [limits] that are in the same wrong unit as a log's inputs.
+
+    [limits] in the wrong unit reach as far as the wrong log. If the inputs are too small, they do
+    not reach as far as the corrected log.
+    """
+    right = []
+    for name in fault.inputs:
+        j = known.input_names.index(name)
+        ends, sent = (task.low[j], task.high[j]), np.abs(known.inputs[:, j]).max(initial=0.0)
+        most, needed = max(map(abs, ends)), COVER * sent / min(fault.factor, 1.0)
+        if np.isfinite(most) and (most >= needed) == (fault.factor > 1):
+            low, high = (f"{end / fault.factor:.4g}" for end in ends)
+            right.append(f"{name} = [{low}, {high}]")
+    if not right:
+        return fault
+    unit = "reach as far as the log" if fault.factor > 1 else "do not reach as far as that log"
+    return replace(fault, mend=f"{fault.mend}; [limits] {unit}: write {', '.join(right)} there")
 
 
 def _exchanged(model: Model, known: Trial) -> Iterator[Fault]:
@@ -160,6 +183,8 @@ def _degrees(model: Model, known: Trial) -> list[Fault]:
             f"{one.signal}] by {one.log.split(' = ')[1]} (a "
             "missing scale is 1)",
             f"write {units[one.signal]}",
+            (one.signal,) if one.signal in model.inputs else (),
+            one.scale,
         )
         for one in findings
         if one.kind == "degrees" and one.log
@@ -223,7 +248,8 @@ def mistaken_in(model: Model, known: Trial) -> list[Fault]:
     scaled = () if told.mistake.swap else told.mistake.inputs
     names = tuple(model.input_names[j] for j in scaled)
     should = "write inputs in the model's unit" * bool(names)
-    return [Fault(described(model, told), mended_by(model, told), should, names)]
+    factor = told.mistake.factor
+    return [Fault(described(model, told), mended_by(model, told), should, names, factor)]
 
 
 def no_angles(model: Model, mapping: LogMapping | None) -> Mapping[str, str]:
