@@ -708,7 +708,7 @@ def test_an_ended_search_asks_for_a_diagnosis_until_a_newer_one_is_made(
 def test_what_was_diagnosed_and_adopted_is_not_diagnosed_again(
     cart, tmp_path, monkeypatch, runs, then
 ):
-    """A car's: diagnose, adopt, propose: `nothing to run ... diagnose the model. next: diagnose`."""
+    """Diagnose, adopt, propose, and `nothing to run ... or diagnose the model. next: diagnose`."""
     folder = copied(cart, tmp_path / "w")
     w = Workspace(folder)
     now = w.status().standing

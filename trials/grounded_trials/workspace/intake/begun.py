@@ -85,7 +85,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     cost = real if np.isfinite(real) and not failed else -_promised(workspace, trial)
     lost, scatter = _lost_by(workspace, trial), _scatter(workspace, trial, cost)
     spoils, tolerated = list[int](), list[int]()
-    for i in sorted(np.flatnonzero(told), key=lambda i: (weight[i] == 0, -share[i])):
+    for i in sorted(np.flatnonzero(told).tolist(), key=lambda i: (weight[i] == 0, -share[i])):
         changes = _changes(workspace, trial, off * (np.arange(len(off)) == i))
         if abs(changes) > scatter and (abs(changes) > SPOILT * cost or 0 < lost < -changes):
             spoils.append(i)
