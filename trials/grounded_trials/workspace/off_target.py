@@ -32,6 +32,7 @@ WRITTEN = 1e-3  # tolerance for target.csv, relative to its range, due to the di
 EXACT = 1e-4  # share of the largest error below which a plan's end is on target
 FARTHER = 1.1  # of the error before: a better candidate's larger error is explained
 STEPS, STEPPED = 3, 0.3  # values that a sensor repeats, their share of its rows: it has steps
+NARROW = 0.25  # of the median gap of repeated values: one beside an interpolated value is smaller
 RATES = ("speed", "heading_rate", "rates")  # roles of velocities
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
 
@@ -249,7 +250,8 @@ def _resolution(trials: Sequence[Trial]) -> Array:
         values, times = np.unique(column[np.isfinite(column)], return_counts=True)
         again = values[times > 1]
         if len(again) >= STEPS and times[times > 1].sum() > STEPPED * len(column):
-            found[i] = np.median(np.diff(again))
+            gaps = np.diff(again)
+            found[i] = gaps[gaps > NARROW * np.median(gaps)].min()
     return found
 
 
