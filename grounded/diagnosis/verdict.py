@@ -298,10 +298,10 @@ def _moved(claims: Claims, adopted: Collection[str]) -> str:
             again.setdefault(effect, {})[key] = text
         else:
             texts.append(f"{name} should be {give_or_take(known[name])}{part}")
-    own = f"{OWN} are off: {', '.join(texts)}" if texts else ""
+    own = f"{OWN} are off: {', '.join(texts)}" if texts or not again else ""
     off = ", ".join(_adopted_off(claims, name, told) for name, told in again.items())
     off = f"the adopted effects have other values: {off}" if off else ""
-    parts = (off, own) if _effect_of(named[0], adopted) else (own, off)
+    parts = (off, own) if named and _effect_of(named[0], adopted) else (own, off)
     more = len(named) - NAMED
     return "; ".join(filter(None, parts)) + (f" and {more} more" if more > 0 else "")
 
