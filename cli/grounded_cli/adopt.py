@@ -8,7 +8,7 @@ import click
 
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
-from grounded_cli.terminal import field, number, remark, sentence, show, show_json
+from grounded_cli.terminal import LABEL, field, number, remark, sentence, show, show_json
 from grounded_trials.wording import ALONE, misread, moved, with_unit
 
 if TYPE_CHECKING:
@@ -100,6 +100,11 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
         text = moved(before[name].value, value, before[name].unit, DIGITS)
         text += ALONE * (name in done.jointly)
         show(field(name, text, "  "))
+    if done.rewritten:
+        show("rewritten in [model] effects, fitted again beside the others:")
+        width = max(LABEL, *(len(one.called) for one in done.rewritten))
+        for new in done.rewritten:
+            show(field(new.called, moved(new.was, new.now, new.unit, DIGITS), "  ", width))
     for one in done.left.values():
         kept, beside = (with_unit(number(value), one.unit) for value in (one.kept, one.value))
         text = f"{one.called} stays at {kept}: these trials do not determine it"

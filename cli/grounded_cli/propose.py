@@ -117,9 +117,9 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
     """Return the best one's utility and, if it differs clearly, what the model gives it and why.
 
     The difference is split into three parts: the start (the model's own run starts at s_0, the real
-    ones elsewhere, if by more than sensor noise), the mean of several runs (which the model
-    replays: it costs less than they do, because their scatter is averaged out), and the rest, which
-    is compared with the scatter of its runs if that is known.
+    ones elsewhere, if by more than their sensors show), the noise in the runs' mean (which the
+    model replays: it costs less than they do, because their scatter is averaged out), and the rest,
+    which is the model's own error if it exceeds the scatter of the runs, if that is known.
     """
     from grounded.trial import mean_trial
     from grounded_trials.workspace.off_target import began_elsewhere
@@ -131,6 +131,8 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
     own = f"{text}. For {best.candidate.id} itself the model predicts {number(same)}"
     if same < ASTRAY * best.utility:
         return f"{own}, so it does not reproduce those runs"
+    better = "better" if same > best.utility else "worse"
+    own += f", {number(abs(same - best.utility))} {better} than measured"
     if not math.isfinite(candidate.base_as_run):
         return own
     elsewhere = began_elsewhere(task, best.trials, estimated)
@@ -138,20 +140,21 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
     each = [task.utility(trial) for trial in best.trials]
     mean = task.utility(mean_trial(best.trials, task.model.angle_mask)) - sum(each) / len(each)
     reasons = (
-        (start, f"its runs began away from [task] start in {listed(elsewhere)}"),
-        (mean, "it replays their mean, without their scatter"),
+        (start, f"because its runs began off [task] start, by {listed(elsewhere.values())}"),
+        (mean, "by noise in the runs, which the model leaves out"),
     )
     parts = [(part, why) for part, why in reasons if abs(part) > told]
     rest = same - best.utility - sum(part for part, _ in parts)
     if math.isfinite(best.standard_error):
         within = abs(rest) <= LUCKY * best.standard_error
-        parts.append((rest, "the scatter of its runs" if within else "not explained by its runs"))
+        why = "within the scatter of its runs" if within else "by the model's own error"
+        parts.append((rest, why))
     elif parts:
-        parts.append((rest, "not known yet"))
+        parts.append((rest, "by noise or by the model's error, which one run can't tell apart"))
     most = max((abs(part) for part, _ in parts), default=0.0)
     parts = [(part, why) for part, why in parts if abs(part) > max(told, MINOR * most)]
-    said = "; ".join(f"{why}: {'+' * (part > 0)}{number(part)}" for part, why in parts)
-    return f"{own} ({said})" if said else own
+    said = "; ".join(f"{'+' * (part > 0)}{number(part)} {why}" for part, why in parts)
+    return f"{own}: {said}" if said else own
 
 
 def noise_share(best: Tried) -> str:

@@ -29,6 +29,7 @@ from grounded.diagnosis.error_report import (
 from grounded.diagnosis.report import (
     Agreement,
     Changed,
+    Estimate,
     Kind,
     Ranked,
     TrialValue,
@@ -36,9 +37,10 @@ from grounded.diagnosis.report import (
     Verdict,
 )
 from grounded.diagnosis.ruler_words import explained, floor, improvement, rest, worsened
+from grounded.errors import GroundedError
 from grounded.instruments.finding import Finding, in_the_log
 from grounded.model import Model
-from grounded.result import listed, percent
+from grounded.result import listed, number, percent
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.validation.claims import Claims
@@ -114,7 +116,7 @@ def verdict(
         return _said("none", text, *once, first=first)
     apart = _apart(per_trial, agreement)
     open_gap = any(one.above for one in remainder)
-    causes = _causes(claims, ranking, credit, identified, apart, open_gap)
+    causes = _causes(claims, ranking, credit, identified, apart, open_gap, adopted)
     told = clauses(
         [one.of for one in credit],
         causes,
@@ -194,6 +196,7 @@ def _causes(
     identified: Sequence[Identifiable],
     apart: Mapping[str, str],
     open_gap: bool = False,
+    adopted: Collection[str] = (),
 ) -> tuple[str, ...]:
     """Return one clause per cause, the largest first; `open_gap`: a gap remains beside them."""
     from grounded.diagnosis.validation.claims import has_size
@@ -217,7 +220,7 @@ def _causes(
             text += UNSURE * (not has_size(effects[one.of], values[one.of], KNOWN))
             text += f", {apart[one.of]}" if one.of in apart else ""
         else:
-            text = f"{OWN} are off: {_moved(claims)}{OPEN * open_gap}"
+            text = f"{_moved(claims, adopted)}{OPEN * open_gap}"
             text += _others(claims, identified)
             named = parameters_off(claims)[:NAMED]
             held = dict.fromkeys(other for n in named for other in given.get(n, ()))
@@ -274,19 +277,64 @@ def parameters_off(claims: Claims) -> list[str]:
     return [claims.data.model.param_names[one.index] for one in claims.moved]
 
 
-def _moved(claims: Claims) -> str:
-    """Return `L should be 0.1662 +- 0.0011 m (+11 %)` for the parameters that are off."""
+def _moved(claims: Claims, adopted: Collection[str]) -> str:
+    """Return which parameters are off: the model's own, and those of adopted effects.
+
+    Own ones as `L should be 0.1662 +- 0.0011 m (+11 %)`; those of an effect by its own sentence.
+    """
+    from grounded.effects import param_name
+
     params, known = claims.data.model.params, claims.parameters()
-    named, texts = parameters_off(claims), []
+    named, texts, again = parameters_off(claims), list[str](), dict[str, dict[str, str]]()
     for name in named[:NAMED]:
         old = params[name].value
         change = 100 * (known[name].value - old) / abs(old) if old else 0.0
         beside = [f"{change:+.{0 if abs(change) >= 1 else 1}f} %"] * bool(old)
         beside += ENDED[known[name].stopped]
         part = f" ({', '.join(beside)})" * bool(beside)
-        texts.append(f"{name} should be {give_or_take(known[name])}{part}")
+        if effect := _effect_of(name, adopted):
+            key = name.removeprefix(param_name(effect, ""))
+            text = f"{key} = {give_or_take(known[name])} instead of {number(old)}{part}"
+            again.setdefault(effect, {})[key] = text
+        else:
+            texts.append(f"{name} should be {give_or_take(known[name])}{part}")
+    own = f"{OWN} are off: {', '.join(texts)}" if texts or not again else ""
+    off = ", ".join(_adopted_off(claims, name, told) for name, told in again.items())
+    off = f"the adopted effects have other values: {off}" if off else ""
+    parts = (off, own) if named and _effect_of(named[0], adopted) else (own, off)
     more = len(named) - NAMED
-    return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
+    return "; ".join(filter(None, parts)) + (f" and {more} more" if more > 0 else "")
+
+
+def _effect_of(name: str, adopted: Collection[str]) -> str:
+    """Return the adopted effect that a parameter belongs to; "" if it is the model's own."""
+    from grounded.effects import param_name
+
+    of = [effect for effect in adopted if name.startswith(param_name(effect, ""))]
+    return max(of, key=len, default="")
+
+
+def _adopted_off(claims: Claims, name: str, told: Mapping[str, str]) -> str:
+    """Return an adopted effect in the words of its family, with the quantities that are off.
+
+    An effect that can't be built on a model that has it already, or comes from another package, is
+    named only.
+    """
+    from grounded.effects import Library, param_name
+
+    model, values = claims.data.model, ", ".join(told.values())
+    try:
+        effect = Library().effect(name, model)
+    except GroundedError:
+        return f"{name} has {values}"
+    known, now = claims.parameters(), dict[str, Estimate]()
+    for q in effect.free:
+        own = param_name(name, q.name)
+        if own in known:
+            now[q.name] = known[own]
+        elif own in model.params:
+            now[q.name] = Estimate(model.params[own].value, 0.0, None, q.unit)
+    return f"{meaning(effect, now)} ({name}: {values})"
 
 
 BARELY = 0.01  # share of the improvement below which a claim needs another reason

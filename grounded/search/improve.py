@@ -275,6 +275,7 @@ def _ended(
     phase: Phase = "stopped"
     ending: Ending
     then: NextCommand | None = NextCommand("diagnose")
+    asked = ""  # the end of the sentence, if that asks for a diagnosis
     lost = len(losers_of(make.now.history, own, make.fingerprint))
     if doubted is not None:
         phase, then, ending = "converged", None, "no step improved"
@@ -284,23 +285,23 @@ def _ended(
             "is the result"
         )
     elif ruinous is not None:
-        ending = "too doubtful"
+        ending, asked = "too doubtful", " or diagnose the model"
         sentence = (
             f"the model promises a gain of {figure(ruinous.predicted_gain)} from a step, but its "
             f"likely error is larger than the whole cost of {own}: no trial is spent on it; run "
-            f"{own} again or diagnose the model"
+            f"{own} again"
         )
     elif promised and not finite:
-        ending = "model diverges"
+        ending, asked = "model diverges", "; a diagnosis may show what it lacks"
         sentence = (
             f"the model grounded on {own} diverges for every step: it is too inaccurate there to "
-            "improve with; a diagnosis may show what it lacks"
+            "improve with"
         )
     elif finite and max(finite) < -least and not lost:
-        ending = "every step loses"
+        ending, asked = "every step loses", "; a diagnosis may show what it lacks"
         sentence = (
             f"every step from {own} loses in the grounded model, by at least {-max(finite):.4g}: "
-            "its derivatives are wrong along this trial; a diagnosis may show what it lacks"
+            "its derivatives are wrong along this trial"
         )
     elif lost:
         phase, then, ending = "converged", None, "no step improved"
@@ -314,6 +315,6 @@ def _ended(
             f"the model promises less than {100 * tolerance:g} % more from any step "
             f"([search] tolerance): {own} is the result"
         )
-    ended = replace(make.now, phase=phase, step=None, missed="")
-    now = replace(ended, sentence=sentence, ending=ending, then=then)
+    ended = replace(make.now, phase=phase, step=None, missed=asked)
+    now = replace(ended, sentence=sentence + asked, ending=ending, then=then)
     return let_down(now, make.fingerprint) if phase == "converged" else now

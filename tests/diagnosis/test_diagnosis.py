@@ -20,8 +20,8 @@ from grounded.diagnosis.ruler_words import rest
 from grounded.diagnosis.validation.blame import Blame, loss
 from grounded.diagnosis.validation.claims import has_size
 from grounded.diagnosis.validation.prediction_error import _stump
-from grounded.diagnosis.verdict import MOST_EFFECTS, sentence, verdict
-from grounded.effects import Library
+from grounded.diagnosis.verdict import MOST_EFFECTS, _moved, sentence, verdict
+from grounded.effects import Library, wrap
 from grounded.effects.memory import shifted
 from grounded.filter import kalman
 from grounded.models.pendulum import model as pendulum
@@ -303,6 +303,20 @@ def test_the_cause_that_makes_most_is_named_first(effect_first):
     assert found.kind == "effect" and min(damped, moved) >= 0
     assert (damped < moved) is effect_first
     assert "omega by 0.10 rad/s instead of 0.50 rad/s (noise: 0.090 rad/s)" in found.sentence
+
+
+def test_values_of_adopted_effects_that_are_off_are_told_in_their_own_words():
+    """A car's: `The model's own parameters are off: sensor_delay_psi_d should be 0.0507`."""
+    model = wrap(Library().effect("viscous_friction:omega", pendulum), {"k": 0.2}, DT)
+    off = ["viscous_friction_omega_k", "m"]
+    known = {off[0]: Estimate(0.3, 0.01, None, "1/s"), "m": Estimate(1.2, 0.01, None, "kg")}
+    claims = SimpleNamespace(data=SimpleNamespace(model=model), parameters=lambda: known)
+    claims.moved = tuple(Blame(model.param_names.index(name), 9.0) for name in off)
+    told = _moved(claims, ["viscous_friction:omega"])
+    assert "omega is damped by 0.3 1/s (viscous_friction:omega: k = 0.300 +- 0.010 1/s" in told
+    assert "instead of 0.2 (+50 %)" in told and off[0] not in told
+    assert "; the model's own parameters are off: m should be 1.200 +- 0.010 kg" in told
+    assert "should be" in _moved(claims, []) and "adopted" not in _moved(claims, [])
 
 
 @pytest.mark.parametrize(

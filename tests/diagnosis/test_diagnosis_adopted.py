@@ -292,6 +292,21 @@ def test_more_of_an_adopted_effect_changes_its_numbers(tmp_path):
     assert grounded("-C", tmp_path / "ws", "status").code == 0
 
 
+def test_adopt_lists_the_values_of_adopted_effects_that_it_rewrites(tmp_path):
+    """A car's: `gain`, `tau` and `trim` were listed, six effects were rewritten silently."""
+    friction = '{name = "viscous_friction:omega", k = 0.3}'
+    workspace(
+        tmp_path / "ws",
+        [friction, '{name = "delay:torque", d = 0.02}'],
+        {"trials": [], "adopted": [], "nominal": {"viscous_friction_omega_k": 0.3, "l": 0.5}},
+        [row("parameter:viscous_friction_omega_k", d=0.05), row("parameter:l", d=0.01)],
+    )
+    adopt = ["adopt", "parameter:viscous_friction_omega_k", "parameter:l"]
+    out = " ".join(grounded("-C", tmp_path / "ws", *adopt).out.split())
+    assert "rewritten in [model] effects" in out and "delay:torque" not in out
+    assert "k of viscous_friction:omega 0.3000 -> 0.3500" in out
+
+
 def test_a_delay_more_adds_to_the_delay(tmp_path):
     config = workspace(
         tmp_path / "ws",

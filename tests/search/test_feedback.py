@@ -212,16 +212,29 @@ def test_the_noise_of_a_first_sample_is_no_motion():
 @pytest.mark.parametrize(
     ("as_run", "error", "parts", "never"),
     [
-        (-9.0, 0.1, ("start in x: +1.000)",), ("scatter", "explain")),
+        (
+            -9.0,
+            0.1,
+            ("+1.000 because its runs began off [task] start, by +0.02 m in x",),
+            ("scatter", "error"),
+        ),
         # a car's line told 0.003 of the 0.129 that its two figures differ by
         (
             -7.5,
             np.nan,
-            ("start in x: -0.5000; not known yet: +1.500)",),
+            (
+                "-0.5000 because its runs",
+                "; +1.500 by noise or by the model's error, which one run",
+            ),
             (),
         ),
-        (-8.0, 0.6, ("the scatter of its runs: +1.000",), ("start",)),
-        (-8.0, 0.1, ("not explained by its runs: +1.000",), ("start",)),
+        (
+            -8.0,
+            0.6,
+            ("1.000 better than measured", "+1.000 within the scatter of its runs"),
+            ("start",),
+        ),
+        (-8.0, 0.1, ("+1.000 by the model's own error",), ("start",)),
         (-8.0, np.nan, (), ("scatter", "start")),  # one run: the scatter is unknown
         (np.nan, 0.1, (), ("scatter", "start")),  # from an older version
     ],
@@ -262,7 +275,7 @@ def test_what_the_scatter_of_runs_costs_is_not_called_unexplained():
         trials=runs,
     )
     text = _so_far(promise("c0001", mean, 0.1 * abs(mean), mean), best, task)
-    assert "replays their mean" in text and "explain" not in text
+    assert "by noise in the runs" in text and "error" not in text
 
 
 def promise(base, of_base, gain, as_run):
@@ -282,6 +295,18 @@ def begun(task, off=0.0, noise=0.0, seed=0):
     return Trial(states, np.zeros((len(states) - 1, 1)), task.dt, *names)
 
 
+@pytest.mark.parametrize(("off", "told"), [(0.4, False), (2.4, True)])
+def test_a_start_within_a_step_of_its_encoder_is_not_elsewhere(off, told):
+    """`Its runs began away from [task] start in alpha: +6.4e-04`: by 0.4 counts of its encoder."""
+    task, step = cart_task(), 0.05
+    run = begun(task)
+    read = np.array(run.states)
+    read[:, 0] = step * (np.arange(len(read)) // 6 + off)
+    read[6::6, 0] -= 0.5 * step + 1e-4 * np.arange(len(read[6::6]))  # interpolated
+    found = began_elsewhere(task, [replace(run, states=read)])
+    assert found == ({"x": "+0.12 m in x"} if told else {})
+
+
 def test_the_noise_of_a_first_row_is_no_start_elsewhere():
     """The sensor noise of a cart at rest is not reported as a different start state."""
     from grounded_cli.propose import _so_far
@@ -289,12 +314,12 @@ def test_the_noise_of_a_first_row_is_no_start_elsewhere():
     task = cart_task()
     rows = [begun(task, noise=0.02, seed=seed) for seed in range(40)]
     assert max(abs(run.states[0, 0]) for run in rows) > 0.03
-    assert sum(began_elsewhere(task, [run]) != () for run in rows) <= 1
-    assert began_elsewhere(task, [begun(task, off=0.02)]) == ("x",)
-    assert began_elsewhere(task, [begun(task, off=0.1, noise=0.02)]) == ("x",)
-    assert began_elsewhere(task, rows) == ()
+    assert sum(began_elsewhere(task, [run]) != {} for run in rows) <= 1
+    assert began_elsewhere(task, [begun(task, off=0.02)]) == {"x": "+0.02 m in x"}
+    assert began_elsewhere(task, [begun(task, off=0.1, noise=0.02)]).keys() == {"x"}
+    assert began_elsewhere(task, rows) == {}
     shifted = [begun(task, off=0.02, noise=0.02, seed=seed) for seed in range(40)]
-    assert began_elsewhere(task, shifted) == ("x",)  # the mean of many is more precise
+    assert began_elsewhere(task, shifted).keys() == {"x"}  # the mean of many is more precise
     made = promise("c0001", -8.0, 0.5, -10.0)
     best = SimpleNamespace(
         candidate=SimpleNamespace(id="c0001"), utility=-10.0, standard_error=0.1, noise_cost=0.0

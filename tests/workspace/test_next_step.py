@@ -704,6 +704,37 @@ def test_an_ended_search_asks_for_a_diagnosis_until_a_newer_one_is_made(
         assert ("a step lost" in " ".join(grounded("-C", folder, "report").out.split())) == asks
 
 
+@pytest.mark.parametrize(("runs", "then"), [(1, "run best"), (2, "export best --runner")])
+def test_what_was_diagnosed_and_adopted_is_not_diagnosed_again(
+    cart, tmp_path, monkeypatch, runs, then
+):
+    """Diagnose, adopt, propose, and `nothing to run ... or diagnose the model. next: diagnose`."""
+    folder = copied(cart, tmp_path / "w")
+    w = Workspace(folder)
+    now = w.status().standing
+    asked = " or diagnose the model"
+    assert now.incumbent is not None
+    best = replace(now.incumbent, trials=now.incumbent.trials[:1] * runs)
+    doubtful = replace(
+        now,
+        phase="stopped",
+        sentence=f"run it again{asked}",
+        ending="too doubtful",
+        incumbent=best,
+        then=DIAGNOSE,
+        missed=asked,
+    )
+    monkeypatch.setattr("grounded.search.standing.standing", lambda *_, **__: doubtful)
+    count = len(list(folder.glob("trials/*.mcap")))
+    for seen, newer in ((count - 1, True), (count, False)):
+        diagnosed(folder, diagnosed=taken_in(folder, *range(1, seen + 1)))
+        if newer:
+            assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
+        done = grounded("-C", folder, "status")
+        assert last(done) == ("grounded diagnose" if newer else f"grounded {then}")
+        assert ("diagnose the model" in plain(done.out)) is newer
+
+
 def test_after_an_unknown_verdict_a_search_that_has_ended_says_so(cart, tmp_path, monkeypatch):
     """A car's diagnosis ended in a report, whose next command was the same diagnosis."""
     w = Workspace(copied(cart, tmp_path / "w"))

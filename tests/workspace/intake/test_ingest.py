@@ -155,6 +155,40 @@ def test_a_start_that_spoils_a_run_is_told_however_earlier_ones_scatter(
     )
 
 
+def test_a_run_that_began_elsewhere_gets_one_verdict(w, tmp_path, monkeypatch):
+    """One run: `discard t0005` for its y, "The run counts, no need to repeat it" for its x."""
+    ran, *_ = read_trial(run(w))
+    cost = -w.task.utility(ran)
+    moved = np.array(ran.states)
+    moved[0] += np.array([np.sqrt(cost / len(ran.states) / 10), np.ptp(moved[:, 1])])
+    write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
+    monkeypatch.setattr(begun, "_changes", lambda *a: -0.5 * cost * bool(a[2][0]))
+    found = ingest_log(w, tmp_path / "t.mcap", "c0001")
+    (told,) = [one for one in found.warnings if "the run started with" in one]
+    assert holds(told, "x = ", "v = ", "By the model x changes", "`discard t0001`")
+    assert "counts" not in told
+
+
+@pytest.mark.parametrize(("scatter", "again"), [(0.001, True), (0.2, False)])
+def test_a_start_that_changes_less_than_runs_scatter_is_no_reason_to_repeat_one(
+    w, tmp_path, monkeypatch, scatter, again
+):
+    """A start changed a utility by -0.00028, where runs scatter by 0.0011: `discard t0010`."""
+    ran, *_ = read_trial(run(w))
+    cost = -w.task.utility(ran)
+    a_step = np.sqrt(cost / len(ran.states) / 10)
+    monkeypatch.setattr(begun, "_changes", lambda *_: -0.02 * cost)
+    monkeypatch.setattr(begun, "_lost_by", lambda *_: 0.01 * cost)
+    for k, off in enumerate((-1.0, 1.0, 1.5)):
+        moved = np.array(ran.states)
+        moved[0, 0] += 1.5 * a_step * (k == 2)
+        moved[1:, 0] += scatter * off * a_step
+        write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
+        found = ingest_log(w, tmp_path / "t.mcap", "c0001")
+    (told,) = [one for one in found.warnings if "the run started with" in one]
+    assert ("`discard t0003`" in told) is again and ("counts" in told) is not again
+
+
 @pytest.mark.parametrize("data", [False, True])
 def test_units_that_a_trial_states_must_be_the_models(w, tmp_path, data):
     """A trial in cm was stored as if it were in m."""

@@ -37,6 +37,16 @@ class Left:
     unit: str
 
 
+@dataclass(frozen=True)
+class Rewritten:
+    """A quantity of an effect that was part of the model before, with its new value."""
+
+    called: str  # `d of sensor_delay:psi`
+    was: float
+    now: float
+    unit: str
+
+
 @dataclass(frozen=True, repr=False)
 class Adopted(Result):
     """The model's effects and parameters after an adoption."""
@@ -49,6 +59,7 @@ class Adopted(Result):
     left: Mapping[str, Left] = field(default_factory=dict)  # by parameter name
     logged: str = ""  # the trial that target.csv still repeats, if it ran no candidate
     jointly: tuple[str, ...] = ()  # of `params`: determined only together with the others
+    rewritten: tuple[Rewritten, ...] = ()  # of effects that were adopted before
     stopped: str = ""  # what to do about parameters that reached their bounds
 
     def summary(self) -> str:
@@ -129,7 +140,29 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
         beside=tuple(n for n in beside if n not in fitted),
         left=left_behind(found) if parameters and physics and claimed else {},
         jointly=tuple(name for name in own if name in calibrated and name in found.jointly),
+        rewritten=_rewritten(found, old, both),
         stopped=wider(found.parameters) if parameters and physics and claimed else "",
+    )
+
+
+def _rewritten(
+    found: Diagnosis, before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, Any]]
+) -> tuple[Rewritten, ...]:
+    """Return the quantities of effects that an adoption changes, in the order of the effects."""
+    from grounded.effects import param_name
+
+    def unit(effect: str, key: str) -> str:
+        name = param_name(effect, key)
+        rows = found.ranked(f"parameter:{name}"), found.ranked(effect)
+        known = [found.parameters.get(name), *(row.params.get("d") for row in rows if row)]
+        return next((one.unit for one in known if one), "")
+
+    return tuple(
+        Rewritten(f"{key} of {name}", float(was), float(now[key]), unit(name, key))
+        for old, now in zip(before, after, strict=False)
+        for name in [str(old["name"])]
+        for key, was in old.items()
+        if key != "name" and now[key] != was
     )
 
 

@@ -30,6 +30,7 @@ DIAGNOSE = NextCommand("diagnose")
 EXPORT = NextCommand("export", ("best", "--runner"))
 REPORT = NextCommand("report", ("--html",))
 TARGET = NextCommand("target", ("SHAPE",))
+AGAIN = 2  # runs of the best candidate after which a search that doubts its model ends
 SHORT = 0.1  # fraction of a control step: shorter filters and delays make no difference
 TRUE = 0.05  # of a utility: a prediction that misses by less came true
 SAME = 1e-6  # relative tolerance for values that were written with eight digits
@@ -94,8 +95,10 @@ def _follows(
     if now.phase == "propose":
         logs = follow is not None and not now.history
         return DIAGNOSE if logs or doubted(now, since, usable) else PROPOSE
-    if (since.changed or since.newer) and not _came_true(workspace, now, diagnosis):
+    if not since.settled and not _came_true(workspace, now, diagnosis):
         return DIAGNOSE
+    if now.ending == "too doubtful" and now.incumbent and len(now.incumbent.trials) < AGAIN:
+        return to_run(workspace, now.incumbent.candidate.id, "best")
     return another_trial(workspace, now) if diagnosis.no_cause else EXPORT
 
 
@@ -329,6 +332,15 @@ class Since:
     adopted: tuple[str, ...] = ()  # effects that are part of the model now, claimed ones first
     missing: tuple[str, ...] = ()  # claimed effects that are not, if others are
     changed: bool = False  # the diagnosis was made with another model
+
+    @property
+    def settled(self) -> bool:
+        """Whether another diagnosis would only repeat this one.
+
+        It is of all trials, and the model is the one that it had, or has all that it claimed.
+        """
+        adopted = self.used > 0 and bool(self.adopted) and not self.missing
+        return not self.newer and (adopted or not self.changed)
 
     @property
     def sentence(self) -> str:

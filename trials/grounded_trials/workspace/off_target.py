@@ -19,6 +19,7 @@ from grounded.result import Document, measured_alike
 from grounded.search.scatter import beyond_noise
 from grounded.task import Task
 from grounded.trial import Trial
+from grounded_trials.wording import with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.task_file import equal_weights
 
@@ -30,6 +31,8 @@ MOST = 0.5  # a group with more than this share of the tracking cost is reported
 WRITTEN = 1e-3  # tolerance for target.csv, relative to its range, due to the digits in the file
 EXACT = 1e-4  # share of the largest error below which a plan's end is on target
 FARTHER = 1.1  # of the error before: a better candidate's larger error is explained
+STEPS, STEPPED = 3, 0.3  # values that a sensor repeats, their share of its rows: it has steps
+NARROW = 0.25  # of the median gap of repeated values: one beside an interpolated value is smaller
 RATES = ("speed", "heading_rate", "rates")  # roles of velocities
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
 
@@ -219,16 +222,37 @@ def cost_of_inputs(task: Task, run: Trial) -> float:
 
 def began_elsewhere(
     task: Task, trials: Sequence[Trial], estimated: Collection[str] = ()
-) -> tuple[str, ...]:
-    """Return the names of the states in which runs of one candidate began away from [task] start.
+) -> dict[str, str]:
+    """Return how far from [task] start runs of one candidate began, `{"x": "+0.02 m in x"}`.
 
-    Differences within the sensors' noise do not count, nor do `estimated` states, whose error no
-    sensor's noise bounds.
+    Differences within the sensors' noise or below their resolution do not count, nor do `estimated`
+    states, whose error no sensor's noise bounds.
     """
     off = np.array([task.model.difference(t.states[0], task.start) for t in trials])
-    names = np.array(task.model.state_names)
-    told = names[beyond_noise(trials, off, task.start)].tolist()
-    return tuple(name for name in told if name not in estimated)
+    mean = off.mean(axis=0)
+    told = beyond_noise(trials, off, task.start) & (np.abs(mean) > _resolution(trials))
+    return {
+        name: f"{with_unit(f'{mean[i]:+.2g}', unit)} in {name}"
+        for i, (name, unit) in enumerate(task.model.states.items())
+        if told[i] and name not in estimated
+    }
+
+
+def _resolution(trials: Sequence[Trial]) -> Array:
+    """Return the step between the values of each state's sensor, (n,); 0 if it shows no steps.
+
+    A sensor with steps, such as an encoder, repeats few values exactly, but for rows in between
+    that were interpolated.
+    """
+    states = np.concatenate([trial.states for trial in trials])
+    found = np.zeros(states.shape[1])
+    for i, column in enumerate(states.T):
+        values, times = np.unique(column[np.isfinite(column)], return_counts=True)
+        again = values[times > 1]
+        if len(again) >= STEPS and times[times > 1].sum() > STEPPED * len(column):
+            gaps = np.diff(again)
+            found[i] = gaps[gaps > NARROW * np.median(gaps)].min()
+    return found
 
 
 def logged_target(workspace: Folder) -> str:

@@ -324,7 +324,7 @@ def _answered(workspace: Folder, now: Standing) -> Standing:
     if found is None:
         return now
     since = since_diagnosis(workspace, found, usable_ids(workspace))
-    return now if since.changed or since.newer else now.answered()
+    return now.answered() if since.settled else now
 
 
 def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()) -> Status:

@@ -11,8 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.frozen import Array
+from grounded.result import listed
 from grounded.search.planner import predicted
 from grounded.search.returned.who_drove import LEAST, second_differences
+from grounded.search.scatter import Repeats
+from grounded.search.standing import standing
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.wording import in_digits_apart, with_unit
@@ -30,10 +33,10 @@ WHITE = 0.6745 * 6**0.5  # median of absolute second differences of white noise 
 
 @dataclass(frozen=True)
 class Begun:
-    """A state in which a run started elsewhere.
+    """A run that started elsewhere.
 
     Args:
-        told: the warning.
+        told: the warning: the states, and one verdict on the run.
         again: whether the run must be discarded and run again.
     """
 
@@ -41,15 +44,15 @@ class Begun:
     again: bool
 
 
-def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
-    """Return the states in which a run did not start at s_0, beyond their sensor noise.
+def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
+    """Return in which states a run did not start at s_0, beyond sensor noise; None if in none.
 
     A state that [reward] weighs along the way is judged by the cost of its offset relative to a
     mean step of the run, the most costly first; another state relative to its range in the run.
     Offsets within the scatter of earlier starts are unavoidable, and tolerated unless they spoil
-    the utility by the model: by much of it, or by more than the run lost to the best candidate. Of
-    a run that left [safety], only the part before counts: a robot on the floor makes every start
-    seem near.
+    the utility by the model: by much of it, or by more than the run lost to the best candidate. A
+    change below the scatter of single runs spoils nothing. Of a run that left [safety], only the
+    part before counts: a robot on the floor makes every start seem near.
 
     Args:
         workspace: the workspace with the task, the model and the earlier runs.
@@ -59,7 +62,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
     before, trial = _starts_before(workspace, trial.id), interpolate_gaps(trial).trial
     trial = trial.until(task.horizon)
     if not trial.candidate or trial.finite_steps < 0:
-        return []
+        return None
     off = task.model.difference(trial.states[0], task.start)
     states = _inside(task, trial.states[: trial.finite_steps + 1])
     failed = len(states) <= trial.finite_steps
@@ -77,35 +80,44 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> list[Begun]:
     if len(before) >= FEWEST:
         beyond = (np.abs(off) > SURE * before.std(axis=0, ddof=1)) | (share > MUCH)
     if not told.any():
-        return []
-    found, real = [], abs(task.utility(trial))
+        return None
+    real = abs(task.utility(trial))
     cost = real if np.isfinite(real) and not failed else -_promised(workspace, trial)
-    lost = _lost_by(workspace, trial)
-    for i in sorted(np.flatnonzero(told), key=lambda i: (weight[i] == 0, -share[i])):
+    lost, scatter = _lost_by(workspace, trial), _scatter(workspace, trial, cost)
+    spoils, tolerated = list[int](), list[int]()
+    for i in sorted(np.flatnonzero(told).tolist(), key=lambda i: (weight[i] == 0, -share[i])):
         changes = _changes(workspace, trial, off * (np.arange(len(off)) == i))
-        again = abs(changes) > SPOILT * cost or 0 < lost < -changes
-        if not (beyond[i] or again):
-            continue
-        name, unit = list(task.model.states.items())[i]
-        began, start = in_digits_apart(float(trial.states[0, i]), float(task.start[i]))
-        turned = f" ({np.rad2deg(off[i]):+.2g} degrees)" if unit == "rad" else ""
+        if abs(changes) > scatter and (abs(changes) > SPOILT * cost or 0 < lost < -changes):
+            spoils.append(i)
+        elif beyond[i]:
+            tolerated.append(i)
+    if not spoils and not tolerated:
+        return None
+    where = "; ".join(_placed(task, trial, i, off[i]) for i in (*spoils, *tolerated))
+    does = "The run counts, no need to repeat it. Place the robot nearer to the start next time"
+    if spoils:
+        changes = _changes(workspace, trial, off * np.isin(np.arange(len(off)), spoils))
+        by = [task.model.state_names[i] for i in spoils] if tolerated else ["this"]
+        change = f"{listed(by)} change{'s' * (len(by) == 1)}"
         does = (
-            f"by the model this changes its utility by {changes:+.3g}: `discard {trial.id}`, place "
-            f"the robot nearer to the start and run {trial.candidate} again. If it always starts "
-            "there, set it in [task] start"
-            if again
-            else "the run counts, no need to repeat it. Place the robot nearer to the start next "
-            "time"
+            f"By the model {change} its utility by {changes:+.3g}: "
+            f"`discard {trial.id}`, place the robot nearer to the start and run "
+            f"{trial.candidate} again. If it always starts there, set it in [task] start"
         )
-        found.append(
-            Begun(
-                f"the run started with {name} = {with_unit(began, unit)}, the task's start is "
-                f"{start}: {with_unit(f'{off[i]:+.2g}', unit)}{turned} off, more than the noise in "
-                f"the log. {does[0].upper()}{does[1:]}",
-                bool(again),
-            )
-        )
-    return found
+    return Begun(
+        f"the run started with {where}, more than the noise in the log. {does}", bool(spoils)
+    )
+
+
+def _placed(task: Task, trial: Trial, i: int, off: float) -> str:
+    """Return where one state started, and by how much that is off."""
+    name, unit = list(task.model.states.items())[i]
+    began, start = in_digits_apart(float(trial.states[0, i]), float(task.start[i]))
+    turned = f" ({np.rad2deg(off):+.2g} degrees)" if unit == "rad" else ""
+    return (
+        f"{name} = {with_unit(began, unit)}, the task's start is {start}: "
+        f"{with_unit(f'{off:+.2g}', unit)}{turned} off"
+    )
 
 
 def _inside(task: Task, states: Array) -> Array:
@@ -123,6 +135,25 @@ def _lost_by(workspace: Folder, trial: Trial) -> float:
             each.setdefault(one.candidate, []).append(task.utility(one))
     best = max((sum(some) / len(some) for some in each.values()), default=-np.inf)
     return float(best - task.utility(trial)) if np.isfinite(best) else 0.0
+
+
+def _scatter(workspace: Folder, trial: Trial, cost: float) -> float:
+    """Return the std of single runs of about this cost, by repeats among the others; 0 if unknown.
+
+    Args:
+        workspace: the workspace with the other runs.
+        trial: the run, whose own start must not count as scatter.
+        cost: what such runs cost.
+    """
+    others = [one for one in workspace.task_trials() if one.id != trial.id]
+    now = standing(
+        workspace.task,
+        workspace.read().candidates,
+        others,
+        workspace.config.search,
+        workspace.planner.fingerprint,
+    )
+    return float(np.nan_to_num(np.sqrt(Repeats(now.history).near(-cost).variance)))
 
 
 def _starts_before(workspace: Folder, identity: str) -> Array:

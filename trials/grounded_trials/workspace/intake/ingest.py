@@ -136,7 +136,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     scaled = [name for one in faults for name in one.inputs]
     elsewhere = begun_elsewhere(workspace, trial)
     checked = warnings_about(workspace, trial, read.last_s, read.fell, scaled)
-    warnings = (*read.warnings, *odd, *(one.told for one in elsewhere), *checked)
+    warnings = (*read.warnings, *odd, *([elsewhere.told] if elsewhere else []), *checked)
     if before:
         warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
     if aside := added.id in workspace.discarded():
@@ -147,7 +147,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     verdict = ASIDE if aside else _verdict(trial, tried, workspace.config.search.repeats)
     slow = "" if read.doubted else steps_skipped(workspace, trial)
     warnings = (*filter(None, [slow]), *warnings)
-    wrong = bool(slow) or any(one.again for one in elsewhere)
+    wrong = bool(slow) or (elsewhere is not None and elsewhere.again)
     if not (odd or wrong or aside):
         asked = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
         if asked:

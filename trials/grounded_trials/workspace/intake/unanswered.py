@@ -33,7 +33,8 @@ def unanswered(workspace: Folder) -> tuple[tuple[str, ...], NextCommand | None]:
     trial, own = last.trial, "source" not in last.meta
     told = [one.told(trial, own=own) for one in log_faults(workspace, trial)]
     told += filter(None, [steps_skipped(workspace, last.measured)])
-    told += [one.told for one in begun_elsewhere(workspace, last.measured) if one.again]
+    begun = begun_elsewhere(workspace, last.measured)
+    told += [begun.told] if begun and begun.again else []
     if not told:
         from grounded_trials.workspace.proposing import standing_in
 
