@@ -55,10 +55,12 @@ def values(document, effect):
 @needs_data
 def test_emps_has_dry_and_viscous_friction_of_the_published_size(tmp_path):
     found = diagnosed(EMPS, tmp_path / "emps")
-    assert {"coulomb_friction:v", "viscous_friction:v"} <= set(found["verdict"]["effects"])
+    published = {"coulomb_friction:v", "viscous_friction:v", "input_bias:u"}
+    assert published == set(found["verdict"]["effects"])
     dry, viscous = values(found, "coulomb_friction:v"), values(found, "viscous_friction:v")
-    assert dry["c"] == pytest.approx(20.394 / 95.109, rel=0.05)
+    assert dry["c"] == pytest.approx(20.394 / 95.109, rel=0.07)
     assert viscous["k"] == pytest.approx(203.5 / 95.109, rel=0.05)
+    assert values(found, "input_bias:u")["b"] == pytest.approx(3.165 / 35.1507, rel=0.05)
     ahead = next(r for r in found["prediction_error"] if r["horizon_s"] == 0.5)
     assert ahead["held_out"] == "pieces"  # two logs: each is half of what there is
     assert ahead["crude"]["q"] == pytest.approx(0.0492, rel=0.05)

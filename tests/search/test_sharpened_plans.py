@@ -61,15 +61,16 @@ def swing_up(x: float) -> Planner:
 
 
 @pytest.mark.slow
-def test_a_swing_up_with_dry_friction_is_no_worse_as_written_than_as_planned():
+@pytest.mark.parametrize("x", [1.9, 2.0])
+def test_a_swing_up_with_dry_friction_is_no_worse_as_written_than_as_planned(x):
     """A plan of -75 ran at -12,383 without smoothing; zero inputs give -2,495."""
-    planner = swing_up(2.0)
+    planner = swing_up(x)
     _, found = planner.first_policy()
     exact = planner.plan.problem(exact=True)
     run = exact.system.rollout(exact, found.u, found.K, found.z[:-1])
     assert run.cost[0] < 400  # less than a sixth of doing nothing
     assert abs(run.z[0, -1, 2] - np.pi) < 0.2 and np.abs(run.z[0, :, 0]).max() < 1.0
-    for share in first.SHARPER:
+    for share in (share for share in first.SHARPER if share < 0.2):
         blend = replace(planner.plan.problem(), smoothing=share * planner.plan.smoothing)
         assert first._cost(blend, found) < 800, share
 
