@@ -205,7 +205,9 @@ def _memory_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[s
         after = base(start, _replaced(model, a, u), p, dt)
         if positions and lead is not None:
             led = {n: u[n] + lead(a[n], s[memory[0]], c, dt) for n, memory in names.items()}
-            less, more = (bare(start, _replaced(model, a, one), p, dt) for one in (u, led))
+            # a plain model has made this step already
+            less = after if inner is model else bare(start, _replaced(model, a, u), p, dt)
+            more = bare(start, _replaced(model, a, led), p, dt)
             by = {q: k * dt * (more[w] - less[w]) for q, (w, k) in positions.items()}
             after = after | {q: after[q] + by[q] for q in by}
         return {**after, **kept}

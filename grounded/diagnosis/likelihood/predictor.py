@@ -273,7 +273,7 @@ class Predictor(SentOnce):
         lead = u[..., m:]
         if lead.any():
             by = self.step(x, u[..., :m] + lead, p) - after
-            after += self.step(x + by, u, p) - after - by
+            after[...] = self.step(x + by, u, p) - by
 
     def left(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Left:
         """Return inputs u (..., m) less the losses at x (..., n), and position terms (`ahead`)."""

@@ -45,6 +45,7 @@ from grounded_trials.workspace.unknown_id import unknown_candidate
 
 if TYPE_CHECKING:
     from grounded.search.planner import Planner
+    from grounded_trials.logs.log_table import LogMapping
     from grounded_trials.store.index import Index
 
 MANY = 200  # from this number of trials on, an index is used
@@ -98,6 +99,14 @@ class Folder:
         params, model = self.config.model.params, self._written
         check_names(params, list(model.params), "grounded.toml: [model] params: parameter")
         return model.with_values(params)
+
+    @property
+    def log_mapping(self) -> LogMapping | None:
+        """Where [log] finds the signals of the model; None without that table."""
+        from grounded_trials.logs.log_table import log_mapping
+
+        model = self.base_model
+        return log_mapping(self.config.log, model.state_names, model.input_names)
 
     @cached_property
     def _written(self) -> Model:

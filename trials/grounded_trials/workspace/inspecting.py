@@ -87,7 +87,6 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     from grounded_trials.logs.inspect_evidence import weigh
     from grounded_trials.logs.inspect_guess import guess_mapping, is_simulated
     from grounded_trials.logs.joint_names import joint_names, joint_units, wide_joints
-    from grounded_trials.logs.log_table import log_mapping
     from grounded_trials.logs.unnamed import from_the_rest
     from grounded_trials.workspace.intake.log_faults import no_angles
 
@@ -108,7 +107,7 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     both = from_the_rest((*states, *inputs), units, report, joint_units(joints))
     states, inputs = both[: model.n], both[model.n :]
     table = mapping_toml(states, inputs, simulated=is_simulated(report))
-    mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
+    mapping = workspace.log_mapping
     odd = tuple(f"{name} {said}" for name, said in no_angles(model, mapping).items())
     odd += wide_joints(states, model.states, joints, report)
     return Inspected(str(log), report, table, ran_nothing=not workspace.candidate_ids(), odd=odd)

@@ -16,7 +16,6 @@ import numpy as np
 
 from grounded.instruments.finding import Finding, late_effects
 from grounded.places import heading, position
-from grounded_trials.logs.log_table import log_mapping
 from grounded_trials.workspace.identity import READ_BY
 from grounded_trials.workspace.task_file import seen_in
 
@@ -49,9 +48,8 @@ def where_to_mend(
     feedback = workspace.config.task.feedback
     read = [meta for trial in used if "source_sha256" in (meta := about[trial.id])]
     if read:
-        model, log = workspace.base_model, workspace.config.log
-        mapping = log_mapping(log, model.state_names, model.input_names)
-        odd = [Finding(n, said, "mismatch") for n, said in no_angles(model, mapping).items()]
+        strange = no_angles(workspace.base_model, workspace.log_mapping)
+        odd = [Finding(name, said, "mismatch") for name, said in strange.items()]
         findings = (*odd, *findings)
         ahead = (
             "the robot's program also gets it late and should predict it ahead by as much, unless "
@@ -85,8 +83,7 @@ def late_alone(workspace: Folder) -> set[str]:
 
     A message has one stamp, so its position and its heading are late together or not at all.
     """
-    model = workspace.base_model
-    mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
+    model, mapping = workspace.base_model, workspace.log_mapping
     pose = [*position(model), *filter(None, [heading(model)])]
     if mapping is None or len(pose) < 2 or not set(pose) <= set(mapping.states):
         return set()
@@ -104,8 +101,7 @@ def in_time_now(workspace: Folder, findings: Sequence[Finding]) -> dict[str, flo
     late = [one for one in findings if one.kind == "delay" and "delay_s = " in one.log]
     if not late:
         return {}
-    model = workspace.base_model
-    mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
+    mapping = workspace.log_mapping
     states, found = mapping.states if mapping else {}, dict[str, float]()
     for one in late:
         whole = float(dict(part.split(" = ") for part in one.log.split(", "))["delay_s"])
