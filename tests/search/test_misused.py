@@ -56,6 +56,25 @@ def test_what_the_program_passed_is_named(waiting, way):
     assert holds(found.why, *named, "runner.action")
 
 
+def test_feedback_on_another_pose_is_not_called_no_feedback(waiting):
+    """A docking robot fed its wheels' pose to the policy, and [log] mapped the motion capture's."""
+    task, made = waiting
+    made = replace(made, policy=replace(made.policy, gain=0.2 * made.policy.gain))
+    runner, model, rng = Runner(made.policy), task.model, np.random.default_rng(0)
+    x, wheels, rows, sent = task.start.copy(), task.start.copy(), [], []
+    for k in range(task.horizon):
+        rows.append(x + rng.normal(0, 0.002, len(x)))
+        u = runner.action(k * task.dt, wheels + rng.normal(0, 0.002, len(x)))
+        sent.append(u)
+        x = model.system.step(x[None], 0.9 * u[None], model.values, task.dt)[0]
+        wheels = model.system.step(wheels[None], 0.99 * u[None], model.values, task.dt)[0]
+    names = model.state_names, model.input_names
+    trial = Trial(np.array([*rows, x]), np.array(sent), task.dt, *names, candidate=made.id)
+    found = suspicion(task, trial, made, [made])
+    assert holds(found.why, "near the feed-forward of c0001", "another message", "[log]")
+    assert "alone" not in found.why
+
+
 def test_other_commands_are_no_misuse(waiting):
     task, made = waiting
     assert suspicion(task, driven(task, made), made, [made]).why == ""

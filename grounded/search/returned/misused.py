@@ -19,7 +19,15 @@ from grounded.result import listed, with_unit
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import multiplied
 from grounded.search.returned.other_scale import NEARLY, UNITS, units_tried
-from grounded.search.returned.who_drove import DECISIVE, FINE, Following, evidence, follows, latest
+from grounded.search.returned.who_drove import (
+    CLEAR,
+    DECISIVE,
+    FINE,
+    Following,
+    evidence,
+    follows,
+    latest,
+)
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -31,6 +39,11 @@ WITHOUT = (
     "without its feedback: send what `runner.action(t, state)` returns, not "
     "`runner.policy.feedforward`, for a state that holds numbers only (`runner.blind` counts the "
     "calls without)"
+)
+BESIDE = 0.95  # share of a run's commands that are the feed-forward's of that step or a neighbour
+ELSEWHERE = (
+    "with feedback on states that lie nearer to its plan than those of the log: does the program "
+    "read another message, estimate or frame than [log] maps? Pass `runner.action` the same signals"
 )
 DIGITS = 1e-4  # largest difference of commands, relative to their size, that rounding makes
 TIMES = {"ms": 1e3, "us": 1e6, "minutes": 1 / 60}  # units of a time that should be in seconds
@@ -80,6 +93,8 @@ def misused(task: Task, own: Candidate, trial: Trial, plain: Following) -> str:
         if fit is None or not (fit.alike and fit.error < most):
             continue
         if evidence(plain, fit) > DECISIVE and _tells(plain, fit):
+            if way.policy.gain is None and own.policy.gain is not None and not _beside(trial, fit):
+                way = replace(way, said=f"they are near the feed-forward of {own.id}, {ELSEWHERE}")
             found.append((fit.error, way))
     least = min((error for error, _ in found), default=0.0)
     near = [(error, way) for error, way in found if error <= SAME * least + FINE]
@@ -123,6 +138,22 @@ def _tells(plain: Following, fit: Following) -> bool:
         told = np.abs(plain.off - fit.off) > TELLS * size
         nearer = np.abs(fit.off) < NEARER * np.abs(plain.off)
     return bool(told.any() and nearer[told].mean() >= NEARLY_ALL)
+
+
+def _beside(trial: Trial, fit: Following) -> bool:
+    """Return whether a run's commands are those of a policy without feedback, but for their timing.
+
+    Args:
+        trial: the run.
+        fit: the comparison with that policy. Its commands depend on time alone, which may be off by
+            one step.
+    """
+    asked = trial.inputs[: len(fit.off)] - fit.off
+    around = np.stack([np.roll(asked, k, axis=0)[1:-1] for k in (-1, 0, 1)])
+    known = np.isfinite(around).all(axis=(0, 2))
+    sent, around = trial.inputs[1 : len(fit.off) - 1][known], around[:, known]
+    off = sent - np.clip(sent, around.min(axis=0), around.max(axis=0))
+    return bool((np.abs(off) <= CLEAR * fit.fine / FINE).all(axis=1).mean() >= BESIDE)
 
 
 def ways(model: Model, own: Candidate, *, unsent: bool) -> Iterator[Way]:

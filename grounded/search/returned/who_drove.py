@@ -33,7 +33,10 @@ FINE = 1e-4  # resolution of logged commands at best, relative to an input's siz
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # ages of the states acted on that are tried, in steps
 AGES = 1.0  # steps by which that age varies in a run (lost packets, clock drift and jitter)
 OTHERS = 20  # number of latest candidates to compare with
-OR_UNITS = ", or `runner.action` got states in other units or order, or a time that is not in s"
+OR_UNITS = (
+    ", or `runner.action` got states of other messages than [log] maps, in other units or order, "
+    "or a time that is not in s"
+)
 
 
 @dataclass(frozen=True)
