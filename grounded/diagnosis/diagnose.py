@@ -71,7 +71,7 @@ class DiagnosisOptions:
         hidden: names of states without a sensor, such as the memory of adopted effects.
         but: names of effects that are not blamed, such as adopted ones, whose values are now
             parameters of the model.
-        ruled_out: names of effects that are not blamed since the log rules them out.
+        one_message: states that are logged in one message, so that all or none of them are late.
         delays: adopted delays [s], {effect: delay}. They are part of the task's latency, and may
             turn out longer or shorter.
         origin: the task before anything was adopted. Improvements are measured relative to the
@@ -86,7 +86,7 @@ class DiagnosisOptions:
     horizon: float = 1.0
     hidden: tuple[str, ...] = ()
     but: Collection[str] = ()
-    ruled_out: Collection[str] = ()
+    one_message: tuple[str, ...] = ()
     delays: Mapping[str, float] = field(default_factory=dict)
     origin: Task | None = None
 
@@ -156,7 +156,7 @@ def diagnose(
     exact = bool(copies) and not (scattered(trials) or scattered(compare))
     first = sum(trial.known_steps >= 2 for trial in trials)
     group = len(trials) if compare else None
-    looked = sound_trials(subject, [*trials, *compare], options.hidden, group)
+    looked = sound_trials(subject, [*trials, *compare], options.hidden, group, options.one_message)
     trials, model = looked.trials, with_measured_filters(model, looked.findings)
     data = prepare(model, trials, latency, past, options.hidden)
     filters = {model.state_names.index(name): tau for name, tau in looked.filters.items()}
@@ -174,7 +174,8 @@ def diagnose(
             data = replace(data, model=held(uncertain, null[0]))
             model = without_others(Predictor(data), null[0].track, options.but, options.library)
             data = replace(data, model=model)
-    settled, late = {*options.but, *options.ruled_out, *looked.settled}, options.delays
+    settled, late = {*options.but, *looked.settled}, options.delays
+    settled |= {f"sensor_delay:{name}" for name in options.one_message}
     offered = list(options.library.candidates(data.model, data.scales))
     names = {effect.name for effect in offered}
     if delay in options.library.families:  # those of the inputs that moved in earlier trials

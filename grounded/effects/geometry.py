@@ -57,6 +57,9 @@ def _velocity(s: Any, a: Any, site: Site) -> Any:
     return s[name] if name in site.model.state_names else a[name]
 
 
+LARGEST = 0.35  # radius of a patch relative to the size of where the robot was: else it is no place
+
+
 def _understeer(site: Site) -> tuple[Quantity, ...]:
     fastest = site.scales.peak(_speed(site))
     return (Quantity("k", "s^2/m^2", low=-0.5 / fastest**2, high=20 / fastest**2),)
@@ -71,14 +74,13 @@ def _patch(site: Site) -> tuple[Quantity, ...]:
     for name, spread in zip(where, spreads, strict=True):
         low = site.scales.low.get(name, -1.0)
         grid = tuple(float(low + spread * (i + 0.5) / count) for i in range(count))
-        found.append(
-            Quantity(
-                f"{name}0", site.unit(name), grid, low - spread, low + 2 * spread, places=count
-            )
-        )
+        known = name in site.scales.low
+        ends = (low, low + spread) if known else (-np.inf, np.inf)  # of an adopted patch
+        found.append(Quantity(f"{name}0", site.unit(name), grid, *ends, places=count))
     size = float(np.sqrt(np.prod(spreads))) if len(where) == 2 else spreads[0]
     radii = tuple(size * r for r in (0.08, 0.16))
-    found.append(Quantity("radius", site.unit(where[0]), radii, 0.02 * size, size, places=2))
+    ends = (0.02 * size, LARGEST * size) if site.scales.low else (0.0, np.inf)
+    found.append(Quantity("radius", site.unit(where[0]), radii, *ends, places=2))
     return tuple(found)
 
 

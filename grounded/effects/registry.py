@@ -134,6 +134,7 @@ class Library:
         idle, outright = derived_states(model), outright_states(model)
         integrals = places.integrated(model)
         geometric = set(integrals) - set(places.velocities(model))
+        pulled = f"{places.heading(model)}<-{places.speed(model)}"  # by unequal wheels
         same = aliases(model, idle | outright) | joint.renamed(model) | medium.renamed(model)
         scaled = set(sensor.sensor_scale.targets(model)) & {*places.only_read(model)}
         same |= {f"rate_gain:{name}": f"sensor_scale:{name}" for name in scaled}
@@ -148,7 +149,7 @@ class Library:
                     continue
                 if driven[2] and integrals.get(driven[0], ("",))[0] == driven[2]:
                     continue  # equivalent to rate_gain
-                if family in rate.ADDED and driven[0] in geometric:
+                if family in rate.ADDED and driven[0] in geometric and target != pulled:
                     continue
                 if same.get(f"{family.name}:{target}", "").partition(":")[0] in offered:
                     continue

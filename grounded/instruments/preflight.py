@@ -87,7 +87,10 @@ SMOOTH = 2.0  # time steps: a velocity averaged over less still resolves the mot
 
 
 def preflight(
-    subject: Task | Model, trials: Sequence[Trial], hidden: Sequence[str] = ()
+    subject: Task | Model,
+    trials: Sequence[Trial],
+    hidden: Sequence[str] = (),
+    one_message: Sequence[str] = (),
 ) -> Preflight:
     """Check the sensors and commands of trials, and correct what is certain.
 
@@ -95,6 +98,7 @@ def preflight(
         subject: the model, whose kinematics relate the sensors; a task adds the input limits.
         trials: real ones, of one time grid; unchanged if they don't fit the model.
         hidden: states without a sensor.
+        one_message: states that are logged in one message, so that all or none of them are late.
 
     Raises:
         GroundedError: for logs that can't be used, with the correction.
@@ -116,8 +120,8 @@ def preflight(
             *mended,
             *bench.odd(ratios_of(model, bench.trials, bench.shown) if mended else ratios),
             *bench.singles(),
-            *bench.pairs(),
-            *bench.positions(),
+            *bench.with_message(bench.pairs(), one_message),
+            *bench.with_message(bench.positions(), one_message),
             *bench.plane(),
             *unexplained(model, bench.trials, bench.rows),
             *judge_inputs(subject, bench.trials),
@@ -261,6 +265,21 @@ class _Bench:
                 yield self.in_time(relation.j, clear, f"the derivative of {q}")
             elif clear and not clear.filtered and clear.mean >= SMOOTH * self.dt:
                 yield self.smoothed(relation, clear.mean)
+
+    def with_message(self, findings: Iterator[Finding], names: Sequence[str]) -> Iterator[Finding]:
+        """Correct all states of a message by the delay of one of them, the most certain one."""
+        found = list(findings)
+        yield from found
+        late = [f for f in found if f.kind == "delay" and f.corrected and f.signal in names]
+        if not late or self.in_step & {*names}:
+            return
+        one = min(late, key=lambda f: f.std_s)
+        for i in self.shown:
+            name = self.model.state_names[i]
+            if name in names and name not in {f.signal for f in late}:
+                self.put(i, [earlier(x, one.delay_s / self.dt) for x in self.column(i)])
+                text = f"as late as {one.signal}, which is in the same message"
+                yield replace(one, signal=name, finding=text)
 
     def unit(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """Correct sign and unit; report a scale, which may be that of either sensor."""

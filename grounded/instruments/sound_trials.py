@@ -21,6 +21,7 @@ def sound_trials(
     trials: Sequence[Trial],
     hidden: Sequence[str] = (),
     first: int | None = None,
+    one_message: Sequence[str] = (),
 ) -> Preflight:
     """Run all instrument checks, and correct the trials where that is certain.
 
@@ -30,6 +31,7 @@ def sound_trials(
         hidden: states without a sensor.
         first: number of trials in the first of two groups, between which inputs may change their
             signs; None: one group.
+        one_message: states that are logged in one message, so that all or none of them are late.
 
     Returns:
         The findings and the corrected trials.
@@ -42,7 +44,7 @@ def sound_trials(
     names = (model.state_names, model.input_names)
     if all((trial.state_names, trial.input_names) == names for trial in trials):
         judge_exchanged(model, [t.until(t.known_steps) for t in trials], hidden)
-    looked = preflight(subject, trials, hidden)
+    looked = preflight(subject, trials, hidden, one_message)
     fit = [(trial.state_names, trial.input_names) == names for trial in looked.trials]
     if fit and all(fit):
         judge_positions(model, looked.trials, hidden)

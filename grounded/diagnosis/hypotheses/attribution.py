@@ -243,10 +243,16 @@ def promised(search: HypothesisSearch, fit: Fitted) -> float:
 
 
 def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
-    """Return the likeliest of up to `most` effects: add one, then try to replace each, repeat."""
-    size = len(best.hypothesis.effects)
+    """Return the likeliest of up to `most` effects: add one, then try to replace each, repeat.
+
+    A part of a larger set may be likelier than the set that was extended to it, and is extended in
+    turn: a robot's true scale of distances took the place of its speed sensor's only beside a limit
+    of its acceleration, and a side slip was found only beside the true one.
+    """
+    size, done = len(best.hypothesis.effects), set[frozenset[str]]()
     while 1 <= size < most:
         starts = _starts(search, size, best)
+        done |= {frozenset(fit.hypothesis.names) for fit in starts}
         halves = _halves(search, starts) if size == 1 else []
         grown = [search.extended(start, AT_FIRST) for start in starts]
         grown += [search.extended(half, 4) for half in halves]
@@ -264,7 +270,9 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
             _nested(search, larger[0])
             best = search.of_size(size)[0]
         if not larger or search.score(larger[0]) < search.score(best) + CLAIM:
-            break
+            if not larger or frozenset(best.hypothesis.names) in done:
+                break
+            continue
         best = swapped(search, larger[0])
         size = len(best.hypothesis.effects)
     for _ in range(most):  # what was fitted last may have given the chosen set its constants

@@ -16,7 +16,7 @@ from grounded_trials.workspace.config import read_config
 from grounded_trials.workspace.diagnosing import instruments_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.intake.where_to_mend import late_alone, where_to_mend
+from grounded_trials.workspace.intake.where_to_mend import one_message, where_to_mend
 from workspaces import make
 
 LOG = """
@@ -85,8 +85,7 @@ psi = { path = "TOPIC.pose.orientation.@rpy.yaw" }
 """.replace("TOPIC", topic)
     toml = w.folder / "grounded.toml"
     toml.write_text(toml.read_text() + table)
-    names = {f"sensor_delay:{name}" for name in ("x", "y", "psi")}
-    assert late_alone(Folder(w.folder)) == (set() if alone else names)
+    assert one_message(Folder(w.folder)) == (() if alone else ("x", "y", "psi"))
 
 
 def test_sensors_that_nothing_is_held_against_are_named_and_not_called_right(tmp_path):

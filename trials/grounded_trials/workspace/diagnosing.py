@@ -16,7 +16,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.instruments.finding import in_the_log
 from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.identity import ROWS
-from grounded_trials.workspace.intake.where_to_mend import late_alone, where_to_mend
+from grounded_trials.workspace.intake.where_to_mend import one_message, where_to_mend
 from grounded_trials.workspace.last_diagnosis import diagnosable, write_diagnosis
 from grounded_trials.workspace.unknown_id import named_trials
 
@@ -83,7 +83,7 @@ def diagnose_in(
         max_effects=max_effects,
         hidden=tuple(memory),
         but={*names} - {*delays},  # the d of a delay is not a model parameter
-        ruled_out=late_alone(workspace),
+        one_message=one_message(workspace),
         delays=delays,
         origin=workspace.origin if effects or workspace.config.model.params else None,
     )
@@ -195,7 +195,8 @@ def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Findi
     planner = workspace.planner
     memory = planner.plan.model.state_names[planner.task.model.n :]
     used = _chosen(workspace, trials)
-    found = sound_trials(planner.plan, [planner.lift(trial) for trial in used], memory)
+    lifted, together = [planner.lift(trial) for trial in used], one_message(workspace)
+    found = sound_trials(planner.plan, lifted, memory, one_message=together)
     return where_to_mend(workspace, used, found.findings)
 
 

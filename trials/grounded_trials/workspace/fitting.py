@@ -214,7 +214,7 @@ def fit_trials(
     from grounded.estimate import of_states, record_of
     from grounded.fit import fit
     from grounded.instruments.sound_trials import sound_trials
-    from grounded_trials.workspace.intake.where_to_mend import where_to_mend
+    from grounded_trials.workspace.intake.where_to_mend import one_message, where_to_mend
 
     planner = workspace.planner
     guessed = estimated_in(workspace.trials())
@@ -222,7 +222,7 @@ def fit_trials(
     shown = [i for i, name in enumerate(model.state_names[:n]) if name not in guessed]
     hidden = [name for i, name in enumerate(model.state_names) if i not in shown]
     lifted = [planner.lift(trial) for trial in used]
-    looked = sound_trials(planner.plan, lifted, hidden)
+    looked = sound_trials(planner.plan, lifted, hidden, one_message=one_message(workspace))
     records, unknown = [], np.array([name in guessed for name in model.state_names])
     for trial, logged in zip(looked.trials, lifted, strict=True):
         # a sensor that was left out still says where the filter may begin

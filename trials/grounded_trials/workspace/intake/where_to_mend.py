@@ -78,17 +78,17 @@ def where_to_mend(
     )
 
 
-def late_alone(workspace: Folder) -> set[str]:
-    """Return delays of sensors that can't be: of one part of a pose that one message holds.
+def one_message(workspace: Folder) -> tuple[str, ...]:
+    """Return the states of a pose if one message holds them, else none.
 
     A message has one stamp, so its position and its heading are late together or not at all.
     """
     model, mapping = workspace.base_model, workspace.log_mapping
     pose = [*position(model), *filter(None, [heading(model)])]
     if mapping is None or len(pose) < 2 or not set(pose) <= set(mapping.states):
-        return set()
+        return ()
     topics = {mapping.states[name].path.partition(".")[0] for name in pose}
-    return {f"sensor_delay:{name}" for name in pose} if len(topics) == 1 else set()
+    return tuple(pose) if len(topics) == 1 else ()
 
 
 def in_time_now(workspace: Folder, findings: Sequence[Finding]) -> dict[str, float]:
