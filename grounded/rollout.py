@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -41,11 +41,30 @@ class Rollout:
 
 
 def simulate(problem: Problem, policy: Policy) -> Rollout:
-    """Simulate a policy in the problem's model, closed loop, with inputs clipped to the limits."""
+    """Simulate a policy in the problem's model, closed loop, with inputs clipped to the limits.
+
+    The policy sees the states as the robot's does (`Problem.seen_off`).
+    """
+    policy = referred(policy, problem, -1.0)
     swarm = problem.system.rollout(problem, policy.feedforward, policy.gain, policy.reference)
     cost = float(swarm.cost[0])
     utility = -cost if np.isfinite(cost) else -np.inf
     return Rollout(swarm.z[0], swarm.u[0], utility, problem.system.n)
+
+
+def referred(policy: Policy, problem: Problem, sign: float = 1.0) -> Policy:
+    """Return a policy about true states as one about what the robot sees of them.
+
+    Args:
+        policy: over the problem's z or fewer states, the measured ones first.
+        problem: says how far off what is seen is (`Problem.seen_off`).
+        sign: -1 for the way back.
+    """
+    if problem.seen_off is None or policy.reference is None:
+        return policy
+    reference = policy.reference.copy()
+    reference[:, : problem.seen_off.shape[1]] += sign * problem.seen_off
+    return replace(policy, reference=reference)
 
 
 def each_stepped(model: Model, x: Array, u: Array, p: Array, dt: float) -> Array:

@@ -83,6 +83,7 @@ class Problem:
     high: Array  # (m,) may be +inf
     angles: NDArray[np.bool_]  # (n,)
     input_shift: Array | None = None  # (H, m) off what the actuators receive, see `bias`
+    seen_off: Array | None = None  # (H, k <= n) what a policy sees of x less x, see `sample_age`
     smoothing: float = 0.0  # width of the smoothed indicator terms; 0: exact
 
     @property
