@@ -83,7 +83,7 @@ class Problem:
     high: Array  # (m,) may be +inf
     angles: NDArray[np.bool_]  # (n,)
     input_shift: Array | None = None  # (H, m) off what the actuators receive, see `bias`
-    seen_off: Array | None = None  # (H, k <= n) what a policy sees of x less x, see `sample_age`
+    age: float = 0.0  # [s] of the samples that a policy acts on, see `rollout.seen_late`
     smoothing: float = 0.0  # width of the smoothed indicator terms; 0: exact
 
     @property

@@ -10,10 +10,9 @@ So a policy pi is taken to see x - age dx/dt. The age is that of the incumbent's
 
     age = argmin sum_t |u_t - pi_t(x_t - age dx_t/dt)|^2
 
-to first order, from the commands and states in its logs. `Problem.seen_off` (H, n) is -age dx/dt
-along the incumbent's run. Predicted runs see the states with it, and new policies refer to it, so
-that a new policy on the robot runs as the model says. Logs of what the policy itself saw (all
-simulated ones) give an age of 0.
+to first order, from the commands and states in its logs. Predicted runs see the states so late
+(`Problem.age`), and the reference of a new policy is late by as much, so that it runs on the robot
+as planned. Logs of what the policy itself saw (all simulated ones) give an age of 0.
 """
 
 from __future__ import annotations
