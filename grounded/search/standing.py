@@ -274,8 +274,8 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
     """Return the ending and its reason if the last candidates gained too little, else None.
 
     Too little is less than the tolerance each on average, or in total less than the standard error
-    of that gain, if repeats show it. Else a search under noise would follow lucky runs. A model that
-    was changed since is given LOST candidates of its own.
+    of that gain, if repeats show it. Else a search under noise would follow lucky runs. A changed
+    model is given LOST candidates of its own.
     """
     history = tuple(t for t in history if t.accepted is not False or t.lost)
     before = [t for t in history[:-PATIENCE] if t.accepted]
