@@ -128,7 +128,7 @@ def propose(
 def _run_again(before: Standing, now: Standing, last: Trial, made: Candidate) -> str:
     """Return why a search goes on after a run of its best candidate that it did not ask for.
 
-    It may have ended before that run; "" for other runs.
+    It may have ended before that run; "" for other runs, and if the model was changed since.
 
     Args:
         before: the standing of the search without the last trial.
@@ -138,6 +138,8 @@ def _run_again(before: Standing, now: Standing, last: Trial, made: Candidate) ->
     """
     was, best = before.incumbent, now.incumbent
     if was is None or best is None or before.phase == "await-trial":
+        return ""
+    if now.history[-1].candidate.model != made.model:
         return ""
     own = was.candidate.id
     ran = next((tried for tried in now.history if tried.candidate.id == own), None)

@@ -148,6 +148,9 @@ def test_a_run_of_the_best_that_makes_an_ended_search_go_on_says_so():
         now.candidates, now.trials = [*story.candidates], [*story.trials, bad(again, value)]
         (note,) = now.propose().notes
         assert holds(note, best, "was run again", goes_on, "goes on")
+        now.candidates[:-1] = [replace(c, model="before") for c in now.candidates[:-1]]
+        changed = propose(TASK, now.candidates[:-1], now.trials, now.options)  # the reason then
+        assert not any("run again" in note for note in changed.notes)
         now.add()
         assert not any("run again" in note for note in now.propose().notes)
 
