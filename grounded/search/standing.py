@@ -326,11 +326,13 @@ def let_down(ended: Standing, model: str) -> Standing:
     lost = losers_of(ended.history, own, model)
     for tried in ended.history:
         made = tried.candidate
+        if made not in lost or made.doubtful:
+            continue
         error, known = error_between(best, tried, ended.history)
         loss, noise = best.utility - tried.utility, LUCK * error if known else 0.0
         short = loss + made.predicted_gain
         luck = short <= noise or max(loss, made.predicted_gain) <= noise
-        if made in lost and not made.doubtful and not luck:
+        if not luck:
             missed.append(made.predicted_gain)
     if not missed or not max(missed) > LITTLE * -best.utility:
         return ended

@@ -684,6 +684,16 @@ def test_whatever_happens_the_search_goes_on_or_says_why(events, repeats, step):
         assert (inside >= TASK.low).all() and (inside <= TASK.high).all()
 
 
+def test_a_candidate_that_was_never_run_does_not_stop_a_search_from_ending():
+    """Repeats that agree to the last bit, and one without a trial: it divided by none."""
+    story = Story(max_halvings=2)
+    story.propose()
+    story.task = story.task.with_model(other(story.task.model, 1.1))
+    story.add(EVENTS["large"])
+    story.trials.append(story.trials[-1])
+    assert story.propose().standing.sentence
+
+
 def weights(state=10.0, terminal=0.0, effort=0.01, change=0.01):
     return Reward(
         np.array([state, 0.0]), np.array([terminal, 0.0]), np.array([effort]), np.array([change])
