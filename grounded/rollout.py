@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from grounded.model import Model
 from grounded.policy import Policy
 
 Run = tuple[Array, Array]  # states (H + 1, n) and inputs (H, m)
+SETTLED = 1e-9  # relative change of a run below which it agrees with the samples that were seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,11 +43,59 @@ class Rollout:
 
 
 def simulate(problem: Problem, policy: Policy) -> Rollout:
-    """Simulate a policy in the problem's model, closed loop, with inputs clipped to the limits."""
+    """Simulate a policy in the problem's model, closed loop, with inputs clipped to the limits.
+
+    If the policy acts on old samples (`Problem.age`), what it sees depends on the run. So the run
+    is repeated until it agrees with what was seen: each repeat makes at least one more step right.
+    """
+    run = _simulated(problem, policy)
+    if not problem.age or policy.gain is None or policy.reference is None:
+        return run
+    n, angles = run.n, tuple(map(bool, problem.angles))
+    for _ in range(problem.horizon):
+        reference = policy.reference.copy()
+        reference[:, :n] -= seen_late(run.states[:-1], problem.age / problem.dt, angles)
+        again = _simulated(problem, replace(policy, reference=reference))
+        scale = 1.0 + np.abs(again.z).max(axis=0)
+        if not (np.abs(again.z - run.z) > SETTLED * scale).any():
+            return again  # also if it diverged
+        run = again
+    return run
+
+
+def _simulated(problem: Problem, policy: Policy) -> Rollout:
     swarm = problem.system.rollout(problem, policy.feedforward, policy.gain, policy.reference)
     cost = float(swarm.cost[0])
     utility = -cost if np.isfinite(cost) else -np.inf
     return Rollout(swarm.z[0], swarm.u[0], utility, problem.system.n)
+
+
+def seen_late(states: Array, steps: float, angles: Sequence[bool]) -> Array:
+    """Return what a policy sees of states less the states themselves, if its samples are old.
+
+    To first order, that is the change since the step before, times the age; 0 at the first step.
+
+    Args:
+        states: (H, n), one row a control step.
+        steps: age of the samples, in steps.
+        angles: (n,) which states wrap.
+    """
+    with np.errstate(all="ignore"):
+        return -steps * wrapped(np.diff(states, axis=0, prepend=states[:1]), angles)
+
+
+def for_late_samples(policy: Policy, problem: Problem) -> Policy:
+    """Return a policy about true states as one about what the robot sees of them.
+
+    Args:
+        policy: planned as if the robot saw its state at once.
+        problem: says how old the samples are that it acts on (`Problem.age`).
+    """
+    if not problem.age or policy.reference is None:
+        return policy
+    n, reference = len(policy.state_names), policy.reference.copy()
+    reference[:, :n] += seen_late(reference[:, :n], problem.age / problem.dt, policy.angles)
+    return replace(policy, reference=reference)
 
 
 def each_stepped(model: Model, x: Array, u: Array, p: Array, dt: float) -> Array:

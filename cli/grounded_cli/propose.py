@@ -78,6 +78,8 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
         show(field("why", standing.sentence, "  "))
     show(field("what", _what(candidate, standing, workspace.task), "  "))
     show(field("predicted", _predicted(proposed), "  "))
+    if candidate.sample_age:
+        show(field("samples", _samples(candidate), "  "))
     if standing.incumbent is not None:
         from grounded_trials.workspace.identity import estimated_in
 
@@ -103,6 +105,15 @@ def _predicted(proposed: Proposed) -> str:
         text += f", about {number(promised - cost)} in its log, including sensor noise"
     errors = "; ".join(one.summary() for one in proposed.off_target)
     return f"{text}; off target: {errors}" if errors else text
+
+
+def _samples(candidate: Candidate) -> str:
+    """Return how old the samples are that the robot acts on."""
+    late, age = candidate.sample_age > 0, with_unit(f"{1e3 * abs(candidate.sample_age):.2g}", "ms")
+    return (
+        f"the commands of {candidate.base} fit samples {age} {'older' if late else 'newer'} than "
+        f"its log has at that time; {candidate.id} allows for it"
+    )
 
 
 def _otherwise(candidate: Candidate, best: Tried) -> bool:

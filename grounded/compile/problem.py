@@ -83,6 +83,7 @@ class Problem:
     high: Array  # (m,) may be +inf
     angles: NDArray[np.bool_]  # (n,)
     input_shift: Array | None = None  # (H, m) off what the actuators receive, see `bias`
+    age: float = 0.0  # [s] of the samples that a policy acts on, see `rollout.seen_late`
     smoothing: float = 0.0  # width of the smoothed indicator terms; 0: exact
 
     @property

@@ -42,7 +42,8 @@ class Verdict(Document):
     `sentences` has one entry per line, `sentence` joins them. One is made of `clauses`, one per
     cause in the order of `Diagnosis.credit`, or per group of `causes`; before it is `comparison`,
     of two groups of trials. `parameters` are off. `look_for`: number of effects to look for before
-    adopting, or 0. `limit`: why no cause is named, an entry of `unknowable`.
+    adopting, or 0. `again`: whether to diagnose again once these effects, as many as can be named,
+    are adopted. `limit`: why no cause is named, an entry of `unknowable`.
     """
 
     kind: str  # one of `Kind`
@@ -53,6 +54,7 @@ class Verdict(Document):
     clauses: tuple[str, ...] = ()
     parameters: tuple[str, ...] = ()
     look_for: int = 0
+    again: bool = field(metadata=BRIEF, default=False)
     limit: str = field(metadata=BRIEF, default="")
     comparison: str = field(metadata=BRIEF, default="")
 

@@ -157,7 +157,7 @@ def verdict(
         clauses=told,
         parameters=off,
     )
-    return replace(said, look_for=more if more > most else 0)
+    return replace(said, look_for=more if more > most else 0, again=0 < more <= most)
 
 
 def also_off(others: int) -> str:

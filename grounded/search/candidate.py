@@ -59,6 +59,7 @@ class Candidate(Result):
     slopes: Slopes = ""  # derivatives of the model that it was planned in
     base_as_run: float = float("nan")  # model's utility of the base from where its trials began
     likely_off: float = 0.0  # likely error of predicted_gain, from held-out trials; 0: unknown
+    sample_age: float = 0.0  # [s] of the samples that the robot acts on, allowed for in it
     seen: tuple[str, ...] = ()  # ids of the search's trials that were known when it was made
     units: Mapping[str, str] = field(default_factory=dict)  # of states and inputs, for figures
 

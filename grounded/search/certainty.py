@@ -254,12 +254,20 @@ def owed_to_start(before: Tried, after: Tried, history: Sequence[Tried]) -> floa
 
 
 def _began_apart(one: Tried, other: Tried) -> bool:
-    """Return whether the trials of two candidates began apart, by more than the sensors' noise."""
+    """Return whether the trials of two candidates began apart.
+
+    That is by more than the sensors' noise, and more than the scatter of where repeats begin, which
+    the scatter of their utilities includes.
+    """
     first, second = (np.array([t.states[0] for t in tried.trials]) for tried in (one, other))
-    s_0 = one.candidate.predicted_states[0]
+    s_0, apart = one.candidate.predicted_states[0], np.ones(first.shape[1], bool)
+    if (freedom := len(first) + len(second) - 2) > 0:
+        squares = sum(len(starts) * starts.var(axis=0) for starts in (first, second)) / freedom
+        error = np.sqrt(squares * (1 / len(first) + 1 / len(second)))
+        apart = np.abs(first.mean(axis=0) - second.mean(axis=0)) > LUCK * error
     return bool(
-        beyond_noise(one.trials, first - second.mean(axis=0), s_0).any()
-        and beyond_noise(other.trials, second - first.mean(axis=0), s_0).any()
+        (apart & beyond_noise(one.trials, first - second.mean(axis=0), s_0)).any()
+        and (apart & beyond_noise(other.trials, second - first.mean(axis=0), s_0)).any()
     )
 
 

@@ -117,7 +117,44 @@ def propose(
             return made
         note = f"the plan is not optimal in the model: {plan.sentence}"
         return replace(made, notes=(*made.notes, note))
-    return _improvement(make, now.incumbent, options)
+    found = _improvement(make, now.incumbent, options)
+    if found.candidate is None:
+        return found
+    before = standing(task, candidates, trials[:-1], options, fingerprint)
+    note = _run_again(before, now, trials[-1], found.candidate)
+    return replace(found, notes=(*found.notes, note)) if note else found
+
+
+def _run_again(before: Standing, now: Standing, last: Trial, made: Candidate) -> str:
+    """Return why a search goes on after a run of its best candidate that it did not ask for.
+
+    It may have ended before that run; "" for other runs, and if the model was changed since.
+
+    Args:
+        before: the standing of the search without the last trial.
+        now: the standing with it.
+        last: the last trial.
+        made: the next candidate.
+    """
+    was, best = before.incumbent, now.incumbent
+    if was is None or best is None or before.phase == "await-trial":
+        return ""
+    if now.history[-1].candidate.model != made.model:
+        return ""
+    own = was.candidate.id
+    ran = next((tried for tried in now.history if tried.candidate.id == own), None)
+    if last.candidate != own or ran is None:
+        return ""
+    mean = (
+        f"{own} was run again, and the mean of its runs is now {figure(ran.utility)} instead of "
+        f"{figure(was.utility)}"
+    )
+    if best.candidate.id != own:
+        return f"{mean}: {best.candidate.id} is the best now, and the search goes on from there"
+    return (
+        f"{mean}: the model replays their mean, and promises {figure(made.promised_over(best))} "
+        "from there, so the search goes on"
+    )
 
 
 def refitted(task: Task, trials: Sequence[Trial]) -> Model:

@@ -11,13 +11,14 @@ import numpy as np
 
 from grounded.compile import Problem
 from grounded.policy import Policy
-from grounded.rollout import Rollout, Run, apart
+from grounded.rollout import Rollout, Run, apart, for_late_samples
 from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Slopes, Tried, Way
 from grounded.search.directions import base_columns, direction
 from grounded.search.limit_cycle import between_limits, limit_cycle
 from grounded.search.margin import steadied
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
+from grounded.search.sample_age import sample_age
 from grounded.search.scatter import beyond_noise
 from grounded.search.standing import LOST, Proposal, Standing, wild
 from grounded.search.step_size import KEPT, SearchOptions, Step, losers_of
@@ -81,7 +82,10 @@ class About:
 
         self.grounding = ground(plan, own, match_inputs=matched)
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
-        self.real = exact.on(plan.problem(exact=True))
+        # without a bias: independent of noise and start
+        age = sample_age(planner.task, incumbent)
+        self.plain = replace(plan.problem(exact=True), age=age)
+        self.real = exact.on(self.plain)
         self.theta = planner.widened(incumbent.candidate.policy)
         self.run = (own.states[:, : planner.task.model.n], own.inputs)
         self.corrected: Corrected | None = None
@@ -106,7 +110,6 @@ class About:
         as_run = replace(self.real, start=began)  # theta's run from where its trial began
         self.as_run = predicted(as_run, incumbent.candidate.policy).utility
         self.least = options.tolerance * abs(self.already)
-        self.plain = plan.problem(exact=True)  # without a bias: independent of noise and start
         self.plainly = predicted(self.plain, incumbent.candidate.policy).utility
         self.ruinous: Candidate | None = None  # a step rejected because of its predicted loss
         self.doubted: Candidate | None = None  # the next step after two losses
@@ -186,7 +189,7 @@ class About:
         directions: dict[float, Policy] = {}
         for step in options.steps_from(first):
             if step.damping not in directions:
-                directions[step.damping] = direction(
+                found = direction(
                     make.planner.aim,
                     self.theta,
                     self.grounding,
@@ -195,6 +198,7 @@ class About:
                     self.corrected,
                     make.planner.task.model.n,
                 )
+                directions[step.damping] = for_late_samples(found, self.real)
             policy = self.theta.toward(directions[step.damping], step.alpha)
             made = self.candidate(policy, step, self.way)
             if any(self._near(made, run) for run in foretold):
@@ -346,7 +350,7 @@ class About:
         if base.model == make.fingerprint or tried:
             return None
         policy, _ = make.planner.first_policy()
-        made = self._told(self.candidate(policy, Step(), "own plan"))
+        made = self._told(self.candidate(for_late_samples(policy, self.real), Step(), "own plan"))
         promise = rival.candidate.expected_gain if rival and rival.candidate else self.least
         swung = wild(self.incumbent) or limit_cycle(self.incumbent, make.planner.task)
         better = swung or self._worth(made) > max(promise, self.least)
@@ -419,6 +423,7 @@ class Maker:
             made,
             policy=policy,
             predicted_gain=run.utility - already,
+            sample_age=problem.age,
             predicted_states=run.states[:, : self.planner.task.model.n],
             predicted_inputs=run.inputs,
             predicted_utility=run.utility,
@@ -458,7 +463,7 @@ class Maker:
         plan, columns = self.planner.plan, base_columns(problem, self.planner.plan)
         K = measured_gains(gentle, run.z, run.inputs, found.gains.K, self.planner.task.model.n)
         made = plan.policy(run.inputs, K[:, :, columns], run.z[:-1, columns])
-        return self.planner.narrowed(made)
+        return self.planner.narrowed(for_late_samples(made, problem))
 
     def with_margin(self, made: Candidate, problem: Problem) -> Candidate:
         """Return the same run with gains that hold under worse conditions, see `margin`."""

@@ -259,9 +259,10 @@ def standing(
         ending, why = hardly
         why = f"{why}: {own} is the result"
         return let_down(replace(now, phase="converged", sentence=why, ending=ending), model)
+    restarted = _restarted(history, model)
     last = history[-1]
     lost = f", since {last.candidate.id} crashed" * (last.accepted is False and bool(last.failed))
-    sentence = f"improve on {own} with {step}{lost}"
+    sentence = f"improve on {own} with {step}{lost}{restarted}"
     if why := _suspicion(history, incumbent, model):
         asked = f"; {why}"
         now = replace(now, then=NextCommand("diagnose"), doubt=why, missed=asked)
@@ -273,12 +274,13 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
     """Return the ending and its reason if the last candidates gained too little, else None.
 
     Too little is less than the tolerance each on average, or in total less than the standard error
-    of that gain, if repeats show it. Else a search under noise would follow lucky runs.
+    of that gain, if repeats show it. Else a search under noise would follow lucky runs. A changed
+    model is given LOST candidates of its own.
     """
     history = tuple(t for t in history if t.accepted is not False or t.lost)
     before = [t for t in history[:-PATIENCE] if t.accepted]
     last = history[-PATIENCE:]
-    if not before or any(t.candidate.model != model for t in last):
+    if not before or any(t.candidate.model != model for t in last[-LOST:]):
         return None
     old, best = before[-1], [t for t in history if t.accepted][-1]
     gained = best.utility - old.utility
@@ -298,6 +300,20 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
     return None
 
 
+def _restarted(history: tuple[Tried, ...], model: str) -> str:
+    """Return that a search goes on after losses because the model was changed since; "" if not."""
+    row = list[Tried]()
+    for tried in history:
+        row = [] if tried.accepted else row + [tried] * tried.lost
+    own = sum(tried.candidate.model == model for tried in row)
+    if len(row) < PATIENCE or own >= LOST:
+        return ""
+    return (
+        f"; the last {len(row)} candidates did not improve, but the model was changed "
+        f"after {row[-1 - own].candidate.id}: {LOST} losses of its own end the search"
+    )
+
+
 def let_down(ended: Standing, model: str) -> Standing:
     """Return an ended search; it asks for a diagnosis if a step that promised much has lost.
 
@@ -310,11 +326,13 @@ def let_down(ended: Standing, model: str) -> Standing:
     lost = losers_of(ended.history, own, model)
     for tried in ended.history:
         made = tried.candidate
+        if made not in lost or made.doubtful:
+            continue
         error, known = error_between(best, tried, ended.history)
         loss, noise = best.utility - tried.utility, LUCK * error if known else 0.0
         short = loss + made.predicted_gain
         luck = short <= noise or max(loss, made.predicted_gain) <= noise
-        if made in lost and not made.doubtful and not luck:
+        if not luck:
             missed.append(made.predicted_gain)
     if not missed or not max(missed) > LITTLE * -best.utility:
         return ended

@@ -374,8 +374,8 @@ def test_where_as_many_as_were_looked_for_leave_more_than_noise_more_are_looked_
     credit = (Credit("calibration", 1.0),)
     left = (Remainder("u", 0.1, "m/s^2", 9.0, None, error, 0.032, 1.0, "m/s", True),)
     found = verdict(claims, rows, (), left, (), credit, most=most)
-    assert found.look_for == more
-    assert ("diagnose again" in found.sentence) is (most == MOST_EFFECTS)
+    assert found.look_for == more and found.again is (most == MOST_EFFECTS)
+    assert ("diagnose again" in found.sentence) is found.again
 
 
 def test_a_rest_above_the_noise_that_is_no_leftover_is_said_with_its_reason():

@@ -120,6 +120,41 @@ def test_trials_that_do_not_improve_raise_the_damping_until_nothing_is_promised(
     assert (ended.phase, ended.ending) == ("converged", "no step improved")
 
 
+def test_losses_before_and_after_a_change_of_the_model_end_a_search_that_says_so():
+    """An arm's search went on after five losses, because `adopt` began the count anew."""
+    story = Story().add().add(bad).add(bad)
+    story.candidates = [replace(c, model="before") for c in story.candidates]
+    story.add(bad)
+    assert "the model was changed" not in story.now.sentence  # three losses
+    story.trials.append(bad(replace(story.trials[-1], candidate="c0006", id="t9")))
+    lost = replace(story.candidates[-1], id="c0006")
+    ended = standing(TASK, [*story.candidates, lost], story.trials, story.options, lost.model)
+    assert (ended.phase, ended.ending) == ("converged", "no step improved")
+    assert holds(ended.sentence, "last 4")
+    again = standing(TASK, [*story.candidates, lost], story.trials, story.options, "after")
+    assert again.phase == "propose"
+    assert holds(again.sentence, "last 4", "the model was changed after c0006", "2 losses")
+
+
+def test_a_run_of_the_best_that_makes_an_ended_search_go_on_says_so():
+    """A car's search had ended; a run to verify its result brought a new candidate, unasked."""
+    story = Story(tolerance=0.2)
+    while story.propose().candidate is not None:
+        story.add()
+    best = story.now.incumbent.candidate.id
+    again = replace(story.now.incumbent.trials[0], id="t99")
+    for value, goes_on in ((0.3, "the best now"), (0.01, "replays")):
+        now = Story(tolerance=1e-3)
+        now.candidates, now.trials = [*story.candidates], [*story.trials, bad(again, value)]
+        (note,) = now.propose().notes
+        assert holds(note, best, "was run again", goes_on, "goes on")
+        now.candidates[:-1] = [replace(c, model="before") for c in now.candidates[:-1]]
+        changed = propose(TASK, now.candidates[:-1], now.trials, now.options)  # the reason then
+        assert not any("run again" in note for note in changed.notes)
+        now.add()
+        assert not any("run again" in note for note in now.propose().notes)
+
+
 @pytest.mark.parametrize(("share", "goes_on"), [(2.0, False), (0.5, True)])
 def test_after_two_losses_no_trial_is_spent_on_a_step_likelier_to_lose(monkeypatch, share, goes_on):
     """A Cessna in wind flew two more steps that promised less than their likely errors."""
@@ -647,6 +682,16 @@ def test_whatever_happens_the_search_goes_on_or_says_why(events, repeats, step):
         assert np.isfinite(policy.feedforward).all() and np.isfinite(policy.gain).all()
         inside = first.candidate.predicted_inputs
         assert (inside >= TASK.low).all() and (inside <= TASK.high).all()
+
+
+def test_a_candidate_that_was_never_run_does_not_stop_a_search_from_ending():
+    """Repeats that agree to the last bit, and one without a trial: it divided by none."""
+    story = Story(max_halvings=2)
+    story.propose()
+    story.task = story.task.with_model(other(story.task.model, 1.1))
+    story.add(EVENTS["large"])
+    story.trials.append(story.trials[-1])
+    assert story.propose().standing.sentence
 
 
 def weights(state=10.0, terminal=0.0, effort=0.01, change=0.01):

@@ -9,10 +9,12 @@ import pytest
 from cli import grounded, plain
 from facts import holding, holds
 from grounded.errors import GroundedError, NextCommand
+from grounded.search.planner import predicted
 from grounded_trials import Workspace
 from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
 from grounded_trials.store.trial_file import read_trial, write_trial
-from grounded_trials.workspace.handover import checked_candidate, outside_limits
+from grounded_trials.workspace.handover import checked_candidate, intact, outside_limits
+from grounded_trials.workspace.identity import encoded
 from rewriting import with_metadata
 from workspaces import CONFIG, MODEL, make
 
@@ -246,6 +248,18 @@ def test_a_rewritten_candidate_is_refused_whatever_its_checksum(w, tmp_path, che
         w.propose()
     (found,) = w.verify().damaged
     assert "c0001.mcap" in found.file and "rewritten" in found.reason
+
+
+def test_a_candidate_for_a_robot_with_old_samples_is_no_rewritten_one(w):
+    """Its policy sends what it predicts for the samples that the robot will have."""
+    made, planner = w.candidate("c0001")[0], w.planner
+    late = replace(planner.plan.problem(exact=True), age=0.3 * w.task.dt)
+    run = predicted(late, made.policy)
+    states, inputs = run.states, run.inputs
+    aged = replace(made, sample_age=late.age, predicted_states=states, predicted_inputs=inputs)
+    assert intact(encoded(aged, w.task, "search"), "c0001")[0].sample_age == late.age
+    with pytest.raises(GroundedError, match="rewritten"):
+        intact(encoded(replace(aged, sample_age=0.0), w.task, "search"), "c0001")
 
 
 def test_deleting_what_was_rewritten_brings_the_candidate_back(w):

@@ -857,6 +857,24 @@ def test_more_effects_are_looked_for_before_those_at_the_limit_are_adopted(cart,
     assert "max-effects" in over and "max-effects" not in most
 
 
+@pytest.mark.parametrize("left", [{"look_for": 5}, {"again": True}, {}])
+def test_what_left_more_to_be_found_is_diagnosed_again_once_it_is_adopted(
+    cart, tmp_path, monkeypatch, left
+):
+    """It said `adopt these effects and diagnose again`, and `next: export best`."""
+    folder = copied(cart, tmp_path / "w")
+    w = Workspace(folder)
+    ended = replace(w.status().standing, phase="converged", ending="nothing promised")
+    monkeypatch.setattr("grounded.search.standing.standing", lambda *_, **__: ended)
+    count = len(list(folder.glob("trials/*.mcap")))
+    claimed = {"kind": "effect", "effects": ["viscous_friction:v"], "sentence": "One."}
+    seen = taken_in(folder, *range(1, count + 1))
+    diagnosed(folder, diagnosed=seen, verdict=claimed | left)
+    assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
+    then = "diagnose" if left else "export best --runner"
+    assert last(grounded("-C", folder, "status")) == f"grounded {then}"
+
+
 def test_an_adoption_is_undone_and_not_proposed_again_until_a_new_diagnosis(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     names = two_claimed(folder)

@@ -25,6 +25,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
+from grounded.rollout import seen_late
 from grounded.search.candidate import Candidate
 from grounded.search.certainty import beyond_one_trial
 from grounded.task import Task
@@ -137,8 +138,10 @@ def intact(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
     """
     candidate, meta = candidate_of(data, identity)
     predicted, policy = candidate.predicted_inputs, candidate.policy
+    true, steps = candidate.predicted_states[:-1], candidate.sample_age / policy.dt
     with np.errstate(all="ignore"):
-        sent = policy.commands(candidate.predicted_states[None, :-1], policy.past, predicted[None])
+        seen = true + seen_late(true, steps, policy.angles)
+        sent = policy.commands(seen[None], policy.past, predicted[None])
         off = np.abs(sent[0] - predicted)
         wrong = off > AGREES * (1 + np.abs(predicted).max(axis=0))
     if wrong.any():
@@ -375,7 +378,7 @@ class Check:
 
         planner, made = self.workspace.planner, self.candidate
         plan, horizon = planner.plan, planner.task.horizon
-        problem = plan.problem(exact=True)
+        problem = replace(plan.problem(exact=True), age=made.sample_age)
         for identity in (made.id, made.base):
             ran = [t.until(horizon) for t in self._trials(identity)] if identity else []
             whole = [t for t in ran if t.finite_steps == horizon]

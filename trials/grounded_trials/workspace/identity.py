@@ -52,6 +52,7 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "slopes": str,
     "base_as_run": float,
     "likely_off": float,
+    "sample_age": float,
     "seen": lambda text: tuple(filter(None, text.split(","))),
 }
 STATUS = NextCommand("status")
@@ -65,6 +66,7 @@ _ABSENT = {
     "slopes": "",
     "base_as_run": "nan",
     "likely_off": "0.0",
+    "sample_age": "0.0",
     "seen": "",
 }
 

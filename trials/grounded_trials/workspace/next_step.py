@@ -332,14 +332,16 @@ class Since:
     adopted: tuple[str, ...] = ()  # effects that are part of the model now, claimed ones first
     missing: tuple[str, ...] = ()  # claimed effects that are not, if others are
     changed: bool = False  # the diagnosis was made with another model
+    further: bool = False  # it left more to be found than it was allowed to claim
 
     @property
     def settled(self) -> bool:
         """Whether another diagnosis would only repeat this one.
 
-        It is of all trials, and the model is the one that it had, or has all that it claimed.
+        It is of all trials, and the model is the one that it had, or has all that it claimed and
+        there was nothing more to look for.
         """
-        adopted = self.used > 0 and bool(self.adopted) and not self.missing
+        adopted = self.used > 0 and bool(self.adopted) and not self.missing and not self.further
         return not self.newer and (adopted or not self.changed)
 
     @property
@@ -390,6 +392,7 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
         adopted=adopted,
         missing=missing if adopted else (),
         changed=not same or params not in (None, dict(model.params)),
+        further=diagnosis.verdict.look_for > 0 or diagnosis.verdict.again,
     )
 
 

@@ -1,0 +1,75 @@
+"""Find how old the samples are that a robot's policy acts on, and allow for it.
+
+A program commands from the last sample that has reached it, while its log has the states at the
+time of the command. A car at 1.8 m/s whose poses were 7 ms old saw itself 12 mm further back than
+it was, and so drove 12 mm ahead of its reference. A model that replays the recorded inputs replays
+that lead; but a policy that is planned about the replayed run, and run on such samples again, leads
+by 12 mm more, which no model promised: two steps lost, the second one to 1.7 times the cost.
+
+So a policy pi is taken to see x - age dx/dt. The age is that of the incumbent's runs,
+
+    age = argmin sum_t |u_t - pi_t(x_t - age dx_t/dt)|^2
+
+to first order, from the commands and states in its logs. Predicted runs see the states so late
+(`Problem.age`), and the reference of a new policy is late by as much, so that it runs on the robot
+as planned. Logs of what the policy itself saw (all simulated ones) give an age of 0.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.search.candidate import Tried
+from grounded.solve.bias import WINDOW, hann_smoothed
+from grounded.task import Task
+from grounded.trial import Trial
+
+PROBED = 0.1  # age for the derivative of the commands, in steps
+OLDEST = 2.0  # largest age, in steps; a program that acts on older samples needs another remedy
+CLEAR = 0.25  # smallest share of the squares of the commands' differences that an age explains
+NOTHING = 1e-6  # rms difference of commands, relative to their size, that is rounding
+
+
+def sample_age(task: Task, tried: Tried) -> float:
+    """Return the age of the samples that a candidate's policy acted on [s]; 0 if none is clear.
+
+    It is negative if the policy had newer samples than its logs, whose states are then late.
+
+    Args:
+        task: the manoeuvre, whose states the robot measures.
+        tried: the candidate with its whole trials.
+    """
+    policy, H = tried.candidate.policy, task.horizon
+    if policy.gain is None:
+        return 0.0
+    angles = tuple(map(bool, task.model.angle_mask))
+    policy = policy.laid_out(task.model.state_names, angles, policy.depths)
+    size = np.abs(policy.feedforward).max(axis=0) + 1e-12
+    off, by_age = list[Array](), list[Array]()
+    for trial in tried.trials:
+        x, sent = trial.states[:H], trial.inputs[:H]
+        past = policy.past if trial.start_inputs is None else trial.start_inputs
+        probed = PROBED * task.dt
+        seen = np.stack([x, x - probed * rates(task, trial)])
+        now, later = policy.commands(seen, past, sent[None])
+        off.append((sent - now) / size)
+        by_age.append((later - now) / probed / size)
+    e, g = np.concatenate(off), np.concatenate(by_age)
+    squares = float(np.vdot(e, e))
+    if not squares > NOTHING**2 * e.size or not (steep := float(np.vdot(g, g))) > 0:
+        return 0.0
+    explains = float(np.vdot(g, e)) ** 2 / steep
+    age = float(np.vdot(g, e)) / steep
+    clear = explains > CLEAR * squares and abs(age) <= OLDEST * task.dt
+    return age if clear else 0.0
+
+
+def rates(task: Task, trial: Trial) -> Array:
+    """Return the rate of each state along a trial's first H steps, (H, n).
+
+    Its noise does not correlate with that of the state itself, which would give an age.
+    """
+    moved = task.model.difference(trial.states[1:], trial.states[:-1])[: task.horizon]
+    mean = 0.5 * (moved + np.vstack([moved[:1], moved[:-1]])) / task.dt
+    return np.column_stack([hann_smoothed(column, WINDOW - 1) for column in mean.T])
