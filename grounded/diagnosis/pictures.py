@@ -74,7 +74,9 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
     if not panels:
         return None
     where = "on held-out data" if held else "on the data used for the diagnosis"
-    least = "" if any(e.floor_bound for e in errors) else " No model gets below the noise."
+    least = " No model gets below the noise."
+    if any(e.floor_bound for e in errors):
+        least = " The noise is at most that, and perhaps far less: a better model may get below it."
     if apart and not any(v > 0 for e in errors for v in e.noise_floor.values()):
         known = any(v == 0 for e in errors for v in e.noise_floor.values())
         least = " Repeated trials agree exactly: the noise is 0." * known

@@ -36,7 +36,14 @@ from grounded.diagnosis.report import (
     Unconfirmed,
     Verdict,
 )
-from grounded.diagnosis.ruler_words import explained, floor, improvement, rest, worsened
+from grounded.diagnosis.ruler_words import (
+    explained,
+    floor,
+    improvement,
+    rest,
+    unknown_noise,
+    worsened,
+)
 from grounded.errors import GroundedError
 from grounded.instruments.finding import Finding, in_the_log
 from grounded.model import Model
@@ -109,8 +116,10 @@ def verdict(
         if above := rest(rows):
             text = f"The model explains what these trials show: {above}."
         elif row is not None and row.floor_at_most:
-            what = "No known effect explains the rest, which may be noise that is not white"
-            return _said("unknown", f"{what}{floor(row)}.", *once, first=first)
+            what = (
+                f"No known effect explains what this model leaves{floor(row)}.{unknown_noise(row)}"
+            )
+            return _said("unknown", what, *once, first=first)
         else:
             text = explained(rows)
         return _said("none", text, *once, first=first)

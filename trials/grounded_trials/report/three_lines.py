@@ -130,7 +130,7 @@ def still_open(diagnosis: Diagnosis) -> str:
         found.append(f"still unexplained: {diagnosis.leftover[0].sentence()}{more}")
     rows = diagnosis.prediction_error
     if not found and (name := open_noise(rows)):
-        found.append(f"only repeated trials tell how much of what is left in {name} is noise")
+        found.append(f"only a repeat of one run tells how much of what is left in {name} is noise")
     nothing = in_doubt(rows) or "nothing is left above the noise"
     if worsened(rows):  # which is said elsewhere
         nothing = "it is open why predictions get worse with it there"
