@@ -119,11 +119,12 @@ def _together(errors: Mapping[str, float], names: list[str]) -> float:
     return math.hypot(*(errors.get(name, math.nan) for name in names))
 
 
-def still_open(diagnosis: Diagnosis) -> str:
-    """What ties, and what no known effect explains."""
+def still_open(diagnosis: Diagnosis, *, ties: bool = True) -> str:
+    """What ties (unless `ties` is False), and what no known effect explains."""
     same, claimed = diagnosis.equivalent, diagnosis.effects
-    ties = [told_apart(group, same, claimed) for group in diagnosis.indistinguishable]
-    found = [f"{text[:1].lower()}{text[1:]}" for text in ties]
+    groups = diagnosis.indistinguishable if ties else ()
+    alike = [told_apart(group, same, claimed) for group in groups]
+    found = [f"{text[:1].lower()}{text[1:]}" for text in alike]
     found += [one.sentence() for one in diagnosis.unconfirmed[:1]]
     if diagnosis.leftover:
         more = also_off(len(diagnosis.leftover) - 1)

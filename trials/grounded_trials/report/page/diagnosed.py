@@ -144,7 +144,8 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     known = {"repeats": "the scatter of repeated trials"}
     known["alike"] = "the scatter of trials whose commands agree to 2 %, and is at most that"
     known["at most"] = (
-        "one-step errors, which hold errors of the model too: it may be far less, and what is unexplained far more. Repeat a run to know"
+        "one-step errors, which hold errors of the model too, so it may be far less, and what is "
+        "unexplained far more. Repeat a run to know"
     )
     source = known.get(splits[main].irreducible_from, "the estimated noise")
     words = (
