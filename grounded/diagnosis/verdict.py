@@ -7,12 +7,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from grounded.diagnosis.cause_words import (
-    ENDED,
     OWN,
     clauses,
     comparison,
     counted,
     disagreement,
+    ended,
     give_or_take,
     meaning,
     other_unit,
@@ -299,7 +299,7 @@ def _moved(claims: Claims, adopted: Collection[str]) -> str:
         old = params[name].value
         change = 100 * (known[name].value - old) / abs(old) if old else 0.0
         beside = [f"{change:+.{0 if abs(change) >= 1 else 1}f} %"] * bool(old)
-        beside += ENDED[known[name].stopped]
+        beside += ended(known[name], old)
         part = f" ({', '.join(beside)})" * bool(beside)
         if effect := _effect_of(name, adopted):
             key = name.removeprefix(param_name(effect, ""))

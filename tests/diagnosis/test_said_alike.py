@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from facts import holds
+from grounded.diagnosis.cause_words import ended
 from grounded.diagnosis.error_report import Credit, Remainder, RulerRow
 from grounded.diagnosis.pictures import accuracy_figure
 from grounded.diagnosis.report import (
@@ -13,6 +14,7 @@ from grounded.diagnosis.report import (
     Diagnosis,
     Estimate,
     Identifiable,
+    Made,
     Ranked,
     TrialValue,
     Verdict,
@@ -206,3 +208,19 @@ def test_trials_that_disagree_are_shown_by_values_that_they_determine():
 
 def test_a_column_of_volts_newtons_or_newton_metres_is_an_effort():
     assert {"V", "N", "N m"} == EFFORT_UNITS
+
+
+@pytest.mark.parametrize(("value", "way"), [(0.0, "less"), (4.0, "more")])
+def test_a_parameter_at_its_lower_bound_asks_for_less(value, way):
+    """A friction of "0.00 (-100 %, at its bound, the data ask for more)" needed less."""
+    found = Estimate(value, 0.1, unit="kg", stopped="bound")
+    assert ended(found, 2.0) == (f"at its bound, the data ask for {way}",)
+    assert not ended(replace(found, stopped=""), 2.0)
+    effect = Library().effect("viscous_friction:v", MODEL)
+    row = Ranked(effect.name, {"k": Estimate(1.0, 0.1)}, {}, 50.0, claimed=True)
+    credit = (Credit(effect.name, 0.6), Credit("calibration", 0.4))
+    claims = _claims(effect, moved="a", parameters={"a": found})
+    assert f"ask for {way}" in verdict(claims, (row,), (), (), (), credit).sentence
+    made = Made(nominal={"a": 2.0})
+    whole = Diagnosis(Verdict("effect", effects=(effect.name,)), parameters={"a": found}, made=made)
+    assert f"ask for {way}" in calibrated_sentence(whole, {})
