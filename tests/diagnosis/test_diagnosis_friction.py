@@ -108,6 +108,20 @@ def test_the_plain_friction_is_compared_with_a_constant_of_its_own(search):
     assert search.score(better) > search.score(fit) + 10
 
 
+def test_the_plain_friction_is_compared_from_the_constants_of_the_richer_one_too(search):
+    """An earlier fit of it, far too slow to build up, lost to a load of the least share."""
+    joint, (loaded,) = search.joints["w"], (e for e in search.candidates if e.name == LOADED)
+    width = joint.fixed["width"]
+    poor = fitted(search, (joint.tuned("width", 30 * width), {"c": 0.2, "width": 30 * width}))
+    fit = fitted(search, (loaded, {"c": FRICTION, "k": 0.02}))
+    names = (JOINT,)
+    search.fits = {key: one for key, one in search.fits.items() if key[2] != names}
+    search.keep([poor])
+    (better,) = plainer(search, fit)
+    assert search.score(better) > search.score(poor) + 10
+    assert better.hypothesis.values[0]["width"] == pytest.approx(width, rel=0.5)
+
+
 def test_what_a_swap_gives_gets_constants_of_its_own(search):
     effects = {e.name: e for e in search.candidates}
     fit = fitted(search, (effects["coulomb_friction:w"], {"c": 5.2}))
