@@ -30,11 +30,9 @@ def plainer(search: HypothesisSearch, fit: Fitted) -> list[Fitted]:
     found = []
     for h in plain_forms(search, fit.hypothesis):
         key = _key(replace(fit, hypothesis=h))
-        known = key in search.fits and h.names != fit.hypothesis.names
-        # an earlier fit may have stopped at other constants and parameters, far below this one
-        own = search.refined([(h, fit.noise, fit.track)], TO_THE_TOP)
-        if not known:  # the speed over which another law builds up is not that of this one
-            tune(search, own)
+        if key not in search.fits or h.names == fit.hypothesis.names:
+            # the speed over which another law builds up is not that of this one
+            tune(search, search.refined([(h, fit.noise, fit.track)], TO_THE_TOP))
         plain_fit = search.fits.get(key)
         if plain_fit is not None and _numbers(plain_fit) < _numbers(fit):
             found.append(plain_fit)
