@@ -61,4 +61,6 @@ def _rms(error: Array) -> Array:
     """Return the rms along the first axis, NaN for a state without a target or a measurement."""
     known = np.isfinite(error)
     total = np.where(known, error, 0.0) ** 2
-    return np.sqrt(total.sum(axis=0) / np.where(known.any(axis=0), known.sum(axis=0), np.nan))
+    return np.asarray(
+        np.sqrt(total.sum(axis=0) / np.where(known.any(axis=0), known.sum(axis=0), np.nan))
+    )
