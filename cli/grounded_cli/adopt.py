@@ -12,7 +12,10 @@ from grounded_cli.terminal import LABEL, field, number, remark, sentence, show, 
 from grounded_trials.wording import ALONE, misread, moved, with_unit
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from grounded_trials import Workspace
+    from grounded_trials.workspace.adopting import Rewritten
 
 DIGITS = 4  # of a parameter, at least
 UNCLAIMED = (
@@ -102,9 +105,7 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
         show(field(name, text, "  "))
     if done.rewritten:
         show("rewritten in [model] effects, fitted again beside the others:")
-        width = max(LABEL, *(len(one.called) for one in done.rewritten))
-        for new in done.rewritten:
-            show(field(new.called, moved(new.was, new.now, new.unit, DIGITS), "  ", width))
+        _rewritten(done.rewritten)
     for one in done.left.values():
         kept, beside = (with_unit(number(value), one.unit) for value in (one.kept, one.value))
         text = f"{one.called} stays at {kept}: these trials do not determine it"
@@ -116,6 +117,13 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
     if done.logged:
         remark("note", f"target.csv is still the logged drive, {done.logged}: {DRAW}")
     show(f"\n{next_line(done.then)}")
+
+
+def _rewritten(changes: Sequence[Rewritten]) -> None:
+    """List quantities of effects that stay in the model, with their old and new values."""
+    width = max(LABEL, *(len(one.called) for one in changes))
+    for new in changes:
+        show(field(new.called, moved(new.was, new.now, new.unit, DIGITS), "  ", width))
 
 
 def _undo(workspace: Workspace, json_: bool) -> None:
@@ -130,6 +138,9 @@ def _undo(workspace: Workspace, json_: bool) -> None:
     for name, was in before.items():
         if was.value != now[name].value:
             show(field(name, moved(was.value, now[name].value, was.unit, DIGITS), "  "))
+    if done.rewritten:
+        show("back in [model] effects:")
+        _rewritten(done.rewritten)
     rest = ", ".join(str(effect["name"]) for effect in done.effects)
     sentence(f"still part of the model: {rest}" if rest else "no effect is adopted now")
     show(f"\n{next_line(done.then)}")

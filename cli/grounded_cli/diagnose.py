@@ -172,8 +172,8 @@ def _held_out(found: Diagnosis) -> str:
     }
     if row.floor_at_most:
         noise["short horizon"] = (
-            "an upper bound, extrapolated from one-step errors that are not white (part of them is "
-            "model error; repeat a trial to know)"
+            "not known, but at most that and perhaps far less: extrapolated from one-step errors, "
+            "which hold errors of the model too (repeat a run to know)"
         )
     text = f"{by.get(row.held_out, 'not held out')}; noise: {noise.get(row.floor_from, 'unknown')}"
     last = furthest(found.prediction_error)

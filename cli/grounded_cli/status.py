@@ -42,7 +42,10 @@ def command(json_: bool) -> None:
     for name, why in status.discarded.items():
         show(field("discarded", f"{name}{why and ': ' + why}"))
     if settled:
-        show(field("model", " ".join(settled.lines)))
+        show(f"\n{table(settled.rows, ('adopted', 'value'))}")
+        for text in filter(None, (settled.gained, settled.briefly)):
+            show("\n".join(wrapped(text, "  ", "  ")))
+        show()
     if status.outdated:
         show(field("diagnosis", status.outdated))
     show(f"\n{next_line(status.then)}")

@@ -361,11 +361,16 @@ def value_of(one: Changed, adopted: Iterable[str]) -> str:
     return one.quantity
 
 
-ENDED = {  # what is said of a parameter that stopped, by `Estimate.stopped`
-    "": (),
-    "bound": ("at its bound, the data ask for more",),
-    "prior": ("at the limit of its std, the data ask for more",),
-}
+def ended(estimate: Estimate, before: float) -> tuple[str, ...]:
+    """Return what is said of a parameter that stopped: nothing, or one clause.
+
+    Args:
+        estimate: its calibrated value.
+        before: its value in the model.
+    """
+    where = {"bound": "at its bound", "prior": "at the limit of its std"}.get(estimate.stopped)
+    way = "less" if estimate.value < before else "more"
+    return (f"{where}, the data ask for {way}",) if where else ()
 
 
 def wider(known: Mapping[str, Estimate]) -> str:
@@ -380,9 +385,9 @@ def wider(known: Mapping[str, Estimate]) -> str:
     one = len(names) == 1
     its, each = ("its", "it is") if one else ("their", "they are")
     return (
-        f"{listed(names)} moved as far as {its} std allows, and the data ask for more: if {each} "
-        f"known less well than that, widen {its} std in the model file, or give bounds instead, "
-        "and diagnose again; otherwise adopt the claimed effects."
+        f"{listed(names)} moved as far as {its} std allows, and the data ask to go further: if "
+        f"{each} known less well than that, widen {its} std in the model file, or give bounds "
+        "instead, and diagnose again; otherwise adopt the claimed effects."
     )
 
 

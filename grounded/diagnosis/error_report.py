@@ -318,9 +318,14 @@ class Remainder(Document):
         errors, unit = [self.error], self.error_unit
         if not self.above and math.isfinite(self.size):
             [off, _] = beside_noise(errors, self.floor, unit, at_most=self.floor_at_most)
+            noise = (
+                "of which noise may be any part"
+                if self.floor_at_most
+                else "which may be noise alone"
+            )
             return (
                 f"the rate of {name} lacks {number(self.size)} {self.unit} rms{where}: small but "
-                f"lasting, while {ahead} {name} is off by {off}, which may be noise alone"
+                f"lasting, while {ahead} {name} is off by {off}, {noise}"
             )
         [off, noise] = beside_noise(errors, self.floor, unit, at_most=self.floor_at_most)
         return f"{name} is still off by {off} {ahead}{noise}{where}"

@@ -18,7 +18,7 @@ CHANGED = (  # advice on the next trial if two groups differ
     "Diagnose the newer trials alone, or discard the older ones."
 )
 AT_BOUNDS = (  # the same if every parameter that moved is at its bound
-    "None helps yet: parameters stopped at their bounds and the data ask for more. Widen the "
+    "None helps yet: parameters stopped at their bounds and the data ask to go further. Widen the "
     "bounds in the model file if the true value may lie beyond; otherwise a parameter that the "
     "model holds constant may be off, so give it bounds. Then diagnose again."
 )

@@ -18,6 +18,10 @@ APART = 0.01  # relative difference of errors below which curves coincide
 WHOLE = "whole trial"
 APART_BY = 2.0  # where errors over whole trials are drawn, in units of the longest horizon
 SHOWS = 1.02  # ratio of errors without and with a cause from which bars show its worth
+SPARED = (
+    "All but: with every cause of this diagnosis except one, fitted again. Causes may offset each "
+    "other, so that all but one are worse than the model as it is."
+)
 CREDIT_S = 1.0  # horizon at which an effect's worth is measured [s]
 MODELS = {  # keys of a prediction error: role, name
     "outset": ("limit", "model.py"),
@@ -74,7 +78,9 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
     if not panels:
         return None
     where = "on held-out data" if held else "on the data used for the diagnosis"
-    least = "" if any(e.floor_bound for e in errors) else " No model gets below the noise."
+    least = " No model gets below the noise."
+    if any(e.floor_bound for e in errors):
+        least = " The noise is at most that, and perhaps far less: a better model may get below it."
     if apart and not any(v > 0 for e in errors for v in e.noise_floor.values()):
         known = any(v == 0 for e in errors for v in e.noise_floor.values())
         least = " Repeated trials agree exactly: the noise is 0." * known
@@ -147,7 +153,8 @@ def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
     panels = [Bars("Errors without each, mean of all (logarithmic)", bars)]
     for name in _improved(known)[:channels] if known else ():
         panels += worth_of([name], name, diagnosis)
-    return Figure("credit", "What each is worth", "", tuple(panels))
+    caption = SPARED if len(panels) > 1 else ""
+    return Figure("credit", "What each is worth", caption, tuple(panels))
 
 
 def worth_figure(
@@ -179,9 +186,10 @@ def worth_figure(
             hidden.append(credit.of)
     panels = [panel for names, what in drawn for panel in worth_of(names, what, diagnosis)]
     known = [_loss(c, error, names) for c in diagnosis.credit[:MOST] for names, _ in drawn]
-    caption = (
-        "A cause is claimed for the mean over all states and horizons. If predictions of one state "
-        "are better without it, its bar is shorter."
+    caption = SPARED * bool(diagnosis.credit)
+    caption += (
+        " A cause is claimed for the mean over all states and horizons. If predictions of one "
+        "state are better without it, its bar is shorter than that of all."
     ) * any(0 < loss < 1 for loss in known)
     caption += (
         f" The improvement by {', '.join(hidden)} shows at other horizons, in no state 1 s ahead."
@@ -200,7 +208,7 @@ def _loss(credit: Credit, error: RulerRow, names: Sequence[str]) -> float:
 
 
 def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars]:
-    """Return the combined error of some states a second ahead, without each cause and with all.
+    """Return the combined error of some states a second ahead, with all causes and all but each.
 
     Args:
         names: names of states with one unit, such as those of a position.
@@ -214,9 +222,9 @@ def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars
     if error is None or not set(names) <= set(error.crude):
         return []
     unit = error.unit_by_channel.get(names[0], "")
-    rows = [(MODELS["crude"], error.crude)]
-    rows += [(("limit", f"without {c.of}"), c.without_it) for c in diagnosis.credit[:MOST]]
-    rows += [(MODELS["with_effects"], error.with_effects)]
+    rows = [(("model", "model as it is"), error.crude)]
+    rows += [(("best", "with all causes"), error.with_effects)]
+    rows += [(("limit", f"all but {c.of}"), c.without_it) for c in diagnosis.credit[:MOST]]
     rows += [(models(error)["noise_floor"], error.noise_floor)]
     found = [(look, math.hypot(*(v[n] for n in names))) for look, v in rows if set(names) <= set(v)]
     bars = _in_unit([(n, v, role) for (role, n), v in found if math.isfinite(v)], unit)

@@ -36,7 +36,27 @@ def improvement(rows: Sequence[RulerRow], tracked: Sequence[str] = ()) -> str:
         return f"{_ahead(first)} hardly change." if first else ""
     told = [(name, *_told(row, name, "with_effects", "crude")) for name in _best(row, tracked)]
     parts = [f"{name} by {now} instead of {then}{noise}" for name, now, then, noise in told]
-    return f"{_ahead(row)} miss {listed(parts)}."
+    return f"{_ahead(row)} miss {listed(parts)}.{unknown_noise(row, [n for n, *_ in told])}"
+
+
+def unknown_noise(row: RulerRow, names: Sequence[str] = ()) -> str:
+    """Return a sentence if these errors may be any part noise; "" if the noise is known.
+
+    An upper bound of the noise says something only of an error above it.
+
+    Args:
+        row: prediction errors at one horizon.
+        names: the states that were named; by default the one that is furthest off.
+    """
+    if not any(_within_bound(row, name) for name in names or [most_off(row)]):
+        return ""
+    return " How much of that is noise is not known: repeat one run to see."
+
+
+def _within_bound(row: RulerRow, name: str) -> bool:
+    """Check that an error may be noise, as only an upper bound of that is known."""
+    bound = row.noise_floor.get(name, math.nan)
+    return row.floor_at_most and row.with_effects[name] <= doubt_of(0.0) * bound
 
 
 def told_row(rows: Sequence[RulerRow]) -> RulerRow | None:
@@ -260,4 +280,6 @@ def _told(row: RulerRow, name: str, *columns: str) -> list[str]:
     """Return a state's errors in these columns, then the noise as text, in one unit."""
     errors = [getattr(row, column)[name] for column in columns]
     noise, unit = row.noise_floor.get(name, math.nan), row.unit_by_channel[name]
+    if _within_bound(row, name):  # as a figure beside the error, it reads as if nothing was left
+        noise = math.nan
     return beside_noise(errors, noise, unit, at_most=row.floor_bound)

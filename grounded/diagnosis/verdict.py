@@ -7,12 +7,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from grounded.diagnosis.cause_words import (
-    ENDED,
     OWN,
     clauses,
     comparison,
     counted,
     disagreement,
+    ended,
     give_or_take,
     meaning,
     other_unit,
@@ -36,7 +36,14 @@ from grounded.diagnosis.report import (
     Unconfirmed,
     Verdict,
 )
-from grounded.diagnosis.ruler_words import explained, floor, improvement, rest, worsened
+from grounded.diagnosis.ruler_words import (
+    explained,
+    floor,
+    improvement,
+    rest,
+    unknown_noise,
+    worsened,
+)
 from grounded.errors import GroundedError
 from grounded.instruments.finding import Finding, in_the_log
 from grounded.model import Model
@@ -109,8 +116,10 @@ def verdict(
         if above := rest(rows):
             text = f"The model explains what these trials show: {above}."
         elif row is not None and row.floor_at_most:
-            what = "No known effect explains the rest, which may be noise that is not white"
-            return _said("unknown", f"{what}{floor(row)}.", *once, first=first)
+            what = (
+                f"No known effect explains what this model leaves{floor(row)}.{unknown_noise(row)}"
+            )
+            return _said("unknown", what, *once, first=first)
         else:
             text = explained(rows)
         return _said("none", text, *once, first=first)
@@ -290,7 +299,7 @@ def _moved(claims: Claims, adopted: Collection[str]) -> str:
         old = params[name].value
         change = 100 * (known[name].value - old) / abs(old) if old else 0.0
         beside = [f"{change:+.{0 if abs(change) >= 1 else 1}f} %"] * bool(old)
-        beside += ENDED[known[name].stopped]
+        beside += ended(known[name], old)
         part = f" ({', '.join(beside)})" * bool(beside)
         if effect := _effect_of(name, adopted):
             key = name.removeprefix(param_name(effect, ""))

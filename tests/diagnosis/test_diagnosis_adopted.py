@@ -304,7 +304,21 @@ def test_adopt_lists_the_values_of_adopted_effects_that_it_rewrites(tmp_path):
     adopt = ["adopt", "parameter:viscous_friction_omega_k", "parameter:l"]
     out = " ".join(grounded("-C", tmp_path / "ws", *adopt).out.split())
     assert "rewritten in [model] effects" in out and "delay:torque" not in out
-    assert "k of viscous_friction:omega 0.3000 -> 0.3500" in out
+    assert "k of viscous_friction:omega 0.3000 -> 0.3500 1/s" in out
+    out = " ".join(grounded("-C", tmp_path / "ws", "adopt", "--undo").out.split())
+    assert "k of viscous_friction:omega 0.3500 -> 0.3000 1/s" in out
+
+
+def test_adopt_lists_what_a_new_gain_of_a_rate_rewrites(tmp_path):
+    """An adopted effect on that rate is scaled by it."""
+    workspace(
+        tmp_path / "ws",
+        ['{name = "viscous_friction:omega", k = 0.3}'],
+        {"trials": [], "adopted": [{"name": "viscous_friction:omega", "k": 0.3}], "nominal": {}},
+        [row("rate_gain:omega", g=0.1)],
+    )
+    out = " ".join(grounded("-C", tmp_path / "ws", "adopt", "rate_gain:omega").out.split())
+    assert "k of viscous_friction:omega 0.3000 -> 0.3300 1/s" in out
 
 
 def test_a_delay_more_adds_to_the_delay(tmp_path):

@@ -1,6 +1,7 @@
 """The dry friction of a motor's joint: one cause, at its plainest, beside a gain and a lag."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.hypotheses.swaps import swapped
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.validation import decide
 from grounded.effects import Library
 from grounded.effects.joint import has_viscous
 
@@ -106,6 +108,25 @@ def test_the_plain_friction_is_compared_with_a_constant_of_its_own(search):
     (better,) = plainer(search, fit)
     assert better.hypothesis.values[0]["width"] < wide / 3
     assert search.score(better) > search.score(fit) + 10
+
+
+@pytest.mark.parametrize(
+    ("nats", "better", "claimed"),
+    [
+        (48.0, False, "plain"),  # a motor's: likelier by 48 nats, and yet called a tie only
+        (-2.0, False, "plain"),
+        (48.0, True, "loaded"),  # predictions refuse it
+        (-9.0, False, "loaded"),
+    ],
+)
+def test_of_two_frictions_that_tie_the_plain_one_is_claimed(monkeypatch, nats, better, claimed):
+    """Predictions with the load-dependent one were better by 3 %, which separates no two causes."""
+    gain = SimpleNamespace(beyond=lambda *bar: better)
+    ruler = SimpleNamespace(held_out=True, gain=lambda *fits: gain)
+    search = SimpleNamespace(score={"plain": nats, "loaded": 0.0}.get)
+    monkeypatch.setattr(decide, "plainer", lambda s, f: ["plain"] if f == "loaded" else [])
+    monkeypatch.setattr(decide, "_pays", lambda *given: True)
+    assert decide._plainest(search, "loaded", ruler, white=False) == claimed
 
 
 def test_what_a_swap_gives_gets_constants_of_its_own(search):

@@ -6,12 +6,15 @@ from types import SimpleNamespace
 import pytest
 
 from facts import holds
+from grounded.diagnosis.cause_words import ended
 from grounded.diagnosis.error_report import Credit, Remainder, RulerRow
+from grounded.diagnosis.pictures import accuracy_figure
 from grounded.diagnosis.report import (
     Agreement,
     Diagnosis,
     Estimate,
     Identifiable,
+    Made,
     Ranked,
     TrialValue,
     Verdict,
@@ -121,11 +124,25 @@ def test_noise_from_trials_that_are_merely_alike_is_a_bound_everywhere():
 
 
 def test_the_noise_of_the_sentence_is_the_noise_of_the_table():
-    """0.5 of 0.45 was "at most that", beside 0.45 in the table."""
+    """0.5 of 0.37 was "at most that", beside 0.37 in the table."""
+    row = replace(_row(floor_at_most=True), noise_floor={"v": 0.37})
+    assert "at most 0.37 m/s" in improvement((row,))
+    left = Remainder("v", error=0.5, floor=0.37, horizon_s=1.0, error_unit="m/s")
+    assert "at most 0.37 m/s" in replace(left, floor_at_most=True).sentence()
+
+
+def test_an_error_no_larger_than_a_bound_of_the_noise_does_not_read_as_if_nothing_was_left():
+    """Of a flexible arm, 0.0029 rad were left; "noise: at most 0.0026 rad", really 0.00045."""
     row = replace(_row(floor_at_most=True), noise_floor={"v": 0.45})
-    assert "at most 0.45 m/s" in improvement((row,))
-    left = Remainder("v", error=0.5, floor=0.45, horizon_s=1.0, error_unit="m/s")
-    assert "at most 0.45 m/s" in replace(left, floor_at_most=True).sentence()
+    said = improvement((row,))
+    assert "0.45" not in said and said.endswith("is not known: repeat one run to see.")
+    known = improvement((replace(row, floor_at_most=False),))
+    assert "noise: 0.45 m/s" in known and "not known" not in known
+    left = Remainder("v", 0.03, "m/s^2", 12.0, error=0.5, floor=0.45, horizon_s=1.0)
+    assert "noise alone" in left.sentence()
+    assert "any part" in replace(left, floor_at_most=True).sentence()
+    found = Diagnosis(Verdict("effect"), prediction_error=(row,))
+    assert "perhaps far less" in accuracy_figure(found).caption
 
 
 def test_every_tie_is_in_the_verdict_and_in_the_page_s_summary():
@@ -191,3 +208,19 @@ def test_trials_that_disagree_are_shown_by_values_that_they_determine():
 
 def test_a_column_of_volts_newtons_or_newton_metres_is_an_effort():
     assert {"V", "N", "N m"} == EFFORT_UNITS
+
+
+@pytest.mark.parametrize(("value", "way"), [(0.0, "less"), (4.0, "more")])
+def test_a_parameter_at_its_lower_bound_asks_for_less(value, way):
+    """A friction of "0.00 (-100 %, at its bound, the data ask for more)" needed less."""
+    found = Estimate(value, 0.1, unit="kg", stopped="bound")
+    assert ended(found, 2.0) == (f"at its bound, the data ask for {way}",)
+    assert not ended(replace(found, stopped=""), 2.0)
+    effect = Library().effect("viscous_friction:v", MODEL)
+    row = Ranked(effect.name, {"k": Estimate(1.0, 0.1)}, {}, 50.0, claimed=True)
+    credit = (Credit(effect.name, 0.6), Credit("calibration", 0.4))
+    claims = _claims(effect, moved="a", parameters={"a": found})
+    assert f"ask for {way}" in verdict(claims, (row,), (), (), (), credit).sentence
+    made = Made(nominal={"a": 2.0})
+    whole = Diagnosis(Verdict("effect", effects=(effect.name,)), parameters={"a": found}, made=made)
+    assert f"ask for {way}" in calibrated_sentence(whole, {})

@@ -192,6 +192,42 @@ def test_degrees_and_signs_are_noticed(tmp_path, mine, scale, expected):
     assert any(s == pytest.approx(expected) for s in scales), scales
 
 
+def steered(tmp_path, scale=1.0, turned=1.0, name="steer"):
+    """A workspace of a car whose steering is `scale` times 0.4 rad in the log."""
+    (tmp_path / "car.py").write_text(
+        "from grounded import Model\n"
+        "import numpy as np\n"
+        "model = Model(states={'v': 'm/s', 'psi': 'rad'},\n"
+        f"    inputs={{'{name}': 'rad', 'a': 'm/s^2'}},\n"
+        f"    derivative=lambda s, a, p: {{'v': a.a, 'psi': s.v * np.tan(a.{name})}})\n"
+    )
+    t = np.arange(200) * 0.05
+    columns = [t, 1 + np.sin(t), turned * np.sin(t), scale * 0.4 * np.sin(2 * t), np.cos(t)]
+    header = f"t,v,psi,{name},a"
+    log = tmp_path / "r.csv"
+    np.savetxt(log, np.column_stack(columns), "%.5f", ",", header=header, comments="")
+    found = begin(tmp_path / "w", log, model=tmp_path / "car.py")
+    return next(g for g in found.inputs if g.name == name)
+
+
+@pytest.mark.parametrize(
+    ("scale", "turned", "name", "doubted"),
+    [
+        (1.0, 1.0, "steer", False),
+        (57.3, 1.0, "steer", True),
+        (57.3, 30.0, "steer", True),  # a steering does not follow the turns of the car
+        (57.3, 30.0, "joint", False),  # of several turns, as the state that follows it
+    ],
+)
+def test_a_steering_in_degrees_where_the_model_has_radians_is_unsure(
+    tmp_path, scale, turned, name, doubted
+):
+    """[limits] were written as +-22.9 rad without a doubt."""
+    guess = steered(tmp_path, scale, turned, name)
+    said = any("0.017453293" in why and "22.9" in why for why in guess.reasons)
+    assert said == doubted and (not guess.sure or not doubted)
+
+
 def test_a_person_is_asked_for_what_is_unsure(tmp_path, mine):
     asked = []
 

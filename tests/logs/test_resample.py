@@ -274,3 +274,21 @@ def test_slow_sensors_in_rows_of_a_faster_one_are_named_once_with_their_rate() -
     (told,) = (w for w in found.warnings if "Hz" in w)
     assert re.match(r"'x' and 'y' change at 25(\.\d)? Hz", told) and "62.5 Hz" in told
     assert "0.012 s late" in told and "'z'" not in told
+
+
+def test_what_holds_of_a_whole_message_is_said_once_and_one_sorted_stamp_not_at_all() -> None:
+    """A car's pose: 'x', 'y' and 'psi' each had "1 stamp out of order", in every log."""
+
+    def of_pose(order: np.ndarray):  # type: ignore[no-untyped-def]
+        x = pose(np.sin)
+        one = replace(x, t=x.t[order], values=x.values[order], log_times=x.log_times[order])
+        names = ["x", "y", "psi"]
+        return to_grid({**dict.fromkeys(names, one), "u": command()}, 0.05, names, ["u"])
+
+    order = np.arange(len(pose(np.sin).t))
+    order[10:12] = 11, 10
+    found = of_pose(order)
+    assert found.reports[0].out_of_order == 1 and not found.warnings
+    order[10:20] = np.arange(20, 10, -1) - 1
+    (said,) = of_pose(order).warnings
+    assert said == "'x', 'y' and 'psi': 9 stamps out of order"

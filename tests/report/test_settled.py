@@ -57,9 +57,19 @@ def test_what_was_adopted_is_told_everywhere_with_what_it_gained(adopted):
     assert "0.3 1/s" in found["clauses"][0] and found["clauses"][1] == "mass 1.00 -> 1.40 kg"
     assert "x by 12 mm instead of 250 mm" in found["gained"] and "v" in found["left"]
     page = (adopted / "reports" / "report.html").read_text().replace("\xa0", " ")
-    for text in (words(adopted, "report"), words(adopted, "status"), re.sub(r"<[^>]+>", "", page)):
+    for text in (words(adopted, "report"), re.sub(r"<[^>]+>", "", page)):
         assert "Found and adopted: " in text and "12 mm instead of 250 mm" in text
     assert "2 trials, t0001 to t0002" in page
+
+
+def test_the_status_has_one_line_for_each_adopted_effect_and_parameter(adopted):
+    """Of a car it was one paragraph of 30 lines."""
+    lines = plain(grounded("-C", adopted, "status").out).splitlines()
+    head = next(k for k, line in enumerate(lines) if line.startswith("adopted "))
+    effect, mass, gain = lines[head + 1 : head + 4]
+    assert re.fullmatch(r"viscous_friction:v +k = 0\.300 \+- 0\.010 1/s", effect)
+    assert re.fullmatch(r"mass +1\.4\d* \+- 0\.\d+ kg, was 1", mass)
+    assert "12 mm instead of 250 mm" in gain
 
 
 def test_a_parameter_that_stays_behind_is_told_and_no_gain_is_claimed(cart, tmp_path):
@@ -206,7 +216,7 @@ def test_the_answer_says_if_only_some_of_the_trials_were_diagnosed(adopted):
 
 def test_nothing_adopted_nothing_said(cart):
     assert grounded("-C", cart, "report", "--json").json["adopted"] is None
-    assert "Found and adopted" not in words(cart, "status")
+    assert "adopted" not in words(cart, "status")
 
 
 def test_parameters_stand_before_now_and_as_diagnosed(adopted):

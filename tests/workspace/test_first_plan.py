@@ -10,6 +10,8 @@ from cli import grounded
 from facts import holds
 from grounded_trials import Workspace
 from grounded_trials.starting.begin import begin
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.wrong_units import in_another_unit
 
 LIFTED = """
 from grounded import Model, Param
@@ -442,3 +444,36 @@ def test_an_input_that_moves_nothing_is_named(tmp_path):
     assert any(holds(note, "servo", "model.py") and "no state" in note for note in notes)
     (w.folder / "model.py").write_text(BALL)
     assert not any("no state" in note for note in Workspace(w.folder).propose().proposal.notes)
+
+
+def test_a_target_start_or_safety_in_another_unit_than_the_model_s_is_told(tmp_path):
+    """A target drawn in degrees, and a [safety] in mm, were planned and guarded as they stood."""
+    (tmp_path / "balanced.py").write_text(BALANCED)
+    t = np.arange(200) * 0.05
+    rows = np.column_stack([t, np.sin(t), 0.4 * np.sin(t), np.cos(t), 0.4 * np.cos(t), np.sin(t)])
+    np.savetxt(tmp_path / "r.csv", rows, "%.5f", ",", header="t,x,th,v,w,u", comments="")
+    folder = tmp_path / "w"
+    begin(folder, tmp_path / "r.csv", model=tmp_path / "balanced.py")
+    assert grounded("-C", folder, "ingest", "--data", tmp_path / "r.csv").code == 0
+    file = folder / "grounded.toml"
+    before = file.read_text()
+
+    def told(start: str = "", safety: str = "") -> list[str]:
+        text = re.sub(r"(?m)^start = .*$", f"start = {{ {start} }}", before)
+        file.write_text(re.sub(r"(?m)^\[limits\]$", f"[safety]\n{safety}\n\n[limits]", text))
+        return in_another_unit(Folder(folder))
+
+    assert not told() and not told("th = 0.3", "x = [-3, 3]\nth = [-6, 6]")
+    assert not told("", "x = [-1e6, 1e6]")  # as good as none, in mm too
+    (note,) = told("th = 20")
+    assert holds(note, "[task] start of th is 20 rad", "50 times", "degrees", "0.017453293")
+    (note,) = told("", "x = [-1500, 1500]")
+    assert holds(note, "[safety] of x is 1500 m", "mm", "0.001")
+    assert note in Workspace(folder).propose().proposal.notes
+    columns = np.genfromtxt(folder / "target.csv", delimiter=",", names=True)
+    columns["th"] *= 57.3
+    names = columns.dtype.names
+    values = np.column_stack([columns[n] for n in names])
+    np.savetxt(folder / "target.csv", values, "%.5f", ",", header=",".join(names), comments="")
+    (note,) = told()
+    assert note.startswith("the target of th is 22.9")

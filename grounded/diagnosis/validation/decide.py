@@ -137,9 +137,15 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
 
 
 def _plainest(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool) -> Fitted:
-    """Replace frictions by their plain forms if their further parameters predict no better."""
+    """Replace frictions by their plain forms if their further parameters predict no better.
+
+    A plain form that is as likely, or likelier, gives way only to clearly better predictions: with
+    less, the two tie, and of two that tie the simpler is claimed.
+    """
     for plain_form in plainer(search, fit) if ruler.held_out else ():
-        if not _pays(search, ruler, plain_form, fit, white):
+        tied = search.score(plain_form) > search.score(fit) - TIE
+        tied = tied and not ruler.gain(plain_form, fit).beyond(*BETTER)
+        if tied or not _pays(search, ruler, plain_form, fit, white):
             return _plainest(search, plain_form, ruler, white)
     return fit
 

@@ -31,6 +31,7 @@ from grounded.effects import (
     SensorLagFamily,
 )
 from grounded.effects.actuator import backlash
+from grounded.effects.sensed import moved_model
 from grounded.filter import kalman
 from grounded.frozen import Array
 from grounded.instruments.finding import Finding
@@ -118,7 +119,8 @@ def joints_without_input(model: Model, claimed: Collection[str]) -> list[str]:
         model: its exact integrals show which states are velocities of joints.
         claimed: names of the claimed effects.
     """
-    rates = {model.state_names[one.j] for one in integrals(model) if one.exact}
+    moved = moved_model(model)  # its true speeds, not those that an adopted filter makes of them
+    rates = {moved.state_names[one.j] for one in integrals(moved) if one.exact}
     found = []
     for v in sorted(rates):
         own = [f"{kind}:{v}" for kind in FRICTIONS if f"{kind}:{v}" in claimed]

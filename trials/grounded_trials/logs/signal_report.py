@@ -7,7 +7,7 @@ values, `warnings_of` turns reports into sentences.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,7 @@ SKEW_S = 0.1  # signals whose clocks differ by more than this cause a warning
 BRIDGED = 1.9  # a value between samples more than this many intervals apart counts as bridged
 LEAST_RUNS, REPEATED = 20, 0.8  # a held signal: fewest runs, and share with two or more samples
 COARSE = 2.5  # least ratio of median to smallest change of a signal that is not quantised
+DISORDERED = 0.01  # least share of stamps out of order that is told; sorting loses nothing of them
 
 
 @dataclass(frozen=True)
@@ -159,21 +160,27 @@ def warnings_of(reports: tuple[SignalReport, ...], late: float) -> tuple[str, ..
     found = []
     if late > 0:
         found.append(f"the trial starts {late:.3f} s late, when all states are known")
+    alike: dict[str, list[str]] = {}  # what holds of the signals of one message is said once
     for r in reports:
-        if r.not_finite:
-            found.append(f"'{r.name}': {r.not_finite} of {r.samples} values are not finite numbers")
-        if r.bridged:
-            found.append(
-                f"'{r.name}': {r.bridged} values bridged, the largest gap is "
-                f"{r.largest_gap_s:.3f} s at {r.largest_gap_at_s:.3f} s"
-            )
-        if r.out_of_order or r.repeated or r.unstamped:
-            kinds = ("out of order", r.out_of_order), ("repeated", r.repeated), ("0", r.unstamped)
-            counts = [f"{n} stamp{'s' * (n > 1)} {kind}" for kind, n in kinds if n]
-            found.append(f"'{r.name}': {', '.join(counts)}")
-        if r.samples == 1:
-            found.append(f"'{r.name}': held from a single sample")
+        for text in _warnings_of(r):
+            alike.setdefault(text, []).append(f"'{r.name}'")
+    found += [f"{listed(names)}: {text}" for text, names in alike.items()]
     low, high, apart = _furthest({r.name: r.skew_s for r in reports})
     if len({r.clock for r in reports}) > 1 and apart > SKEW_S:
         found.append(f"'{low}' and '{high}' are on clocks that differ by {apart:.3f} s")
     return tuple(found)
+
+
+def _warnings_of(r: SignalReport) -> Iterator[str]:
+    """Yield warnings on one signal, without its name."""
+    if r.not_finite:
+        yield f"{r.not_finite} of {r.samples} values are not finite numbers"
+    if r.bridged:
+        gap = f"{r.largest_gap_s:.3f} s at {r.largest_gap_at_s:.3f} s"
+        yield f"{r.bridged} values bridged, the largest gap is {gap}"
+    disordered = r.out_of_order if r.out_of_order >= DISORDERED * r.samples else 0
+    kinds = ("out of order", disordered), ("repeated", r.repeated), ("0", r.unstamped)
+    if counts := [f"{n} stamp{'s' * (n > 1)} {kind}" for kind, n in kinds if n]:
+        yield ", ".join(counts)
+    if r.samples == 1:
+        yield "held from a single sample"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from grounded.diagnosis.cause_words import ENDED, furthest_apart, value_of, with_worth
+from grounded.diagnosis.cause_words import ended, furthest_apart, value_of, with_worth
 from grounded.diagnosis.error_report import Correction, Gap
 from grounded.diagnosis.report import Changed, Diagnosis, Estimate
 from grounded.result import listed
@@ -144,7 +144,7 @@ def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> st
         old = then.get(name, math.nan)
         if abs(e.value - old) > 1e-6 * max(abs(e.value), abs(old)):
             change = abs(e.value - old) / abs(old) if old else math.inf
-            more = "".join(f" ({text})" for text in ENDED[e.stopped])
+            more = "".join(f" ({text})" for text in ended(e, old))
             more += " (not identified, not adopted)" * (name not in known)
             more += ALONE * (name in joint)
             moved.append((-change, changed(name, old, e.value, e.unit) + more))

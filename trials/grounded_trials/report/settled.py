@@ -6,13 +6,15 @@ or claims what was adopted since. Otherwise no gain is reported.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from grounded.diagnosis.report import Diagnosis, Estimate, Made
 from grounded.errors import GroundedError
 from grounded.model import Model
+from grounded.result import number
 from grounded.task import Task
 from grounded_trials.report.diagnosis_words import made_from
 from grounded_trials.report.three_lines import gained, still_open, three_lines
@@ -24,6 +26,7 @@ from grounded_trials.workspace.last_diagnosis import read_diagnosis
 from grounded_trials.workspace.next_step import Since, since_diagnosis, usable_ids
 
 NOW = "the model now"
+WRITTEN = 1e-6  # relative difference of a value and what `adopt` writes of it
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,8 @@ class Settled:
     gained: str = ""  # "" if no diagnosis measured the current planning model
     left: str = ""
     closed: bool = False
+    rows: tuple[tuple[str, str], ...] = ()  # name and values of each, as short as can be
+    briefly: str = ""  # `left` without what ties, and with names instead of clauses
 
     @property
     def lines(self) -> list[str]:
@@ -55,16 +60,20 @@ def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> 
     clauses += _moved(task.model, table.params, diagnosis.jointly if diagnosis else set())
     if not clauses:
         return None
+    found = Settled(tuple(clauses), rows=tuple(_rows(task.model, table, diagnosis)))
     if diagnosis is None or diagnosis.no_cause:
-        return Settled(tuple(clauses))
+        return found
     if not since.changed:
         text = gained(diagnosis, task, now="crude", before="outset", who=NOW)
-        return Settled(tuple(clauses), text, _still(diagnosis))
+        causes = diagnosis.verdict.causes or diagnosis.effects
+        left, briefly = (_still(diagnosis, some) for some in (causes, diagnosis.effects))
+        return replace(found, gained=text, left=left, briefly=briefly)
     if not _as_claimed(diagnosis, table):
-        return Settled(tuple(clauses))
+        return found
     before = "outset" if gained(diagnosis, task, before="outset") else "crude"
     text = gained(diagnosis, task, before=before, who=NOW)
-    return Settled(tuple(clauses), text, still_open(diagnosis), closed=True)
+    left, briefly = still_open(diagnosis), still_open(diagnosis, ties=False)
+    return replace(found, gained=text, left=left, closed=True, briefly=briefly)
 
 
 def measured_now(workspace: Folder) -> str:
@@ -116,10 +125,10 @@ def so_far(diagnosis: Diagnosis, since: Since, settled: Settled | None) -> list[
     return [*lines, f"The diagnosis, {made_from(diagnosis)}, said:"] if lines else []
 
 
-def _still(diagnosis: Diagnosis) -> str:
-    """Return the first sentence of a diagnosis of the current planning model."""
+def _still(diagnosis: Diagnosis, causes: Sequence[str]) -> str:
+    """Return the first sentence of a diagnosis of the current planning model; its `causes`."""
     if diagnosis.effects:
-        return f"Found, not adopted: {'; '.join(diagnosis.verdict.causes or diagnosis.effects)}."
+        return f"Found, not adopted: {'; '.join(causes)}."
     return diagnosis.verdict.lines[0]
 
 
@@ -155,6 +164,43 @@ def _clause(entry: Mapping[str, Any], model: Model) -> str:
         return meaning(effect, values)
     except (GroundedError, TypeError, ValueError):
         return f"{name} ({', '.join(f'{k} = {v}' for k, v in given.items())})"
+
+
+def _rows(
+    model: Model, table: ModelTable, diagnosis: Diagnosis | None
+) -> Iterator[tuple[str, str]]:
+    """Yield the name and the values of each adopted effect, then of each adopted parameter.
+
+    A value has the standard deviation by which the last diagnosis knows it.
+    """
+    from grounded.diagnosis.cause_words import give_or_take
+    from grounded.effects import param_name
+    from grounded_trials.workspace.adopted import installed_effects
+
+    library = installed_effects()
+    fitted = {} if diagnosis is None else dict(diagnosis.parameters)
+    for ranked in () if diagnosis is None else diagnosis.ranking:
+        fitted |= {param_name(ranked.effect, q): e for q, e in ranked.params.items()}
+
+    def known(name: str, value: float, unit: str) -> str:
+        own = fitted.get(name, Estimate(value, unit=unit))
+        same = math.isclose(own.value, value, rel_tol=WRITTEN)
+        return give_or_take(own if same else Estimate(value, unit=unit))
+
+    for entry in table.effects:
+        name = str(entry["name"])
+        try:
+            quantities = library.effect(name, model).free
+        except GroundedError:
+            quantities = ()
+        units = {q.name: q.unit for q in quantities if q.name in entry}
+        units = units or {key: "" for key in entry if key != "name"}
+        told = (f"{q} = {known(param_name(name, q), entry[q], unit)}" for q, unit in units.items())
+        yield name, ", ".join(told)
+    for name, value in table.params.items():
+        if name in model.params and model.params[name].value != value:
+            first, unit = model.params[name].value, model.params[name].unit
+            yield name, f"{known(name, value, unit)}, was {number(first)}"
 
 
 def _moved(model: Model, params: Mapping[str, float], jointly: set[str]) -> list[str]:

@@ -119,18 +119,19 @@ def _together(errors: Mapping[str, float], names: list[str]) -> float:
     return math.hypot(*(errors.get(name, math.nan) for name in names))
 
 
-def still_open(diagnosis: Diagnosis) -> str:
-    """What ties, and what no known effect explains."""
+def still_open(diagnosis: Diagnosis, *, ties: bool = True) -> str:
+    """What ties (unless `ties` is False), and what no known effect explains."""
     same, claimed = diagnosis.equivalent, diagnosis.effects
-    ties = [told_apart(group, same, claimed) for group in diagnosis.indistinguishable]
-    found = [f"{text[:1].lower()}{text[1:]}" for text in ties]
+    groups = diagnosis.indistinguishable if ties else ()
+    alike = [told_apart(group, same, claimed) for group in groups]
+    found = [f"{text[:1].lower()}{text[1:]}" for text in alike]
     found += [one.sentence() for one in diagnosis.unconfirmed[:1]]
     if diagnosis.leftover:
         more = also_off(len(diagnosis.leftover) - 1)
         found.append(f"still unexplained: {diagnosis.leftover[0].sentence()}{more}")
     rows = diagnosis.prediction_error
     if not found and (name := open_noise(rows)):
-        found.append(f"only repeated trials tell how much of what is left in {name} is noise")
+        found.append(f"only a repeat of one run tells how much of what is left in {name} is noise")
     nothing = in_doubt(rows) or "nothing is left above the noise"
     if worsened(rows):  # which is said elsewhere
         nothing = "it is open why predictions get worse with it there"

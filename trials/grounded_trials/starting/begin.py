@@ -33,6 +33,7 @@ from grounded_trials.logs.stated_units import Stated, factor_between
 from grounded_trials.logs.unnamed import from_the_rest
 from grounded_trials.starting.examples import fresh_folder
 from grounded_trials.starting.first_toml import held_first, write_first
+from grounded_trials.starting.in_degrees import in_degrees
 from grounded_trials.starting.interval import interval_of, too_coarse
 from grounded_trials.starting.kinds import KINDS, Joints, called_input, kind_in, moving, skeleton
 from grounded_trials.starting.own_model import OwnModel, own_model
@@ -215,12 +216,13 @@ def _begin(
             tuple(_asked(g, ask, partial(as_stated, said, units[g.name])) for g in some)
             for some in (states, inputs)
         )
+    ranges = {g.name: _range(report, g) for g in (*states, *inputs)}
+    inputs = in_degrees(inputs, units, ranges)
     slow = () if states_time_unit(files[0]) else _in_seconds(report)
     notes = (*notes, *slow, *wide_joints(states, units, joints, report))
     step, whose, note = (
         (dt, "", too_coarse(report, inputs, dt)) if dt else interval_of(report, inputs, states)
     )
-    ranges = {g.name: _range(report, g) for g in (*states, *inputs)}
     if chosen != "drone":  # zero is sent after a run, so the limits must include it
         ranges |= {
             g.name: (min(r[0], 0.0), max(r[1], 0.0)) for g in inputs if (r := ranges[g.name])

@@ -7,5 +7,6 @@ Read `folder.py` first (how a folder becomes a task, trials and candidates). `co
 `grounded_trials.door` makes them the methods of one class. `identity.py` resolves the names of
 trials and candidates, `handover.py` checks candidates before they are handed over, `next_step.py`
 chooses the command to suggest next, after what `last_diagnosis.py` reads. `first_plan.py` and
-`at_rest.py` serve the first `propose`, `adopted.py` plans with adopted effects.
+`at_rest.py` serve the first `propose`, with `wrong_units.py`; `adopted.py` plans with adopted
+effects.
 """

@@ -87,6 +87,7 @@ class Undone(Result):
     effects: tuple[Mapping[str, Any], ...]  # all adopted effects
     params: Mapping[str, float]  # [model] params
     then: NextCommand = PROPOSE
+    rewritten: tuple[Rewritten, ...] = ()  # of effects that stay
 
     def summary(self) -> str:
         """Return the effects that were removed from the model."""
@@ -140,29 +141,33 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
         beside=tuple(n for n in beside if n not in fitted),
         left=left_behind(found) if parameters and physics and claimed else {},
         jointly=tuple(name for name in own if name in calibrated and name in found.jointly),
-        rewritten=_rewritten(found, old, both),
+        rewritten=_rewritten(workspace, old, adopted),
         stopped=wider(found.parameters) if parameters and physics and claimed else "",
     )
 
 
 def _rewritten(
-    found: Diagnosis, before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, Any]]
+    workspace: Folder, before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, Any]]
 ) -> tuple[Rewritten, ...]:
-    """Return the quantities of effects that an adoption changes, in the order of the effects."""
-    from grounded.effects import param_name
+    """Return the quantities of effects in both lists that differ, in the order of the effects."""
+    from grounded_trials.workspace.adopted import installed_effects
+
+    library, model = installed_effects(), workspace.base_model
+    now = {str(effect["name"]): effect for effect in after}
 
     def unit(effect: str, key: str) -> str:
-        name = param_name(effect, key)
-        rows = found.ranked(f"parameter:{name}"), found.ranked(effect)
-        known = [found.parameters.get(name), *(row.params.get("d") for row in rows if row)]
-        return next((one.unit for one in known if one), "")
+        try:
+            known = library.effect(effect, model).quantities
+        except GroundedError:  # of a package that is not installed
+            return ""
+        return next((q.unit for q in known if q.name == key), "")
 
     return tuple(
-        Rewritten(f"{key} of {name}", float(was), float(now[key]), unit(name, key))
-        for old, now in zip(before, after, strict=False)
-        for name in [str(old["name"])]
+        Rewritten(f"{key} of {name}", float(was), float(now[name][key]), unit(name, key))
+        for old in before
+        if (name := str(old["name"])) in now
         for key, was in old.items()
-        if key != "name" and now[key] != was
+        if key != "name" and now[name].get(key, was) != was
     )
 
 
@@ -216,8 +221,13 @@ def undo_adoption(workspace: Folder) -> Undone:
         )
     set_in_model(file, params=before["params"], effects=before["effects"])
     write_document(workspace.reports / KEPT, {"adoptions": earlier, "undone": [*undone, *names]})
-    now = tuple(before["effects"]), before["params"]
-    return Undone(tuple(names), *now, then=to_plan(workspace))
+    return Undone(
+        tuple(names),
+        tuple(before["effects"]),
+        before["params"],
+        then=to_plan(workspace),
+        rewritten=_rewritten(workspace, last["after"]["effects"], before["effects"]),
+    )
 
 
 def declined(workspace: Folder) -> tuple[str, ...]:

@@ -30,6 +30,7 @@ from grounded_trials.workspace.off_target import (
     weighed_groups,
 )
 from grounded_trials.workspace.task_file import limited_changes, seen_in
+from grounded_trials.workspace.wrong_units import in_another_unit
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
@@ -91,6 +92,7 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
                 "search gains most by smoother inputs: with less weight there (a tenth, say), "
                 "errors would count for more"
             )
+    found += in_another_unit(workspace)
     found += _of_other_limits(workspace)
     if first is not None:
         short = _held_back(task, first) or _falls_short(task, first)

@@ -128,7 +128,11 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     if not splits:
         return []
     bound = any(one.bound for one in splits.values())
-    header = ("ahead", "explained", "unexplained", "noise" + ", at most" * bound)
+    least = any(one.irreducible_from == "at most" for one in splits.values())
+    header = (
+        *("ahead", "explained", "unexplained" + ", at least" * least),
+        "noise" + ", at most" * bound,
+    )
     named = {
         key: words.format(f"{one.horizon_s:.3g} s")
         for key, words in HORIZONS.items()
@@ -139,7 +143,10 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     by_state = [(parts.name, *_shares(splits[main], parts)) for parts in splits[main].channels]
     known = {"repeats": "the scatter of repeated trials"}
     known["alike"] = "the scatter of trials whose commands agree to 2 %, and is at most that"
-    known["at most"] = "one-step errors, and is at most that: no trial was repeated"
+    known["at most"] = (
+        "one-step errors, which hold errors of the model too, so it may be far less, and what is "
+        "unexplained far more. Repeat a run to know"
+    )
     source = known.get(splits[main].irreducible_from, "the estimated noise")
     words = (
         "Explained: the share of the squared error of held-out predictions that the effects "

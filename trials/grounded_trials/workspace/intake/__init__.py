@@ -13,6 +13,7 @@ passed its candidate the wrong things, and `skipped_steps.py` whether it ran all
 `gone_wrong.py` asks whether a run went as it should, `ended_early.py` whether it crashed or was cut
 off, and `unanswered.py` repeats in `status` what they ask. `odd_run.py` reports what a run that
 does not belong did to its candidate, `trial_check.py` what the user should know about a trial,
-`where_to_mend.py` which key of [log] corrects a sensor fault, and `stored_before.py` whether a log
-is stored already.
+`where_to_mend.py` which key of [log] corrects a sensor fault, `handed_over.py` what it costs that
+samples were old when the program acted on them, and `stored_before.py` whether a log is stored
+already.
 """

@@ -37,6 +37,7 @@ from grounded_trials.workspace.intake.begun import begun_elsewhere
 from grounded_trials.workspace.intake.earlier_task import OfEarlierTask, of_earlier_task
 from grounded_trials.workspace.intake.ended_early import ended_early
 from grounded_trials.workspace.intake.gone_wrong import gone_wrong
+from grounded_trials.workspace.intake.handed_over import old_samples
 from grounded_trials.workspace.intake.ingested import Ingested
 from grounded_trials.workspace.intake.log_faults import dead_sensors, log_faults, mistaken_in
 from grounded_trials.workspace.intake.look import Look
@@ -235,6 +236,9 @@ def _recognised(workspace: Folder, path: Path, read: Read, candidate: str | None
         loose = found.loose_s > LOOSE * workspace.task.dt and not look.exact
         unsure = filter(None, [loosely(found.loose_s, ran) if loose else "", doubtful(found, ran)])
         read = replace(read, warnings=(*read.warnings, *unsure))
+    if look.old is not None:
+        aged = old_samples(workspace, own, whole, look.old)
+        read = replace(read, notes=(*read.notes, *aged))
     why, other = seen.why, seen.other
     fell, stored = look.fell, read.log.stored if read.log else ()
     task = workspace.task

@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import cache, partial
 from typing import TYPE_CHECKING
 
+from grounded.frozen import Array
 from grounded.result import listed
 from grounded.search.candidate import Candidate
 from grounded.search.returned.who_drove import suspicion
@@ -45,6 +46,7 @@ class Look:
         ran, judged = read.trial.candidate, partial(suspicion, task, own=own, others=candidates)
         apart = None if log is read.log else log  # set if judged on other samples than stored
         self.read, self.found, self.exact = read, None, False
+        self.old: Array | None = None  # ages of the samples acted on [s], (n,), if it is surely its
         self.whole = interpolate_gaps(apart.cut(ran)[0] if apart else read.trial).trial
         seen = judged(self.whole)
         if read.bare and (alone := judged(self.whole, others=())).why:
@@ -58,6 +60,8 @@ class Look:
                 seen = judged(self.whole)
             sender = sender_of(self.log, own, candidates, start_of)
             self.exact = sender.own is not None and sender.own.exact
+            if sender.own is not None and sender.sure:
+                self.old = sender.own.old
             if sender.sure:
                 seen = replace(seen, why="", other="")
             elif sender.other:
