@@ -35,6 +35,7 @@ from grounded.instruments.dead import judge_dead
 from grounded.instruments.derived import Derived, derived
 from grounded.instruments.finding import (
     A_SECOND,
+    AS_LATE,
     DEGREES,
     RPM,
     Finding,
@@ -75,7 +76,7 @@ from grounded.instruments.single import judge_signal, signal_of
 from grounded.instruments.swapped import judge_columns
 from grounded.instruments.way import judge_way, rate_agrees
 from grounded.model import Model
-from grounded.places import Integral, integrals
+from grounded.places import Integral, integrals, speed
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -129,6 +130,12 @@ def preflight(
     in_step, refuted = frozenset(bench.in_step), frozenset(bench.refuted)
     found = told_by_the_clock(model, trials, found, refuted)
     return Preflight(tuple(found), tuple(bench.trials), in_step, refuted)
+
+
+def _size(delay: float, lag: Lag) -> str:
+    """Return a delay with its standard deviation, if that is known."""
+    known = np.isfinite(lag.std) and lag.std > 0
+    return f"{delay:.3g}{f' +- {lag.std:.2g}' * bool(known)} s"
 
 
 class _Bench:
@@ -278,8 +285,7 @@ class _Bench:
             name = self.model.state_names[i]
             if name in names and name not in {f.signal for f in late}:
                 self.put(i, [earlier(x, one.delay_s / self.dt) for x in self.column(i)])
-                text = f"as late as {one.signal}, which is in the same message"
-                yield replace(one, signal=name, finding=text)
+                yield replace(one, signal=name, finding=f"{AS_LATE} {one.signal}")
 
     def unit(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """Correct sign and unit; report a scale, which may be that of either sensor."""
@@ -331,7 +337,7 @@ class _Bench:
         if lag.delay > 0:
             i, name, other = (relation.j, w, f"the derivative of {q}")
         if i == relation.i and not relation.exact:  # a disturbed heading also looks late
-            yield Finding(name, f"{d:.3g} s later than {other}", "delay", d, lag.std)
+            yield Finding(name, f"{_size(d, lag)} later than {other}", "delay", d, lag.std)
         else:
             yield self.in_time(i, lag, other)
 
@@ -348,7 +354,7 @@ class _Bench:
             text = f"follows {other} through a filter of {d:.3g} s"
             return put_right(name, text, "lag", "", delay_s=d, std_s=lag.std)
         self.put(i, [earlier(x, d / self.dt) for x in self.column(i)])
-        text, log = f"{d:.3g} s later than {other}", f"delay_s = {d:.3g}"
+        text, log = f"{_size(d, lag)} later than {other}", f"delay_s = {d:.3g}"
         return put_right(name, text, "delay", log, delay_s=d, std_s=lag.std)
 
     def smoothed(self, relation: Integral, over: float) -> Finding:
@@ -395,9 +401,15 @@ class _Bench:
         if found.refuted:
             self.refuted |= {f"sensor_bias:{w}", f"offset:{q}"}
         elif found.found:
-            unit, more = self.model.states[w], "more" if found.value > 0 else "less"
+            unit, v = self.model.states[w], speed(self.model)
+            more = "more" if (found.pull or found.value) > 0 else "less"
             text = f"shows {abs(found.value):.3g} {unit} {more} than the rate of {q} throughout"
-            yield Finding(w, f"{text}: a sensor bias, or {q} drifts", "offset")
+            why = f"a sensor bias, or {q} drifts"
+            if found.pull and v:
+                size = f"{abs(found.pull):.3g} {unit} per {self.model.states[v]} of {v}"
+                text = f"shows {size} {more} than the rate of {q}"
+                why = "wheels of unequal size, or a pull to one side"
+            yield Finding(w, f"{text}: {why}", "offset")
 
     def plane(self) -> Iterator[Finding]:
         """Check a heading and a speed against the course travelled."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.instruments.finding import Finding, late_effects
+from grounded.instruments.finding import AS_LATE, Finding, late_effects
 from grounded.places import heading, position
 from grounded_trials.workspace.identity import READ_BY
 from grounded_trials.workspace.task_file import seen_in
@@ -60,7 +60,7 @@ def where_to_mend(
                 one,
                 log=_whole(one, read[-1]),
                 advice=ahead.format(f"sensor_delay:{one.signal}")
-                if feedback and one.kind == "delay" and one.corrected
+                if feedback and one.kind == "delay" and one.corrected and AS_LATE not in one.finding
                 else one.advice,
             )
             for one in findings
