@@ -83,7 +83,7 @@ class About:
         self.grounding = ground(plan, own, match_inputs=matched)
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
         # without a bias: independent of noise and start
-        age = sample_age(planner.task, incumbent)
+        age = sample_age(planner.task, incumbent.candidate, incumbent.trials)
         self.plain = replace(plan.problem(exact=True), age=age)
         self.real = exact.on(self.plain)
         self.theta = planner.widened(incumbent.candidate.policy)

@@ -17,10 +17,12 @@ as planned. Logs of what the policy itself saw (all simulated ones) give an age 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from grounded.frozen import Array
-from grounded.search.candidate import Tried
+from grounded.search.candidate import Candidate
 from grounded.solve.bias import WINDOW, hann_smoothed
 from grounded.task import Task
 from grounded.trial import Trial
@@ -31,23 +33,24 @@ CLEAR = 0.25  # smallest share of the squares of the commands' differences that 
 NOTHING = 1e-6  # rms difference of commands, relative to their size, that is rounding
 
 
-def sample_age(task: Task, tried: Tried) -> float:
+def sample_age(task: Task, candidate: Candidate, trials: Sequence[Trial]) -> float:
     """Return the age of the samples that a candidate's policy acted on [s]; 0 if none is clear.
 
     It is negative if the policy had newer samples than its logs, whose states are then late.
 
     Args:
         task: the manoeuvre, whose states the robot measures.
-        tried: the candidate with its whole trials.
+        candidate: the one whose policy acted.
+        trials: its whole trials.
     """
-    policy, H = tried.candidate.policy, task.horizon
+    policy, H = candidate.policy, task.horizon
     if policy.gain is None:
         return 0.0
     angles = tuple(map(bool, task.model.angle_mask))
     policy = policy.laid_out(task.model.state_names, angles, policy.depths)
     size = np.abs(policy.feedforward).max(axis=0) + 1e-12
     off, by_age = list[Array](), list[Array]()
-    for trial in tried.trials:
+    for trial in trials:
         x, sent = trial.states[:H], trial.inputs[:H]
         past = policy.past if trial.start_inputs is None else trial.start_inputs
         probed = PROBED * task.dt

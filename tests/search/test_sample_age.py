@@ -7,7 +7,6 @@ import pytest
 
 from grounded.policy import z_difference
 from grounded.rollout import for_late_samples, simulate
-from grounded.search.candidate import Tried
 from grounded.search.improve import propose
 from grounded.search.sample_age import sample_age
 from grounded.search.step_size import SearchOptions
@@ -40,16 +39,12 @@ def first(task):
     return propose(task, [], [], SearchOptions()).candidate
 
 
-def tried(task, made, trial):
-    return Tried(made, (trial,), (task.utility(trial),), True)
-
-
 @pytest.mark.parametrize("age", [AGE, 0.04, -0.01])
 @pytest.mark.parametrize("seed", [None, 0])
 def test_the_age_is_found_from_commands_and_states(age, seed):
     task = rover_task()
     made = first(task)
-    found = sample_age(task, tried(task, made, driven(task, made, age, seed)))
+    found = sample_age(task, made, [driven(task, made, age, seed)])
     assert found == pytest.approx(age, abs=0.003 if seed is None else 0.005)
 
 
@@ -57,7 +52,7 @@ def test_the_age_is_found_from_commands_and_states(age, seed):
 def test_fresh_samples_have_no_age_though_logs_are_noisy(seed):
     task = rover_task()
     made = first(task)
-    assert sample_age(task, tried(task, made, driven(task, made, 0.0, seed))) == 0.0
+    assert sample_age(task, made, [driven(task, made, 0.0, seed)]) == 0.0
 
 
 def test_a_model_that_replays_a_trial_replays_it_with_its_policy_on_old_samples():

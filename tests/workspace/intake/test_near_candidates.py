@@ -209,7 +209,7 @@ def test_how_old_the_samples_were_is_found_and_what_that_costs(ladder, tmp_path)
     near = w.task.target[: len(run.states)].copy()
     near[:, 0] += 0.05 * np.sin(np.arange(len(near)))  # off by 35 mm, and moving fast
     (note,) = old_samples(w, made, replace(run, states=near), old)
-    assert holds(note, "22 ms old", "x by", "its error in this run: 35", "no plan allows")
+    assert holds(note, "22 ms old", "x by", "its error in this run: 35", "does not allow for that")
     assert not old_samples(w, made, replace(run, states=near), np.zeros(2))
     far = near + 10.0
     assert not old_samples(w, made, replace(run, states=far), old)
