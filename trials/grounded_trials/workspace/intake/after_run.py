@@ -21,9 +21,10 @@ from grounded.search.safety import coasting
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import with_unit
-from grounded_trials.workspace.off_target import reaches, weighed_groups
+from grounded_trials.workspace.off_target import rates_among, reaches, weighed_groups
 
 AWAY = 0.02  # drift after a run, relative to the target's extent, above which it is reported
+DEAR = 0.2  # of the run's cost: what its end would cost more where the robot came to be after it
 REACHED = 0.05  # of the target's extent: a plan that ends farther away does not reach it
 LAST_STEPS, AT_LIMIT = 3, 1e-3  # steps of a kick; distance from a limit, as a share of the range
 SETTLED = 5.0  # [s] for which an input is held until the memory of effects has settled
@@ -80,7 +81,9 @@ def kicked(planner: Planner, run: Trial, held: Array) -> str:
 def _moved_on(planner: Planner, whole: Trial) -> list[str]:
     """Return a warning if a robot that was to reach a point drifts away from it after the run.
 
-    Only if the inputs are constant after the run, so that nobody drove it.
+    Only if the inputs are constant after the run, so that nobody drove it. What counts is how far
+    the first group of states moved, and what the end of the run would cost more where any group
+    came to be: late commands of its last steps turned a docked robot by 0.5 degrees.
     """
     task = planner.task
     end, last = task.horizon, whole.finite_steps
@@ -88,20 +91,25 @@ def _moved_on(planner: Planner, whole: Trial) -> list[str]:
     held = whole.inputs[end:last]
     if not groups or last <= end + 1 or np.ptp(held[1:], axis=0).any():
         return []
-    names, what = groups[0]
-    states = [task.model.state_names.index(name) for name in names]
-    off, way = _from_target(task, whole.states[: last + 1], states)
-    far = np.linalg.norm(off, axis=1)
-    worst = end + int(np.argmax(far[end:]))
-    if not far[worst] > max(AWAY * way, 2 * far[end]):
+    cost = DEAR * -task.utility(whole.until(end))
+    for k, rate in enumerate(rates_among(task, groups)):
+        states = [task.model.state_names.index(name) for name in groups[k][0]]
+        off, way = _from_target(task, whole.states[: last + 1], states)
+        far, dear = np.linalg.norm(off, axis=1), off**2 @ task.reward.terminal[states]
+        worst = end + int(np.argmax(far[end:]))
+        away = not k and far[worst] > max(AWAY * way, 2 * far[end])
+        more = 0.0 if rate else dear[worst] - dear[end]
+        if away or (far[worst] > 2 * far[end] and more > cost):
+            break
+    else:
         return []
-    later, then = measured_alike([far[worst], far[end]], task.model.states[names[0]])
+    later, then = measured_alike([far[worst], far[end]], task.model.states[groups[k][0][0]])
     was = (
-        f"{(worst - end) * task.dt:.2g} s after the run {what} was {later} from its target, at its "
+        f"{(worst - end) * task.dt:.2g} s after the run {groups[k][1]} was {later} from its target, at its "
         f"end {then}: "
     )
     drift = off[worst] - off[end]
-    if let_go(planner, whole, states, worst - end, drift):
+    if away and let_go(planner, whole, states, worst - end, drift):
         return [was + _to_hold(planner, whole, held[-1])]
     return [
         f"{was}[reward] only judges the run. To make the robot stay there, {_to_stay(task, states)}"
