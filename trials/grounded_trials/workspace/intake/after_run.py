@@ -105,8 +105,8 @@ def _moved_on(planner: Planner, whole: Trial) -> list[str]:
         return []
     later, then = measured_alike([far[worst], far[end]], task.model.states[groups[k][0][0]])
     was = (
-        f"{(worst - end) * task.dt:.2g} s after the run {groups[k][1]} was {later} from its target, at "
-        f"its end {then}: "
+        f"{(worst - end) * task.dt:.2g} s after the run {groups[k][1]} was {later} from its "
+        f"target, at its end {then}: "
     )
     drift = off[worst] - off[end]
     if away and let_go(planner, whole, states, worst - end, drift):
