@@ -85,10 +85,12 @@ class Planner:
 
     @cached_property
     def aim(self) -> Task:
-        """The planning task with terminal weights on true values instead of filtered ones.
+        """The planning task with terminal weights on true values beside filtered or late ones.
 
-        Trials are judged by the filtered log. But a plan with terminal weights on filtered states
+        Trials are judged by the log. But a plan with terminal weights on filtered states alone
         makes abrupt inputs in its last steps, so that the filter shows rest while the robot moves.
+        With weights on true values alone a log that is 30 ms late shows a robot that still brakes:
+        the smoother the plan, the better it was judged.
         """
         n, names = self.task.model.n, self.plan.model.state_names
         if len(names) == n:
@@ -98,7 +100,7 @@ class Planner:
         terminal, target = self.plan.reward.terminal.copy(), self.plan.target.copy()
         for true, logged in true_values(names, names[n:]).items():
             if terminal[logged] > 0:
-                terminal[true], terminal[logged] = terminal[logged], 0.0
+                terminal[true] = terminal[logged]
                 target[:, true] = target[:, logged]
         goals = dataclasses.replace(self.plan.reward, terminal=terminal)
         return dataclasses.replace(self.plan, target=target, reward=goals)

@@ -11,7 +11,7 @@ from grounded.utility import Reward
 STEPS = 60
 
 
-def cart(terminal: float, lag: float = 0.04) -> Planner:
+def cart(terminal: float, lag: float = 0.04, change: float = 1e-4, rests: int = 10) -> Planner:
     """A cart that moves 0.4 m in 1.2 s; its speed sensor has a filter."""
     model = Model(
         states={"x": "m", "v": "m/s"},
@@ -19,7 +19,7 @@ def cart(terminal: float, lag: float = 0.04) -> Planner:
         params={},
         derivative=lambda s, a, p: {"x": s.v, "v": 2.0 * a.force - 0.5 * s.v},
     )
-    way = np.clip(np.arange(STEPS + 1) / 50, 0.0, 1.0)
+    way = np.clip(np.arange(STEPS + 1) / (STEPS - rests), 0.0, 1.0)
     x = 0.4 * way**2 * (3 - 2 * way)
     task = Task(
         model=model,
@@ -29,7 +29,7 @@ def cart(terminal: float, lag: float = 0.04) -> Planner:
             np.array([10.0, 0.5]),
             terminal * np.array([500.0, 50.0]),
             np.zeros(1),
-            np.array([1e-4]),
+            np.array([change]),
         ),
         start=np.zeros(2),
         past=np.zeros(1),
@@ -55,9 +55,19 @@ def test_what_is_judged_stays_what_is_logged():
     aim, plan = planner.aim, planner.plan
     v, true = (plan.model.state_names.index(name) for name in ("v", "v_true"))
     assert aim.reward.terminal[true] == plan.reward.terminal[v] == 50.0
-    assert aim.reward.terminal[v] == plan.reward.terminal[true] == 0.0
+    assert aim.reward.terminal[v] == 50.0 and plan.reward.terminal[true] == 0.0
     np.testing.assert_array_equal(aim.reward.state, plan.reward.state)
     np.testing.assert_array_equal(aim.target[:, true], plan.target[:, v])
+
+
+def test_cheaper_inputs_make_no_plan_worse_by_its_late_log():
+    """A crane braked in its last 30 ms, which its log had not seen: -0.6, then -2.9, then -6.1."""
+    found = []
+    for change in (3e-3, 1e-3, 1e-4, 1e-5):
+        planner = cart(20.0, change=change, rests=0)
+        policy, _ = planner.first_policy()
+        found.append(predicted(planner.plan.problem(exact=True), policy).utility)
+    assert (np.diff(found) > 0.05 * np.array(found[:-1])).all()
 
 
 def test_nothing_changes_without_a_late_sensor_or_a_goal_for_the_end():
