@@ -71,7 +71,7 @@ def test_feedback_on_another_pose_is_not_called_no_feedback(waiting):
     names = model.state_names, model.input_names
     trial = Trial(np.array([*rows, x]), np.array(sent), task.dt, *names, candidate=made.id)
     found = suspicion(task, trial, made, [made])
-    assert holds(found.why, "near the feed-forward of c0001", "another message", "[log]")
+    assert holds(found.why, "near the feed-forward of c0001", "another message", "logged")
     assert "alone" not in found.why
 
 

@@ -43,7 +43,7 @@ WITHOUT = (
 BESIDE = 0.95  # share of a run's commands that are the feed-forward's of that step or a neighbour
 ELSEWHERE = (
     "with feedback on states that lie nearer to its plan than those of the log: does the program "
-    "read another message, estimate or frame than [log] maps? Pass `runner.action` the same signals"
+    "read another message, estimate or frame? Pass `runner.action` the signals that are logged"
 )
 DIGITS = 1e-4  # largest difference of commands, relative to their size, that rounding makes
 TIMES = {"ms": 1e3, "us": 1e6, "minutes": 1 / 60}  # units of a time that should be in seconds

@@ -34,8 +34,8 @@ BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # ages of the states acted on that
 AGES = 1.0  # steps by which that age varies in a run (lost packets, clock drift and jitter)
 OTHERS = 20  # number of latest candidates to compare with
 OR_UNITS = (
-    ", or `runner.action` got states of other messages than [log] maps, in other units or order, "
-    "or a time that is not in s"
+    ", or `runner.action` got states of another sensor, in other units or order, or a time that is "
+    "not in s"
 )
 
 
