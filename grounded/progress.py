@@ -45,6 +45,7 @@ class Stages:
     began: float = field(default_factory=time.monotonic)
     count: int = 0
     so_far: str = "nothing was found yet"  # the result so far, for Ctrl-C
+    beside: str = ""  # what all further stages are for
 
     def __call__(self, stage: str) -> None:
         """Report that a stage begins or continues."""
@@ -52,7 +53,7 @@ class Stages:
         if self.tell is None:
             return
         taken = time.monotonic() - self.began
-        text = f"{stage}, {_told(taken)} so far"
+        text = f"{stage}{f' ({self.beside})' * bool(self.beside)}, {_told(taken)} so far"
         if SEEN < self.count <= self.usual[1]:  # beyond, nothing is known of what is left
             least, most = (taken * (n / self.count - 1) for n in self.usual)
             text += f", {_range(max(least, 0.0), most)} left"

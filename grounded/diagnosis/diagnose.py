@@ -44,7 +44,7 @@ from grounded.diagnosis.validation.limits import (
 )
 from grounded.diagnosis.validation.motions import without_others
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.diagnosis.verdict import MOST_EFFECTS, with_faults
+from grounded.diagnosis.verdict import MOST_EFFECTS, interrupted, with_faults
 from grounded.diagnosis.writer import Writer
 from grounded.effects import Effect, Library
 from grounded.effects.actuator import delay, delay_again
@@ -123,7 +123,8 @@ def diagnose(
         The diagnosis, with its verdict, ranking of effects and prediction errors.
 
     Raises:
-        Interrupted: on Ctrl-C, with the best hypothesis so far and its prediction errors.
+        Interrupted: on Ctrl-C before the first verdict, with the best hypothesis so far. Later, the
+            search for one more effect ends, and what was found before it is returned.
         GroundedError: if the trials don't fit the model, or hold no data.
     """
     given: Any = trials
@@ -203,50 +204,57 @@ def diagnose(
     used = [trial for trial in trials if trial.known_steps >= 2]
     task = subject if isinstance(subject, Task) else None
     written: Writer | None = None
-    before, once_more = best, True
+    before, once_more, cut_short = best, True, False
 
     def found_so_far() -> str:
         return so_far(search, most, written.claims.names if written else None)
 
     here = interruptible(found_so_far)
     with np.errstate(all="ignore"), here, running(engine):
-        while True:
-            tick("predict")
-            ruler = Ruler(search.predictor, options.origin)
-            decision = decide(search, best, ruler, most)
-            tick("leftover")
-            writer = Writer(
-                decision,
-                ruler,
-                known,
-                (*options.but, *options.delays),
-                options.horizon,
-                most,
-                tick,
-                task,
-                used,
-                first,
-                exact,
-                uncertain,
-            )
-            if written and not writer.worth_more_than(written):
-                written.most = most  # one more was sought
-                # two effects may be needed for what neither predicts better alone
-                likelier = search.score(best) > search.score(before) + LARGE_GAIN
-                if not (once_more and likelier and most < MOST_EFFECTS):
-                    break
-                once_more = False
-            else:
-                written, once_more = writer, True
-                if options.max_effects or not (most < MOST_EFFECTS and writer.unfinished):
-                    break
-            most += 1
-            tick("more effects")
-            before, best = best, grown(search, best, most)
+        try:
+            while True:
+                tick("predict")
+                ruler = Ruler(search.predictor, options.origin)
+                decision = decide(search, best, ruler, most)
+                tick("leftover")
+                writer = Writer(
+                    decision,
+                    ruler,
+                    known,
+                    (*options.but, *options.delays),
+                    options.horizon,
+                    most,
+                    tick,
+                    task,
+                    used,
+                    first,
+                    exact,
+                    uncertain,
+                )
+                if written and not writer.worth_more_than(written):
+                    written.most = most  # one more was sought
+                    # two effects may be needed for what neither predicts better alone
+                    likelier = search.score(best) > search.score(before) + LARGE_GAIN
+                    if not (once_more and likelier and most < MOST_EFFECTS):
+                        break
+                    once_more = False
+                else:
+                    written, once_more = writer, True
+                    if options.max_effects or not (most < MOST_EFFECTS and writer.unfinished):
+                        break
+                most += 1
+                tick.beside = "one more effect; Ctrl-C keeps what was found"
+                tick("more effects")
+                before, best = best, grown(search, best, most)
+        except KeyboardInterrupt:
+            if written is None:
+                raise
+            cut_short, tick.beside = True, ""
         groups = [k < first for k in range(data.count)]
         apart = compared(search, written.decision.fit, groups) if compare else None
         found = written.diagnosis(apart)
         said = with_faults(found.verdict, looked.findings)
+        said = interrupted(said) if cut_short else said
         return replace(found, verdict=said, preflight=looked.findings)
 
 

@@ -169,6 +169,15 @@ def verdict(
     return replace(said, look_for=more if more > most else 0, again=0 < more <= most)
 
 
+def interrupted(said: Verdict) -> Verdict:
+    """Return the verdict of a diagnosis that was interrupted as it looked for one more effect."""
+    more = "Interrupted while it looked for one more effect: diagnose again after adopting these."
+    if not said.effects:
+        more = "Interrupted while it looked for one more effect."
+    sentences = (*said.lines, more)
+    return replace(said, sentences=sentences, sentence=" ".join(sentences), again=True)
+
+
 def also_off(others: int) -> str:
     """Return a clause on states that are off beside the first; "" if there are none."""
     if others < 1:

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.writer import Writer
 from grounded.engine import Engine
 from grounded.estimate import NoiseStd, of_states, record_of
 from grounded.fit import fit
@@ -115,6 +116,23 @@ def test_ctrl_c_in_a_diagnosis_says_the_best_hypothesis_so_far(trials, after):
         assert "no diagnosis is stored" in str(stopped.value)
         told = r"Predictions \S+ s ahead miss v by \S+ instead of \S+ m/s"
         assert re.search(told, str(stopped.value))
+
+
+def test_ctrl_c_while_one_more_effect_is_sought_keeps_what_was_found(trials, monkeypatch):
+    """After 18 minutes, five effects were confirmed, all true, and nothing was stored."""
+    monkeypatch.setattr(Writer, "unfinished", property(lambda writer: True))
+    whole = diagnose(MODEL, trials, DiagnosisOptions(max_effects=3)).verdict
+    told = []
+
+    def stop(stage):
+        told.append(stage)
+        if "one more effect; Ctrl-C keeps" in stage and "more effects" not in stage:
+            raise KeyboardInterrupt
+
+    found = diagnose(MODEL, trials, progress=stop).verdict
+    assert found.effects == whole.effects and found.again
+    assert found.lines[:-1] == whole.lines and "Interrupted" in found.lines[-1]
+    assert any(stage.startswith("more effects (one more effect; Ctrl-C") for stage in told)
 
 
 def test_ctrl_c_in_a_fit_says_the_values_so_far(trials):
