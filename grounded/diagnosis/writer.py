@@ -44,6 +44,8 @@ from grounded.places import position
 from grounded.task import Task
 from grounded.trial import Trial
 
+MUCH = 0.4  # gain of one state at one horizon, a third of its error, that is worth a name
+
 
 class Writer:
     """Turns a decision into a Diagnosis."""
@@ -90,14 +92,15 @@ class Writer:
         return full and promised(self.search, self.best) > SURE
 
     def worth_more_than(self, other: Writer) -> bool:
-        """Whether predictions gain by one effect more, in some channel what is worth a name.
+        """Whether predictions gain by one effect more what is worth a name (`SLIGHT`).
 
-        Whole trials may predict worse in others: a robot's side slip made errors of its position a
-        second ahead a fifth, and doubled that at the end of a drive of 46 s.
+        Or some state at some horizon gains much, and all do on average: a robot's side slip made
+        its position's error a second ahead a fifth, and doubled that at the end of 46 s.
         """
         fit, ruler = self.decision.fit, self.ruler
         more = ruler.gain(other.decision.fit, fit)
-        return more.mean > 0 and more.channels.max() > SLIGHT * ruler.since_outset(fit)
+        much = more.mean > 0 and more.largest > MUCH
+        return much or more.mean > SLIGHT * ruler.since_outset(fit)
 
     def diagnosis(self, apart: Compared | None = None) -> Diagnosis:
         """All of it; `apart` is what differs between two groups of trials, if there are two."""
