@@ -17,7 +17,8 @@ from grounded.instruments.short_runs import LEAST, SAME, Ahead, basis
 
 ROUNDS = 5  # iterations
 BLOCKS = 12  # stretches of a trial whose scatter gives a standard error
-BENT = 0.5  # largest deviation from a linear effect, as a share of the effect
+BENT = 1.001  # largest deviation from a linear effect, as a share of the effect
+FARTHEST = 100.0  # times as far as the states move: farther, a prediction diverges
 TINY = 1e-3  # of how far the states move: a deviation that is always small enough
 
 
@@ -52,9 +53,9 @@ class Acting:
         self.off, turned, without = off[0], off[1 : m + 1], off[m + 1 :]
         self.by = np.moveaxis(self.off - turned, 0, -1) / 2  # (N, shown, m): what each input does
         bent = np.moveaxis((self.off + turned) / 2 - without, 0, -1)
-        moved = ahead.moved[ahead.shown] + ahead.least
-        does, strays = (np.sqrt(((x / moved[:, None]) ** 2).sum(axis=1)) for x in (self.by, bent))
-        even = (strays <= BENT * does + TINY).all(axis=1)
+        moved = (ahead.moved[ahead.shown] + ahead.least)[:, None]
+        does, strays = ((np.abs(x * self.by) / moved**2).sum(axis=1) for x in (self.by, bent))
+        even = ((strays <= BENT * does + TINY**2) & (does < FARTHEST**2)).all(axis=1)
         self.even: NDArray[np.bool_] = even & np.isfinite(off).all(axis=(0, 2))
 
     def strengths(self, rows: NDArray[np.bool_]) -> Strengths | None:
