@@ -30,8 +30,7 @@ STARTS = 120  # samples to predict from
 # standard errors from 0 from which on an input acts the other way round, or as in the model
 SURE, USUAL = 6.0, 3.0
 LEAST = 0.2  # least share of its modelled effect from which on an input shows its sign
-DELAYS, LONGEST = 13, 0.3  # number of delays that must agree on a sign, and the longest [s]
-PART = 0.25  # longest delay as a part of a trial
+DELAYS, LONGEST = 13, 0.3  # number of delays tried from 0 to the longest [s]
 AS_WELL = 0.5  # [nats] by which a fit with the other sign must be worse
 
 
@@ -94,8 +93,7 @@ def _by_longest_delay(ahead: Ahead, prompt: Acting) -> list[list[Strengths]]:
     The commands before a trial are unknown, so each of them uses the predictions after the longest
     delay only. Empty lists have too few.
     """
-    far = min(LONGEST / ahead.dt, PART * len(ahead.sent))
-    delays = sorted({round(d) for d in np.linspace(0.0, far, DELAYS)})
+    delays = sorted({round(d / ahead.dt) for d in np.linspace(0.0, LONGEST, DELAYS)})
     each = [prompt, *(Acting(ahead, late) for late in delays[1:])]
     even = np.logical_and.reduce([one.even for one in each])
     found = []
