@@ -5,6 +5,10 @@ linear in the states is removed from them. Friction, springs and the feedback it
 would make a right input seem to act the wrong way round. A model may be crude, but its signs are
 right in most cases: if trials contradict each other, the fewer are wrong, and of equally many those
 that contradict the model.
+
+Feedback through late or lagging commands makes a robot swing. A swing is all but linear in the
+states, up to harmonics, and a third harmonic is turned round by a delay of a sixth of the period:
+no sign is judged by such a trial unless all delays agree on it.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ import numpy as np
 from grounded.errors import NextCommand
 from grounded.instruments.other_units import UnusableTrials
 from grounded.instruments.short_runs import Ahead
+from grounded.instruments.strengths import Acting, Strengths
 from grounded.model import Model
 from grounded.result import listed
 from grounded.trial import Trial
@@ -24,7 +29,9 @@ from grounded.trial import Trial
 STARTS = 120  # samples to predict from
 # standard errors from 0 from which on an input acts the other way round, or as in the model
 SURE, USUAL = 6.0, 3.0
-LEAST = 0.2  # least share of its modelled effect with which an input acts the other way round
+LEAST = 0.2  # least share of its modelled effect from which on an input shows its sign
+DELAYS, LONGEST = 13, 0.3  # number of delays tried from 0 to the longest [s]
+AS_WELL = 0.5  # [nats] by which a fit with the other sign must be worse
 
 
 @dataclass(frozen=True)
@@ -47,6 +54,9 @@ class Acts:
         return f"{100 * self.share:.0f} %"
 
 
+UNKNOWN = Acts(0, float("nan"), float("nan"))
+
+
 def how_inputs_act(model: Model, trial: Trial, shown: Sequence[int]) -> tuple[Acts, ...]:
     """Return how each input acts in a trial.
 
@@ -57,27 +67,58 @@ def how_inputs_act(model: Model, trial: Trial, shown: Sequence[int]) -> tuple[Ac
     """
     known = trial.until(max(trial.known_steps, 0))
     some = [i for i in shown if np.isfinite(known.states[:, i]).any()]
-    unknown = Acts(0, float("nan"), float("nan"))
     if not some or not np.isfinite(known.inputs).all():
-        return (unknown,) * model.m
-    ahead = Ahead(model, known, some, STARTS, (0.0,), linear=True)
+        return (UNKNOWN,) * model.m
+    ahead = Ahead(model, known, some, STARTS, (0.0,))
     if not ahead.enough:
-        return (unknown,) * model.m
+        return (UNKNOWN,) * model.m
     with np.errstate(all="ignore"):
-        fit = ahead.strengths()
-        found = tuple(map(_acts, fit.factors, fit.errors))
-        if any(one.sign < 0 for one in found):  # commands that act late may look like that
-            late = Ahead(model, known, some, STARTS, linear=True)
-            fits = [late.strengths(steps) for steps in late.delays] if late.enough else []
-            best = min(fits, key=lambda one: one.score, default=fit)
-            if fits and best is not fits[0]:
-                found = tuple(map(_acts, best.factors, best.errors))
+        prompt = Acting(ahead, 0)
+        fit = prompt.strengths(prompt.even)
+        found = tuple(map(_acts, fit.factors, fit.errors)) if fit else (UNKNOWN,) * model.m
+        if any(one.sign < 0 for one in found):
+            fits = _by_longest_delay(ahead, prompt)
+            found = tuple(_agreed(fits, i) for i in range(model.m))
     return found
 
 
 def _acts(share: float, error: float) -> Acts:
     wrong = share < min(-LEAST, -SURE * error)
-    return Acts(-1 if wrong else int(share > USUAL * error), share, error)
+    return Acts(-1 if wrong else int(share > max(LEAST, USUAL * error)), share, error)
+
+
+def _by_longest_delay(ahead: Ahead, prompt: Acting) -> list[list[Strengths]]:
+    """Return the fits with each delay up to a longest one, for every longest one, best first.
+
+    The commands before a trial are unknown, so each of them uses the predictions after the longest
+    delay only. Empty lists have too few.
+    """
+    delays = sorted({round(d / ahead.dt) for d in np.linspace(0.0, LONGEST, DELAYS)})
+    each = [prompt, *(Acting(ahead, late) for late in delays[1:])]
+    even = np.logical_and.reduce([one.even for one in each])
+    found = []
+    for longest in delays:
+        fits = [e.strengths(even & (ahead.at >= longest)) for e in each if e.late <= longest]
+        found.append(sorted((f for f in fits if f and np.isfinite(f.score)), key=lambda f: f.score))
+    return found
+
+
+def _agreed(found: list[list[Strengths]], i: int) -> Acts:
+    """Return how input i acts, with sign 0 unless all longest delays that show one agree on it."""
+    best = [_acts(fits[0].factors[i], fits[0].errors[i]) for fits in found if fits]
+    sure = [one for one in best if one.sign]
+    doubtful = not found[-1] or any(_contested(fits, i) for fits in found)
+    if doubtful or len({one.sign for one in sure}) > 1:
+        return UNKNOWN
+    return next(iter(sure), UNKNOWN)
+
+
+def _contested(fits: list[Strengths], i: int) -> bool:
+    """Return whether another delay explains the trial about as well with the other sign."""
+    if not (fits and _acts(fits[0].factors[i], fits[0].errors[i]).sign):
+        return False
+    near = [fit.factors[i] for fit in fits if fit.score < fits[0].score + AS_WELL]
+    return any(factor * near[0] < 0 for factor in near)
 
 
 def judge_signs(model: Model, trials: Sequence[Trial], hidden: Sequence[str] = ()) -> None:

@@ -26,7 +26,6 @@ LITTLE, TINY = 1e-3, 1e-12  # smallest error that counts: of a state's spread, a
 ROUNDS, DAMPING, SLOPE = 5, (1.0, 0.3, 0.1), 0.02  # iterations, step sizes, difference step
 SAME = 1e-6  # singular values below this share of the largest count as zero
 ENOUGH = 0.01  # [nats] smallest gain of an iteration: below it the fit stops
-BLOCKS = 12  # stretches of a trial whose scatter gives a standard error
 
 Steps = NDArray[np.intp]
 
@@ -47,22 +46,6 @@ class Fit:
     def score(self) -> float:
         """Sum of the logarithms of the errors [nats]; it is invariant to exchanged columns."""
         return float(np.log(self.rms).sum())
-
-
-@dataclass(frozen=True)
-class Strengths:
-    """How strongly the inputs act in one trial.
-
-    Args:
-        factors: 1 as in the model, below 0 the other way round (m,); NaN if the log does not show
-            it.
-        errors: their standard errors (m,).
-        score: sum of the logarithms of the errors that are left [nats].
-    """
-
-    factors: Array
-    errors: Array
-    score: float
 
 
 class Ahead:
@@ -99,7 +82,7 @@ class Ahead:
         at = at[(at >= max(self.delays)) & (at + self.steps <= len(self.sent))]
         self.at = at[:: -(-len(at) // starts)] if len(at) else at
         self.first, self.last = logged[self.at], logged[self.at + self.steps]
-        self.left_out = _basis(self.first[:, self.shown] if linear else self.first[:, :0])
+        self.left_out = basis(self.first[:, self.shown] if linear else self.first[:, :0])
         self.left_out = self.left_out if constant else self.left_out[:, :0]
         moves = np.nanstd(logged[:, self.shown], axis=0) if good.any() else np.zeros(len(shown))
         self.least = LITTLE * moves + TINY
@@ -135,40 +118,12 @@ class Ahead:
         starts = [np.maximum(self.at + a, 0) for a, _ in spans]
         told = [sums[self.at + b] - sums[a] for a, (_, b) in zip(starts, spans, strict=True)]
         other = self._with(self.sent)
-        other.left_out = _basis(np.hstack([self.left_out, *told]))
+        other.left_out = basis(np.hstack([self.left_out, *told]))
         return other
 
     def plain(self, gains: Array) -> Fit:
         """Return the fit of the uncalibrated model with given gains (m,) of its inputs."""
-        return self._fit(self._size(self._off(gains, self.model.values, 0)[0]), gains)
-
-    def strengths(self, late: int = 0) -> Strengths:
-        """Fit how strongly each input acts, with its commands `late` steps late."""
-        m, found, error = self.model.m, np.full(self.model.m, np.nan), np.full(self.model.m, np.nan)
-        signs = np.vstack([np.ones(m), 1.0 - 2.0 * np.eye(m)])
-        off = self._off(signs, self.model.values, late)
-        by = np.moveaxis(off[0] - off[1:], 0, -1) / 2  # (N, shown, m): what each input does
-        left, size = off[0], self._size(off[0])
-        acts = np.asarray((np.sqrt((by**2).mean(axis=0)) > self.least[:, None]).any(axis=0))
-        if not (acts.any() and np.isfinite(off).all()):
-            return Strengths(found, error, float(np.log(size).sum()))
-        by = by[:, :, acts]
-        for _ in range(ROUNDS):
-            slopes = by / size[:, None]
-            inverse = np.linalg.pinv(np.einsum("nki,nkj->ij", slopes, slopes), SAME, hermitian=True)
-            change = -inverse @ np.einsum("nki,nk->i", slopes, off[0] / size)
-            left = off[0] + by @ change
-            size = self._size(left)
-        pulls = self._in_blocks(np.einsum("nki,nk->ni", slopes, left / size))
-        found[acts] = 1.0 + change
-        error[acts] = np.sqrt(np.diag(inverse @ (pulls.T @ pulls) @ inverse))
-        return Strengths(found, error, float(np.log(size).sum()))
-
-    def _in_blocks(self, each: Array) -> Array:
-        """Sum rows (N, k) over stretches of the trial whose errors count as independent."""
-        block = np.arange(len(each)) * BLOCKS // len(each)
-        sums = [np.bincount(block, column, minlength=BLOCKS) for column in each.T]
-        return np.asarray(np.array(sums).T * np.sqrt(BLOCKS / (BLOCKS - 1)))
+        return self._fit(self.size(self._off(gains, self.model.values, 0)[0]), gains)
 
     def still(self) -> Fit:
         """Return the calibrated fit with every command at its mean: the commands have no effect."""
@@ -188,7 +143,7 @@ class Ahead:
     def _late(self, gains: Array) -> int:
         """Return the command delay [steps] that fits best with these gains."""
         off = self._off(gains, self.model.values, np.array(self.delays))
-        left = [float(np.log(self._size(one)).sum()) for one in off]
+        left = [float(np.log(self.size(one)).sum()) for one in off]
         return self.delays[int(np.argmin(left))]
 
     def _with(self, sent: Array) -> Ahead:
@@ -212,7 +167,7 @@ class Ahead:
             return self._off(moved, values, late)
 
         (r,) = off(theta[None])
-        size = self._size(r)
+        size = self.size(r)
         for _ in range(ROUNDS if len(theta) else 0):
             each = (off(theta + SLOPE * np.eye(len(theta))) - r) / size / SLOPE
             J, white = each.reshape(len(theta), -1).T, (r / size).ravel()
@@ -222,11 +177,11 @@ class Ahead:
             step = -np.linalg.lstsq(H, J.T @ white + prior * theta, rcond=None)[0]
             for part in DAMPING:
                 (new,) = off((theta + part * step)[None])
-                if np.log(self._size(new) / size).sum() < -ENOUGH:
+                if np.log(self.size(new) / size).sum() < -ENOUGH:
                     break
             else:
                 break
-            theta, r, size = theta + part * step, new, self._size(new)
+            theta, r, size = theta + part * step, new, self.size(new)
         found = gains.copy()
         found[:m] += theta[:m]
         return self._fit(size, found)
@@ -236,19 +191,29 @@ class Ahead:
 
         For K gains (K, m), parameters (K, k) and delays (K,); a single one is broadcast.
         """
+        off = self.missed(gains, values, late)
+        return np.asarray(off - self.left_out @ (self.left_out.T @ off))
+
+    def missed(self, gains: Array, values: Array, late: int | Steps) -> Array:
+        """Return the errors of the predictions (K, N, shown), nothing removed.
+
+        For K gains (K, m), parameters (K, k) and delays (K,) in steps; a single one is broadcast.
+        Before the trial its first command is taken as sent.
+        """
         gains, values, late = np.atleast_2d(gains), np.atleast_2d(values), np.atleast_1d(late)
         K, N = max(len(gains), len(values), len(late)), len(self.at)
         at = self.at - late[:, None]
         x, last = np.tile(self.first, (K, 1)), np.tile(self.last, (K, 1))
         own = np.repeat(np.broadcast_to(values, (K, values.shape[1])), N, axis=0)
         for j in range(self.steps):
-            u = np.broadcast_to(self.sent[at + j] * gains[:, None], (K, N, self.model.m))
+            sent = self.sent[np.maximum(at + j, 0)]
+            u = np.broadcast_to(sent * gains[:, None], (K, N, self.model.m))
             x = each_stepped(self.model, x, u.reshape(K * N, -1), own, self.dt)
             x = np.fmax(np.fmin(x, FAR), -FAR)
-        off = self.model.difference(x, last)[:, self.shown].reshape(K, N, -1)
-        return np.asarray(off - self.left_out @ (self.left_out.T @ off))
+        return np.asarray(self.model.difference(x, last)[:, self.shown].reshape(K, N, -1))
 
-    def _size(self, off: Array) -> Array:
+    def size(self, off: Array) -> Array:
+        """Return the rms of errors (..., N, shown) by state, at least what counts."""
         size = np.sqrt((off**2).mean(axis=0))
         return np.asarray(np.maximum(np.where(np.isfinite(size), size, FAR), self.least))
 
@@ -258,7 +223,7 @@ class Ahead:
         return Fit(rms, gains)
 
 
-def _basis(told: Array) -> Array:
+def basis(told: Array) -> Array:
     """Return an orthonormal basis (N, k) of a constant and the columns `told` (N, m)."""
     told = told - told.mean(axis=0) if len(told) else told
     spread = told.std(axis=0) if len(told) else np.zeros(told.shape[1])

@@ -1,5 +1,6 @@
 """A motor wired the wrong way round in some trials, seen by a model without friction."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from grounded import Model, Param
 from grounded.errors import GroundedError
 from grounded.instruments.input_signs import how_inputs_act, judge_signs
 from grounded.instruments.sound_trials import sound_trials
+from grounded.models import arm, cart_pole
 from grounded.trial import Trial
 
 DT = 0.01
@@ -78,3 +80,54 @@ def test_the_trial_that_contradicts_the_others_is_named():
     with pytest.raises(GroundedError) as raised:
         judge_signs(AXIS, [right, *more])
     assert holds(str(raised.value), "trial t0001", "than in t0002 and t0003", "as in the model")
+
+
+SWINGS = {  # model, goal, inputs there, their limit, gains, largest distance of the start
+    "axis": (AXIS, np.zeros(2), np.zeros(1), 1.5, np.array([[40.0, 3.0]]), [0.3, 0.0]),
+    "cart": (
+        cart_pole.model,
+        np.zeros(4),
+        np.zeros(1),
+        12.0,
+        np.array([[-30.0, -160.0, -30.0, -35.0]]),
+        [0.3, 0.05, 0.0, 0.0],
+    ),
+    "arm": (
+        arm.model,
+        np.array([0.5, 1.0, 0.0, 0.0]),
+        np.array([20.0, 2.0]),
+        40.0,
+        np.array([[900.0, 150.0, 60.0, 15.0], [150.0, 150.0, 15.0, 12.0]]),
+        [0.6, 0.3, 0.0, 0.0],
+    ),
+}
+
+
+def swinging(plant, late, seed, strong, dt, seconds):
+    """A robot under feedback through commands `late` seconds late: it swings or whirls."""
+    model, at, held, limit, gains, far = SWINGS[plant]
+    rng, fine = np.random.default_rng(seed), 0.005
+    x = at + np.array(far) * rng.uniform(-1.0, 1.0, model.n)
+    queue, states, inputs = [held] * round(late / fine), [], []
+    for _ in range(round(seconds / dt)):
+        states.append(x + 1e-4 * rng.normal(size=model.n))
+        inputs.append(np.clip(held - strong * gains @ (states[-1] - at), -limit, limit))
+        for _ in range(round(dt / fine)):
+            queue.append(inputs[-1])
+            x = model.system.step(x[None], queue.pop(0)[None], model.values, fine)[0]
+            rate = x[model.n // 2 :]
+            rate -= fine * 2.0 * rate  # a friction that the model lacks
+    return model, Trial(
+        np.array([*states, x]), np.array(inputs), dt, model.state_names, model.input_names
+    )
+
+
+@pytest.mark.parametrize("plant", SWINGS)
+@pytest.mark.parametrize("strong", [0.1, 0.3, 1.0])
+def test_an_input_that_acts_late_is_never_said_to_act_the_other_way_round(plant, strong):
+    """Its feedback swings: a delay turns the harmonics round, and a whirling arm ends anywhere."""
+    runs = itertools.product((0.03, 0.06, 0.1, 0.15, 0.25), range(4), (0.02, 0.05), (1.2, 3.0))
+    for late, seed, dt, seconds in runs:
+        model, trial = swinging(plant, late, seed, strong, dt, seconds)
+        acts = how_inputs_act(model, trial, range(model.n))
+        assert min(one.sign for one in acts) >= 0, (late, seed, dt, seconds, acts)
