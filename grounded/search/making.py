@@ -340,7 +340,8 @@ class About:
         model, where local steps from it can't go. Both are judged by the grounded prediction less
         its likely error, and the own plan also by the changed model alone if that predicts the
         incumbent's trial (`_worth`). No gain is required if that trial failed badly or was a limit
-        cycle: a bias measured there does not apply to other runs.
+        cycle, since a bias measured there does not apply to other runs; but if a step gains, the
+        own plan must not lose.
 
         Args:
             rival: the best step along a direction; None if there is none.
@@ -353,7 +354,8 @@ class About:
         made = self._told(self.candidate(for_late_samples(policy, self.real), Step(), "own plan"))
         promise = rival.candidate.expected_gain if rival and rival.candidate else self.least
         swung = wild(self.incumbent) or limit_cycle(self.incumbent, make.planner.task)
-        better = swung or self._worth(made) > max(promise, self.least)
+        blind = swung and (rival is None or made.predicted_utility > self.incumbent.utility)
+        better = blind or self._worth(made) > max(promise, self.least)
         proposal = make.checked(make.with_margin(made, self.real)) if better else None
         return proposal if proposal is not None and proposal.candidate is not None else None
 

@@ -15,7 +15,7 @@ from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
 from grounded.search.making import About, Maker, begun_at
 from grounded.search.planner import Planner, model_fingerprint, planner_for, predicted
-from grounded.search.standing import standing
+from grounded.search.standing import Proposal, standing
 from grounded.search.step_size import SearchOptions, Step
 from grounded.trial import Trial, mean_trial
 from grounded.utility import Reward
@@ -327,3 +327,19 @@ def test_the_noise_of_a_first_row_is_no_start_elsewhere():
     best.trials = [begun(task, noise=0.02)]
     text = _so_far(made, best, task)
     assert "began" not in text and "+2.000" in text
+
+
+def test_an_own_plan_after_a_swing_must_not_lose_where_a_step_gains(noisy, monkeypatch):
+    """An arm slammed: its own plan was predicted at -126, after -0.75, beside a step to -0.01."""
+    about, task = noisy.about, noisy.task
+    better = planner_for(task, task.model.with_values({"mass": 1.2}), np.zeros(1))
+    about.make = Maker(better, about.make.now, "c0099", model_fingerprint(better.plan))
+    monkeypatch.setattr("grounded.search.making.wild", lambda tried: True)
+    about.missed = 1e9  # so that no gain counts
+    step = Proposal(about.make.now, about.candidate(about.theta, Step(), ""), False)
+    best = about.incumbent
+    about.incumbent = replace(best, utilities=(-1e-9,))  # the grounded model predicts a loss
+    assert about.own_plan(step) is None
+    assert about.own_plan(None).candidate.way == "own plan"
+    about.incumbent = replace(best, utilities=(-1e9,))
+    assert about.own_plan(step).candidate.way == "own plan"

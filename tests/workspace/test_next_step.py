@@ -242,6 +242,13 @@ def test_a_filter_of_a_sensor_is_adopted_with_the_physics(cart, tmp_path):
     assert last(grounded("-C", folder, "status")) == "grounded diagnose"
 
 
+def test_a_filter_of_a_sensor_comes_along_where_only_the_physics_is_named(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    diagnosed(folder, preflight=[LAGGING])
+    done = grounded("-C", folder, "adopt", "viscous_friction:v", "--json").json
+    assert done["effects"][-1] == {"name": "sensor_lag:v", "tau": 0.03}
+
+
 def test_a_filter_is_adopted_alone_where_nothing_else_was_found(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     nothing = {"kind": "none", "effects": [], "sentence": "None."}

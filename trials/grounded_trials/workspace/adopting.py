@@ -107,7 +107,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     that it does not claim was fitted instead of those, without parameters.
     """
     from grounded_trials.workspace.adopted import in_order
-    from grounded_trials.workspace.next_step import to_plan
+    from grounded_trials.workspace.next_step import late_open, to_plan
     from grounded_trials.workspace.off_target import logged_target
 
     found = read_diagnosis(workspace.reports)
@@ -118,6 +118,8 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     _check(names, found, workspace, before)
     physics = [name for name in names if name not in found.late_sensors]
     claimed = not physics or _claimed(found, physics)
+    if physics and {*found.effects} <= {*physics}:
+        names += [name for name in late_open(workspace, found) if name not in names]
     calibrated = found.known_parameters if parameters and physics and claimed else {}
     nominal = nominal_values(found, workspace, names)
     old = workspace.config.model.effects
