@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.proposing import Status
 
 
+MOST = 3  # effects that are looked for if not all trials are used: each more takes 20 s
 STEPS = 1600  # total steps of the diagnosed trials, so that a demo ends within a minute or two
 
 
@@ -55,7 +56,9 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     with stages() as tell:
         tell("diagnosing the gap")
         some, engine = _few(workspace, status), Engine(os.cpu_count() or 1)
-        diagnosed = workspace.diagnose(some, engine=engine, progress=tell)
+        diagnosed = workspace.diagnose(
+            some, max_effects=MOST if some else None, engine=engine, progress=tell
+        )
     with progress("writing the report"):
         html, rrd = (find_spec(name) is not None for name in ("jinja2", "rerun"))
         report = workspace.report(html=html, rrd=rrd)
