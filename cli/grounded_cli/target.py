@@ -23,6 +23,7 @@ SECONDS = 5.0  # default duration of a step or a swing-up
 REACHED = 0.95  # of --speed: a path that stays below it brings a note
 STRAIGHT = 1e3  # times --size: larger turning radii are those of a straight line
 SLOW = 0.5  # of the highest speed: below it a path's radius is not computed from its samples
+OBEYED = 0.1  # of a sensor's bias: a target that ends there was drawn in readings
 TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
 
 
@@ -155,7 +156,8 @@ def command(
         text = with_unit(span, model.states[name])
         show(field(name, text, "  "))
     if free:
-        show(field("free", _free(free, reward, _rest_of(model, free) * (shape == "line")), "  "))
+        rest = _rest_of(model, free) * (shape == "line")
+        show(field("free", _free(free, reward, rest, _reading_at_rest(workspace, rest)), "  "))
     if ran:
         _tell_undo(old, before, reward, rows - 1)
     if rest:
@@ -181,7 +183,10 @@ def command(
             remark("note", f"{name} goes to {goes}, beyond its bound in [safety], {number(bound)}")
     for effect in workspace.config.model.effects:
         family, _, name = str(effect["name"]).partition(":")
-        if family == "sensor_bias" and name in columns:
+        if family != "sensor_bias" or name not in columns:
+            continue
+        ends = float(columns[name][-1]), float(workspace.config.task.start.get(name, 0.0))
+        if not all(math.isclose(end, effect["b"], rel_tol=OBEYED) for end in ends):
             remark(
                 "note",
                 f"the target of {name} is in readings of its sensor, which by the adopted "
@@ -243,13 +248,20 @@ def _rest_of(model: Model, free: list[str]) -> str:
     return next((name for name in free if name in velocities(model)), free[0])
 
 
-def _free(names: list[str], reward: dict[str, dict[str, float]], rest: str) -> str:
+def _reading_at_rest(workspace: Workspace, name: str) -> float:
+    """Return what the sensor of a state shows at 0, by the adopted effects."""
+    biases = {str(e["name"]): float(e.get("b", 0.0)) for e in workspace.config.model.effects}
+    return biases.get(f"sensor_bias:{name}", 0.0)
+
+
+def _free(names: list[str], reward: dict[str, dict[str, float]], rest: str, at: float) -> str:
     """Explain what it means that the target has no column for some states.
 
     Args:
         names: the states.
         reward: the tables of [reward].
         rest: the state to suggest bringing to rest with --to, "" for no suggestion.
+        at: what its sensor shows there.
     """
     weighed = [n for n in names if any(reward.get(k, {}).get(n) for k in ("state", "terminal"))]
     it = "them" if len(names) > 1 else "it"
@@ -260,7 +272,7 @@ def _free(names: list[str], reward: dict[str, dict[str, float]], rest: str) -> s
             f"add a column (`--to {weighed[0]}=VALUE`), or remove the weight"
         )
     if rest:
-        text += f". Add `--to {rest}=0` to ask for rest there"
+        text += f". Add `--to {rest}={at:.3g}` to ask for rest there"
     return text
 
 
