@@ -156,8 +156,10 @@ def command(
         text = with_unit(span, model.states[name])
         show(field(name, text, "  "))
     if free:
-        rest = _rest_of(model, free) * (shape == "line")
-        show(field("free", _free(free, reward, rest, _reading_at_rest(workspace, rest)), "  "))
+        resting = _rest_of(model, free) * (shape == "line")
+        show(
+            field("free", _free(free, reward, resting, _reading_at_rest(workspace, resting)), "  ")
+        )
     if ran:
         _tell_undo(old, before, reward, rows - 1)
     if rest:
@@ -185,8 +187,8 @@ def command(
         family, _, name = str(effect["name"]).partition(":")
         if family != "sensor_bias" or name not in columns:
             continue
-        ends = float(columns[name][-1]), float(workspace.config.task.start.get(name, 0.0))
-        if not all(math.isclose(end, effect["b"], rel_tol=OBEYED) for end in ends):
+        asked = float(columns[name][-1]), float(workspace.config.task.start.get(name, 0.0))
+        if not all(math.isclose(one, effect["b"], rel_tol=OBEYED) for one in asked):
             remark(
                 "note",
                 f"the target of {name} is in readings of its sensor, which by the adopted "

@@ -37,6 +37,7 @@ NEAR = 0.2  # relative distance to a run that lost within which a step counts as
 WITNESS = 3.0  # factor on a model's largest miss, below which its prediction of a ruin says nothing
 REFUTED = 2  # bad losses of steps with corrected derivatives before those are given up
 MISTAKEN = 0.5  # share of its predictions that the plain model may miss
+ALIKE = 0.05  # of the incumbent's cost: promises of two plans that differ by less
 FORETOLD = 0.2  # largest error of the plain model at the incumbent, as a fraction of its cost
 
 
@@ -340,8 +341,8 @@ class About:
         model, where local steps from it can't go. Both are judged by the grounded prediction less
         its likely error, and the own plan also by the changed model alone if that predicts the
         incumbent's trial (`_worth`). No gain is required if that trial failed badly or was a limit
-        cycle, since a bias measured there does not apply to other runs; but if a step gains, the
-        own plan must not lose.
+        cycle, since a bias measured there does not apply to other runs; but a step that promises
+        about as much goes first.
 
         Args:
             rival: the best step along a direction; None if there is none.
@@ -354,10 +355,21 @@ class About:
         made = self._told(self.candidate(for_late_samples(policy, self.real), Step(), "own plan"))
         promise = rival.candidate.expected_gain if rival and rival.candidate else self.least
         swung = wild(self.incumbent) or limit_cycle(self.incumbent, make.planner.task)
-        blind = swung and (rival is None or made.predicted_utility > self.incumbent.utility)
-        better = blind or self._worth(made) > max(promise, self.least)
+        better = swung and self._promises_more(made, rival)
+        better = better or self._worth(made) > max(promise, self.least)
         proposal = make.checked(make.with_margin(made, self.real)) if better else None
         return proposal if proposal is not None and proposal.candidate is not None else None
+
+    def _promises_more(self, made: Candidate, rival: Proposal | None) -> bool:
+        """Return whether an own plan does better in its model than a step in the grounded one.
+
+        Of two promises that differ little, the step keeps the run that it is measured from: an arm
+        slammed on its own plan, and stood on its target after the step.
+        """
+        if rival is None or rival.candidate is None:
+            return True
+        more = predicted(self.plain, made.policy).utility - rival.candidate.predicted_utility
+        return bool(more > ALIKE * -self.incumbent.utility)
 
     def _worth(self, made: Candidate) -> float:
         """Return the likely gain of an own plan: the larger of the estimates of two models.

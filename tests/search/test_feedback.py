@@ -329,17 +329,18 @@ def test_the_noise_of_a_first_row_is_no_start_elsewhere():
     assert "began" not in text and "+2.000" in text
 
 
-def test_an_own_plan_after_a_swing_must_not_lose_where_a_step_gains(noisy, monkeypatch):
-    """An arm slammed: its own plan was predicted at -126, after -0.75, beside a step to -0.01."""
+def test_after_a_swing_a_step_precedes_an_own_plan_that_promises_as_much(noisy, monkeypatch):
+    """An arm slammed on its own plan (-0.005 promised), beside a step that promised -0.009."""
     about, task = noisy.about, noisy.task
     better = planner_for(task, task.model.with_values({"mass": 1.2}), np.zeros(1))
     about.make = Maker(better, about.make.now, "c0099", model_fingerprint(better.plan))
+    about.plain, about.missed = better.plan.problem(exact=True), 1e9  # so that no gain counts
     monkeypatch.setattr("grounded.search.making.wild", lambda tried: True)
-    about.missed = 1e9  # so that no gain counts
-    step = Proposal(about.make.now, about.candidate(about.theta, Step(), ""), False)
-    best = about.incumbent
-    about.incumbent = replace(best, utilities=(-1e-9,))  # the grounded model predicts a loss
-    assert about.own_plan(step) is None
     assert about.own_plan(None).candidate.way == "own plan"
-    about.incumbent = replace(best, utilities=(-1e9,))
-    assert about.own_plan(step).candidate.way == "own plan"
+    plainly = predicted(about.plain, about.own_plan(None).candidate.policy).utility
+    made = about.candidate(about.theta, Step(), "")
+    cost = -about.incumbent.utility
+    for promise, way in ((plainly - 0.01 * cost, None), (plainly - 0.5 * cost, "own plan")):
+        step = Proposal(about.make.now, replace(made, predicted_utility=promise), False)
+        found = about.own_plan(step)
+        assert (found and found.candidate.way) == way
