@@ -341,8 +341,8 @@ class About:
         model, where local steps from it can't go. Both are judged by the grounded prediction less
         its likely error, and the own plan also by the changed model alone if that predicts the
         incumbent's trial (`_worth`). No gain is required if that trial failed badly or was a limit
-        cycle, since a bias measured there does not apply to other runs; but a step that promises
-        about as much goes first.
+        cycle, since a bias measured there does not apply to other runs; but if that predicts a
+        loss, a step that promises about as much goes first.
 
         Args:
             rival: the best step along a direction; None if there is none.
@@ -361,12 +361,13 @@ class About:
         return proposal if proposal is not None and proposal.candidate is not None else None
 
     def _promises_more(self, made: Candidate, rival: Proposal | None) -> bool:
-        """Return whether an own plan does better in its model than a step in the grounded one.
+        """Return whether an own plan goes before a step, after an incumbent that swung.
 
-        Of two promises that differ little, the step keeps the run that it is measured from: an arm
-        slammed on its own plan, and stood on its target after the step.
+        It need not promise more, unless the grounded model predicts that it loses: an arm slammed
+        on such a plan, and stood on its target after a step that promised as much.
         """
-        if rival is None or rival.candidate is None:
+        gains = made.predicted_utility > self.incumbent.utility
+        if rival is None or rival.candidate is None or gains:
             return True
         more = predicted(self.plain, made.policy).utility - rival.candidate.predicted_utility
         return bool(more > ALIKE * -self.incumbent.utility)

@@ -338,8 +338,11 @@ def test_after_a_swing_a_step_precedes_an_own_plan_that_promises_as_much(noisy, 
     monkeypatch.setattr("grounded.search.making.wild", lambda tried: True)
     assert about.own_plan(None).candidate.way == "own plan"
     plainly = predicted(about.plain, about.own_plan(None).candidate.policy).utility
-    made = about.candidate(about.theta, Step(), "")
-    cost = -about.incumbent.utility
+    made, best = about.candidate(about.theta, Step(), ""), about.incumbent
+    step = Proposal(about.make.now, replace(made, predicted_utility=plainly), False)
+    about.incumbent = replace(best, utilities=(-1e9,))  # the grounded model predicts a gain
+    assert about.own_plan(step).candidate.way == "own plan"
+    about.incumbent, cost = replace(best, utilities=(-1e-6,)), 1e-6  # a loss
     for promise, way in ((plainly - 0.01 * cost, None), (plainly - 0.5 * cost, "own plan")):
         step = Proposal(about.make.now, replace(made, predicted_utility=promise), False)
         found = about.own_plan(step)
