@@ -85,7 +85,8 @@ def constant_of(model: Model, relation: Integral, trials: Sequence[Trial]) -> Co
 def _line(off: Array, columns: Sequence[Array], counts: Array) -> tuple[Array, float, Array]:
     """Return a weighted fit of the columns, the sum of squares that it leaves, and its inverse."""
     design = np.stack(columns, axis=1)
-    inverse = np.asarray(np.linalg.pinv(design.T @ (counts[:, None] * design)), np.float64)
+    square = design.T @ (counts[:, None] * design)
+    inverse = np.asarray(np.linalg.pinv(square, hermitian=True), np.float64)
     fitted = inverse @ (design.T @ (counts * off))
     return fitted, float(counts @ (off - design @ fitted) ** 2), inverse
 

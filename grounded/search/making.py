@@ -355,12 +355,12 @@ class About:
         made = self._told(self.candidate(for_late_samples(policy, self.real), Step(), "own plan"))
         promise = rival.candidate.expected_gain if rival and rival.candidate else self.least
         swung = wild(self.incumbent) or limit_cycle(self.incumbent, make.planner.task)
-        better = swung and self._promises_more(made, rival)
+        better = swung and self._goes_first(made, rival)
         better = better or self._worth(made) > max(promise, self.least)
         proposal = make.checked(make.with_margin(made, self.real)) if better else None
         return proposal if proposal is not None and proposal.candidate is not None else None
 
-    def _promises_more(self, made: Candidate, rival: Proposal | None) -> bool:
+    def _goes_first(self, made: Candidate, rival: Proposal | None) -> bool:
         """Return whether an own plan goes before a step, after an incumbent that swung.
 
         It need not promise more, unless the grounded model predicts that it loses: an arm slammed

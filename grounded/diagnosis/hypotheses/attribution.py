@@ -269,12 +269,11 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         if larger:
             _nested(search, larger[0])
             best = search.of_size(size)[0]
-        if not larger or search.score(larger[0]) < search.score(best) + CLAIM:
-            if not larger or frozenset(best.hypothesis.names) in done:
-                break
-            continue
-        best = swapped(search, larger[0])
-        size = len(best.hypothesis.effects)
+        if larger and not search.score(larger[0]) < search.score(best) + CLAIM:
+            best = swapped(search, larger[0])
+            size = len(best.hypothesis.effects)
+        elif not larger or frozenset(best.hypothesis.names) in done:
+            break
     for _ in range(most):  # what was fitted last may have given the chosen set its constants
         chosen = search.chosen(most)
         _nested(search, chosen)
