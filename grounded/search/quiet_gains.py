@@ -56,16 +56,17 @@ class Quiet:
         """Return a sentence if a candidate's feedback is stronger than what ran quietly, else ""."""
         if self.allows(made.policy):
             return ""
-        strength, swung = self.strength(made.policy), self.swung.id
-        if self.by:
-            than = f"{strength / self.most:.2g} times as strong as that of {self.by}, which did not"
+        strength, swung, name = self.strength(made.policy), self.swung.id, made.id
+        weaker = f", while that of {self.by}, {100 * self.most / strength:.0f} % as strong, did not"
+        weaker = weaker * bool(self.by) + ", but much weaker feedback did far worse" * self.needed
+        if name == swung:
+            told = f"the feedback of {name} made inputs oscillate when it ran{weaker}"
         else:
-            than = f"{100 * strength:.0f} % as strong, and none weaker ran without"
-        why = " (weaker feedback did far worse)" * self.needed
-        return (
-            f"the feedback of {swung} made inputs oscillate, and that of {made.id} is {than}{why}: "
-            "be ready to stop the robot"
-        )
+            told = (
+                f"the feedback of {swung} made inputs oscillate{weaker}, and that of {name} is "
+                f"{100 * strength:.0f} % as strong as that of {swung}"
+            )
+        return f"{told}: be ready to stop the robot"
 
 
 def quiet_gains(task: Task, history: Sequence[Tried], model: str | None = None) -> Quiet | None:
@@ -81,8 +82,7 @@ def quiet_gains(task: Task, history: Sequence[Tried], model: str | None = None) 
         for t in history
         if t.trials and t.candidate.policy.gain is not None and model in (None, t.candidate.model)
     ]
-    ranges = np.minimum.accumulate([plan_range(t.candidate, task) for t in ran]) if ran else ()
-    loud = [t for t, calm in zip(ran, ranges, strict=True) if limit_cycle(t, task, calm)]
+    loud = [t for t in ran if limit_cycle(t, task, calm_range(task, ran, t.candidate))]
     if not loud:
         return None
     last = loud[-1]
@@ -96,13 +96,23 @@ def quiet_gains(task: Task, history: Sequence[Tried], model: str | None = None) 
         if tried in loud:
             swung, cost = min(swung, level), max(cost, -tried.utility)
             quiet = [(each, name) for each, name in quiet if STRONGER * each < level]
-        elif -tried.utility <= FELL * cost or not cost:
-            quiet.append((level, made.id))
-        else:
+        elif cost and not -tried.utility <= FELL * cost:
             fallen.append(level)
+        elif np.isfinite(tried.utility):
+            quiet.append((level, made.id))
     most, by = max(quiet, default=(HALF * swung, ""))
     needed = any(most <= STRONGER * level for level in fallen)
     return Quiet(task, last.candidate, moved, most, by, needed)
+
+
+def calm_range(task: Task, history: Sequence[Tried], made: Candidate) -> Array:
+    """Return the least range of each input in a candidate's plan and those before it, (m,).
+
+    The plan of a step from a run that swung replays its swings: its own range is no measure.
+    """
+    ids = [t.candidate.id for t in history]
+    before = [t.candidate for t in history[: ids.index(made.id)] if t.candidate.model == made.model]
+    return np.min([plan_range(one, task) for one in (*before, made)], axis=0)
 
 
 def _moved(task: Task, tried: Tried) -> Array:
