@@ -386,3 +386,28 @@ def test_runs_of_another_task_are_told_once_as_data(ran):
     configure(ran, CONFIG.replace(LIMITS, NARROW))
     (note,) = [note for note in ran.status().notes if "only as data" in note]
     assert names[0] in note and names[-1] in note
+
+
+def test_feedback_that_oscillated_is_told_when_it_is_handed_over_again(ran):
+    """An arm's candidate was run again without a word that it had oscillated."""
+    assert not any("oscillate" in one for one in ran.export("c0001", ran.folder / "a.json").notes)
+    trial, *_ = read_trial(ran.run("c0001").trial_file)
+    made = ran.candidate("c0001")[0]
+    swing = 1.1 * np.ptp(made.predicted_inputs) * np.sign(np.sin(0.9 * np.arange(trial.steps)))
+    inputs = np.clip(made.predicted_inputs + swing[:, None], -5.0, 5.0)
+    write_trial(ran.folder / "swung.mcap", replace(trial, inputs=inputs), {"kind": "trial"})
+    taken = ran.ingest(ran.folder / "swung.mcap", candidate="c0001")
+    (warned,) = [one for one in taken.warnings if "oscillate" in one]
+    assert holds(warned, "force", "swings of more than", " N")
+    (told,) = [n for n in ran.export("c0001", ran.folder / "b.json").notes if "oscillate" in n]
+    assert holds(told, "c0001", "be ready to stop")
+
+
+def test_what_a_discarded_run_made_void_is_told_once(ran):
+    """Each of three notes came with every `next`."""
+    ran.ingest(ran.run(ran.propose().candidate.id).trial_file)
+    third = ran.propose().candidate.id
+    ran.discard("t0002")
+    first = ran.propose().proposal.notes
+    assert any(third in one and "void" in one for one in first)
+    assert not any("void" in one for one in ran.propose().proposal.notes)
