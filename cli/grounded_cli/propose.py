@@ -164,8 +164,10 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
     elif parts:
         parts.append((rest, "by noise or by the model's error, which one run can't tell apart"))
     most = max((abs(part) for part, _ in parts), default=0.0)
-    parts = [(part, why) for part, why in parts if abs(part) > max(told, MINOR * most)]
-    said = "; ".join(f"{'+' * (part > 0)}{number(part)} {why}" for part, why in parts)
+    large = [(part, why) for part, why in parts if abs(part) > max(told, MINOR * most)]
+    if len(large) == 1 and (large[0][0] > 0) == (same > best.utility):
+        return f"{own}, {large[0][1]}"
+    said = "; ".join(f"{'+' * (part > 0)}{number(part)} {why}" for part, why in large)
     return f"{own}: {said}" if said else own
 
 
