@@ -93,6 +93,15 @@ def test_a_step_that_may_well_lose_is_handed_over_with_a_word(ran):
     assert "e+08" not in note and f"more than the whole cost of {made.base}" in note
 
 
+def test_a_doubted_step_from_one_that_was_doubted_and_won_is_doubted_less(ran):
+    """A crane's three steps would `well lose`, and won by three to five times."""
+    best = ran.status().standing.incumbent
+    made = replace(ran.propose().candidate, id="c0003", predicted_gain=0.07, likely_off=0.3)
+    assert "c0003 may well lose: it" in made.doubt(best)
+    won = replace(best, candidate=replace(best.candidate, predicted_gain=1.0, likely_off=2.0))
+    assert "c0003 may lose, as was said of c0001, which won: it" in made.doubt(won)
+
+
 def test_what_was_just_proposed_is_handed_over_without_a_word(w, tmp_path):
     assert w.propose().proposal.notes == ()
     ran, exported = w.run("c0001"), w.export("c0001", tmp_path / "c.json")
