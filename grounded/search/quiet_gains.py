@@ -53,7 +53,7 @@ class Quiet:
         return self.strength(policy) <= STRONGER * self.most
 
     def risk(self, made: Candidate) -> str:
-        """Return a sentence if a candidate's feedback is stronger than what ran quietly, else ""."""
+        """Return a sentence if a candidate's feedback is stronger than what ran quietly; or ""."""
         if self.allows(made.policy):
             return ""
         strength, swung, name = self.strength(made.policy), self.swung.id, made.id
@@ -112,7 +112,7 @@ def calm_range(task: Task, history: Sequence[Tried], made: Candidate) -> Array:
     """
     ids = [t.candidate.id for t in history]
     before = [t.candidate for t in history[: ids.index(made.id)] if t.candidate.model == made.model]
-    return np.min([plan_range(one, task) for one in (*before, made)], axis=0)
+    return np.asarray(np.min([plan_range(one, task) for one in (*before, made)], axis=0))
 
 
 def _moved(task: Task, tried: Tried) -> Array:

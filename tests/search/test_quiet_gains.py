@@ -8,9 +8,8 @@ import pytest
 
 from grounded.model import Model, Param
 from grounded.plant import Noise, Plant
-from grounded.search import making, quiet_gains as quietness
+from grounded.search import making
 from grounded.search.improve import propose
-from grounded.search.limit_cycle import SWINGS
 from grounded.search.planner import Planner
 from grounded.search.quiet_gains import calm_range, quiet_gains
 from grounded.search.standing import standing
@@ -176,7 +175,9 @@ def test_stronger_feedback_says_what_it_risks(told):
 def test_a_plan_that_replays_swings_is_no_measure_of_them(told):
     """A step from a run that swung plans with its swings; the plan before it does not."""
     history = told.ran((-1.0, -9.0), (1.0, -9.0))
-    swung = replace(told.first, id="c0002", predicted_inputs=told.first.predicted_inputs + told.wave)
+    swung = replace(
+        told.first, id="c0002", predicted_inputs=told.first.predicted_inputs + told.wave
+    )
     later = [history[0], replace(history[1], candidate=swung)]
     sizes = calm_range(told.task, later, swung)
     np.testing.assert_array_equal(sizes, np.ptp(told.first.predicted_inputs, axis=0))
