@@ -36,9 +36,10 @@ def swings(made: Candidate, trial: Trial, range_: Array) -> Array:
         range_: range of each input in its plan, or in one that replays no swings (m,); an input
             with range 0 counts as never swinging.
     """
+    plan = made.predicted_inputs
     if trial.steps < SWINGS:
         return np.zeros(len(range_), int)
-    off = trial.inputs - made.predicted_inputs[: trial.steps]
+    off = trial.inputs[: len(plan)] - plan[: trial.steps]  # a log may be longer
     sizes = np.maximum(range_, np.abs(median(off)))
     each = zip(off.T, sizes, range_, strict=True)
     return np.array([_swings(one, size) if of > 0 else 0 for one, size, of in each])

@@ -77,12 +77,12 @@ def quiet_gains(task: Task, history: Sequence[Tried], model: str | None = None) 
         history: all candidates with their trials, in the order of proposal.
         model: fingerprint: only candidates of this model count; None for all.
     """
-    ran = [
-        t
-        for t in history
-        if t.trials and t.candidate.policy.gain is not None and model in (None, t.candidate.model)
-    ]
-    loud = [t for t in ran if limit_cycle(t, task, calm_range(task, ran, t.candidate))]
+    ran, loud = list[Tried](), list[Tried]()
+    for tried, calm in zip(history, calm_ranges(task, history), strict=True):
+        made = tried.candidate
+        if tried.trials and made.policy.gain is not None and model in (None, made.model):
+            ran.append(tried)
+            loud += [tried] * limit_cycle(tried, task, calm)
     if not loud:
         return None
     last = loud[-1]
@@ -105,14 +105,19 @@ def quiet_gains(task: Task, history: Sequence[Tried], model: str | None = None) 
     return Quiet(task, last.candidate, moved, most, by, needed)
 
 
-def calm_range(task: Task, history: Sequence[Tried], made: Candidate) -> Array:
-    """Return the least range of each input in a candidate's plan and those before it, (m,).
+def calm_ranges(task: Task, history: Sequence[Tried]) -> list[Array]:
+    """Return the least range of each input in each candidate's plan and those before it, (m,).
 
-    The plan of a step from a run that swung replays its swings: its own range is no measure.
+    The plan of a step from a run that swung replays its swings: its own range is no measure. Plans
+    of other models are none either.
     """
-    ids = [t.candidate.id for t in history]
-    before = [t.candidate for t in history[: ids.index(made.id)] if t.candidate.model == made.model]
-    return np.asarray(np.min([plan_range(one, task) for one in (*before, made)], axis=0))
+    least: dict[str, Array] = {}
+    found = []
+    for made in (tried.candidate for tried in history):
+        own = plan_range(made, task)
+        least[made.model] = np.minimum(least.get(made.model, own), own)
+        found.append(least[made.model])
+    return found
 
 
 def _moved(task: Task, tried: Tried) -> Array:

@@ -36,10 +36,12 @@ def no_longer(workspace: Folder, trial: str, now: Standing) -> list[str]:
         trial: id of that trial.
         now: the standing with it.
     """
+    tried = next((t for t in now.history if any(one.id == trial for one in t.trials)), None)
+    if tried is None or len(tried.trials) < 2:
+        return []
     before = _without(workspace, {trial})
     waited, doubt = before.outstanding, next((t for t in before.history if t.in_doubt), None)
-    tried = next((t for t in now.history if any(one.id == trial for one in t.trials)), None)
-    if waited is None or doubt is None or tried is None or tried.candidate.id == waited.id:
+    if waited is None or doubt is None or tried.candidate.id == waited.id:
         return []
     if now.outstanding is not None and now.outstanding.id == waited.id:
         return []

@@ -9,7 +9,7 @@ import numpy as np
 from grounded.result import figure, listed
 from grounded.search.candidate import Tried
 from grounded.search.limit_cycle import SWINGS, swings
-from grounded.search.quiet_gains import calm_range
+from grounded.search.quiet_gains import calm_ranges
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import with_unit
@@ -27,7 +27,8 @@ def swung(task: Task, tried: Tried | None, trial: Trial, history: Sequence[Tried
     if tried is None or tried.candidate.policy.gain is None:
         return []
     made, model = tried.candidate, task.model
-    sizes = calm_range(task, history, made)
+    ids = [one.candidate.id for one in history]
+    sizes = calm_ranges(task, history)[ids.index(made.id)]
     counts = swings(made, trial, sizes)
     told = [
         f"{model.input_names[i]} ({counts[i]} swings of more than "
