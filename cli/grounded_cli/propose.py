@@ -112,7 +112,8 @@ def _samples(candidate: Candidate) -> str:
     late, age = candidate.sample_age > 0, with_unit(f"{1e3 * abs(candidate.sample_age):.2g}", "ms")
     return (
         f"the commands of {candidate.base} fit samples {age} {'older' if late else 'newer'} than "
-        f"its log has at that time; {candidate.id} allows for it"
+        f"its log has at that time (stamps may tell less: what passes before a stamp or after a "
+        f"command is not in them); {candidate.id} allows for it"
     )
 
 
@@ -163,8 +164,10 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
     elif parts:
         parts.append((rest, "by noise or by the model's error, which one run can't tell apart"))
     most = max((abs(part) for part, _ in parts), default=0.0)
-    parts = [(part, why) for part, why in parts if abs(part) > max(told, MINOR * most)]
-    said = "; ".join(f"{'+' * (part > 0)}{number(part)} {why}" for part, why in parts)
+    large = [(part, why) for part, why in parts if abs(part) > max(told, MINOR * most)]
+    if len(large) == 1 and (large[0][0] > 0) == (same > best.utility):
+        return f"{own}, {large[0][1]}"
+    said = "; ".join(f"{'+' * (part > 0)}{number(part)} {why}" for part, why in large)
     return f"{own}: {said}" if said else own
 
 
@@ -192,6 +195,7 @@ def _what(candidate: Candidate, standing: Standing, task: Task) -> str:
         step = Step(candidate.damping, candidate.alpha)
         by = ", with derivatives corrected by the trials" * candidate.of_corrected
         by += ", with derivatives corrected step by step" * (candidate.way == BY_STEP)
+        by += ", its gains as low as ran without oscillating" * (candidate.caution > 0)
         if candidate.of_original:
             by += ", by the model without the adopted effects, which broke their promises"
         return f"iteration {candidate.iteration}: {step} from {candidate.base}{by}, {seconds}"
@@ -324,6 +328,8 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     if best is None or candidate.id in tried or not math.isfinite(missed[-1]):
         return text
     gain = candidate.promised_over(best)
+    if candidate.way == "gentler gains":  # its run is that of the base, which lacked the swings
+        return f"{text}; the model does not swing with any gains, so it can't say what these gain"
     if not gain > 0:
         return text
     promise = f"{text}; this one promises a gain of {number(gain)}"

@@ -9,6 +9,7 @@ import re
 import sys
 import textwrap
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TextIO
@@ -119,7 +120,7 @@ def stages() -> Iterator[Callable[[str], None]]:
     """Yield a function that shows the current stage of a long command ("" clears it).
 
     On a terminal the line is updated in place; elsewhere (in a log file, for example) the current
-    stage is written every `EVERY` seconds.
+    stage is written every `EVERY` seconds, from the second time on with the seconds so far.
     """
     live, now, ended = is_live(sys.stderr), "", threading.Event()
 
@@ -131,9 +132,12 @@ def stages() -> Iterator[Callable[[str], None]]:
             _write(f"{stage and stage + ' ...'}", sys.stderr, end="")
 
     def remind() -> None:
+        last, began = "", time.monotonic()
         while not ended.wait(EVERY):
             if now:
-                _write(f"{now} ...", sys.stderr)
+                since = f", {time.monotonic() - began:.0f} s so far" * (now == last)
+                _write(f"{now}{since} ...", sys.stderr)
+            last = now
 
     if not live:
         threading.Thread(target=remind, daemon=True).start()

@@ -43,7 +43,7 @@ __all__ = [
     "history_depths",
     "system_of",
 ]
-MAX_COMPILED = 14_000  # operations of a model and its derivatives, about 6 s of compiling
+MAX_COMPILED = 30_000  # operations of a model and its derivatives, about 7 s of compiling
 MAX_STEPS = 4_000  # of a model alone, where its derivatives are too many
 
 

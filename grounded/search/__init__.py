@@ -10,6 +10,7 @@ step_size       damping and alpha of the next step, and the settings of a search
 directions      the direction of the step, by DDP or policy gradient
 making          builds a `candidate`
 limit_cycle     detects feedback that makes the inputs oscillate
+quiet_gains     bounds gains by what ran without oscillating
 margin          checks gains under noise and with old samples
 mispredictions  corrects the model's derivatives from earlier trials (`corrected`), and compares
                 gains in several models that explain the trials

@@ -123,8 +123,11 @@ class Candidate(Result):
         stop = ""
         if best and self.predicted_gain < LITTLE * abs(best.utility):
             stop = f". You may stop here, with {best.candidate.id}, the best so far"
+        may = "may well lose"
+        if best and best.candidate.doubtful:  # it has won, so that such a likely error says less
+            may = f"may lose, as was said of {best.candidate.id}, which won"
         return (
-            f"{self.id} may well lose: it promises {gain:.3g} over {over}, but judging by earlier "
+            f"{self.id} {may}: it promises {gain:.3g} over {over}, but judging by earlier "
             f"trials the model's likely error there is {off}{stop}"
         )
 

@@ -7,28 +7,47 @@ import math
 import numpy as np
 
 from grounded.frozen import Array, median
-from grounded.search.candidate import Tried
+from grounded.search.candidate import Candidate, Tried
 from grounded.task import Task
+from grounded.trial import Trial
 
 # fraction of an input's range within which it counts as at its limit; share of steps that is often
 NEAR, OFTEN = 0.01, 0.3
 SWINGS = 6  # swings of an input about its plan by at least the plan's range: a limit cycle
 
 
-def limit_cycle(tried: Tried, task: Task) -> bool:
-    """Return whether feedback made an input oscillate about its plan by at least the plan's range.
-
-    Each swing must also exceed the median offset from the plan: a sagging load, or friction that
-    holds a joint, needs its gains despite the noise that they amplify.
-    """
+def limit_cycle(tried: Tried, task: Task, range_: Array | None = None) -> bool:
+    """Return whether feedback made an input oscillate in a candidate's trials, see `swings`."""
+    range_ = plan_range(tried.candidate, task) if range_ is None else range_
     made = tried.candidate
-    range_ = np.minimum(np.ptp(made.predicted_inputs, axis=0), task.high - task.low)
-    for trial in tried.trials:
-        off = trial.inputs - made.predicted_inputs[: trial.steps]
-        sizes = np.maximum(range_, np.abs(median(off)))
-        if any(_swings(off[:, i], size) >= SWINGS for i, size in enumerate(sizes) if range_[i] > 0):
-            return True
-    return False
+    return any((swings(made, trial, range_) >= SWINGS).any() for trial in tried.trials)
+
+
+def swings(made: Candidate, trial: Trial, range_: Array) -> Array:
+    """Count the swings of each input about a candidate's plan in one of its runs, (m,) int.
+
+    Each swing is at least as large as a plan's range. It must also exceed the median offset from
+    the plan: a sagging load, or friction that holds a joint, needs its gains despite the noise that
+    they amplify.
+
+    Args:
+        made: the candidate.
+        trial: its run.
+        range_: range of each input in its plan, or in one that replays no swings (m,); an input
+            with range 0 counts as never swinging.
+    """
+    plan = made.predicted_inputs
+    if trial.steps < SWINGS:
+        return np.zeros(len(range_), int)
+    off = trial.inputs[: len(plan)] - plan[: trial.steps]  # a log may be longer
+    sizes = np.maximum(range_, np.abs(median(off)))
+    each = zip(off.T, sizes, range_, strict=True)
+    return np.array([_swings(one, size) if of > 0 else 0 for one, size, of in each])
+
+
+def plan_range(made: Candidate, task: Task) -> Array:
+    """Return the range of each input in a candidate's plan, at most that of its limits, (m,)."""
+    return np.asarray(np.minimum(np.ptp(made.predicted_inputs, axis=0), task.high - task.low))
 
 
 def between_limits(tried: Tried, task: Task) -> bool:

@@ -17,6 +17,7 @@ from grounded.search.directions import base_columns, direction
 from grounded.search.limit_cycle import between_limits, limit_cycle
 from grounded.search.margin import steadied
 from grounded.search.planner import Planner, predicted
+from grounded.search.quiet_gains import Quiet, quiet_gains
 from grounded.search.safety import objections, spread
 from grounded.search.sample_age import sample_age
 from grounded.search.scatter import beyond_noise
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 GENTLER = 1e3  # factor on the input weights for each unit of caution
 HALF, FINE = 0.5, 12  # share of the mean gain to fall below; parts of a unit of caution
+MOST = 3  # units of caution by which gains are lowered at most to what ran quietly
 NEAR = 0.2  # relative distance to a run that lost within which a step counts as the same
 WITNESS = 3.0  # factor on a model's largest miss, below which its prediction of a ruin says nothing
 REFUTED = 2  # bad losses of steps with corrected derivatives before those are given up
@@ -465,7 +467,8 @@ class Maker:
             most = HALF * _gain(own.policy)
             few = (c for c in less if _gain(self._gently(own.policy, problem, c)) < most)
             caution = float(next(few, caution))
-        return self.candidate(own.policy, problem, Step(), real, "gentler gains", caution)
+        made = self.candidate(own.policy, problem, Step(), real, "gentler gains", caution)
+        return self.quietened(made, problem)
 
     def _gently(self, policy: Policy, problem: Problem, caution: float) -> Policy:
         """Return the same run with the gains of an LQR with GENTLER ** caution the input weight."""
@@ -481,13 +484,34 @@ class Maker:
         return self.planner.narrowed(for_late_samples(made, problem))
 
     def with_margin(self, made: Candidate, problem: Problem) -> Candidate:
-        """Return the same run with gains that hold under worse conditions, see `margin`."""
+        """Return the same run with gains that hold under worse conditions, and that ran quietly."""
+        return self.quietened(self._with_margin(made, problem), problem)
+
+    def _with_margin(self, made: Candidate, problem: Problem) -> Candidate:
         own = made.policy
         if own.gain is None or not self.planner.needs_margin:
             return made
         gently, loose = partial(self._gently, own, problem), self.planner.loosened(problem)
         new = steadied(problem, own, gently, loose)
         return made if new is own else self.foretold(made, new, problem, made.expected_of_base)
+
+    @cached_property
+    def quiet(self) -> Quiet | None:
+        """How strong feedback may be, from runs of this model; None if none oscillated."""
+        return quiet_gains(self.planner.task, self.now.history, self.fingerprint)
+
+    def quietened(self, made: Candidate, problem: Problem) -> Candidate:
+        """Return the same run with feedback no stronger than ran quietly, see `quiet_gains`."""
+        quiet = self.quiet
+        if quiet is None or quiet.needed or quiet.allows(made.policy):
+            return made
+        policy, caution = made.policy, made.caution
+        for more in np.arange(1, MOST * FINE + 1) / FINE:
+            policy, caution = self._gently(made.policy, problem, made.caution + more), float(more)
+            if quiet.allows(policy):
+                break
+        made = replace(made, caution=made.caution + caution)
+        return self.foretold(made, policy, problem, made.expected_of_base)
 
     def checked(self, made: Candidate) -> Proposal:
         """Return a proposal of the candidate, or a refusal if it violates limits or [safety]."""

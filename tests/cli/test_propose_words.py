@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from grounded.search.candidate import Tried
-from grounded_cli.propose import _came_true
+from grounded_cli.propose import _came_true, _what
 
 
 def test_a_prediction_has_one_value_and_the_noise_of_its_log_is_named():
@@ -15,3 +15,18 @@ def test_a_prediction_has_one_value_and_the_noise_of_its_log_is_named():
     assert said.index("-0.01330") < said.index("or -0.01340 with the sensor noise seen since")
     twice = _came_true(made, [tried, tried], SimpleNamespace(incumbent=None, history=(tried,)))
     assert "with sensor noise, missed the utility by 0.0066" in twice
+
+
+def test_gentler_gains_promise_no_gain_and_steps_from_them_say_why_they_are_gentle():
+    """Those of an arm "promised a gain of 0.8135", all of its cost, and lost as much."""
+    made = SimpleNamespace(id="c0002", way="gentler gains", predicted_utility=-1e-3)
+    best = SimpleNamespace(candidate=made, utility=-0.8, promised=-1e-3)
+    best.trials, best.utilities = (SimpleNamespace(id="t0001"),), (-0.8,)
+    next_one = SimpleNamespace(id="c0003", way="gentler gains", promised_over=lambda best: 0.8)
+    said = _came_true(next_one, [best], SimpleNamespace(incumbent=best, history=(best,)))
+    assert "promises" not in said and "does not swing with any gains" in said
+    step = SimpleNamespace(base="c0001", way="", damping=1.0, alpha=1.0, iteration=1)
+    step.of_corrected = step.of_original = False
+    task = SimpleNamespace(horizon=100, dt=0.01)
+    for step.caution, told in ((0.0, False), (0.4, True)):
+        assert ("as low as ran without oscillating" in _what(step, None, task)) == told

@@ -1,5 +1,6 @@
 """Words on a terminal: columns, labels and remarks within 80 columns."""
 
+import re
 import time
 from dataclasses import replace
 
@@ -126,6 +127,15 @@ def test_a_long_command_says_its_stage_in_a_log_too_now_and_then(capsys, monkeyp
         tell("")
         time.sleep(0.6)
     assert capsys.readouterr().err == "comparing effects, 40 % ...\n"
+
+
+def test_a_stage_that_lasts_is_not_said_twice_in_the_same_words(capsys, monkeypatch):
+    monkeypatch.setattr(terminal, "EVERY", 0.4)
+    with terminal.stages() as tell:
+        tell("planning")
+        time.sleep(1.0)
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == "planning ..." and re.fullmatch(r"planning, \d s so far \.\.\.", second)
 
 
 def test_errors_of_what_falls_over_by_itself_are_said_to_tell_little_farther_ahead():

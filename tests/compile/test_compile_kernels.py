@@ -14,8 +14,10 @@ from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.graph import TooLong
 from grounded.compile.trace.tracing import Signature, Variant, trace
 from grounded.engine import Engine, each, running
+from grounded.search.planner import planner_with
 from grounded.solve.ddp import solve
 from problems import SPECS, problem
+from small_tasks import scara_task
 
 TIGHT = {"rtol": 1e-10, "atol": 1e-10}
 
@@ -323,3 +325,18 @@ def test_a_run_by_itself_is_the_run_beside_others(delays):
         reference = slow.system.rollout(slow, *policy, np.array([0.7]))
         for a, b, c in zip(*(vars(run).values() for run in (one, some, reference)), strict=True):
             assert np.allclose(a[0], b[0], **TIGHT) and np.allclose(a[0], c[0], **TIGHT)
+
+
+@pytest.mark.slow
+def test_an_arm_with_six_adopted_effects_is_compiled_with_its_derivatives():
+    """Those were 18,749 operations, more than 14,000: a proposal took 70 s instead of 12 s."""
+    effects = [
+        ("delay:tau1+tau2", {"d": 0.0149}),
+        ("joint_friction:tau1<-w1", {"c": 0.754, "b": 0.314}),
+        ("joint_friction:tau2<-w2", {"c": 0.235, "b": 0.078}),
+        ("added_inertia:tau2<-w2", {"J": 0.0281}),
+        ("input_gain:tau1+tau2", {"g": -0.407}),
+        ("rate_gain:w2", {"g": 0.068}),
+    ]
+    system = planner_with(scara_task(), effects).plan.model.system
+    assert (system.how, system.note) == ("compiled", "")

@@ -215,7 +215,7 @@ def test_the_noise_of_a_first_sample_is_no_motion():
         (
             -9.0,
             0.1,
-            ("+1.000 because its runs began off [task] start, by +0.02 m in x",),
+            ("1.000 better than measured, because its runs began off [task] start, by",),
             ("scatter", "error"),
         ),
         # a car's line told 0.003 of the 0.129 that its two figures differ by
@@ -231,10 +231,10 @@ def test_the_noise_of_a_first_sample_is_no_motion():
         (
             -8.0,
             0.6,
-            ("1.000 better than measured", "+1.000 within the scatter of its runs"),
+            ("1.000 better than measured, within the scatter of its runs",),
             ("start",),
         ),
-        (-8.0, 0.1, ("+1.000 by the model's own error",), ("start",)),
+        (-8.0, 0.1, ("1.000 better than measured, by the model's own error",), ("start",)),
         (-8.0, np.nan, (), ("scatter", "start")),  # one run: the scatter is unknown
         (np.nan, 0.1, (), ("scatter", "start")),  # from an older version
     ],
@@ -276,6 +276,26 @@ def test_what_the_scatter_of_runs_costs_is_not_called_unexplained():
     )
     text = _so_far(promise("c0001", mean, 0.1 * abs(mean), mean), best, task)
     assert "by noise in the runs" in text and "error" not in text
+
+
+def test_a_difference_with_one_reason_has_one_number():
+    """A crane's 0.4687 worse than measured was -0.5257 by the scatter of its runs."""
+    from grounded_cli.propose import _so_far
+
+    task = cart_task()
+    runs = [begun(task, noise=0.02, seed=seed) for seed in range(2)]
+    costs = [-task.utility(run) for run in runs]
+    best = SimpleNamespace(
+        candidate=SimpleNamespace(id="c0001"),
+        utility=-np.mean(costs),
+        standard_error=1.0,
+        noise_cost=0.0,
+        trials=runs,
+    )
+    off = 2 * best.utility  # and more but for the noise, which the model leaves out
+    same = best.utility + off
+    text = _so_far(promise("c0001", same, -4 * off, same), best, task)
+    assert text.endswith(f"{-off:.4g} worse than measured, within the scatter of its runs")
 
 
 def promise(base, of_base, gain, as_run):
@@ -326,7 +346,7 @@ def test_the_noise_of_a_first_row_is_no_start_elsewhere():
     )
     best.trials = [begun(task, noise=0.02)]
     text = _so_far(made, best, task)
-    assert "began" not in text and "+2.000" in text
+    assert "began" not in text and "2.000 better than measured, by the model's own error" in text
 
 
 def test_after_a_swing_a_step_precedes_an_own_plan_that_promises_as_much(noisy, monkeypatch):

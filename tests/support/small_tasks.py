@@ -95,6 +95,57 @@ def rover_task(**changes: Any) -> Task:
     return Task(**fields | changes)
 
 
+def scara(friction: float) -> Model:
+    """A SCARA of two joints; the crude one has no friction, no rotors and half of the load."""
+
+    def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
+        mc = 2.1 * 0.11**2 + 0.016 + p.load * 0.25**2
+        h = (2.1 * 0.11 + p.load * 0.25) * 0.3
+        c, sn = np.cos(s.q2), np.sin(s.q2)
+        M11 = 4.2 * 0.14**2 + 0.045 + (2.1 + p.load) * 0.3**2 + mc + 2 * h * c + p.rotor
+        M12, M22 = mc + h * c, mc + 0.5 * p.rotor
+        lost1 = 1.2 * np.tanh(s.w1 / 0.02) + 0.5 * s.w1
+        lost2 = 0.4 * np.tanh(s.w2 / 0.02) + 0.12 * s.w2
+        r1 = a.tau1 - p.friction * lost1 + h * sn * (2 * s.w1 * s.w2 + s.w2**2)
+        r2 = a.tau2 - p.friction * lost2 - h * sn * s.w1**2
+        det = M11 * M22 - M12**2
+        w1, w2 = (M22 * r1 - M12 * r2) / det, (M11 * r2 - M12 * r1) / det
+        return {"q1": s.w1, "q2": s.w2, "w1": w1, "w2": w2}
+
+    return Model(
+        states={"q1": "rad", "q2": "rad", "w1": "rad/s", "w2": "rad/s"},
+        inputs={"tau1": "N m", "tau2": "N m"},
+        params={
+            "load": Param(0.5 + 0.4 * friction, "kg"),
+            "rotor": Param(0.1 * friction, "kg m^2"),
+            "friction": Param(friction, "1"),
+        },
+        derivative=dynamics,
+    )
+
+
+def scara_task() -> Task:
+    """Return a task of 0.8 s from rest to rest, and 0.2 s at rest, for a SCARA."""
+    t = np.clip(np.linspace(0.0, 1.0, 101) / 0.8, 0.0, 1.0)
+    way = 10 * t**3 - 15 * t**4 + 6 * t**5
+    q = np.array([-0.4, 1.6]) + way[:, None] * np.array([1.1, -1.0])
+    return Task(
+        model=scara(0.0),
+        dt=0.01,
+        target=np.hstack([q, np.gradient(q, 0.01, axis=0)]),
+        reward=Reward(
+            np.array([0.826, 1.0, 0.0132, 0.016]),
+            np.array([100.0, 100.0, 10.0, 10.0]),
+            np.zeros(2),
+            np.array([1.6e-5, 1e-4]),
+        ),
+        start=np.array([-0.4, 1.6, 0.0, 0.0]),
+        past=np.zeros(2),
+        low=np.array([-25.0, -10.0]),
+        high=np.array([25.0, 10.0]),
+    )
+
+
 def other(model: Model, factor: float = 1.2) -> Model:
     """Return the same robot as a real system, every parameter scaled by a factor."""
     return model.with_values({k: factor * v.value for k, v in model.params.items()})

@@ -93,6 +93,15 @@ def test_a_step_that_may_well_lose_is_handed_over_with_a_word(ran):
     assert "e+08" not in note and f"more than the whole cost of {made.base}" in note
 
 
+def test_a_doubted_step_from_one_that_was_doubted_and_won_is_doubted_less(ran):
+    """A crane's three steps would `well lose`, and won by three to five times."""
+    best = ran.status().standing.incumbent
+    made = replace(ran.propose().candidate, id="c0003", predicted_gain=0.07, likely_off=0.3)
+    assert "c0003 may well lose: it" in made.doubt(best)
+    won = replace(best, candidate=replace(best.candidate, predicted_gain=1.0, likely_off=2.0))
+    assert "c0003 may lose, as was said of c0001, which won: it" in made.doubt(won)
+
+
 def test_what_was_just_proposed_is_handed_over_without_a_word(w, tmp_path):
     assert w.propose().proposal.notes == ()
     ran, exported = w.run("c0001"), w.export("c0001", tmp_path / "c.json")
@@ -386,3 +395,28 @@ def test_runs_of_another_task_are_told_once_as_data(ran):
     configure(ran, CONFIG.replace(LIMITS, NARROW))
     (note,) = [note for note in ran.status().notes if "only as data" in note]
     assert names[0] in note and names[-1] in note
+
+
+def test_feedback_that_oscillated_is_told_when_it_is_handed_over_again(ran):
+    """An arm's candidate was run again without a word that it had oscillated."""
+    assert not any("oscillate" in one for one in ran.export("c0001", ran.folder / "a.json").notes)
+    trial, *_ = read_trial(ran.run("c0001").trial_file)
+    made = ran.candidate("c0001")[0]
+    swing = 1.1 * np.ptp(made.predicted_inputs) * np.sign(np.sin(0.9 * np.arange(trial.steps)))
+    inputs = np.clip(made.predicted_inputs + swing[:, None], -5.0, 5.0)
+    write_trial(ran.folder / "swung.mcap", replace(trial, inputs=inputs), {"kind": "trial"})
+    taken = ran.ingest(ran.folder / "swung.mcap", candidate="c0001")
+    (warned,) = [one for one in taken.warnings if "oscillate" in one]
+    assert holds(warned, "force", "swings of more than", " N")
+    (told,) = [n for n in ran.export("c0001", ran.folder / "b.json").notes if "oscillate" in n]
+    assert holds(told, "c0001", "be ready to stop")
+
+
+def test_what_a_discarded_run_made_void_is_told_once(ran):
+    """Each of three notes came with every `next`."""
+    ran.ingest(ran.run(ran.propose().candidate.id).trial_file)
+    third = ran.propose().candidate.id
+    ran.discard("t0002")
+    first = ran.propose().proposal.notes
+    assert any(third in one and "void" in one for one in first)
+    assert not any("void" in one for one in ran.propose().proposal.notes)

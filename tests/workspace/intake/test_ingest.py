@@ -169,6 +169,20 @@ def test_a_run_that_began_elsewhere_gets_one_verdict(w, tmp_path, monkeypatch):
     assert "counts" not in told
 
 
+def test_the_first_runs_say_that_starts_which_scatter_as_much_are_not_told_later(w, tmp_path):
+    """A run began 5.0 mm off with a warning, a later one 6.9 mm off without."""
+    ran, *_ = read_trial(run(w))
+    told = []
+    for k, off in enumerate((0.2, -0.2, 0.25)):
+        moved = np.array(ran.states) + 1e-6 * k
+        moved[0, 1] += off * np.ptp(moved[:, 1])  # a state without weight
+        write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
+        told += [ingest_log(w, tmp_path / "t.mcap", "c0001").warnings]
+    later = "after 3 runs, offsets within their scatter are not told again"
+    assert [any(later in one for one in warnings) for warnings in told] == [True, True, False]
+    assert not any("started with" in one for one in told[2])
+
+
 @pytest.mark.parametrize(("scatter", "again"), [(0.001, True), (0.2, False)])
 def test_a_start_that_changes_less_than_runs_scatter_is_no_reason_to_repeat_one(
     w, tmp_path, monkeypatch, scatter, again

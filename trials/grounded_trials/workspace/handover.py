@@ -28,6 +28,7 @@ from grounded.policy import Policy
 from grounded.rollout import seen_late
 from grounded.search.candidate import Candidate
 from grounded.search.certainty import beyond_one_trial
+from grounded.search.quiet_gains import quiet_gains
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.store.store import Stored
@@ -255,6 +256,8 @@ class Check:
         if best is not None and untried:
             small = beyond_one_trial(made, best, self.workspace.config.search.repeats)
             yield from [small] if small else []
+        if quiet := quiet_gains(self.workspace.task, self.standing.history):
+            yield from [risk] if (risk := quiet.risk(made)) else []
         yield from self._became()
         if "sha256" not in self.meta:
             yield f"{name} was written by an older version: its file has no checksum of its own"

@@ -125,7 +125,13 @@ class Noted:
     kept: set[str] = field(default_factory=set)  # trials that were discarded and restored
     handed: dict[str, set[str]] = field(default_factory=dict)  # candidate -> SHA-256 of its files
     ran: dict[str, str] = field(default_factory=dict)  # trial without a policy -> SHA-256 of it
-    last: set[str] = field(default_factory=set)  # the last trial file at each hand-out, or ""
+    hand_outs: list[tuple[str, str]] = field(default_factory=list)  # candidate, last trial by then
+    since: list[str] = field(default_factory=list)  # handed out since a trial was last set aside
+
+    @property
+    def last(self) -> set[str]:
+        """The last trial file at each hand-out, or ""."""
+        return {after for _, after in self.hand_outs}
 
     def why_aside(self, stored: Stored) -> str | None:
         """Return why a trial is set aside, or None if it is not."""
@@ -151,12 +157,14 @@ def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
         kind = note["note"]
         if kind == "discard":
             found.aside[note["trial"]] = note["why"]
+            found.since.clear()
         elif kind == "restore":
             found.aside.pop(note["trial"], None)
             found.kept.add(note["trial"])
         elif kind == "hand-out":
             found.handed.setdefault(note["candidate"], set()).add(note["sha256"])
-            found.last.add(note["after"])
+            found.hand_outs.append((note["candidate"], note["after"]))
+            found.since.append(note["candidate"])
         elif kind == "run":
             found.ran[note["trial"]] = note["sha256"]
     return found

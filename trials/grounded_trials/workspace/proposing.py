@@ -57,7 +57,8 @@ class Proposed(Result):
         """Return the document of `propose --json`; candidate is null if the search has ended."""
         found = self.proposal.to_json() | {"file": str(self.file) if self.file else None}
         errors = [one.to_json() for one in self.off_target]
-        return found | {"noise_cost": self.noise_cost, "off_target": errors}
+        age = self.candidate.sample_age if self.candidate else None
+        return found | {"noise_cost": self.noise_cost, "off_target": errors, "sample_age_s": age}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -112,17 +113,20 @@ def propose_in(workspace: Folder) -> Proposed:
             "target`; `fit` and `diagnose` need none",
             NextCommand("target", ("SHAPE",)),
         )
-    before = workspace.candidate_ids()
+    before, told = workspace.candidate_ids(), bool(workspace.noted.since)
     proposal, void = _handed_over(workspace)
     proposal = replace(proposal, standing=_answered(workspace, proposal.standing))
     candidate = proposal.candidate
     notes = [f"{name} was not run and is void: {why}" for name, why in void.items()]
+    left = _disowned(proposal.standing)
     if candidate is not None and proposal.is_new:
-        notes = notes or _disowned(proposal.standing) or _void(workspace, before)
-        notes = [f"{note}; run {candidate.id} instead" for note in notes]
+        notes = notes or left or _void(workspace, before)
     elif candidate is not None:
-        left = _disowned(proposal.standing)
-        notes += [f"{note}; run {candidate.id} instead" for note in left]
+        notes += left
+    if told:  # when the candidate that replaced them was handed out
+        notes = [note for note in notes if note not in left]
+    instead = f"; run {candidate.id} instead" if candidate is not None else ""
+    notes = [f"{note}{instead}" for note in notes]
     held: list[str] = []
     if not proposal.standing.trials and (candidate is None or proposal.is_new):
         from grounded_trials.workspace.at_rest import held_before

@@ -95,6 +95,8 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
         return None
     where = "; ".join(_placed(task, trial, i, off[i]) for i in (*spoils, *tolerated))
     does = "The run counts, no need to repeat it. Place the robot nearer to the start next time"
+    if len(before) < FEWEST:
+        does += f" (after {FEWEST + 1} runs, offsets within their scatter are not told again)"
     if spoils:
         changes = _changes(workspace, trial, off * np.isin(np.arange(len(off)), spoils))
         by = [task.model.state_names[i] for i in spoils] if tolerated else ["this"]

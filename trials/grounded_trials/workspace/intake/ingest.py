@@ -33,6 +33,7 @@ from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.intake.after_run import afterwards
+from grounded_trials.workspace.intake.asked_again import no_longer
 from grounded_trials.workspace.intake.begun import begun_elsewhere
 from grounded_trials.workspace.intake.earlier_task import OfEarlierTask, of_earlier_task
 from grounded_trials.workspace.intake.ended_early import ended_early
@@ -74,6 +75,7 @@ from grounded_trials.workspace.intake.stored_before import (
     repeated,
     what_repeats,
 )
+from grounded_trials.workspace.intake.swung import swung
 from grounded_trials.workspace.intake.trial_check import warnings_about
 from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of, traded
@@ -159,6 +161,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         warnings, wrong = (*warnings, *said) if read.doubted else (*said, *warnings), early.aside
     if trial.candidate and not wrong and (whole := _whole(read, workspace.task)):
         warnings = (*warnings, *afterwards(workspace.planner, whole))
+    if not (odd or wrong or aside):
+        warnings = (*warnings, *swung(workspace.task, tried, trial, history))
     if ahead and verdict == "run again":
         now = standing_in(workspace, ahead=True)
     judged = [interpolate_gaps(trial).trial] if trial.candidate else []
@@ -181,6 +185,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         notes=(
             *read.notes,
             *filter(None, [told]),
+            *(no_longer(workspace, added.id, now) if now and not added.known else ()),
             *(odd_run(workspace, now, added.id) if now and read.doubted else ()),
         ),
         off_target=off_target_of(workspace.task, judged),

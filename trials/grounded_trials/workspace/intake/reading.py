@@ -26,6 +26,7 @@ from grounded_trials.store.store import DIGITS
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, ROWS, sha256
+from grounded_trials.workspace.intake.asked_again import asked_again
 from grounded_trials.workspace.intake.crossed import crossed
 from grounded_trials.workspace.intake.log_faults import no_angles
 from grounded_trials.workspace.intake.stored_before import (
@@ -250,6 +251,8 @@ class NoneWaits(GroundedError):
 
 def _outstanding(workspace: Folder, path: Path) -> str:
     now = standing_in(workspace)
+    if now.outstanding is None and (asked := asked_again(workspace)):
+        return asked
     if now.outstanding is None:
         raise NoneWaits(path, now.incumbent.candidate.id if now.incumbent else "")
     return now.outstanding.id
