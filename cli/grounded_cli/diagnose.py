@@ -264,7 +264,19 @@ def _effects(found: Diagnosis, *, details: bool) -> None:
             + "; alone: log-likelihood gained by it alone" * ("alone [nats]" in header)
             + "; +-: one standard deviation"
             + _if_right(found)
+            + _within_rows(found)
         )
+
+
+def _within_rows(found: Diagnosis) -> str:
+    """Say what the +- of delays is, if the log's rows do not tell when a command was sent."""
+    row = found.made.rows_s if found.made is not None else 0.0
+    if not row or not any(r.claimed and r.effect.startswith("delay:") for r in found.ranking):
+        return ""
+    return (
+        f"; that of a delay is mostly half the {row:.3g} s between rows of the log, which do not "
+        "say when in between a command was sent"
+    )
 
 
 def _if_right(found: Diagnosis) -> str:

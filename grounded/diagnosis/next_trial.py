@@ -39,7 +39,6 @@ def next_trial(
     unrepeatable: Mapping[str, str] | None = None,
     worse: str = "",
     adopted: Collection[str] = (),
-    further: bool = False,
     ended: bool = False,
     flip: str = "",
 ) -> str:
@@ -54,7 +53,6 @@ def next_trial(
         unrepeatable: trials that cannot or should not be repeated, with the reason.
         worse: why adopting the claimed effects is unwise (`ruler_words.objection`), or "".
         adopted: adopted effects, whose values are parameters of the model.
-        further: whether more effects should be looked for first (`Verdict.look_for`).
         ended: whether all parameters that moved stopped at their bounds (`at_bounds`).
         flip: an input whose sign is to be flipped before anything is adopted, also one of another
             strength if parameters `ended`; "" for none.
@@ -64,7 +62,7 @@ def next_trial(
 
     if claims.known.no_cause:
         return "Run two or more trials in which every input changes."
-    if groups and groups[0] in same and not (worse or further or ended or flip):
+    if groups and groups[0] in same and not (worse or ended or flip):
         own = next((name for name in groups[0] if name in claims.names), groups[0][0])
         return f"None helps: {told_apart(groups[0], same)}, so adopt the claimed one, {own}."
     if groups and groups[0] not in same:
@@ -87,8 +85,6 @@ def next_trial(
         return "None is needed: nothing is tied and nothing needs adopting."
     if worse:
         return f"Adopt nothing yet: {worse}. Run another trial and diagnose again."
-    if further:
-        return "None is needed yet: look for more effects first."
     if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names):
         return "None is needed yet: give the model a parameter for a load and diagnose again."
     if ended:

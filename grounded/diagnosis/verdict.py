@@ -370,14 +370,19 @@ def _others(claims: Claims, identified: Sequence[Identifiable]) -> str:
     old = {name: params[name].value for name in known if name not in (*off, *lost)}
     if not old:
         return ""
-    one = len(old) == 1
-    by = ""
-    if all(old.values()):
-        most = max(abs(known[name].value / value - 1) for name, value in old.items())
-        by = f" by {'' if one else 'at most '}{percent(most)}"
-    others = f"{len(old)} others" if len(old) > NAMED else listed(old)
     it = "it" if len(off) == 1 else "them"
-    return f"; {others} {'is' if one else 'are'} adjusted with {it}{by}, but need not be wrong"
+    by = {name: known[name].value / value - 1 for name, value in old.items() if value}
+    if len(old) > NAMED:
+        most = sorted(by, key=lambda name: -abs(by[name]))[:NAMED]
+        told = [f"{n} ({'-' if by[n] < 0 else '+'}{percent(abs(by[n]))})" for n in most]
+        named = f", most of all {listed(told)}" * bool(told)
+        return f"; {len(old)} others are adjusted with {it}{named}, but need not be wrong"
+    one = len(old) == 1
+    much = ""
+    if len(by) == len(old):
+        much = f" by {'' if one else 'at most '}{percent(max(map(abs, by.values())))}"
+    are = "is" if one else "are"
+    return f"; {listed(old)} {are} adjusted with {it}{much}, but need not be wrong"
 
 
 def sentence(clauses: Iterable[str]) -> str:

@@ -156,7 +156,6 @@ class Writer:
             adopted=self.adopted,
             tracked=() if self.task is None else _tracked(self.task),
         )
-        further = said.look_for > 0
         differ = bool(apart and apart.changed) and not self.known.no_cause
         return Diagnosis(
             verdict=said,
@@ -200,7 +199,6 @@ class Writer:
                 lost,
                 worse,
                 self.adopted,
-                further=further,
                 ended=ended,
                 flip=next((n for n in named if _to_flip(n, ranking, ended)), "").partition(":")[2],
             ),

@@ -87,6 +87,14 @@ def test_the_smallest_of_many_are_told_in_words_with_their_values():
     assert all("(without this, " in clause for clause in found)
 
 
+def test_a_limited_rate_of_a_commanded_speed_is_no_motion():
+    """A robot's verdict: `The speed can't move faster than 0.7 m/s/s`."""
+    limit = Library().effect("rate_limit:throttle", car)
+    assert meaning(limit, {"r": Estimate(0.7, 0.01, unit="1/s")}) == (
+        "the throttle can't change faster than 0.7 1/s"
+    )
+
+
 def test_a_joint_with_dry_friction_is_not_told_beside_one_with_viscous_friction():
     some = VALUES[TWO]
     VALUES[TWO] = some | {"b": Estimate(0.0, 0.01, unit="N m s/rad")}

@@ -107,7 +107,6 @@ def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt
     )
     said = next_trial(claims, "", (), worse=why)
     assert why in said and not said.endswith("adopt the claimed effects.")
-    assert "adopt" not in next_trial(claims, "", (), further=True)
     look = "Run c0001 twice more, to see whether the gap in v repeats."
     said = next_trial(claims, look, ())  # the verdict speaks of a gap
     assert holds(said, "adopt the claimed effects and diagnose again", "run c0001 twice more")
