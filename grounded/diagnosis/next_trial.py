@@ -41,12 +41,14 @@ def next_trial(
     adopted: Collection[str] = (),
     ended: bool = False,
     flip: str = "",
+    noise: bool = False,
 ) -> str:
     """Return a sentence on the next trial; `excitation.probe` designs the trial itself.
 
     Args:
         claims: the causes that are claimed.
-        look: what to run because of a gap without a cause; "" if there is none.
+        look: what to run because of a gap without a cause, or because all that is left may be
+            `noise`; "" if there is neither.
         groups: effects that the data cannot tell apart.
         seen: effects that only one trial shows.
         same: those of `groups` that are equivalent in this model.
@@ -56,6 +58,7 @@ def next_trial(
         ended: whether all parameters that moved stopped at their bounds (`at_bounds`).
         flip: an input whose sign is to be flipped before anything is adopted, also one of another
             strength if parameters `ended`; "" for none.
+        noise: whether the verdict names no gap: all that is left may be noise.
     """
     from grounded import places
     from grounded.effects import like_a_load
@@ -94,9 +97,12 @@ def next_trial(
     fit = _own_numbers(claims, adopted)
     do = "fit the model's parameters" if fit else "adopt the claimed effects"
     said = f"None is needed to tell causes apart: {do}"
-    if look:  # a gap without a cause
-        return f"{said} and diagnose again. If the gap is still there: {look[:1].lower()}{look[1:]}"
-    return f"{said}."
+    if not look:
+        return f"{said}."
+    look = f"{look[:1].lower()}{look[1:]}"
+    if noise:
+        return f"{said}. Not needed, but useful: {look}"
+    return f"{said} and diagnose again. If the gap is still there: {look}"
 
 
 def at_bounds(claims: Claims) -> bool:

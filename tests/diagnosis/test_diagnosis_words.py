@@ -110,6 +110,9 @@ def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt
     look = "Run c0001 twice more, to see whether the gap in v repeats."
     said = next_trial(claims, look, ())  # the verdict speaks of a gap
     assert holds(said, "adopt the claimed effects and diagnose again", "run c0001 twice more")
+    look = "Run c0001 twice more, to see how much of what is left in v is noise."
+    said = next_trial(claims, look, (), noise=True)  # the verdict names no gap: a crane's
+    assert "gap" not in said and holds(said, "adopt the claimed effects.", "run c0001 twice more")
     pair = ("coulomb_friction:v", "viscous_friction:v")
     said = next_trial(claims, "", (pair,), same=(pair,))
     assert said.startswith("None helps") and said.endswith("the claimed one, coulomb_friction:v.")
@@ -326,6 +329,8 @@ def test_repeats_are_asked_for_where_there_are_none_as_they_can_be_made():
     assert holds(another_look(task, single, "x"), f"Run {best} twice more", "gap in x")
     twice = another_look(task, [*single, ran(3, "c0002")], "x", "|v| > 1")
     assert "twice" not in twice and holds(twice, "x", "|v| > 1")
+    noise = another_look(task, single, "x", noise=True)  # no gap was named: it asked for `the gap`
+    assert holds(noise, f"Run {best} twice more", "in x is noise") and "gap" not in noise
     by_hand = another_look(task, [ran(1, ""), ran(2, "")], "x")
     assert "same inputs" in by_hand and "best" not in by_hand
     assert "same inputs" not in another_look(task, [ran(1, ""), ran(1, "")], "x")
