@@ -187,12 +187,12 @@ def command(
         family, _, name = str(effect["name"]).partition(":")
         if family != "sensor_bias" or name not in columns:
             continue
-        start = float(workspace.config.task.start.get(name, columns[name][0]))
-        asked = {"the target ends at": float(columns[name][-1]), "[task] start is": start}
+        begins = float(workspace.config.task.start.get(name, columns[name][0]))
+        asked = {"the target ends at": float(columns[name][-1]), "[task] start is": begins}
         off = [
-            f"{what} {with_unit(number(at), model.states[name])}"
-            for what, at in asked.items()
-            if not math.isclose(at, effect["b"], rel_tol=OBEYED)
+            f"{what} {with_unit(number(value), model.states[name])}"
+            for what, value in asked.items()
+            if not math.isclose(value, effect["b"], rel_tol=OBEYED)
         ]
         if off:
             remark(

@@ -216,21 +216,17 @@ def traded(task: Task, best: Tried, before: Tried) -> str:
 
 def _nearer(task: Task, best: Tried, before: Tried) -> str:
     """Return which state's error costs less than before, of those that fell most, with figures."""
+    known, weights = tracked(task), task.reward
     errors = [[tracking_error(task, run) for run in one.trials] for one in (before, best)]
-    known = tracked(task)
-    running, last = (
-        np.array([np.mean([cost(e) for e in own], axis=0) for own in errors])
-        for cost in (
-            lambda e: (e[:, known] ** 2).sum(axis=0) * task.reward.state[known],
-            lambda e: e[-1, known] ** 2 * task.reward.terminal[known],
-        )
+    way, last = (
+        np.subtract(*[np.mean([(e[rows] ** 2).sum(axis=0) for e in own], axis=0) for own in errors])
+        for rows in (slice(None), slice(-1, None))
     )
-    fell = running[0] - running[1] + last[0] - last[1]
-    k = int(fell.argmax())
-    if not fell[k] > 0:
+    way, last = (weights.state * way)[known], (weights.terminal * last)[known]
+    k = int((way + last).argmax())
+    if not way[k] + last[k] > 0:
         return "other states are nearer to theirs"
-    at_end = last[0, k] - last[1, k] > running[0, k] - running[1, k]
-    i = known[k]
+    i, at_end = known[k], last[k] > way[k]
     ends = [np.concatenate([e[-1:, i] if at_end else e[:, i] for e in own]) for own in errors]
     name, unit = list(task.model.states.items())[i]
     was, now = measured_alike([float(np.sqrt(np.mean(e**2))) for e in ends], unit)
