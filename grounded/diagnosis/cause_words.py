@@ -331,15 +331,25 @@ def comparison(changed: Iterable[Changed], adopted: Iterable[str]) -> str:
 
 def value_of(one: Changed, adopted: Iterable[str]) -> str:
     """Name a compared value: `r`, `c of dead_zone:u`, also if an adopted effect has it."""
-    from grounded.effects import param_name
-
     if not one.effect.startswith("parameter:"):
         return f"{one.quantity} of {one.effect}"
-    for effect in adopted:
-        start = param_name(effect, "")
-        if one.quantity.startswith(start):
-            return f"{one.quantity.removeprefix(start)} of {effect}"
-    return one.quantity
+    return value_called(one.quantity, adopted)
+
+
+def value_called(name: str, adopted: Iterable[str]) -> str:
+    """Name a parameter of the model: `r`, or `d of delay:u` if it is an adopted effect's."""
+    from grounded.effects import param_name
+
+    effect = effect_of(name, adopted)
+    return f"{name.removeprefix(param_name(effect, ''))} of {effect}" if effect else name
+
+
+def effect_of(name: str, adopted: Iterable[str]) -> str:
+    """Return the adopted effect that a parameter belongs to; "" if it is the model's own."""
+    from grounded.effects import param_name
+
+    of = [effect for effect in adopted if name.startswith(param_name(effect, ""))]
+    return max(of, key=len, default="")
 
 
 def ended(estimate: Estimate, before: float) -> tuple[str, ...]:

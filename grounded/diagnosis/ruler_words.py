@@ -119,13 +119,14 @@ def worsened(rows: Sequence[RulerRow]) -> str:
     ratio, row, name = _lost_most(rows)
     if row is None or not (ratio > 1 + SHOWS or outweighed(rows)):
         return ""
-    text = f"{_ahead(row)} get worse for {_instead(row, name)}"
     others = dict[str, RulerRow]()
     for lost, at, other in sorted(_losses(rows), key=lambda loss: -loss[0]):
         if lost > 1 + SHOWS and other != name and at.tells(other, "with_effects"):
             others.setdefault(other, at)
+    parts = [f"for {_instead(row, name)}"]
     for other, at in [*others.items()][: NAMED - 1]:
-        text += f", {'' if at is row else f'{_when(at)} '}for {_instead(at, other)}"
+        parts.append(f"{'' if at is row else f'{_when(at)} '}for {_instead(at, other)}")
+    text = f"{_ahead(row)} get worse {listed(parts)}"
     if not row.tells(name, "with_effects"):  # how far says nothing
         (then,) = measured_alike([row.crude[name]], row.unit_by_channel[name])
         text = f"{_ahead(row)} diverge for {name}, which the crude model misses by {then}"

@@ -117,7 +117,12 @@ def test_of_many_adjusted_parameters_those_that_move_most_are_named():
     (told,) = _causes(claims, (), [Credit("calibration")], (), {})
     most = "5 others are adjusted with it, most of all p4 (+8.0 %), p3 (-7.5 %) and p2 (+6.7 %)"
     assert f"; {most}, but need not be wrong" in told
-    known.pop("p0"), known.pop("p1"), known.pop("p2")
+    params["delay_u_d"] = Param(0.03, "s", 0.001, 0.1)
+    known["delay_u_d"] = Estimate(0.045, 0.001, None, "s")
+    claims.data = SimpleNamespace(model=replace(model, params=params))
+    (told,) = _causes(claims, (), [Credit("calibration")], (), {}, adopted=("delay:u",))
+    assert "most of all d of delay:u (+50 %), p4" in told
+    known.pop("delay_u_d"), known.pop("p0"), known.pop("p1"), known.pop("p2")
     (told,) = _causes(claims, (), [Credit("calibration")], (), {})
     assert "; p3 and p4 are adjusted with it by at most 8.0 %, but need not be wrong" in told
 

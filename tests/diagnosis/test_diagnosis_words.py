@@ -81,7 +81,10 @@ def test_every_state_that_gets_worse_is_told_at_the_horizon_where_it_loses_most(
     named = {"unit_by_channel": {"x": "m", "y": "m"}, "noise_floor": {"x": 1e-3, "y": 1e-3}}
     said = worsened(tuple(replace(one, **named) for one in (near, far)))
     assert holds(said, "0.5 s ahead get worse for y: 1.5 mm instead of 1.3 mm")
-    assert holds(said, "1 s ahead for x: 3.3 mm instead of 3.0 mm") and said.count("for y") == 1
+    assert (
+        holds(said, "1.3 mm and 1 s ahead for x: 3.3 mm instead of 3.0 mm")
+        and said.count("for y") == 1
+    )
 
 
 def test_where_noise_alone_leaves_all_that_was_measured_nothing_is_told_of_a_horizon():
