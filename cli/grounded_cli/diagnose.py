@@ -252,7 +252,7 @@ def _places(found: Diagnosis, *, details: bool) -> None:
 
 def _effects(found: Diagnosis, *, details: bool) -> None:
     """Print the claimed effects and what ties with them, or with `details` all rivals."""
-    from grounded.diagnosis.tables import WITHOUT, effect_table
+    from grounded.diagnosis.tables import WITHOUT, effect_table, of_delays
 
     rows, header = effect_table(found, rivals=details)
     tied = " (a tied effect: in place of the claimed one)" * bool(found.indistinguishable)
@@ -264,19 +264,8 @@ def _effects(found: Diagnosis, *, details: bool) -> None:
             + "; alone: log-likelihood gained by it alone" * ("alone [nats]" in header)
             + "; +-: one standard deviation"
             + _if_right(found)
-            + _within_rows(found)
+            + (f"; {rows_apart}" if (rows_apart := of_delays(found)) else "")
         )
-
-
-def _within_rows(found: Diagnosis) -> str:
-    """Say what the +- of delays is, if the log's rows do not tell when a command was sent."""
-    row = found.made.rows_s if found.made is not None else 0.0
-    if not row or not any(r.claimed and r.effect.startswith("delay:") for r in found.ranking):
-        return ""
-    return (
-        f"; that of a delay is mostly half the {row:.3g} s between rows of the log, which do not "
-        "say when in between a command was sent"
-    )
 
 
 def _if_right(found: Diagnosis) -> str:

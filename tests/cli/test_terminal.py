@@ -94,7 +94,7 @@ def test_a_delay_of_a_log_with_rows_is_told_where_its_spread_comes_from(capsys):
     row = Ranked("delay:u", {"d": Estimate(0.0297, 0.01, unit="s")}, claimed=True)
     said = Diagnosis(Verdict("effect", ("delay:u",)), ranking=(row,), made=Made(rows_s=0.02))
     _effects(said, details=False)
-    assert "half the 0.02 s between rows" in " ".join(capsys.readouterr().out.split())
+    assert "half of the 0.02 s between rows" in " ".join(capsys.readouterr().out.split())
     _effects(replace(said, made=Made()), details=False)
     assert "between rows" not in " ".join(capsys.readouterr().out.split())
 
