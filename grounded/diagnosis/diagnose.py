@@ -65,8 +65,8 @@ class DiagnosisOptions:
 
     Args:
         library: the families that may be blamed.
-        max_effects: largest number of effects at once, 1 to 12; None: 3, or more while the errors
-            are above the noise.
+        max_effects: largest number of effects at once, 1 to 12, all of which are searched while
+            likely effects remain; None: 3, and one more at a time while that pays.
         horizon: how far ahead the gap is measured [s].
         hidden: names of states without a sensor, such as the memory of adopted effects.
         but: names of effects that are not blamed, such as adopted ones, whose values are now
@@ -190,6 +190,7 @@ def diagnose(
     )
     joints = options.library.joints(data.model, data.scales)
     joints = knowable(data, [e for e in joints if e.name not in settled])
+    limit = options.max_effects or MOST_EFFECTS
     with running(engine):
         search, best = attribute(
             data,
@@ -200,7 +201,7 @@ def diagnose(
             alone=null,
         )
     many = len(best.hypothesis.effects)  # may exceed the usual number if it has all joints
-    most = options.max_effects or (many + 1 if many > USUAL_EFFECTS else USUAL_EFFECTS)
+    most = min(limit, many + 1 if many > USUAL_EFFECTS else USUAL_EFFECTS)
     used = [trial for trial in trials if trial.known_steps >= 2]
     task = subject if isinstance(subject, Task) else None
     written: Writer | None = None
@@ -235,12 +236,12 @@ def diagnose(
                     written.most = most  # one more was sought
                     # two effects may be needed for what neither predicts better alone
                     likelier = search.score(best) > search.score(before) + LARGE_GAIN
-                    if not (once_more and likelier and most < MOST_EFFECTS):
+                    if not ((once_more or options.max_effects) and likelier and most < limit):
                         break
                     once_more = False
                 else:
                     written, once_more = writer, True
-                    if options.max_effects or not (most < MOST_EFFECTS and writer.unfinished):
+                    if not (most < limit and writer.unfinished):
                         break
                 most += 1
                 tick.beside = "one more effect; Ctrl-C keeps what was found"

@@ -96,7 +96,8 @@ def instrument_lines(findings: Iterable[Finding]) -> list[str]:
         left_out = unused.get(one.signal)
         if left_out and (one.kind == "lag" or (one is left_out and one.signal in late)):
             continue  # `left_out` says how old it is, or is said with the delay
-        done = "; corrected here" * (one.corrected and not left_out)
+        cut = one.kind == "unresolved"  # says so itself
+        done = "; corrected here" * (one.corrected and not (left_out or cut))
         if left_out and one.kind == "delay":
             done = f"; {left_out.finding}"
         more = f"; to correct it for good, set {one.log} in its table of [log]" * bool(one.log)

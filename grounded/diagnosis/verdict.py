@@ -188,12 +188,15 @@ def also_off(others: int) -> str:
 
 
 def with_faults(said: Verdict, findings: Iterable[Finding]) -> Verdict:
-    """Add the faults of the log that this diagnosis corrected, but the stored trials still have."""
-    odd = in_the_log(findings)
-    if not odd:
+    """Add what was left out, and the faults that the stored trials still have."""
+    findings = list(findings)
+    more = [f"{one.signal} {one.finding}." for one in findings if one.kind == "unresolved"]
+    if odd := in_the_log(findings):
+        told = "; ".join(f"{one.signal} {one.finding}" for one in odd)
+        more.append(f"Corrected here, but not in the stored trials: {told}.")
+    if not more:
         return said
-    told = "; ".join(f"{one.signal} {one.finding}" for one in odd)
-    sentences = (*said.lines, f"Corrected here, but not in the stored trials: {told}.")
+    sentences = (*said.lines, *more)
     return replace(said, sentences=sentences, sentence=" ".join(sentences))
 
 

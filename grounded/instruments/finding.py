@@ -23,8 +23,8 @@ class Finding(Document):
         signal: a state or an input, or several joined by "+".
         finding: one clause that continues a sentence after the signal's name.
         kind: delay, lag, smoothed, scale, sign, degrees, wrapped, offset, stuck, held, dropout,
-            missing, quantised, saturated, beyond (its limits), constant, copy or mismatch (with
-            others).
+            missing, quantised, saturated, beyond (its limits), constant, copy, mismatch (with
+            others) or unresolved (too fast for the model's time step).
         delay_s: delay of the signal [s].
         std_s: standard deviation of the delay [s].
         scale: measured value over true value.

@@ -6,6 +6,7 @@ other_units   a position in mm beside a velocity in m/s
 swapped       two exchanged columns
 way           speeds in world axes or in knots, compass headings
 mismatch      a position that doesn't move as velocities and angles imply
+unresolved    a trial that becomes too fast for the model's time step
 single        each state on its own
 dead          a velocity that shows nothing while its position moves
 constant      a velocity with a constant bias against its position
@@ -74,6 +75,7 @@ from grounded.instruments.rate_ratios import Ratios, ratios_of
 from grounded.instruments.rows import kinematic_rows, tied
 from grounded.instruments.single import judge_signal, signal_of
 from grounded.instruments.swapped import judge_columns
+from grounded.instruments.unresolved import judge_resolution
 from grounded.instruments.way import judge_way, rate_agrees
 from grounded.model import Model
 from grounded.places import Integral, integrals, speed
@@ -120,6 +122,7 @@ def preflight(
             *bench.dead(),
             *mended,
             *bench.odd(ratios_of(model, bench.trials, bench.shown) if mended else ratios),
+            *bench.resolved(),
             *bench.singles(),
             *bench.with_message(bench.pairs(), one_message),
             *bench.with_message(bench.positions(), one_message),
@@ -213,6 +216,13 @@ class _Bench:
                 yield from (in_degrees(n, unit) for n, unit in self.named(odd))
         for odd in list(odd_commands(self.model, self.trials, shown)):
             yield from self.in_unit(odd)
+
+    def resolved(self) -> Iterator[Finding]:
+        """Cut trials where the model can't be integrated, if two steps or more are left."""
+        for k, keep, finding in list(judge_resolution(self.model, self.trials, self.shown)):
+            if keep >= 2:
+                self.trials[k] = self.trials[k].until(keep)
+                yield finding
 
     def in_unit(self, odd: Odd) -> Iterator[Finding]:
         """Convert one trial to the unit of the others; it concerns no key of [log]."""

@@ -59,8 +59,8 @@ def attribute(
     Args:
         data: from `prepare`.
         candidates: the effects that may be blamed.
-        max_effects: the largest number of effects at once; None: `USUAL_EFFECTS`, or more if
-            joints share an inertia and each of them is off.
+        max_effects: the largest number of effects at once; None: any. At most `USUAL_EFFECTS` are
+            searched for, or more if joints share an inertia and each of them is off.
         tick: called with the current activity, for a progress display.
         joints: plain dry frictions of joints, tried in place of richer ones even if they are not
             candidates.
@@ -69,12 +69,13 @@ def attribute(
     Returns:
         The search and its best fit.
     """
-    search, most = HypothesisSearch(data, candidates, tick, joints), max_effects or USUAL_EFFECTS
+    search = HypothesisSearch(data, candidates, tick, joints)
+    most = min(max_effects or USUAL_EFFECTS, USUAL_EFFECTS)
     with (
         np.errstate(all="ignore"),  # a hypothesis that diverges scores minus infinity
         interruptible(lambda: so_far(search, most)),
     ):
-        search, best = _searched(search, alone, any_number=max_effects is None)
+        search, best = _searched(search, alone, max_effects)
         return search, grown(search, best, max(most, len(best.hypothesis.effects)))
 
 
@@ -107,22 +108,22 @@ def so_far(search: HypothesisSearch, most: int, decided: Sequence[str] | None = 
 
 
 def _searched(
-    search: HypothesisSearch, alone: Sequence[Fitted], *, any_number: bool
+    search: HypothesisSearch, alone: Sequence[Fitted], limit: int | None
 ) -> tuple[HypothesisSearch, Fitted]:
     """Return the search and its best single effect; with outliers, those under their weights."""
     search.nulls(alone)
-    best = _explore(search, any_number=any_number)
+    best = _explore(search, limit)
     if outliers(best):
         search = search.with_weights(clean(search.predictor, best))
-        best = _explore(search, any_number=any_number)
+        best = _explore(search, limit)
     return search, best
 
 
-def _explore(search: HypothesisSearch, *, any_number: bool) -> Fitted:
+def _explore(search: HypothesisSearch, limit: int | None) -> Fitted:
     """Return the best hypothesis of at most one effect.
 
-    If any number of effects is allowed and all joints of an arm together are far likelier than any
-    single effect, return that hypothesis.
+    If all joints of an arm together are far likelier than any single effect, and need no more than
+    `limit` effects (None: any number), return that hypothesis.
     """
     null = search.best_null()
     plain = search.fits.get((Structure(), 0.0, ()), null)
@@ -133,9 +134,10 @@ def _explore(search: HypothesisSearch, *, any_number: bool) -> Fitted:
         return null
     # a large effect starts far from its optimum after the scan
     search.finished(singles[:SHORTLIST], 8, rivals=True)
-    if any_number and (whole := joint_model(search)) is not None:
+    many = limit is None or limit > USUAL_EFFECTS
+    if many and (whole := joint_model(search)) is not None:
         more = search.score(whole) - search.score(search.of_size(1)[0])
-        if more > LARGE_GAIN:
+        if more > LARGE_GAIN and (limit is None or len(whole.hypothesis.effects) <= limit):
             return whole
     search.again(search.of_size(1)[: RESTARTED if search.data.model.n <= LARGE else 2])
     sweep(search)
