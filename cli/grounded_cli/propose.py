@@ -164,10 +164,6 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
         parts.append((rest, "by noise or by the model's error, which one run can't tell apart"))
     most = max((abs(part) for part, _ in parts), default=0.0)
     parts = [(part, why) for part, why in parts if abs(part) > max(told, MINOR * most)]
-    if parts:  # the largest takes what is too little to be told, so that they add up
-        k = max(range(len(parts)), key=lambda k: abs(parts[k][0]))
-        others = sum(part for part, _ in (*parts[:k], *parts[k + 1 :]))
-        parts[k] = float(same - best.utility - others), parts[k][1]
     said = "; ".join(f"{'+' * (part > 0)}{number(part)} {why}" for part, why in parts)
     return f"{own}: {said}" if said else own
 

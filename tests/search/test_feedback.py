@@ -278,20 +278,6 @@ def test_what_the_scatter_of_runs_costs_is_not_called_unexplained():
     assert "by noise in the runs" in text and "error" not in text
 
 
-def test_the_reasons_add_up_to_the_difference_that_is_told():
-    """`0.4687 worse than measured: -0.5257 within the scatter of its runs`."""
-    from grounded_cli.propose import _so_far
-
-    made, task = promise("c0001", -9.47, 0.5, -9.52), cart_task()
-    best = SimpleNamespace(
-        candidate=SimpleNamespace(id="c0001"), utility=-9.0, standard_error=0.6, noise_cost=0.0
-    )
-    best.trials = [begun(task, off=0.02)]  # the start makes +0.05, which is too little to be told
-    told = _so_far(made, best, task)
-    assert "0.4700 worse than measured: -0.4700 within the scatter" in told
-    assert "start" not in told
-
-
 def promise(base, of_base, gain, as_run):
     """Return a candidate with the model's utility of its base, the gain, and the base as run."""
     return Candidate(
