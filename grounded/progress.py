@@ -53,7 +53,7 @@ class Stages:
         if self.tell is None:
             return
         taken = time.monotonic() - self.began
-        text = f"{stage}{f' ({self.beside})' * bool(self.beside)}, {_told(taken)} so far"
+        text = f"{stage}{f' ({self.beside})' * bool(self.beside)}, {duration(taken)} so far"
         if SEEN < self.count <= self.usual[1]:  # beyond, nothing is known of what is left
             least, most = (taken * (n / self.count - 1) for n in self.usual)
             text += f", {_range(max(least, 0.0), most)} left"
@@ -65,7 +65,7 @@ SEEN = 10  # calls from which on the time left is told
 
 def _range(least: float, most: float) -> str:
     """Format a range of durations: `about 10 s to 2 min`, `up to about 40 s`."""
-    low, high = (_told(_round(end)).replace(".0 ", " ") for end in (least, most))
+    low, high = (duration(_round(end)).replace(".0 ", " ") for end in (least, most))
     if low == high or most < NOW:
         return f"about {high}"
     return f"up to about {high}" if least < NOW else f"about {low} to {high}"
@@ -79,7 +79,7 @@ def _round(seconds: float) -> float:
     return float(f"{seconds:.1g}") if seconds < 100 else 60 * round(seconds / 60)
 
 
-def _told(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """Format a duration: 40 s, 2.5 min, 12 min."""
     if seconds < 100:
         return f"{seconds:.0f} s"

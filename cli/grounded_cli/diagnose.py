@@ -252,7 +252,7 @@ def _places(found: Diagnosis, *, details: bool) -> None:
 
 def _effects(found: Diagnosis, *, details: bool) -> None:
     """Print the claimed effects and what ties with them, or with `details` all rivals."""
-    from grounded.diagnosis.tables import WITHOUT, effect_table
+    from grounded.diagnosis.tables import WITHOUT, effect_table, of_delays
 
     rows, header = effect_table(found, rivals=details)
     tied = " (a tied effect: in place of the claimed one)" * bool(found.indistinguishable)
@@ -264,6 +264,7 @@ def _effects(found: Diagnosis, *, details: bool) -> None:
             + "; alone: log-likelihood gained by it alone" * ("alone [nats]" in header)
             + "; +-: one standard deviation"
             + _if_right(found)
+            + (f"; {rows_apart}" if (rows_apart := of_delays(found)) else "")
         )
 
 

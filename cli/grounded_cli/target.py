@@ -187,13 +187,20 @@ def command(
         family, _, name = str(effect["name"]).partition(":")
         if family != "sensor_bias" or name not in columns:
             continue
-        asked = float(columns[name][-1]), float(workspace.config.task.start.get(name, 0.0))
-        if not all(math.isclose(one, effect["b"], rel_tol=OBEYED) for one in asked):
+        begins = float(workspace.config.task.start.get(name, columns[name][0]))
+        asked = {"the target ends at": float(columns[name][-1]), "[task] start is": begins}
+        off = [
+            f"{what} {with_unit(number(value), model.states[name])}"
+            for what, value in asked.items()
+            if not math.isclose(value, effect["b"], rel_tol=OBEYED)
+        ]
+        if off:
             remark(
                 "note",
-                f"the target of {name} is in readings of its sensor, which by the adopted "
-                f"sensor_bias:{name} reads {misread(effect['b'], model.states[name])}: a true 0 is "
-                f"{effect['b']:.3g} there. Draw it, and set [task] start, in readings",
+                f"the target and [task] start of {name} are in readings of its sensor, which by "
+                f"the adopted sensor_bias:{name} reads "
+                f"{misread(effect['b'], model.states[name])}: a true 0 is {effect['b']:.3g} there, "
+                f"but {listed(off)}. If a true 0 is meant, correct that",
             )
     if still := without_range(columns, model.states):
         at = {number(ranges[name][0]) for name in still}

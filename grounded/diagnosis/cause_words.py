@@ -29,8 +29,6 @@ OWN = "the model's own parameters"
 MOST_TIMES = 1000  # a larger ratio of errors says no more
 HARDLY = 1.001  # ratio of errors below which they count as the same
 FEW = 3  # up to so many causes get a clause each
-LATE = ("delay", "sensor_delay", "first_order_lag", "sensor_lag")  # they decide if a loop is stable
-TOLD = 4  # clauses otherwise: one per kind of effect, the smallest causes only counted
 
 
 def give_or_take(estimate: Estimate) -> str:
@@ -240,8 +238,7 @@ def clauses(
 ) -> tuple[str, ...]:
     """Return the clauses of the verdict's first sentence, each with its worth, largest first.
 
-    More than FEW causes are grouped by kind: the friction of every joint in one clause. Those of
-    the smallest groups are only named, but delays and lags never.
+    More than FEW causes are grouped by kind: the friction of every joint in one clause.
 
     Args:
         names: names of the causes, largest first.
@@ -262,28 +259,12 @@ def clauses(
         key = (own.family.name, *_told(values[name])) if own is not None and alike else (name,)
         kinds.setdefault(key, []).append(i)
     groups = sorted(kinds.values(), key=lambda group: -sum(credit[i].share for i in group))
-    told = [group for group in groups if group in groups[:TOLD] or is_late(names[group[0]])]
-    told = groups if len(groups) <= len(told) + 1 else told
     found = []
-    for first, *others in told:
+    for first, *others in groups:
         same = [f", {_beside(effects[names[i]], values[names[i]])}" for i in others]
         together = [credit[i] for i in (first, *others)]
         found.append(with_worth(f"{causes[first]}{''.join(same)}", together))
-    if rest := [credit[i] for group in groups if group not in told for i in group]:
-        found.append(only_named(rest))
     return tuple(found)
-
-
-def only_named(rest: Sequence[Credit]) -> str:
-    """Return a clause that names causes, as the table of effects does, with what they are worth."""
-    names = (one.of.removeprefix("parameter:") for one in rest)
-    told = listed(OWN if name == "calibration" else name for name in names)
-    return with_worth(f"also {told}", rest)
-
-
-def is_late(cause: str) -> bool:
-    """Check whether a cause is a delay or a lag, which is named however small its share is."""
-    return cause.partition(":")[0] in LATE
 
 
 def with_worth(clause: str, credit: Sequence[Credit]) -> str:
@@ -350,15 +331,25 @@ def comparison(changed: Iterable[Changed], adopted: Iterable[str]) -> str:
 
 def value_of(one: Changed, adopted: Iterable[str]) -> str:
     """Name a compared value: `r`, `c of dead_zone:u`, also if an adopted effect has it."""
-    from grounded.effects import param_name
-
     if not one.effect.startswith("parameter:"):
         return f"{one.quantity} of {one.effect}"
-    for effect in adopted:
-        start = param_name(effect, "")
-        if one.quantity.startswith(start):
-            return f"{one.quantity.removeprefix(start)} of {effect}"
-    return one.quantity
+    return value_called(one.quantity, adopted)
+
+
+def value_called(name: str, adopted: Iterable[str]) -> str:
+    """Name a parameter of the model: `r`, or `d of delay:u` if it is an adopted effect's."""
+    from grounded.effects import param_name
+
+    effect = effect_of(name, adopted)
+    return f"{name.removeprefix(param_name(effect, ''))} of {effect}" if effect else name
+
+
+def effect_of(name: str, adopted: Iterable[str]) -> str:
+    """Return the adopted effect that a parameter belongs to; "" if it is the model's own."""
+    from grounded.effects import param_name
+
+    of = [effect for effect in adopted if name.startswith(param_name(effect, ""))]
+    return max(of, key=len, default="")
 
 
 def ended(estimate: Estimate, before: float) -> tuple[str, ...]:

@@ -39,32 +39,33 @@ def next_trial(
     unrepeatable: Mapping[str, str] | None = None,
     worse: str = "",
     adopted: Collection[str] = (),
-    further: bool = False,
     ended: bool = False,
     flip: str = "",
+    noise: bool = False,
 ) -> str:
     """Return a sentence on the next trial; `excitation.probe` designs the trial itself.
 
     Args:
         claims: the causes that are claimed.
-        look: what to run because of a gap without a cause; "" if there is none.
+        look: what to run because of a gap without a cause, or because all that is left may be
+            `noise`; "" if there is neither.
         groups: effects that the data cannot tell apart.
         seen: effects that only one trial shows.
         same: those of `groups` that are equivalent in this model.
         unrepeatable: trials that cannot or should not be repeated, with the reason.
         worse: why adopting the claimed effects is unwise (`ruler_words.objection`), or "".
         adopted: adopted effects, whose values are parameters of the model.
-        further: whether more effects should be looked for first (`Verdict.look_for`).
         ended: whether all parameters that moved stopped at their bounds (`at_bounds`).
         flip: an input whose sign is to be flipped before anything is adopted, also one of another
             strength if parameters `ended`; "" for none.
+        noise: whether the verdict names no gap: all that is left may be noise.
     """
     from grounded import places
     from grounded.effects import like_a_load
 
     if claims.known.no_cause:
         return "Run two or more trials in which every input changes."
-    if groups and groups[0] in same and not (worse or further or ended or flip):
+    if groups and groups[0] in same and not (worse or ended or flip):
         own = next((name for name in groups[0] if name in claims.names), groups[0][0])
         return f"None helps: {told_apart(groups[0], same)}, so adopt the claimed one, {own}."
     if groups and groups[0] not in same:
@@ -87,8 +88,6 @@ def next_trial(
         return "None is needed: nothing is tied and nothing needs adopting."
     if worse:
         return f"Adopt nothing yet: {worse}. Run another trial and diagnose again."
-    if further:
-        return "None is needed yet: look for more effects first."
     if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names):
         return "None is needed yet: give the model a parameter for a load and diagnose again."
     if ended:
@@ -98,9 +97,12 @@ def next_trial(
     fit = _own_numbers(claims, adopted)
     do = "fit the model's parameters" if fit else "adopt the claimed effects"
     said = f"None is needed to tell causes apart: {do}"
-    if look:  # a gap without a cause
-        return f"{said} and diagnose again. If the gap is still there: {look[:1].lower()}{look[1:]}"
-    return f"{said}."
+    if not look:
+        return f"{said}."
+    look = f"{look[:1].lower()}{look[1:]}"
+    if noise:
+        return f"{said}. Not needed, but useful: {look}"
+    return f"{said} and diagnose again. If the gap is still there: {look}"
 
 
 def at_bounds(claims: Claims) -> bool:

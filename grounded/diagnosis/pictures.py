@@ -210,6 +210,8 @@ def _loss(credit: Credit, error: RulerRow, names: Sequence[str]) -> float:
 def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars]:
     """Return the combined error of some states a second ahead, with all causes and all but each.
 
+    If effects were adopted before, also that of the model without them.
+
     Args:
         names: names of states with one unit, such as those of a position.
         what: their label.
@@ -222,8 +224,10 @@ def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars
     if error is None or not set(names) <= set(error.crude):
         return []
     unit = error.unit_by_channel.get(names[0], "")
-    rows = [(("model", "model as it is"), error.crude)]
-    rows += [(("best", "with all causes"), error.with_effects)]
+    rows = [((MODELS["outset"][0], "model.py, nothing adopted"), error.outset)]  # {} if it is so
+    rows += [(("model", "model as it is"), error.crude)]
+    if diagnosis.credit:  # else nothing was found: the same error once more
+        rows += [(("best", "with all causes"), error.with_effects)]
     rows += [(("limit", f"all but {c.of}"), c.without_it) for c in diagnosis.credit[:MOST]]
     rows += [(models(error)["noise_floor"], error.noise_floor)]
     found = [(look, math.hypot(*(v[n] for n in names))) for look, v in rows if set(names) <= set(v)]

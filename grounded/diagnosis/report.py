@@ -41,9 +41,9 @@ class Verdict(Document):
 
     `sentences` has one entry per line, `sentence` joins them. One is made of `clauses`, one per
     cause in the order of `Diagnosis.credit`, or per group of `causes`; before it is `comparison`,
-    of two groups of trials. `parameters` are off. `look_for`: number of effects to look for before
-    adopting, or 0. `again`: whether to diagnose again once these effects, as many as can be named,
-    are adopted. `limit`: why no cause is named, an entry of `unknowable`.
+    of two groups of trials. `parameters` are off. `look_for`: number of effects that a
+    deeper diagnosis may name, or 0. `again`: whether to diagnose again once these effects, as many
+    as can be named, are adopted. `limit`: why no cause is named, an entry of `unknowable`.
     """
 
     kind: str  # one of `Kind`
@@ -204,6 +204,7 @@ class Made(Document):
     named: tuple[str, ...] = ()  # trials named by the user, if not all were used
     compared: tuple[str, ...] = ()  # the second group
     without: tuple[str, ...] = ()  # families that were excluded
+    rows_s: float = field(metadata=BRIEF, default=0.0)  # see `Gridded.row_s`; 0: of no such table
 
     def __post_init__(self) -> None:
         if not all("name" in effect for effect in self.adopted):

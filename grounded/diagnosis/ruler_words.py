@@ -112,17 +112,32 @@ def _ahead(row: RulerRow) -> str:
 
 
 def worsened(rows: Sequence[RulerRow]) -> str:
-    """Return a sentence on the channel that gets worst; "" if none gets worse by SHOWS."""
+    """Return a sentence on the channels that get worse, the worst first; "" if none does by SHOWS.
+
+    Each at the horizon at which it loses most.
+    """
     ratio, row, name = _lost_most(rows)
     if row is None or not (ratio > 1 + SHOWS or outweighed(rows)):
         return ""
-    unit = row.unit_by_channel[name]
-    now, then = measured_alike([row.with_effects[name], row.crude[name]], unit)
-    text = f"{_ahead(row)} get worse for {name}: {now} instead of {then}"
+    others = dict[str, RulerRow]()
+    for lost, at, other in sorted(_losses(rows), key=lambda loss: -loss[0]):
+        if lost > 1 + SHOWS and other != name and at.tells(other, "with_effects"):
+            others.setdefault(other, at)
+    parts = [f"for {_instead(row, name)}"]
+    for other, at in [*others.items()][: NAMED - 1]:
+        parts.append(f"{'' if at is row else f'{_when(at)} '}for {_instead(at, other)}")
+    text = f"{_ahead(row)} get worse {listed(parts)}"
     if not row.tells(name, "with_effects"):  # how far says nothing
-        (then,) = measured_alike([row.crude[name]], unit)
+        (then,) = measured_alike([row.crude[name]], row.unit_by_channel[name])
         text = f"{_ahead(row)} diverge for {name}, which the crude model misses by {then}"
     return f"{text}." if outweighed(rows) else f"{text}, but they improve over all states."
+
+
+def _instead(row: RulerRow, name: str) -> str:
+    """Return `y: 1.5 mm instead of 1.3 mm`."""
+    errors = [row.with_effects[name], row.crude[name]]
+    now, then = measured_alike(errors, row.unit_by_channel[name])
+    return f"{name}: {now} instead of {then}"
 
 
 def outweighed(rows: Sequence[RulerRow]) -> bool:

@@ -137,6 +137,20 @@ def effect_table(diagnosis: Diagnosis, *, rivals: bool = True) -> tuple[list[Cel
     return rows, ("effect (*: claimed)", "without", *evidence, "value")
 
 
+def of_delays(diagnosis: Diagnosis) -> str:
+    """Say where the +- of delays comes from if the log's rows don't tell when a command was sent.
+
+    "" if they do, or if no delay is claimed.
+    """
+    row = diagnosis.made.rows_s if diagnosis.made is not None else 0.0
+    if not row or not any(r.claimed and r.effect.startswith("delay:") for r in diagnosis.ranking):
+        return ""
+    return (
+        f"+- of a delay: mostly half of the {row:.3g} s between rows of the log, which do not say "
+        "when in between a command was sent"
+    )
+
+
 def weighed_beside(diagnosis: Diagnosis) -> set[str]:
     """Return the effects whose evidence is what is lost without them: claimed or tied with these.
 

@@ -135,7 +135,9 @@ def unrepeatable(task: Task, trials: Sequence[Trial]) -> dict[str, str]:
     return found
 
 
-def another_look(task: Task | None, trials: Sequence[Trial], left: str, when: str = "") -> str:
+def another_look(
+    task: Task | None, trials: Sequence[Trial], left: str, when: str = "", *, noise: bool = False
+) -> str:
     """Return what to run to investigate a leftover: first a repeat, then a new motion.
 
     Args:
@@ -143,12 +145,14 @@ def another_look(task: Task | None, trials: Sequence[Trial], left: str, when: st
         trials: the trials that were diagnosed.
         left: the channel whose error has no known cause.
         when: the region that holds most of it; "" if none does.
+        noise: whether all of that error may be noise, so that it is not called a gap.
     """
+    what = f"how much of what is left in {left} is noise" if noise else f"the gap in {left}"
     runs = Counter(trial.candidate or trial.inputs.tobytes() for trial in trials)
     if max(runs.values(), default=0) > 1:
         where = f"spends more time where {when}" if when else f"moves {left} in another way"
-        return f"Run a trial that {where}, to investigate the gap in {left}."
-    why = f"to see whether the gap in {left} repeats"
+        return f"Run a trial that {where}, to investigate {what}."
+    why = f"to see {what}" if noise else f"to see whether {what} repeats"
     ran = [trial for trial in trials if trial.candidate] if task else []
     best = max(ran, key=task.utility, default=None) if task else None
     if task is None or best is None or math.isinf(task.utility(best)):

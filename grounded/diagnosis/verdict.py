@@ -12,10 +12,12 @@ from grounded.diagnosis.cause_words import (
     comparison,
     counted,
     disagreement,
+    effect_of,
     ended,
     give_or_take,
     meaning,
     other_unit,
+    value_called,
     wider,
 )
 from grounded.diagnosis.error_report import (
@@ -242,7 +244,7 @@ def _causes(
             text += f", {apart[one.of]}" if one.of in apart else ""
         else:
             text = f"{_moved(claims, adopted)}{OPEN * open_gap}"
-            text += _others(claims, identified)
+            text += _others(claims, identified, adopted)
             named = parameters_off(claims)[:NAMED]
             held = dict.fromkeys(other for n in named for other in given.get(n, ()))
             text += f", given {listed(held)} as in the model" * bool(held)
@@ -313,7 +315,7 @@ def _moved(claims: Claims, adopted: Collection[str]) -> str:
         beside = [f"{change:+.{0 if abs(change) >= 1 else 1}f} %"] * bool(old)
         beside += ended(known[name], old)
         part = f" ({', '.join(beside)})" * bool(beside)
-        if effect := _effect_of(name, adopted):
+        if effect := effect_of(name, adopted):
             key = name.removeprefix(param_name(effect, ""))
             text = f"{key} = {give_or_take(known[name])} instead of {number(old)}{part}"
             again.setdefault(effect, {})[key] = text
@@ -322,17 +324,9 @@ def _moved(claims: Claims, adopted: Collection[str]) -> str:
     own = f"{OWN} are off: {', '.join(texts)}" if texts or not again else ""
     off = ", ".join(_adopted_off(claims, name, told) for name, told in again.items())
     off = f"the adopted effects have other values: {off}" if off else ""
-    parts = (off, own) if named and _effect_of(named[0], adopted) else (own, off)
+    parts = (off, own) if named and effect_of(named[0], adopted) else (own, off)
     more = len(named) - NAMED
     return "; ".join(filter(None, parts)) + (f" and {more} more" if more > 0 else "")
-
-
-def _effect_of(name: str, adopted: Collection[str]) -> str:
-    """Return the adopted effect that a parameter belongs to; "" if it is the model's own."""
-    from grounded.effects import param_name
-
-    of = [effect for effect in adopted if name.startswith(param_name(effect, ""))]
-    return max(of, key=len, default="")
 
 
 def _adopted_off(claims: Claims, name: str, told: Mapping[str, str]) -> str:
@@ -363,7 +357,7 @@ OPEN = ", unless the gap that remains is the reason"  # a value that a parameter
 UNSURE = ", but its size is uncertain: within 2 standard deviations of zero"
 
 
-def _others(claims: Claims, identified: Sequence[Identifiable]) -> str:
+def _others(claims: Claims, identified: Sequence[Identifiable], adopted: Collection[str]) -> str:
     """Return a clause on the parameters that are adopted too, though they need not be off.
 
     They were calibrated together with those that are off, whose values are only valid with them.
@@ -373,14 +367,23 @@ def _others(claims: Claims, identified: Sequence[Identifiable]) -> str:
     old = {name: params[name].value for name in known if name not in (*off, *lost)}
     if not old:
         return ""
-    one = len(old) == 1
-    by = ""
-    if all(old.values()):
-        most = max(abs(known[name].value / value - 1) for name, value in old.items())
-        by = f" by {'' if one else 'at most '}{percent(most)}"
-    others = f"{len(old)} others" if len(old) > NAMED else listed(old)
     it = "it" if len(off) == 1 else "them"
-    return f"; {others} {'is' if one else 'are'} adjusted with {it}{by}, but need not be wrong"
+    by = {name: known[name].value / value - 1 for name, value in old.items() if value}
+    if len(old) > NAMED:
+        most = sorted(by, key=lambda name: -abs(by[name]))[:NAMED]
+        told = [
+            f"{value_called(n, adopted)} ({'-' if by[n] < 0 else '+'}{percent(abs(by[n]))})"
+            for n in most
+        ]
+        named = f", most of all {listed(told)}" * bool(told)
+        return f"; {len(old)} others are adjusted with {it}{named}, but need not be wrong"
+    one = len(old) == 1
+    much = ""
+    if len(by) == len(old):
+        much = f" by {'' if one else 'at most '}{percent(max(map(abs, by.values())))}"
+    are = "is" if one else "are"
+    names = listed(value_called(name, adopted) for name in old)
+    return f"; {names} {are} adjusted with {it}{much}, but need not be wrong"
 
 
 def sentence(clauses: Iterable[str]) -> str:

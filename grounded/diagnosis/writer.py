@@ -44,6 +44,7 @@ from grounded.places import position
 from grounded.task import Task
 from grounded.trial import Trial
 
+HALF = 0.5  # of the time driven in a region, from which a trial can hardly spend more there
 MUCH = 0.4  # gain of one state at one horizon, a third of its error, that is worth a name
 
 
@@ -124,8 +125,9 @@ class Writer:
         off, region = open_noise(rows), None
         if remainder:
             off, region = remainder[0].channel, remainder[0].region
-        when = region.told if region else ""
-        look = another_look(self.task, self.trials, off, when) if off else ""
+        when = region.told if region and region.occupancy < HALF else ""
+        noise = not remainder  # no gap is named then
+        look = another_look(self.task, self.trials, off, when, noise=noise) if off else ""
         named = [row.effect for row in ranking if row.claimed]
         seen = unconfirmed(self.claims, self.decision.doubtful, groups, furthest(rows))
         told = {one.effect for one in seen}.union(*groups)
@@ -156,7 +158,6 @@ class Writer:
             adopted=self.adopted,
             tracked=() if self.task is None else _tracked(self.task),
         )
-        further = said.look_for > 0
         differ = bool(apart and apart.changed) and not self.known.no_cause
         return Diagnosis(
             verdict=said,
@@ -200,9 +201,9 @@ class Writer:
                 lost,
                 worse,
                 self.adopted,
-                further=further,
                 ended=ended,
                 flip=next((n for n in named if _to_flip(n, ranking, ended)), "").partition(":")[2],
+                noise=noise,
             ),
             unknowable=(*self.known.sentences, *joints_without_input(data.model, named)),
             noise=self.noise(),

@@ -342,7 +342,7 @@ first_order_lag = MemoryFamily(
 rate_limit = MemoryFamily(
     name="rate_limit",
     equation="|u_eff'| <= r",
-    sentence="{target} can't move faster than {r}",
+    sentence="{target} can't change faster than {r}",
     targets=_one_or_alike,
     quantities=lambda site: speed_limit(site, f"{site.unit(site.target)}/s"),
     lookalikes=("slew_limit", "first_order_lag", "delay", "saturation"),

@@ -87,6 +87,19 @@ def test_evidence_that_is_not_known_is_a_dash(capsys):
     assert "parameter:m" in told and "nan" not in told
 
 
+def test_a_delay_of_a_log_with_rows_is_told_where_its_spread_comes_from(capsys):
+    """A crane's: +- 10 ms, with nothing on the 20 ms between the rows; the scatter was 0.5 ms."""
+    from grounded.diagnosis.report import Estimate, Made, Ranked
+    from grounded_cli.diagnose import _effects
+
+    row = Ranked("delay:u", {"d": Estimate(0.0297, 0.01, unit="s")}, claimed=True)
+    said = Diagnosis(Verdict("effect", ("delay:u",)), ranking=(row,), made=Made(rows_s=0.02))
+    _effects(said, details=False)
+    assert "half of the 0.02 s between rows" in " ".join(capsys.readouterr().out.split())
+    _effects(replace(said, made=Made()), details=False)
+    assert "between rows" not in " ".join(capsys.readouterr().out.split())
+
+
 def test_a_diagnosis_lists_rivals_and_whole_trials_only_in_its_details(capsys):
     from grounded.diagnosis.report import Ranked
     from grounded_cli.diagnose import _show

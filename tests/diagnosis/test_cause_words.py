@@ -1,4 +1,4 @@
-"""Many causes in few words: those of one kind together, the smallest only named."""
+"""Many causes in words: those of one kind together, each with its values."""
 
 from dataclasses import replace
 
@@ -75,25 +75,24 @@ def test_volts_are_said_to_be_counted_before_or_after_a_gain_of_their_input():
     assert not any(counted(one, [gain, one]) for one in (known[TWO], late, known[BIAS], fade))
 
 
-def test_the_smallest_of_many_are_only_named():
-    names = [INERTIA, ONE, "calibration", GAIN, BIAS, "input_bias:t2"]
-    VALUES["input_bias:t2"] = {"b": Estimate(0.03, 0.001, unit="N m")}
-    found = told(names, [0.5, 0.2, 0.15, 0.1, 0.03, 0.02])
-    assert len(found) == 5
-    worth = "(without these, errors are 7.2 % larger)"
-    assert found[-1] == f"also {BIAS} and input_bias:t2 {worth}"
-
-
-@pytest.mark.parametrize("late", ["delay:t1+t2", "first_order_lag:t2"])
-def test_a_delay_is_named_however_small_its_share(late):
-    """A delay that made the machine oscillate was one of `2 smaller causes`."""
-    names = [INERTIA, ONE, "calibration", GAIN, BIAS, late, "input_bias:t2"]
-    VALUES["input_bias:t2"] = {"b": Estimate(0.03, 0.001, unit="N m")}
-    VALUES[late] = {n: Estimate(0.06, 0.001, unit="s") for n in ("d", "tau")}
+def test_the_smallest_of_many_are_told_in_words_with_their_values():
+    """A crane's dead zone was `also viscous_friction:w and dead_zone:u`, without a value."""
+    late = "delay:t1+t2"
+    names = [INERTIA, ONE, "calibration", GAIN, BIAS, late, "dead_zone:t2"]
+    VALUES["dead_zone:t2"] = {"c": Estimate(0.255, 0.02, unit="N m")}
+    VALUES[late] = {"d": Estimate(0.06, 0.001, unit="s")}
     found = told(names, [0.4, 0.2, 0.15, 0.1, 0.08, 0.05, 0.02])
-    assert len(found) == 6 and "0.06 s" in found[4]
-    worth = "(without these, errors are 15 % larger)"
-    assert found[-1] == f"also {BIAS} and input_bias:t2 {worth}"
+    assert len(found) == len(names) and not any(name in " ".join(found) for name in VALUES)
+    assert holds(found[-1], "0.255 N m") and holds(found[-2], "0.06 s")
+    assert all("(without this, " in clause for clause in found)
+
+
+def test_a_limited_rate_of_a_commanded_speed_is_no_motion():
+    """A robot's verdict: `The speed can't move faster than 0.7 m/s/s`."""
+    limit = Library().effect("rate_limit:throttle", car)
+    assert meaning(limit, {"r": Estimate(0.7, 0.01, unit="1/s")}) == (
+        "the throttle can't change faster than 0.7 1/s"
+    )
 
 
 def test_a_joint_with_dry_friction_is_not_told_beside_one_with_viscous_friction():

@@ -404,6 +404,20 @@ def test_a_threshold_that_is_zero_but_for_rounding_reads_zero(scale):
     )  # others are told as they are
 
 
+@pytest.mark.parametrize(("within", "named"), [(0.71, False), (0.92, True)])
+def test_a_part_of_what_was_driven_is_no_place_unless_the_gap_is_clearly_denser_there(
+    within, named
+):
+    """A robot's `mostly where x < 2.38 m`, with 71 % of the gap in 50 % of the time."""
+    x = np.linspace(0.0, 1.0, 1000)[:, None]
+    gain = np.where(x < 0.5, within, 1 - within)
+    row = _stump("x", x, gain, np.ones_like(x, bool), float(gain.sum()))
+    assert (row is not None) is named
+    few = np.where(x < 0.2, 4.0, 1.0)  # half of it in a fifth of the time
+    row = _stump("x", x, few, np.ones_like(x, bool), float(few.sum()))
+    assert row is not None and row.share == pytest.approx(0.5) and row.when == "x < 0.2"
+
+
 @pytest.mark.slow
 def test_without_the_family_a_look_alike_is_marked_by_what_it_leaves():
     model, trials = cart(dead=0.25, trials=6)

@@ -103,6 +103,30 @@ def test_a_value_that_adopt_leaves_alone_is_told_as_not_determined():
     assert "determine" not in told[0]
 
 
+def test_of_many_adjusted_parameters_those_that_move_most_are_named():
+    """`10 others are adjusted with it by at most 59 %` named none."""
+    params = {f"p{k}": Param(1.0 + k, "kg", 0.1, 99.0) for k in range(6)}
+    model = Model(states={"v": "m/s"}, inputs={"u": "N"}, params=params, derivative=dict)
+    known = {f"p{k}": Estimate(1.0 + k + (-1) ** k * 0.1 * k, 0.01, None, "kg") for k in range(6)}
+    claims = SimpleNamespace(
+        best=SimpleNamespace(hypothesis=SimpleNamespace(effects=())),
+        data=SimpleNamespace(model=model),
+        moved=(Blame(5, 9.0),),
+        parameters=lambda: known,
+    )
+    (told,) = _causes(claims, (), [Credit("calibration")], (), {})
+    most = "5 others are adjusted with it, most of all p4 (+8.0 %), p3 (-7.5 %) and p2 (+6.7 %)"
+    assert f"; {most}, but need not be wrong" in told
+    params["delay_u_d"] = Param(0.03, "s", 0.001, 0.1)
+    known["delay_u_d"] = Estimate(0.045, 0.001, None, "s")
+    claims.data = SimpleNamespace(model=replace(model, params=params))
+    (told,) = _causes(claims, (), [Credit("calibration")], (), {}, adopted=("delay:u",))
+    assert "most of all d of delay:u (+50 %), p4" in told
+    known.pop("delay_u_d"), known.pop("p0"), known.pop("p1"), known.pop("p2")
+    (told,) = _causes(claims, (), [Credit("calibration")], (), {})
+    assert "; p3 and p4 are adjusted with it by at most 8.0 %, but need not be wrong" in told
+
+
 def test_a_line_names_no_twenty_parameters():
     """An aircraft's page had a paragraph of them, all known together with one inertia."""
     names = [f"C{k}" for k in range(20)]

@@ -1,7 +1,8 @@
 """A likely effect stays without which the model's parameters would end at their bounds.
 
 A balancer's delay of 24 ms was dropped: its moment of inertia, at 7 times the model's value and at
-its bound, predicted 0.5 s ahead as well. Nothing could be adopted from that.
+its bound, predicted 0.5 s ahead as well. Nothing could be adopted from that. It does not stay if
+predictions lose nothing without it: an arm's verdict claimed a `rate_gain` worth `+0.0 %`.
 """
 
 from types import SimpleNamespace
@@ -11,7 +12,9 @@ import pytest
 
 from grounded import Model, Param
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.validation import decide
 from grounded.diagnosis.validation.decide import Decision
+from grounded.diagnosis.validation.gain import Gain
 from grounded.effects import Library
 
 MODEL = Model(
@@ -51,3 +54,28 @@ def decision(fit, less, nats):
 def test_what_keeps_a_parameter_off_its_bound_is_told(inside, without, nats, held):
     fit = fitted(inside, "delay:u")
     assert decision(fit, fitted(without), nats).held_up == held
+
+
+@pytest.mark.parametrize(("gain", "kept"), [(0.01, True), (0.0, False), (-0.02, False)])
+def test_what_predictions_lose_nothing_without_is_not_claimed(monkeypatch, gain, kept):
+    """It keeps the inertia off its bound, but a claim has to help on data it has not seen."""
+    fit, less, bare = fitted(0.005, "delay:u"), fitted(0.02), fitted(0.003)
+    fits = {"delay:u": less, "calibration": bare}
+    monkeypatch.setattr(decide, "fit_without", lambda search, f, name, ruler: fits[name])
+    monkeypatch.setattr(decide, "counterparts", lambda *_: [])
+    monkeypatch.setattr(decide, "repeats", lambda *_: 0)
+    monkeypatch.setattr(decide, "of_no_size", lambda *_: [])
+    monkeypatch.setattr(decide, "folds", lambda data: None)
+    monkeypatch.setattr(decide, "_pays", lambda search, ruler, rest, f, white: rest is bare)
+
+    def gained(before, after):
+        by = gain if before is less else 0.5
+        return Gain(by, 0.1, by, np.array([by]), np.array([0.1]))
+
+    ruler = SimpleNamespace(held_out=True, gain=gained, since_outset=lambda f: 1.0)
+    search = SimpleNamespace(
+        data=SimpleNamespace(model=MODEL), predictor=None, score=lambda f: 766.0 * (f is fit)
+    )
+    found, _, doubtful = decide._pruned(search, fit, ruler, True)
+    assert (found is fit) is kept
+    assert [one.name for one in doubtful] == ([] if kept else ["delay:u"])  # told as unconfirmed

@@ -357,6 +357,15 @@ def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
     names = ["model as it is", "with all causes", "all but delay:u", "noise alone"]
     assert [bar.label for bar in worth.bars] == names and worth.bars[2].text == "0.40 m/s"
     assert "except one" in figure.caption  # such a bar may be longer than the model's
+    later = replace(row, outset={"x": 0.7, "v": 1.4}, crude=row.with_effects)
+    settled = replace(found, credit=(), prediction_error=(later,))
+    (bars,) = worth_figure(settled, [(["v"], "v")]).panels  # was `1.2 mm` twice, without 142 mm
+    assert [bar.label for bar in bars.bars] == [
+        "model.py, nothing adopted",
+        "model as it is",
+        "noise alone",
+    ]
+    assert [bar.value for bar in bars.bars] == [1.4, 0.05, 0.04]
     (x, v) = accuracy_figure(found).panels
     assert [bar.value for bar in x.bars] == [0.2, 0.1, 0.1, 0.05] and "v" in v.title
 

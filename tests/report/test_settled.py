@@ -72,6 +72,25 @@ def test_the_status_has_one_line_for_each_adopted_effect_and_parameter(adopted):
     assert "12 mm instead of 250 mm" in gain
 
 
+def test_a_value_stays_as_sure_as_it_was_adopted_after_a_diagnosis_that_claims_nothing(adopted):
+    """`c = 0.255 +- 0.020 V` of a crane became `c = 0.255 V`."""
+    before = plain(grounded("-C", adopted, "status").out)
+    made = MADE | {
+        "adopted": [{"name": "viscous_friction:v", "k": 0.3}],
+        "params": {"mass": 1.4},
+        "nominal": {"mass": 1.4, "viscous_friction_v_k": 0.3},
+    }
+    said = {"kind": "none", "sentence": "The model explains the data."}
+    more = {"ranking": [], "parameters": {}, "credit": [], "leftover": []}
+    written(adopted, verdict=said, diagnosed=made, **more)
+    rows = re.findall(r"(?m)^(?:viscous_friction:v|mass) .*", before)
+    assert len(rows) == 2 and all("+-" in row for row in rows)
+    after = plain(grounded("-C", adopted, "status").out)
+    assert all(row in after for row in rows)
+    (adopted / "reports" / "adoptions.json").unlink()  # derived: the values stay, not how sure
+    assert "k = 0.3" in plain(grounded("-C", adopted, "status").out)
+
+
 def test_a_parameter_that_stays_behind_is_told_and_no_gain_is_claimed(cart, tmp_path):
     """The effect was fitted beside a mass of 1.4 kg, which the trials do not tell."""
     lost = {"parameter": "mass", "verdict": "not identifiable"}

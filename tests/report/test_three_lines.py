@@ -49,15 +49,8 @@ def diagnosis():
 
 def test_causes_gain_and_what_is_left(diagnosis):
     wrong, gained, left = three_lines(diagnosis, cart_task())
-    assert CAUSES[0][1:] in wrong and CAUSES[1] in wrong and "also" not in wrong
-    assert CAUSES[2] in wrong  # a delay, however small its share: it decides stability
-    (*_, bias) = diagnosis.credit
-    other = replace(diagnosis, credit=(*diagnosis.credit[:2], replace(bias, of="input_bias:force")))
-    small = "also input_bias:force (without this, errors are 6.0 % larger)"
-    assert small in three_lines(other, cart_task())[0]
-    large = replace(bias, of="input_bias:force", share=0.22)  # was only counted
-    other = replace(diagnosis, credit=(*diagnosis.credit[:2], large))
-    assert CAUSES[2] in three_lines(other, cart_task())[0]
+    assert CAUSES[0][1:] in wrong and CAUSES[1] in wrong
+    assert CAUSES[2] in wrong  # in words, however small its share
     assert "x by 12 mm instead of 250 mm" in gained
     assert "v" in left and "0.020 m/s" in left and "0.0050 m/s" in left and "x > 0.2" in left
 

@@ -154,8 +154,13 @@ def test_a_target_beside_an_adopted_bias_is_told_to_be_in_readings(w):
     said = grounded("-C", w.folder, "target", "step", "--to", "theta=1")
     assert said.code == 0, said.err
     assert holds(said.err, "in readings of its sensor", "0.02 rad too high", "sensor_bias:theta")
+    assert holds(said.err, "the target ends at 1.000 rad and [task] start is 0 rad")
     config.write_text(config.read_text().replace("start = { }", "start = { theta = 0.02 }"))
     there = np.column_stack([t := 0.05 * np.arange(41), 0.02 + 0.3 * np.sin(np.pi * t / 2) ** 2])
     np.savetxt(w.folder / "there.csv", there, "%.6f", ",", header="t,theta", comments="")
     drawn = grounded("-C", w.folder, "target", str(w.folder / "there.csv"))
     assert drawn.code == 0 and "in readings" not in drawn.err
+    there[:, 1] -= 0.02
+    np.savetxt(w.folder / "there.csv", there, "%.6f", ",", header="t,theta", comments="")
+    drawn = grounded("-C", w.folder, "target", str(w.folder / "there.csv"))
+    assert holds(drawn.err, "but the target ends at 0 rad. If") and "start is" not in drawn.err

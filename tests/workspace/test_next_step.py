@@ -27,7 +27,7 @@ from grounded_trials.store.documents import write_document
 from grounded_trials.wording import ELSEWHERE, folded, placed, rendered
 from grounded_trials.workspace.adopting import diagnosed_again
 from grounded_trials.workspace.config import set_in_model
-from grounded_trials.workspace.diagnosing import _in_vain
+from grounded_trials.workspace.diagnosing import _deeper, _in_vain
 from grounded_trials.workspace.fitting import apply_fit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import diagnosable, read_diagnosis
@@ -38,6 +38,7 @@ from grounded_trials.workspace.next_step import (
     nothing_to_do,
     since_diagnosis,
     to_adopt,
+    to_look_deeper,
 )
 from grounded_trials.workspace.proposing import standing_in
 from recorded import LOGGED, record
@@ -843,13 +844,13 @@ def test_an_adoption_in_vain_is_told_how_to_be_undone(tmp_path, monkeypatch):
     assert "adopt --undo" in said("unknown", False, False, outset={"x": 0.1, "v": 0.1})
 
 
-def test_more_effects_are_looked_for_before_those_at_the_limit_are_adopted(cart, tmp_path):
-    """It said `beyond 3 effects nothing was looked for`, and `next: adopt`."""
+def test_what_was_claimed_can_be_adopted_before_a_deeper_diagnosis(cart, tmp_path):
+    """After 10 min `next:` was another 10 min, and nothing said that the six could be adopted."""
     folder = copied(cart, tmp_path / "w")
     names = two_claimed(folder)
     verdict = {"kind": "several", "effects": names, "sentence": "Two.", "look_for": 5}
     diagnosed(folder, verdict=verdict)
-    assert last(grounded("-C", folder, "status")) == "grounded diagnose --max-effects 5"
+    assert last(grounded("-C", folder, "status")) == f"grounded adopt {' '.join(names)}"
     made = {"trials": ["t0001", "t0002"], "params": {}, "without": ["delay"]}
     asked = {
         " --trials t0001,t0002": {"named": ["t0001", "t0002"]},
@@ -857,8 +858,10 @@ def test_more_effects_are_looked_for_before_those_at_the_limit_are_adopted(cart,
     }
     for words, one in asked.items():
         found = Diagnosis.from_json({**DIAGNOSIS, "verdict": verdict, "diagnosed": made | one})
-        then = after_diagnosis(Folder(folder), found)
-        assert rendered(then) == f"grounded diagnose{words} --without delay --max-effects 5"
+        typed = f"grounded diagnose{words} --without delay --max-effects 5"
+        assert rendered(to_look_deeper(found)) == typed
+        assert holds(_deeper(found, 400.0), f"`{typed}`", "took 6.7 min", "17 min or more")
+    assert to_look_deeper(Diagnosis.from_json(DIAGNOSIS)) is None
     allowed, beyond = MOST_EFFECTS, MOST_EFFECTS + 1
     most, over = (grounded("diagnose", "--max-effects", str(k)).err for k in (allowed, beyond))
     assert "max-effects" in over and "max-effects" not in most

@@ -229,3 +229,20 @@ def test_a_better_candidate_that_is_farther_off_says_what_it_gained_by():
     assert best.utility > before.utility
     assert holds(traded(here, best, before), "c0002", "c0001", "inputs cost less", "20 mm")
     assert traded(here, tried("c0003", 0.01, 0 * rough), before) == ""
+
+
+def test_a_better_candidate_that_is_farther_off_names_the_state_that_came_nearer():
+    """`because other states are nearer to theirs` named none: a crane's speed at the end."""
+    here = task(state=np.array([1.0, 1.0, 1.0, 0.0]), terminal=np.array([0.0, 0.0, 1e3, 0.0]))
+
+    def tried(name, off, psi, end):
+        states = np.zeros((H + 1, 4))
+        states[:, 0], states[:-1, 2], states[-1, 2] = off, psi, end
+        own = run(states)
+        candidate = SimpleNamespace(id=name)
+        return SimpleNamespace(candidate=candidate, trials=(own,), utility=here.utility(own))
+
+    ends = traded(here, tried("c0002", 0.02, 0.1, 0.11), tried("c0001", 0.01, 0.1, 0.23))
+    assert holds(ends, "psi is nearer to its target (0.11 rad at the end instead of 0.23 rad)")
+    way = traded(here, tried("c0002", 0.02, 0.1, 0.0), tried("c0001", 0.01, 0.3, 0.0))
+    assert "rms instead of 0.29 rad)" in way

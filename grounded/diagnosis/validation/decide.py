@@ -12,7 +12,8 @@ under every other noise structure, are compared by the `ruler`:
        effect with very high evidence, beside white innovations only, is dropped only if predictions
        gain nothing.
     3. An effect that a parameter's shift undoes is dropped; the parameter alone describes both.
-       A likely effect stays without which the model's parameters would end at their bounds.
+       A likely effect stays without which the model's parameters would end at their bounds, if
+       predictions gain by it at all.
     4. An effect without a mechanism that a single motion shows is dropped, however often the motion
        was repeated, unless its one coefficient explains all that the model lacks and nothing else
        explains nearly as much.
@@ -331,8 +332,9 @@ def _pruned(
                 if gains[name].channels.max() < least or not _pays(search, ruler, less, fit, white)
             ]
         )
-        if not undone:
-            idle = [n for n in idle if not _held_up(search, fit, without[n], n)]
+        if not undone:  # what loses nothing is not needed, whatever its evidence
+            helps = {n for n in idle if gains[n].mean > 0}
+            idle = [n for n in idle if n not in helps or not _held_up(search, fit, without[n], n)]
         if not idle:
             return fit, without, doubtful
         name = _least_needed(search, ruler, without, min(idle, key=lambda n: gains[n].mean), idle)

@@ -28,6 +28,7 @@ from grounded.filter import kalman
 from grounded.frozen import Array
 
 MOST_STARTS = 400
+CLEARLY = 3.0  # times as dense as outside: with less of the gap a region is not worth naming
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,6 +192,8 @@ def _stump(name: str, signal: Array, gain: Array, valid: Any, whole: float) -> R
                 share = float(gain[inside].sum()) / whole
                 if occupancy < 0.03 or share - occupancy <= margin:
                     continue
+                if share * (1 - occupancy) < CLEARLY * (1 - share) * occupancy:
+                    continue  # the gap is nearly everywhere that was driven
                 margin = share - occupancy
                 shown = 0.0 if abs(level) < nothing else level
                 best = Region(f"{label} {sign} {shown:.3g}", min(share, 1.0), occupancy)

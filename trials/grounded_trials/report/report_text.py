@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from grounded.diagnosis.tables import WITHOUT, effect_table, error_table
+from grounded.diagnosis.tables import WITHOUT, effect_table, error_table, of_delays
 from grounded.errors import NextCommand
 from grounded.result import percent
 from grounded.search.candidate import SURE, Tried
@@ -170,7 +170,8 @@ def _diagnosis(findings: Findings, table: Table) -> str:
     rows, header = effect_table(diagnosis, rivals=False)
     if rows and not diagnosis.no_cause:
         known = any(row[1] for row in rows)
-        lines += ["", table(rows, header), *(_wrapped(WITHOUT, "  ") if known else ())]
+        notes = "; ".join(filter(None, (WITHOUT * known, of_delays(diagnosis))))
+        lines += ["", table(rows, header), *(_wrapped(notes, "  ") if notes else ())]
     return "\n".join(lines)
 
 

@@ -19,7 +19,7 @@ from grounded.task import Task
 from grounded_trials.report.diagnosis_words import made_from
 from grounded_trials.report.three_lines import gained, still_open, three_lines
 from grounded_trials.wording import ALONE, changed
-from grounded_trials.workspace.adopting import joined, left_behind
+from grounded_trials.workspace.adopting import as_adopted, joined, left_behind
 from grounded_trials.workspace.config import ModelTable
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
@@ -60,7 +60,8 @@ def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> 
     clauses += _moved(task.model, table.params, diagnosis.jointly if diagnosis else set())
     if not clauses:
         return None
-    found = Settled(tuple(clauses), rows=tuple(_rows(task.model, table, diagnosis)))
+    rows = tuple(_rows(task.model, table, diagnosis, as_adopted(workspace)))
+    found = Settled(tuple(clauses), rows=rows)
     if diagnosis is None or diagnosis.no_cause:
         return found
     if not since.changed:
@@ -167,11 +168,15 @@ def _clause(entry: Mapping[str, Any], model: Model) -> str:
 
 
 def _rows(
-    model: Model, table: ModelTable, diagnosis: Diagnosis | None
+    model: Model,
+    table: ModelTable,
+    diagnosis: Diagnosis | None,
+    before: Mapping[str, Estimate],
 ) -> Iterator[tuple[str, str]]:
     """Yield the name and the values of each adopted effect, then of each adopted parameter.
 
-    A value has the standard deviation by which the last diagnosis knows it.
+    A value has the standard deviation by which the last diagnosis knows it, or else the one that
+    it was adopted with (`before`): a diagnosis that finds nothing new estimates nothing.
     """
     from grounded.diagnosis.cause_words import give_or_take
     from grounded.effects import param_name
@@ -183,9 +188,10 @@ def _rows(
         fitted |= {param_name(ranked.effect, q): e for q, e in ranked.params.items()}
 
     def known(name: str, value: float, unit: str) -> str:
-        own = fitted.get(name, Estimate(value, unit=unit))
-        same = math.isclose(own.value, value, rel_tol=WRITTEN)
-        return give_or_take(own if same else Estimate(value, unit=unit))
+        for own in (one[name] for one in (fitted, before) if name in one):
+            if math.isclose(own.value, value, rel_tol=WRITTEN):
+                return give_or_take(replace(own, unit=unit))
+        return give_or_take(Estimate(value, unit=unit))
 
     for entry in table.effects:
         name = str(entry["name"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from grounded.diagnosis.cause_words import is_late, only_named
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.ruler_words import COMPARABLE, in_doubt, open_noise, rest, telling, worsened
 from grounded.diagnosis.verdict import also_off, told_apart
@@ -14,9 +13,6 @@ from grounded.task import Task
 from grounded_trials.wording import shown
 from grounded_trials.workspace.off_target import rates_among, weighed_groups
 
-CAUSES = 2  # that the first line names in any case
-LARGE = 0.15  # of the improvement: a further cause above it is named too
-SMALL = 0.05  # of the improvement: a cause below it is only named
 FEW = 2  # states in the second line
 
 
@@ -40,21 +36,8 @@ def three_lines(diagnosis: Diagnosis, task: Task) -> list[str]:
 
 
 def _wrong(diagnosis: Diagnosis) -> str:
-    """The largest causes without what they are worth, which the bars show; the others by name.
-
-    Delays and lags are named in any case, as they decide whether a loop is stable.
-    """
-    told: list[str] = []
-    small = []
-    for clause, credit in zip(diagnosis.verdict.causes, diagnosis.credit, strict=True):
-        many = credit.share < (LARGE if len(told) >= CAUSES else SMALL)
-        if told and many and not is_late(credit.of):
-            small.append(credit)
-        else:
-            told.append(clause)
-    if small:
-        told.append(only_named(small))
-    text = "; ".join(told)
+    """The causes, largest first, without what they are worth, which the bars show."""
+    text = "; ".join(diagnosis.verdict.causes)
     return f"{text[:1].upper()}{text[1:]}."
 
 

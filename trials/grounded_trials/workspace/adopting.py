@@ -1,7 +1,8 @@
 """Adopt in a workspace: add diagnosed effects to the model of grounded.toml, with their values.
 
 A diagnosis estimates the model's parameters together with the effects, so both are adopted
-together. reports/adoptions.json records [model] before each adoption, so that it can be undone.
+together. reports/adoptions.json records [model] before each adoption, so that it can be undone, and
+how sure the adopted values are.
 """
 
 from __future__ import annotations
@@ -130,7 +131,8 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     set_in_model(workspace.config.file, params=whole if own else None, effects=adopted or None)
     model = workspace.config.model
     after = {"effects": adopted or model.effects, "params": whole if own else model.params}
-    step = {"names": names, "before": _written(model), "after": after}
+    known = _as_estimated(found, names, nominal, calibrated)
+    step = {"names": names, "before": _written(model), "after": after, "known": known}
     write_document(workspace.reports / KEPT, {"adoptions": [*earlier, step], "undone": []})
     fitted = {*names, *before, *(found.effects if claimed else ()), *found.late_sensors}
     beside = (str(effect["name"]) for effect in adopted)
@@ -146,6 +148,53 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
         rewritten=_rewritten(workspace, old, adopted),
         stopped=wider(found.parameters) if parameters and physics and claimed else "",
     )
+
+
+def _as_estimated(
+    found: Diagnosis,
+    names: Sequence[str],
+    nominal: Mapping[str, float],
+    calibrated: Mapping[str, Estimate],
+) -> dict[str, list[float]]:
+    """Return [value, std] of what is adopted, by its name as a parameter of the model.
+
+    Args:
+        found: the diagnosis.
+        names: its effects that are adopted.
+        nominal: see `joined`.
+        calibrated: see `joined`.
+    """
+    from grounded.effects import param_name
+
+    known, before = dict(calibrated), {} if found.made is None else found.made.effects
+    for row in (row for row in found.ranking if row.effect in names):
+        family, _, target = row.effect.partition(":")
+        for q, estimate in row.params.items():
+            if family == "parameter":
+                known[target] = estimate.moved(nominal[target])
+            else:
+                at = float(before.get(row.effect, {}).get(q, 0.0))
+                known[param_name(row.effect, q)] = estimate.moved(at)
+    return {
+        name: [one.value, one.std]
+        for name, one in known.items()
+        if math.isfinite(one.value) and math.isfinite(one.std)
+    }
+
+
+def as_adopted(workspace: Folder) -> dict[str, Estimate]:
+    """Return the values that were adopted last, as parameters of the model, without units.
+
+    Empty if reports/adoptions.json is missing or can't be read: how sure they are is lost then.
+    """
+    found = dict[str, Estimate]()
+    try:
+        for step in _kept(workspace)[0]:
+            known = step.get("known", {}).items()
+            found |= {str(name): Estimate(float(v), float(std)) for name, (v, std) in known}
+    except (GroundedError, AttributeError, TypeError, ValueError):
+        return {}
+    return found
 
 
 def _rewritten(

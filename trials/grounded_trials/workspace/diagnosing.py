@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.report import Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand
 from grounded.instruments.finding import in_the_log
+from grounded.progress import duration
 from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.identity import ROWS
 from grounded_trials.workspace.intake.where_to_mend import one_message, where_to_mend
@@ -96,13 +98,16 @@ def diagnose_in(
         named=tuple(trial.id for trial in used) if trials or compare else (),
         compared=tuple(compare),
         without=tuple(without),
+        rows_s=_row_interval(workspace, {trial.id for trial in used + others}),
     )
+    began = time.monotonic()
     found = diagnose(
         planner.plan, lifted, options, compare=second, engine=engine, progress=progress
     )
+    took = time.monotonic() - began
     measured = found.preflight
     seen = where_to_mend(workspace, used + others, measured)
-    known = _as_known(workspace, found.ranking, made)
+    known = _as_known(found.ranking, made.rows_s)
     found = replace(found, made=made, preflight=seen, ranking=known)
     write_diagnosis(workspace.reports, found)
     diagnosed_again(workspace)
@@ -117,6 +122,8 @@ def diagnose_in(
         run = f" ({identity}: `{rendered(to_run(workspace, identity, identity))}`)"
         run *= bool(identity)
         found = replace(found, next_trial=f"{words}{run}", probe=identity)
+    if deeper := _deeper(found, took):
+        found = replace(found, next_trial=f"{found.next_trial} {deeper}")
     undo = _in_vain(workspace, found)
     if undo:
         found = replace(found, next_trial=f"{undo} {found.next_trial}")
@@ -144,10 +151,33 @@ def diagnose_in(
     return replace(found, then=then)
 
 
-def _as_known(workspace: Folder, ranking: Sequence[Ranked], made: Made) -> tuple[Ranked, ...]:
-    """Widen delays in the ranking by the row interval of tables, see `Gridded`."""
-    logs = [one for one in workspace.whole_trials() if one.stored.id in made.trials]
-    row = max((float(one.meta.get(ROWS, 0.0)) for one in logs), default=0.0)
+def _deeper(found: Diagnosis, took: float) -> str:
+    """Offer a diagnosis of more effects, with its time by that of this one; "" if none is due.
+
+    Args:
+        found: the diagnosis.
+        took: how long it took [s].
+    """
+    from grounded_trials.workspace.next_step import to_look_deeper
+
+    then = to_look_deeper(found)
+    if then is None:
+        return ""
+    least = duration(took * found.verdict.look_for / max(len(found.effects), 1))
+    return (
+        f"Or look for more causes before adopting these: `{rendered(then)}`, which takes {least} "
+        f"or more (this diagnosis took {duration(took)})."
+    )
+
+
+def _row_interval(workspace: Folder, trials: Collection[str]) -> float:
+    """Return the largest interval of rows in the tables of these trials, see `Gridded` [s]."""
+    logs = [one for one in workspace.whole_trials() if one.stored.id in trials]
+    return max((float(one.meta.get(ROWS, 0.0)) for one in logs), default=0.0)
+
+
+def _as_known(ranking: Sequence[Ranked], row: float) -> tuple[Ranked, ...]:
+    """Widen delays in the ranking by the interval of table rows [s], see `Gridded`."""
 
     def wider(name: str, one: Estimate) -> Estimate:
         if name != "d" or one.interval is None:

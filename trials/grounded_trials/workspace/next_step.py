@@ -238,8 +238,6 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     claimed = diagnosis.kind in ("effect", "several") and not diagnosis.contested
     if not claimed or {*new} <= undone or _like_a_load(workspace, new):
         return NextCommand("adopt", late) if late else None
-    if most := diagnosis.verdict.look_for:
-        return _with_more(most, _made(diagnosis))
     params = workspace.base_model.params
     known = {n: e.value for n, e in diagnosis.parameters.items() if n in params}
     if all_at_bounds(params, {n: known[n] for n in diagnosis.verdict.parameters if n in known}):
@@ -310,8 +308,14 @@ def late_open(workspace: Folder, diagnosis: Diagnosis) -> tuple[str, ...]:
     return tuple(n for n, own in found if n not in known and max(own.values()) > least)
 
 
-def _with_more(effects: int, made: Made) -> NextCommand:
-    """Return the command for the same diagnosis of the same trials with more effects allowed."""
+def to_look_deeper(diagnosis: Diagnosis) -> NextCommand | None:
+    """Return the same diagnosis with more effects allowed; None if this one left no more to name.
+
+    What it did name can be adopted before.
+    """
+    effects, made = diagnosis.verdict.look_for, _made(diagnosis)
+    if not effects:
+        return None
     asked: tuple[str, ...] = ()
     if made.compared:
         asked = ("--compare", ",".join(made.named), ",".join(made.compared))

@@ -205,13 +205,33 @@ def traded(task: Task, best: Tried, before: Tried) -> str:
     pairs = ([cost_of_inputs(task, run) for run in one.trials] for one in (before, best))
     costs = [float(np.mean(own)) for own in pairs]
     smoother = costs[0] - costs[1] > 0.5 * (best.utility - before.utility)
-    why = "its inputs cost less" if smoother else "other states are nearer to theirs"
+    why = "its inputs cost less" if smoother else _nearer(task, best, before)
     a, b = measured_alike([was.rms, now.rms], was.unit)
     return (
         f"{best.candidate.id} is better than {before.candidate.id} because {why}: {was.what} is "
         f"off by {b} rms instead of {a}. If that matters more, weigh it more in [reward] state, or "
         "stop here"
     )
+
+
+def _nearer(task: Task, best: Tried, before: Tried) -> str:
+    """Return which state's error costs less than before, of those that fell most, with figures."""
+    known, weights = tracked(task), task.reward
+    errors = [[tracking_error(task, run) for run in one.trials] for one in (before, best)]
+    way, last = (
+        np.subtract(*[np.mean([(e[rows] ** 2).sum(axis=0) for e in own], axis=0) for own in errors])
+        for rows in (slice(None), slice(-1, None))
+    )
+    way, last = (weights.state * way)[known], (weights.terminal * last)[known]
+    k = int((way + last).argmax())
+    if not way[k] + last[k] > 0:
+        return "other states are nearer to theirs"
+    i, at_end = known[k], last[k] > way[k]
+    ends = [np.concatenate([e[-1:, i] if at_end else e[:, i] for e in own]) for own in errors]
+    name, unit = list(task.model.states.items())[i]
+    was, now = measured_alike([float(np.sqrt(np.mean(e**2))) for e in ends], unit)
+    when = "at the end" if at_end else "rms"
+    return f"{name} is nearer to its target ({now} {when} instead of {was})"
 
 
 def cost_of_inputs(task: Task, run: Trial) -> float:

@@ -341,6 +341,7 @@ def begun(found: Gridded, dt: float, inputs: Sequence[str]) -> Iterator[str]:
         )
     if found.row_s > dt / 20:
         yield (
-            f"its rows come every {found.row_s:.3g} s, so commands were sent up to that much "
-            "before their rows, which limits the accuracy of delays"
+            f"its rows come every {found.row_s:.3g} s and repeat the commands: a row does not say "
+            f"if its command was sent just then or up to {found.row_s:.3g} s before, so a delay is "
+            f"known to +- {found.row_s / 2:.3g} s only"
         )
