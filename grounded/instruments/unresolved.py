@@ -58,7 +58,7 @@ def judge_resolution(
 
 
 def _spread(trial: Trial) -> Array:
-    return np.nan_to_num(np.nanstd(trial.states, axis=0))
+    return np.asarray(np.nan_to_num(np.nanstd(trial.states, axis=0)))
 
 
 def _error_of_a_step(model: Model, trial: Trial, shown: Sequence[int]) -> Array:
