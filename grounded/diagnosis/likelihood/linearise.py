@@ -33,12 +33,19 @@ start of the track to its smoothed value (`smoothed`),
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, losses_of, param_scale
+from grounded.diagnosis.likelihood.hypothesis import (
+    Hypothesis,
+    adds_to_steps,
+    losses_of,
+    param_scale,
+)
 from grounded.diagnosis.likelihood.moving import moving
 from grounded.diagnosis.likelihood.noise import NoiseModel
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -94,9 +101,10 @@ def linearise(
     r[..., 0] = model.difference(y - here, np.asarray(offset))
     if (begun := predictor.begun(h)) is not None:
         r[0, ..., 0] += begun
+    exact = not adds_to_steps(h) or simulated(model)
     F, f_p = (
         sensitivities_of(predictor, h, x, u, after)
-        if h.spread
+        if h.spread and exact
         else (step_jacobian(predictor, h, x, after), None)
     )
     theta, near = h.theta, tangent(predictor, h, x, u) if h.effects else predictor
@@ -116,9 +124,13 @@ def linearise(
             d[..., 1 + j], r[..., 1 + j] = by_d, by_r
             if by_d.any() or by_r.any():
                 break
-    if f_p is not None:
-        for j, i in enumerate(calibrated(data), start=1 + len(theta)):
+    for j, i in enumerate(calibrated(data) if h.spread else (), start=1 + len(theta)):
+        if f_p is not None:
             np.multiply(f_p[..., i], param_scale(model)[i], out=d[..., j])
+        else:
+            other, moved = _shifted(h, model, i)
+            shifted = predictor.advance(other, x, u, data.time)
+            d[..., j] = model.difference(shifted, after) / moved
     if data.idle.any():  # padding is never measured: identity, so that nothing grows there
         F, d[data.idle] = np.where(data.idle[..., None, None], np.eye(model.n), F), 0.0
     return F, d, r
@@ -272,6 +284,19 @@ def _nudged(h: Hypothesis, theta: Array, j: int, size: float) -> tuple[Hypothesi
     return other, moved
 
 
+def _shifted(h: Hypothesis, model: Model, i: int) -> tuple[Hypothesis, float]:
+    """Return a hypothesis with parameter i shifted inside its bounds, and by how much of its scale.
+
+    Effects on steps act on what the parameter does: a rotor adds to the inertia that it scales.
+    """
+    shift = np.zeros(model.system.k) if h.shift is None else h.shift.copy()
+    param = model.params[model.param_names[i]]
+    size = SLIGHT if param.value + shift[i] < sum(param.reach) / 2 else -SLIGHT
+    shift[i] += size * param.spread
+    return replace(h, shift=shift), size
+
+
+SLIGHT = 1e-5  # finite-difference step of a parameter, as a fraction of its scale
 SOME = 10  # samples that show at once of most parameters that they have a slope
 PART = 0.05  # fraction of a parameter's size, to each side, of the step for thresholds
 
