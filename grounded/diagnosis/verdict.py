@@ -47,7 +47,7 @@ from grounded.diagnosis.ruler_words import (
 from grounded.errors import GroundedError
 from grounded.instruments.finding import Finding, in_the_log
 from grounded.model import Model
-from grounded.result import listed, number, percent
+from grounded.result import listed, number, percent, with_unit
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.validation.claims import Claims
@@ -136,6 +136,7 @@ def verdict(
     words = [sentence(told), improvement(rows, tracked), worsened(rows)]
     words += [runaway(rows), wider(claims.parameters())]
     words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed])
+    words += _combined(claims)
     words += [f"{told_apart(group, same, [r.effect for r in claimed])}." for group in groups]
     words += [one.sentence() for one in claims.one_clock[:1]]
     words += _geared(claims.data.model, [row.effect for row in claimed])[:1]
@@ -223,6 +224,7 @@ def _causes(
     acting = claims.best.hypothesis.effects
     effects = {e.name: e for e in acting}
     given = {one.parameter: tuple(one.given) for one in identified}
+    rests = {n: one.rests_on for one in claims.by_priors.combinations for n in one.values}
     lost = {one.parameter for one in identified if one.lost}
     joint = {one.parameter for one in identified if one.jointly}
     values = {row.effect: row.params for row in ranking}
@@ -235,6 +237,7 @@ def _causes(
             if one.share < BARELY and one.of in claims.held_up:
                 text += f", without which {listed(claims.held_up[one.of])} would end at a bound"
             text += OPEN * (open_gap and one.of.startswith("parameter:"))
+            text += GIVEN.format(listed(rests.get(one.of, ()))) * (one.of in rests)
             text += UNSURE * (not has_size(effects[one.of], values[one.of], KNOWN))
             text += f", {apart[one.of]}" if one.of in apart else ""
         else:
@@ -242,7 +245,7 @@ def _causes(
             text += _others(claims, identified)
             named = parameters_off(claims)[:NAMED]
             held = dict.fromkeys(other for n in named for other in given.get(n, ()))
-            text += f", given {listed(held)} as in the model" * bool(held)
+            text += GIVEN.format(listed(held)) * bool(held)
             vague = [n for n in named if n in lost]
             text += f", but these trials do not determine {listed(vague)}" * bool(vague)
             joined = [n for n in named if n in joint]
@@ -277,6 +280,23 @@ def _level(model: Model, claimed: Sequence[str]) -> list[str]:
         f"Gravity or a spring that acts about another {listed(names)} than the model's 0 looks the "
         "same in any log as a sensor's wrong zero, and is adopted in the same way."
     ]
+
+
+def _combined(claims: Claims) -> list[str]:
+    """Return a sentence on each group of values that the trials show only in combination."""
+    found = []
+    for one in claims.by_priors.combinations:
+        params = {name: claims.declared[name] for name in one.rests_on}
+        told = listed(
+            with_unit(f"{name} = {number(p.value)} +- {number(p.spread)}", p.unit)
+            for name, p in params.items()
+        )
+        found.append(
+            f"These trials show {listed([*one.values, *params])} only in combination, such as "
+            f"ratios: the values hold for {told}, as declared. To know each of them, measure one, "
+            f"or correct {listed(params)} in the model, and diagnose again."
+        )
+    return found
 
 
 def _apart(per_trial: Sequence[TrialValue], agreement: Sequence[Agreement]) -> dict[str, str]:
@@ -356,6 +376,7 @@ def _adopted_off(claims: Claims, name: str, told: Mapping[str, str]) -> str:
 
 
 BARELY = 0.01  # share of the improvement below which a claim needs another reason
+GIVEN = ", given {} as in the model"
 OPEN = ", unless the gap that remains is the reason"  # a value that a parameter should have
 UNSURE = ", but its size is uncertain: within 2 standard deviations of zero"
 

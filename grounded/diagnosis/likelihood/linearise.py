@@ -128,9 +128,7 @@ def linearise(
         if f_p is not None:
             np.multiply(f_p[..., i], param_scale(model)[i], out=d[..., j])
         else:
-            other, moved = _shifted(h, model, i)
-            shifted = predictor.advance(other, x, u, data.time)
-            d[..., j] = model.difference(shifted, after) / moved
+            d[..., j] = _by_parameter(predictor, h, x, u, after, i)
     if data.idle.any():  # padding is never measured: identity, so that nothing grows there
         F, d[data.idle] = np.where(data.idle[..., None, None], np.eye(model.n), F), 0.0
     return F, d, r
@@ -284,16 +282,27 @@ def _nudged(h: Hypothesis, theta: Array, j: int, size: float) -> tuple[Hypothesi
     return other, moved
 
 
-def _shifted(h: Hypothesis, model: Model, i: int) -> tuple[Hypothesis, float]:
-    """Return a hypothesis with parameter i shifted inside its bounds, and by how much of its scale.
+def _by_parameter(
+    predictor: Predictor, h: Hypothesis, x: Array, u: Array, after: Array, i: int
+) -> Array:
+    """Return the slope of a hypothesis' steps in parameter i, in units of its scale (L, B, n).
 
-    Effects on steps act on what the parameter does: a rotor adds to the inertia that it scales.
+    Effects on steps act on what the parameter does: a rotor adds to the inertia that it scales. The
+    difference is one-sided, away from the nearer bound; that at a threshold is a secant.
     """
-    shift = np.zeros(model.system.k) if h.shift is None else h.shift.copy()
-    param = model.params[model.param_names[i]]
-    size = SLIGHT if param.value + shift[i] < sum(param.reach) / 2 else -SLIGHT
-    shift[i] += size * param.spread
-    return replace(h, shift=shift), size
+    model, time = predictor.data.model, predictor.data.time
+    param, start = model.params[model.param_names[i]], predictor.params(h)[i]
+
+    def reached(size: float) -> Array:
+        shift = np.zeros(model.system.k) if h.shift is None else h.shift.copy()
+        shift[i] += size * param.spread
+        return predictor.advance(replace(h, shift=shift), x, u, time)
+
+    size = SLIGHT if 2 * start < sum(param.reach) else -SLIGHT
+    slope = model.difference(reached(size), after) / size
+    if not slope.any():
+        slope = model.difference(reached(PART), reached(-PART)) / (2 * PART)
+    return np.asarray(slope)
 
 
 SLIGHT = 1e-5  # finite-difference step of a parameter, as a fraction of its scale
