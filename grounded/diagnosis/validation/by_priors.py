@@ -78,7 +78,8 @@ def by_priors(predictor: Predictor, fit: Fitted, worth: float = 1.0) -> ByPriors
     std = np.sqrt(np.diag(C))
     lone = (fisher(G) > ALONE * std) & (std > LEAST * np.abs(value))
     rest = {  # of each such value, the parameters that it rests on
-        i: {j for j in range(k, len(C)) if C[i, j] ** 2 > PART * C[i, i]}
+        i: {k + int(np.argmax(C[i, k:] ** 2))}
+        | {j for j in range(k, len(C)) if C[i, j] ** 2 > PART * C[i, i]}
         for i in np.flatnonzero(lone).tolist()
     }
     found = []
