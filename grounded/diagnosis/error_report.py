@@ -273,12 +273,12 @@ class Identifiable(Document):
 class Combination(Document):
     """Values that the trials show only in combination, such as their ratios.
 
-    values: the claimed effects and calibrated parameters in it. rests_on: the parameters whose
-    declared values and priors alone set each of them.
+    values: the claimed effects and calibrated parameters in it. rests_on: {parameter: standard
+    deviation of its prior} for those whose declared values and priors alone set each of them.
     """
 
     values: tuple[str, ...]
-    rests_on: tuple[str, ...] = ()
+    rests_on: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ from grounded.diagnosis.cause_words import (
     wider,
 )
 from grounded.diagnosis.error_report import (
+    Combination,
     Credit,
     Identifiable,
     Remainder,
@@ -70,6 +71,7 @@ def verdict(
     most: int = 0,
     one_motion: bool = False,
     identified: Sequence[Identifiable] = (),
+    combinations: Sequence[Combination] = (),
     per_trial: Sequence[TrialValue] = (),
     agreement: Sequence[Agreement] = (),
     changed: Sequence[Changed] | None = None,
@@ -90,6 +92,7 @@ def verdict(
         most: the largest number of effects that was looked for; 0 for no limit.
         one_motion: whether all trials repeat one motion.
         identified: how well the trials identify each parameter, and relative to which others.
+        combinations: values that the trials show only in combination.
         per_trial: each claimed value by trial.
         agreement: whether the trials agree on each of these values.
         changed: the values that differ between two groups of trials; None for one group.
@@ -125,7 +128,7 @@ def verdict(
         return _said("none", text, *once, first=first)
     apart = _apart(per_trial, agreement)
     open_gap = any(one.above for one in remainder)
-    causes = _causes(claims, ranking, credit, identified, apart, open_gap, adopted)
+    causes = _causes(claims, ranking, credit, identified, combinations, apart, open_gap, adopted)
     told = clauses(
         [one.of for one in credit],
         causes,
@@ -136,7 +139,7 @@ def verdict(
     words = [sentence(told), improvement(rows, tracked), worsened(rows)]
     words += [runaway(rows), wider(claims.parameters())]
     words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed])
-    words += _combined(claims)
+    words += [_combined(claims.data.model, one) for one in combinations]
     words += [f"{told_apart(group, same, [r.effect for r in claimed])}." for group in groups]
     words += [one.sentence() for one in claims.one_clock[:1]]
     words += _geared(claims.data.model, [row.effect for row in claimed])[:1]
@@ -213,6 +216,7 @@ def _causes(
     ranking: Sequence[Ranked],
     credit: Sequence[Credit],
     identified: Sequence[Identifiable],
+    combinations: Sequence[Combination],
     apart: Mapping[str, str],
     open_gap: bool = False,
     adopted: Collection[str] = (),
@@ -224,7 +228,7 @@ def _causes(
     acting = claims.best.hypothesis.effects
     effects = {e.name: e for e in acting}
     given = {one.parameter: tuple(one.given) for one in identified}
-    rests = {n: one.rests_on for one in claims.by_priors.combinations for n in one.values}
+    rests = {n: one.rests_on for one in combinations for n in one.values}
     lost = {one.parameter for one in identified if one.lost}
     joint = {one.parameter for one in identified if one.jointly}
     values = {row.effect: row.params for row in ranking}
@@ -282,21 +286,18 @@ def _level(model: Model, claimed: Sequence[str]) -> list[str]:
     ]
 
 
-def _combined(claims: Claims) -> list[str]:
-    """Return a sentence on each group of values that the trials show only in combination."""
-    found = []
-    for one in claims.by_priors.combinations:
-        params = {name: claims.declared[name] for name in one.rests_on}
-        told = listed(
-            with_unit(f"{name} = {number(p.value)} +- {number(p.spread)}", p.unit)
-            for name, p in params.items()
-        )
-        found.append(
-            f"These trials show {listed([*one.values, *params])} only in combination, such as "
-            f"ratios: the values hold for {told}, as declared. To know each of them, measure one, "
-            f"or correct {listed(params)} in the model, and diagnose again."
-        )
-    return found
+def _combined(model: Model, one: Combination) -> str:
+    """Return a sentence on values that the trials show only in combination."""
+    told = listed(
+        with_unit(f"{name} = {number(model.params[name].value)} +- {number(std)}", unit)
+        for name, std in one.rests_on.items()
+        for unit in [model.params[name].unit]
+    )
+    return (
+        f"These trials show {listed([*one.values, *one.rests_on])} only in combination, such as "
+        f"ratios: the values hold for {told}, as declared. To know each of them, measure one, or "
+        f"correct {listed(one.rests_on)} in the model, and diagnose again."
+    )
 
 
 def _apart(per_trial: Sequence[TrialValue], agreement: Sequence[Agreement]) -> dict[str, str]:

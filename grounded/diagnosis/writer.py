@@ -161,6 +161,7 @@ class Writer:
             self.most,
             one_motion=moved == 1 < data.count,
             identified=identified,
+            combinations=combinations,
             per_trial=values,
             agreement=() if apart else agreement,
             changed=apart.changed if apart else None,

@@ -52,10 +52,12 @@ def test_a_gain_beside_an_uncertain_mass_is_as_uncertain_as_the_mass():
     assert g.std == pytest.approx(0.7 * 0.05 / 2.0, rel=0.1)
     assert g.interval[1] - g.interval[0] > 3.8 * g.std
     (one,) = found.combinations
-    assert one.values == ("input_gain:u",) and one.rests_on == ("m",)
+    assert one.values == ("input_gain:u",) and one.rests_on == {"m": 0.05}
     assert "given m as in the model" in found.sentence
     assert "only in combination" in found.sentence and "m = 2 +- 0.05 kg" in found.sentence
-    assert found.to_json()["combinations"] == [{"values": ["input_gain:u"], "rests_on": ["m"]}]
+    assert found.to_json()["combinations"] == [
+        {"values": ["input_gain:u"], "rests_on": {"m": 0.05}}
+    ]
 
 
 def test_a_gain_beside_a_known_drag_is_known_alone():
@@ -114,7 +116,7 @@ def fitted(model):
 def test_the_scale_of_a_planar_arm_rests_on_the_surest_inertia():
     found, fit = fitted(planar())
     (one,) = found.combinations
-    assert {*one.values} == {*PLANAR, "load"} and one.rests_on == ("I1",)
+    assert {*one.values} == {*PLANAR, "load"} and one.rests_on == {"I1": 0.01}
     g = fit.hypothesis.values[0]["g"]
     # I1 + 0.2 + 0.09 load is in proportion to the torques, and so is 0.07 + 0.075 load
     per_g = (0.245 + 0.09 * 0.5 - 0.09 / 0.075 * (0.07 + 0.075 * 0.5)) / (1 + g)

@@ -87,7 +87,8 @@ def by_priors(predictor: Predictor, fit: Fitted, worth: float = 1.0) -> ByPriors
         if any(i < k and own[i] for i in members):
             pins = set.union(*(rest[i] for i in members))
             told = dict.fromkeys(keys[i][0] or keys[i][1] for i in members if i not in pins)
-            found.append(Combination(tuple(told), tuple(keys[j][1] for j in sorted(pins))))
+            priors = {keys[j][1]: float(unit[j]) for j in sorted(pins)}
+            found.append(Combination(tuple(told), priors))
     said = {name for one in found for name in one.values}
     wide = {key: float(s * u) for key, s, u in zip(keys, std, unit, strict=True)}
     marked = {keys[i]: wide[keys[i]] for i in rest if (keys[i][0] or keys[i][1]) in said}

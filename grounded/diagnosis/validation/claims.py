@@ -31,7 +31,6 @@ from grounded.diagnosis.validation.prediction_error import normalised
 from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.effects import Effect
 from grounded.frozen import Array
-from grounded.model import Param
 
 UNTOLD = 1e6  # times a value: standard deviation from which it counts as unknown
 LEAST_TOLD = 0.1  # standard deviations below which a strength is not listed
@@ -201,11 +200,6 @@ class Claims:
     def by_priors(self) -> ByPriors:
         """Which values only priors set."""
         return by_priors(self._uncertain, self.best, self.search.tempering.factor)
-
-    @property
-    def declared(self) -> Mapping[str, Param]:
-        """The parameters as the model declares them, with those that the search held."""
-        return self._uncertain.data.model.params
 
     def _widened(self, sure: tuple[Array, Array], keys: Sequence[Key]) -> tuple[Array, Array]:
         """Return standard deviations and half-widths, (C,) each, of at least those by priors.
