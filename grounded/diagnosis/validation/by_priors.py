@@ -35,6 +35,7 @@ from grounded.frozen import Array
 ALONE = 5.0  # times as wide without the priors: as many standard deviations may one be wrong
 LEAST = 0.02  # part of a value; a smaller standard deviation is no news, whatever it comes from
 PART = 0.2  # part of the variance of a value that a prior has at least if the value rests on it
+MOST = 0.5  # part that such priors have together; many parameters are hardly all off alike
 
 Key = tuple[str, str]  # of a value: effect and quantity, or "" and parameter
 
@@ -77,10 +78,11 @@ def by_priors(predictor: Predictor, fit: Fitted, worth: float = 1.0) -> ByPriors
     C = _inverse(G + np.diag([0.0] * k + [1.0] * len(kept)))
     std = np.sqrt(np.diag(C))
     lone = (fisher(G) > ALONE * std) & (std > LEAST * np.abs(value))
+    parts = C[:, k:] ** 2 / np.maximum(np.diag(C), 1e-300)[:, None]
+    parts[parts < PART] = 0.0
     rest = {  # of each such value, the parameters that it rests on
-        i: {k + int(np.argmax(C[i, k:] ** 2))}
-        | {j for j in range(k, len(C)) if C[i, j] ** 2 > PART * C[i, i]}
-        for i in np.flatnonzero(lone).tolist()
+        i: {k + j for j in np.flatnonzero(parts[i]).tolist()}
+        for i in np.flatnonzero(lone & (parts.sum(axis=1) > MOST)).tolist()
     }
     found = []
     for members in _joined(rest):
