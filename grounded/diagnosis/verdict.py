@@ -128,7 +128,7 @@ def verdict(
         return _said("none", text, *once, first=first)
     apart = _apart(per_trial, agreement)
     open_gap = any(one.above for one in remainder)
-    causes = _causes(claims, ranking, credit, identified, combinations, apart, open_gap, adopted)
+    causes = _causes(claims, ranking, credit, identified, apart, open_gap, adopted, combinations)
     told = clauses(
         [one.of for one in credit],
         causes,
@@ -216,10 +216,10 @@ def _causes(
     ranking: Sequence[Ranked],
     credit: Sequence[Credit],
     identified: Sequence[Identifiable],
-    combinations: Sequence[Combination],
     apart: Mapping[str, str],
     open_gap: bool = False,
     adopted: Collection[str] = (),
+    combinations: Sequence[Combination] = (),
 ) -> tuple[str, ...]:
     """Return one clause per cause, the largest first; `open_gap`: a gap remains beside them."""
     from grounded.diagnosis.validation.claims import has_size
