@@ -80,7 +80,8 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
         show_json(done.to_json())
         return
     for name in dict.fromkeys(effects):
-        sentence(f"{name} is part of the model now ({workspace.config.file})")
+        alone = ALONE * (name in done.jointly)
+        sentence(f"{name} is part of the model now ({workspace.config.file}){alone}")
     units = workspace.base_model.states
     for effect in done.effects:
         family, _, state = str(effect["name"]).partition(":")

@@ -251,9 +251,9 @@ class Identifiable(Document):
     """How well the trials identify one uncertain parameter, with all others free.
 
     left: remaining fraction of its prior standard deviation `prior`, 0 to 1. jointly: not alone,
-    but as calibrated, all together. given: {parameter: slope} for parameters that were held though
-    the trials don't identify them: how many per cent this one is off per per cent of error of the
-    other (1: only the ratio is known). Its `+-` assumes them exact.
+    but together with other values as they are stated. given: {parameter: slope} for parameters that
+    were held though the trials don't identify them: how many per cent this one is off per per cent
+    of error of the other (1: only the ratio is known). Its `+-` assumes them exact.
     """
 
     parameter: str
@@ -267,6 +267,18 @@ class Identifiable(Document):
     def lost(self) -> bool:
         """Whether its calibrated value is not known, not even together with the others."""
         return self.verdict == "not identifiable" and not self.jointly
+
+
+@dataclass(frozen=True, eq=False)
+class Combination(Document):
+    """Values that the trials show only in combination, such as their ratios.
+
+    values: the claimed effects and calibrated parameters in it. rests_on: {parameter: standard
+    deviation of its prior} for those whose declared values and priors alone set each of them.
+    """
+
+    values: tuple[str, ...]
+    rests_on: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from grounded.diagnosis.error_report import (
     BRIEF,
+    Combination,
     Correction,
     Credit,
     Gap,
@@ -238,6 +239,7 @@ class Diagnosis(Document):
     noise: NoiseLevels = field(default_factory=NoiseLevels)
     parameters: Mapping[str, Estimate] = field(default_factory=dict)  # calibrated beside effects
     identifiable: tuple[Identifiable, ...] = ()  # each uncertain parameter
+    combinations: tuple[Combination, ...] = ()  # values that show only in combination
     prediction_error: tuple[RulerRow, ...] = ()  # by horizon, the whole trial last
     credit: tuple[Credit, ...] = ()  # largest first
     preflight: tuple[Finding, ...] = ()  # of the sensors, before any physics
@@ -344,6 +346,11 @@ class Diagnosis(Document):
         """The calibrated parameters that the trials identify, which may be adopted."""
         lost = {one.parameter for one in self.identifiable if one.lost}
         return {name: e for name, e in self.parameters.items() if name not in lost}
+
+    @property
+    def combined(self) -> set[str]:
+        """The effects and parameters that the trials show only in combination."""
+        return {name for one in self.combinations for name in one.values}
 
     @property
     def jointly(self) -> set[str]:

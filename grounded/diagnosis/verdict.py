@@ -21,6 +21,7 @@ from grounded.diagnosis.cause_words import (
     wider,
 )
 from grounded.diagnosis.error_report import (
+    Combination,
     Credit,
     Identifiable,
     Remainder,
@@ -49,7 +50,7 @@ from grounded.diagnosis.ruler_words import (
 from grounded.errors import GroundedError
 from grounded.instruments.finding import Finding, in_the_log
 from grounded.model import Model
-from grounded.result import listed, number, percent
+from grounded.result import listed, number, percent, with_unit
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.validation.claims import Claims
@@ -72,6 +73,7 @@ def verdict(
     most: int = 0,
     one_motion: bool = False,
     identified: Sequence[Identifiable] = (),
+    combinations: Sequence[Combination] = (),
     per_trial: Sequence[TrialValue] = (),
     agreement: Sequence[Agreement] = (),
     changed: Sequence[Changed] | None = None,
@@ -92,6 +94,7 @@ def verdict(
         most: the largest number of effects that was looked for; 0 for no limit.
         one_motion: whether all trials repeat one motion.
         identified: how well the trials identify each parameter, and relative to which others.
+        combinations: values that the trials show only in combination.
         per_trial: each claimed value by trial.
         agreement: whether the trials agree on each of these values.
         changed: the values that differ between two groups of trials; None for one group.
@@ -127,7 +130,7 @@ def verdict(
         return _said("none", text, *once, first=first)
     apart = _apart(per_trial, agreement)
     open_gap = any(one.above for one in remainder)
-    causes = _causes(claims, ranking, credit, identified, apart, open_gap, adopted)
+    causes = _causes(claims, ranking, credit, identified, apart, open_gap, adopted, combinations)
     told = clauses(
         [one.of for one in credit],
         causes,
@@ -138,6 +141,7 @@ def verdict(
     words = [sentence(told), improvement(rows, tracked), worsened(rows)]
     words += [runaway(rows), wider(claims.parameters())]
     words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed])
+    words += [_combined(claims.data.model, one) for one in combinations]
     words += [f"{told_apart(group, same, [r.effect for r in claimed])}." for group in groups]
     words += [one.sentence() for one in claims.one_clock[:1]]
     words += _geared(claims.data.model, [row.effect for row in claimed])[:1]
@@ -220,6 +224,7 @@ def _causes(
     apart: Mapping[str, str],
     open_gap: bool = False,
     adopted: Collection[str] = (),
+    combinations: Sequence[Combination] = (),
 ) -> tuple[str, ...]:
     """Return one clause per cause, the largest first; `open_gap`: a gap remains beside them."""
     from grounded.diagnosis.validation.claims import has_size
@@ -228,6 +233,7 @@ def _causes(
     acting = claims.best.hypothesis.effects
     effects = {e.name: e for e in acting}
     given = {one.parameter: tuple(one.given) for one in identified}
+    rests = {n: one.rests_on for one in combinations for n in one.values}
     lost = {one.parameter for one in identified if one.lost}
     joint = {one.parameter for one in identified if one.jointly}
     values = {row.effect: row.params for row in ranking}
@@ -240,6 +246,7 @@ def _causes(
             if one.share < BARELY and one.of in claims.held_up:
                 text += f", without which {listed(claims.held_up[one.of])} would end at a bound"
             text += OPEN * (open_gap and one.of.startswith("parameter:"))
+            text += GIVEN.format(listed(rests.get(one.of, ()))) * (one.of in rests)
             text += UNSURE * (not has_size(effects[one.of], values[one.of], KNOWN))
             text += f", {apart[one.of]}" if one.of in apart else ""
         else:
@@ -247,7 +254,7 @@ def _causes(
             text += _others(claims, identified, adopted)
             named = parameters_off(claims)[:NAMED]
             held = dict.fromkeys(other for n in named for other in given.get(n, ()))
-            text += f", given {listed(held)} as in the model" * bool(held)
+            text += GIVEN.format(listed(held)) * bool(held)
             vague = [n for n in named if n in lost]
             text += f", but these trials do not determine {listed(vague)}" * bool(vague)
             joined = [n for n in named if n in joint]
@@ -282,6 +289,20 @@ def _level(model: Model, claimed: Sequence[str]) -> list[str]:
         f"Gravity or a spring that acts about another {listed(names)} than the model's 0 looks the "
         "same in any log as a sensor's wrong zero, and is adopted in the same way."
     ]
+
+
+def _combined(model: Model, one: Combination) -> str:
+    """Return a sentence on values that the trials show only in combination."""
+    told = listed(
+        with_unit(f"{name} = {number(model.params[name].value)} +- {number(std)}", unit)
+        for name, std in one.rests_on.items()
+        for unit in [model.params[name].unit]
+    )
+    return (
+        f"These trials show {listed([*one.values, *one.rests_on])} only in combination, such as "
+        f"ratios: the values hold for {told}, as declared. To know each of them, measure one, or "
+        f"correct {listed(one.rests_on)} in the model, and diagnose again."
+    )
 
 
 def _apart(per_trial: Sequence[TrialValue], agreement: Sequence[Agreement]) -> dict[str, str]:
@@ -353,6 +374,7 @@ def _adopted_off(claims: Claims, name: str, told: Mapping[str, str]) -> str:
 
 
 BARELY = 0.01  # share of the improvement below which a claim needs another reason
+GIVEN = ", given {} as in the model"
 OPEN = ", unless the gap that remains is the reason"  # a value that a parameter should have
 UNSURE = ", but its size is uncertain: within 2 standard deviations of zero"
 

@@ -73,7 +73,7 @@ class Writer:
         self.predictor, self.data = self.search.predictor, self.search.data
         self.shown = list(zip(ruler.shown, ruler.names, strict=True))
         self.measured = Measured(decision, ruler, trials, first, exact)
-        self.claims = Claims(decision, self.measured.credit, known, ruler)
+        self.claims = Claims(decision, self.measured.credit, known, ruler, uncertain)
         self.left, self.uncertain = self.measured.left, uncertain
 
     @property
@@ -138,8 +138,19 @@ class Writer:
         lost, ended = self.unrepeatable(), at_bounds(self.claims)
         moved, parameters = how_many(predictor), self.claims.parameters()
         identified = tuple(_identified(self.uncertain, self.best, parameters))
-        if not self.ruler.held_out:  # what predicts no other trial is adopted only if it is known
-            identified = tuple(replace(one, jointly=False) for one in identified)
+        combinations = self.claims.by_priors.combinations
+        joint = {name for one in combinations for name in (*one.values, *one.rests_on)}
+        joint &= parameters.keys()
+        # what predicts no other trial is adopted only if it is known
+        held_out = self.ruler.held_out
+        identified = tuple(
+            replace(
+                one,
+                jointly=(one.jointly or one.parameter in joint)
+                and (held_out or one.verdict != "not identifiable"),
+            )
+            for one in identified
+        )
         said = verdict(
             self.claims,
             ranking,
@@ -152,6 +163,7 @@ class Writer:
             self.most,
             one_motion=moved == 1 < data.count,
             identified=identified,
+            combinations=combinations,
             per_trial=values,
             agreement=() if apart else agreement,
             changed=apart.changed if apart else None,
@@ -209,6 +221,7 @@ class Writer:
             noise=self.noise(),
             parameters=parameters,
             identifiable=identified,
+            combinations=combinations,
             prediction_error=rows,
             credit=credit,
             per_trial=values,

@@ -10,7 +10,7 @@ from grounded.diagnosis.hypotheses.explored import price
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.linearise import sensitivities, step_jacobian
+from grounded.diagnosis.likelihood.linearise import linearise, sensitivities, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, wrap
 
@@ -55,6 +55,27 @@ def test_the_jacobian_is_that_of_the_hypothesis(cars, name, values):
         error = np.abs(F[..., j] - slope)
         # kinks (braking, a limit that is just reached) lie on few of the steps
         assert np.quantile(error.max(axis=-1), 0.9) < 0.02 * max(1.0, np.abs(slope).max())
+
+
+@pytest.mark.parametrize(
+    ("name", "values"), [("viscous_friction:v", {"k": 2.0}), ("rate_gain:v", {"g": 0.3})]
+)
+def test_parameters_act_through_the_effects(cars, name, values):
+    """Slopes of the bare model were 30 % off beside a gain, and fits ended beside the optimum."""
+    _, data = cars
+    predictor = Predictor(data)
+    h = replace(Hypothesis().plus(effect(data, name), values), spread=1.0)
+    x, u, t = data.y[:-1], predictor.inputs(h), data.time
+    d, size = linearise(predictor, h, data.y)[1], 1e-6
+    free = [p for p in data.model.params.values() if p.spread > 0]
+    assert d.shape[-1] == 1 + len(values) + len(free)
+    for i, param in enumerate(data.model.params.values()):
+        shift = size * param.spread * np.eye(len(data.model.params))[i]
+        up, down = (predictor.advance(replace(h, shift=s), x, u, t) for s in (shift, -shift))
+        slope = data.model.difference(up, down) / (2 * size)
+        got = d[..., 1 + len(values) + i]
+        error = np.quantile(np.abs(got - slope).max(axis=-1), 0.9)
+        assert error <= 1e-3 * np.abs(slope).max()
 
 
 @pytest.mark.slow
@@ -104,6 +125,11 @@ def test_a_threshold_of_the_model_has_a_slope(cars):
     assert f_p[:, model.state_names.index("v"), stall].min() < 0
     others = [i for i in range(len(model.param_names)) if i != stall and exact[..., i].any()]
     np.testing.assert_array_equal(f_p[..., others], exact[..., others])
+    drag = Hypothesis().plus(effect(data, "viscous_friction:v"), {"k": 0.1})
+    near = replace(data, commands=np.full_like(data.commands, 0.182))
+    track = np.tile(x[0], (*data.y.shape[:2], 1))
+    d = linearise(Predictor(near), replace(drag, spread=1.0), track)[1]
+    assert d[..., 2 + stall].any()  # also beside effects
 
 
 @pytest.mark.slow

@@ -116,6 +116,16 @@ def test_a_parameter_known_only_with_the_others_is_adopted_and_marked(cart, tmp_
     assert any("not determined alone" in clause for clause in adopted["clauses"])
 
 
+def test_an_effect_that_shows_only_in_combination_is_adopted_and_marked(cart, tmp_path):
+    one = {"values": ["viscous_friction:v"], "rests_on": {"mass": 0.1}}
+    folder = written(copied(cart, tmp_path / "w"), combinations=[one])
+    done = grounded("-C", folder, "adopt", "viscous_friction:v")
+    assert done.code == 0 and "not determined alone" in done.out
+    assert grounded("-C", folder, "adopt", "--undo").code == 0
+    again = grounded("-C", folder, "adopt", "viscous_friction:v", "--json").json
+    assert again["jointly"] == ["viscous_friction:v"]
+
+
 def test_a_number_of_an_adopted_effect_that_stays_behind_is_told_by_its_effect(cart, tmp_path):
     """A KeyError, with grounded.toml written: it was looked for among the model's parameters."""
     adopted = {"name": "quadratic_drag:v", "k": 0.2}

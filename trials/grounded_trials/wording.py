@@ -20,7 +20,7 @@ ITERATION = (
     "iter.: improvements that a candidate builds on; it decreases where the search returns to "
     "an earlier one"
 )
-ALONE = " (not determined alone, only with the others)"  # of an adopted parameter
+ALONE = " (not determined alone, only with the others)"  # of an adopted value
 PIECES = 4  # largest number of ranges that a list of trials names
 NARROW, WIDE = 60, 80  # columns: smallest and largest line width
 MARKS = "\ufdd0\ufdd1\ufdd2\ufdd3\ufdd4"  # colour marks in a text, of zero width

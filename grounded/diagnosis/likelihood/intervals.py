@@ -47,7 +47,7 @@ def standard_deviations(
     """
     if fit.gram.shape[-1] == 0:
         return np.zeros(0), np.zeros(0)
-    std = _fisher(worth * fit.gram.sum(axis=0) + np.diag(fit.prior))
+    std = fisher(worth * fit.gram.sum(axis=0) + np.diag(fit.prior))
     half = 1.96 * std
     shifts, _ = leave_one_out(fit, trial_of)
     for some in (shifts, *_by_stretch(predictor, fit)):
@@ -102,7 +102,7 @@ def _whitener(information: Array) -> Array:
     return np.asarray(scale[:, None] * axes[:, known] / np.sqrt(size[known]))
 
 
-def _fisher(information: Array) -> Array:
+def fisher(information: Array) -> Array:
     """Return standard deviations from an information matrix (C, C).
 
     Unknowns that take part in a direction without information get a very large one.

@@ -33,12 +33,19 @@ start of the track to its smoothed value (`smoothed`),
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, losses_of, param_scale
+from grounded.diagnosis.likelihood.hypothesis import (
+    Hypothesis,
+    adds_to_steps,
+    losses_of,
+    param_scale,
+)
 from grounded.diagnosis.likelihood.moving import moving
 from grounded.diagnosis.likelihood.noise import NoiseModel
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -94,9 +101,10 @@ def linearise(
     r[..., 0] = model.difference(y - here, np.asarray(offset))
     if (begun := predictor.begun(h)) is not None:
         r[0, ..., 0] += begun
+    exact = not adds_to_steps(h) or simulated(model)
     F, f_p = (
         sensitivities_of(predictor, h, x, u, after)
-        if h.spread
+        if h.spread and exact
         else (step_jacobian(predictor, h, x, after), None)
     )
     theta, near = h.theta, tangent(predictor, h, x, u) if h.effects else predictor
@@ -116,9 +124,11 @@ def linearise(
             d[..., 1 + j], r[..., 1 + j] = by_d, by_r
             if by_d.any() or by_r.any():
                 break
-    if f_p is not None:
-        for j, i in enumerate(calibrated(data), start=1 + len(theta)):
+    for j, i in enumerate(calibrated(data) if h.spread else (), start=1 + len(theta)):
+        if f_p is not None:
             np.multiply(f_p[..., i], param_scale(model)[i], out=d[..., j])
+        else:
+            d[..., j] = _by_parameter(predictor, h, x, u, after, i)
     if data.idle.any():  # padding is never measured: identity, so that nothing grows there
         F, d[data.idle] = np.where(data.idle[..., None, None], np.eye(model.n), F), 0.0
     return F, d, r
@@ -272,6 +282,30 @@ def _nudged(h: Hypothesis, theta: Array, j: int, size: float) -> tuple[Hypothesi
     return other, moved
 
 
+def _by_parameter(
+    predictor: Predictor, h: Hypothesis, x: Array, u: Array, after: Array, i: int
+) -> Array:
+    """Return the slope of a hypothesis' steps in parameter i, in units of its scale (L, B, n).
+
+    Effects on steps act on what the parameter does: a rotor adds to the inertia that it scales. The
+    difference is one-sided, away from the nearer bound; that at a threshold is a secant.
+    """
+    model, time = predictor.data.model, predictor.data.time
+    param, start = model.params[model.param_names[i]], predictor.params(h)[i]
+
+    def reached(size: float) -> Array:
+        shift = np.zeros(model.system.k) if h.shift is None else h.shift.copy()
+        shift[i] += size * param.spread
+        return predictor.advance(replace(h, shift=shift), x, u, time)
+
+    size = SLIGHT if 2 * start < sum(param.reach) else -SLIGHT
+    slope = model.difference(reached(size), after) / size
+    if not slope.any():
+        slope = model.difference(reached(PART), reached(-PART)) / (2 * PART)
+    return np.asarray(slope)
+
+
+SLIGHT = 1e-5  # finite-difference step of a parameter, as a fraction of its scale
 SOME = 10  # samples that show at once of most parameters that they have a slope
 PART = 0.05  # fraction of a parameter's size, to each side, of the step for thresholds
 

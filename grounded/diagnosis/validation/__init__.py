@@ -17,6 +17,7 @@ Read `ruler`, then `decide`. The modules, from the measurement to the claims:
     blame              which of the model's own parameters are off
     claims             the claimed effects with intervals, their rivals and look-alikes
     averaged           intervals averaged over models
+    by_priors          values that only priors set, since the data show combinations
     limits             what the data can't determine
     agreement          whether the trials agree; changes between two groups of trials
 """

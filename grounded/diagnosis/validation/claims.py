@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from itertools import islice
 from typing import Any
+
+import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import CLAIM, TIE, parametric
 from grounded.diagnosis.hypotheses.lookalike import lookalikes, of_parameters, one_thing
@@ -15,9 +17,11 @@ from grounded.diagnosis.hypotheses.stand_in import moving, swap, twins
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.likelihood.intervals import standard_deviations
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Estimate, Likeness, Ranked
-from grounded.diagnosis.validation.averaged import averaged
+from grounded.diagnosis.validation.averaged import NORMAL, averaged
 from grounded.diagnosis.validation.blame import ENOUGH, moved_parameters
+from grounded.diagnosis.validation.by_priors import ByPriors, Key, by_priors
 from grounded.diagnosis.validation.credit import ordered
 from grounded.diagnosis.validation.decide import Decision
 from grounded.diagnosis.validation.gain import BETTER
@@ -47,13 +51,20 @@ class Claims:
     """The effects that the decision claims, or the parameters if calibration is enough."""
 
     def __init__(
-        self, decision: Decision, credit: dict[str, float], known: Limits, ruler: Ruler
+        self,
+        decision: Decision,
+        credit: dict[str, float],
+        known: Limits,
+        ruler: Ruler,
+        uncertain: Predictor | None = None,
     ) -> None:
+        """`uncertain`: evaluates hypotheses with those parameters free that the search held."""
         self.search, self.best, self.known = decision.search, decision.fit, known
         self.ruler = ruler
         self.whole, self.held_up = decision.whole, decision.held_up
         search, best, self.credit = decision.search, decision.fit, credit
         self.predictor, self.data = search.predictor, search.data
+        self._uncertain = uncertain or search.predictor
         self.names, self._same = best.hypothesis.names, dict[tuple[str, str], bool]()
         calibrating = not self.names and best.hypothesis.spread > 0
         self.null = best if calibrating else search.best_null()
@@ -182,7 +193,25 @@ class Claims:
     @cached_property
     def _sure(self) -> tuple[Array, Array]:
         """Model-averaged standard deviations and half-widths of the claim's values."""
-        return averaged(self.search, self.best, self.ruler, self._alone)
+        keys = [(e.name, q.name) for e in self.best.hypothesis.effects for q in e.free]
+        return self._widened(averaged(self.search, self.best, self.ruler, self._alone), keys)
+
+    @cached_property
+    def by_priors(self) -> ByPriors:
+        """Which values only priors set."""
+        return by_priors(self._uncertain, self.best, self.search.tempering.factor)
+
+    def _widened(self, sure: tuple[Array, Array], keys: Sequence[Key]) -> tuple[Array, Array]:
+        """Return standard deviations and half-widths, (C,) each, of at least those by priors.
+
+        A fit may hold its parameters, or keep them to a fraction of their priors. Of values that
+        only priors set, that would state what no data told. `keys` name the first of the values.
+        """
+        std, half = (np.array(a) for a in sure)
+        for i, key in enumerate(keys):
+            std[i] = max(std[i], self.by_priors.std.get(key, 0.0))
+            half[i] = max(half[i], NORMAL * self.by_priors.std.get(key, 0.0))
+        return std, half
 
     def _alone(self, fit: Fitted) -> tuple[Array, Array]:
         b = self.search.tempering.factor
@@ -311,12 +340,12 @@ class Claims:
         h, model = self.best.hypothesis, self.data.model
         if h.spread == 0 or h.shift is None:
             return {}
-        stds, halves = self._alone(self.best)
-        scale, k = param_scale(model), len(h.theta)
+        which, scale, k = calibrated(self.data), param_scale(model), len(h.theta)
+        own = tuple(a[k:] * scale[which] for a in self._alone(self.best))
+        stds, halves = self._widened(own, [("", model.param_names[i]) for i in which])
         found = {}
-        for at, index in enumerate(calibrated(self.data)):
+        for index, std, half in zip(which, stds.tolist(), halves.tolist(), strict=True):
             value = float(model.values[index] + h.shift[index])
-            std, half = (float(a[k + at] * scale[index]) for a in (stds, halves))
             name, interval = model.param_names[index], (value - half, value + half)
             param = model.params[name]
             found[name] = Estimate(value, std, interval, param.unit, param.stopped(value))

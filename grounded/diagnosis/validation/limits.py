@@ -12,13 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.diagnosis.error_report import Identifiable
-from grounded.diagnosis.hypotheses.leftover import filter_of
 from grounded.diagnosis.likelihood.data import PIECES, Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
-from grounded.diagnosis.likelihood.linearise import base_columns
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.report import Estimate
+from grounded.diagnosis.validation.by_priors import information
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -32,7 +31,6 @@ from grounded.effects import (
 )
 from grounded.effects.actuator import backlash
 from grounded.effects.sensed import moved_model
-from grounded.filter import kalman
 from grounded.frozen import Array
 from grounded.instruments.finding import Finding
 from grounded.model import Model, Param
@@ -372,13 +370,7 @@ def _information(predictor: Predictor, fit: Fitted) -> Array:
 
     The values of the effects are marginalised.
     """
-    h, k = fit.hypothesis, len(fit.hypothesis.theta)
-    columns, of_log = base_columns(predictor, replace(fit, hypothesis=replace(h, spread=1.0)))
-    if columns.shape[-1] == k:
-        return np.zeros((0, 0))
-    white = kalman.innovations(filter_of(predictor, fit), columns, of_log)[0]
-    W = white.reshape(-1, columns.shape[-1])
-    G = np.nan_to_num(W.T @ W)
+    k, G = len(fit.hypothesis.theta), information(predictor, fit)
     across = G[k:, :k]
     return np.asarray(G[k:, k:] - across @ np.linalg.pinv(G[:k, :k], hermitian=True) @ across.T)
 

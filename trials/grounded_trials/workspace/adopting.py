@@ -59,7 +59,7 @@ class Adopted(Result):
     beside: tuple[str, ...] = ()  # adopted from the same diagnosis, but fitted instead of these
     left: Mapping[str, Left] = field(default_factory=dict)  # by parameter name
     logged: str = ""  # the trial that target.csv still repeats, if it ran no candidate
-    jointly: tuple[str, ...] = ()  # of `params`: determined only together with the others
+    jointly: tuple[str, ...] = ()  # parameters and effects determined only with the others
     rewritten: tuple[Rewritten, ...] = ()  # of effects that were adopted before
     stopped: str = ""  # what to do about parameters that reached their bounds
 
@@ -144,7 +144,10 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
         logged=logged_target(workspace) if not workspace.candidate_ids() else "",
         beside=tuple(n for n in beside if n not in fitted),
         left=left_behind(found) if parameters and physics and claimed else {},
-        jointly=tuple(name for name in own if name in calibrated and name in found.jointly),
+        jointly=(
+            *(name for name in own if name in calibrated and name in found.jointly),
+            *(name for name in names if name in found.combined),
+        ),
         rewritten=_rewritten(workspace, old, adopted),
         stopped=wider(found.parameters) if parameters and physics and claimed else "",
     )
