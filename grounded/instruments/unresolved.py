@@ -32,8 +32,7 @@ def judge_resolution(
     """
     if model.derivative is None or len(trials) < 2:
         return
-    size = np.array([_spread(t) for t in trials])
-    reach = np.array([np.nanmax(np.abs(t.states), axis=0, initial=0.0) for t in trials])
+    size, reach = np.array([_extent(t) for t in trials]).swapaxes(0, 1)
     for k, trial in enumerate(trials):
         others = [j for j in range(len(trials)) if j != k]
         usual, far = np.median(size[others], axis=0), np.median(reach[others], axis=0)
@@ -57,8 +56,13 @@ def judge_resolution(
         yield k, keep, Finding(name, text, "unresolved", share=share, corrected=True)
 
 
-def _spread(trial: Trial) -> Array:
-    return np.asarray(np.nan_to_num(np.nanstd(trial.states, axis=0)))
+def _extent(trial: Trial) -> tuple[Array, Array]:
+    """Return spread and largest size of each state (n,), infinite if it was not measured."""
+    spread, reach = np.full((2, trial.states.shape[1]), np.inf)
+    seen = np.flatnonzero(np.isfinite(trial.states).any(axis=0))
+    spread[seen] = np.nanstd(trial.states[:, seen], axis=0)
+    reach[seen] = np.nanmax(np.abs(trial.states[:, seen]), axis=0)
+    return spread, reach
 
 
 def _error_of_a_step(model: Model, trial: Trial, shown: Sequence[int]) -> Array:
