@@ -47,7 +47,11 @@ def simulate(problem: Problem, policy: Policy) -> Rollout:
 
     If the policy acts on old samples (`Problem.age`), what it sees depends on the run. So the run
     is repeated until it agrees with what was seen: each repeat makes at least one more step right.
+    A policy made with a longer latency feeds back older inputs than this problem's z holds: z is
+    extended by them.
     """
+    if policy.depths != problem.depths:
+        problem = replace(problem, fed_back=policy.depths)
     run = _simulated(problem, policy)
     if not problem.age or policy.gain is None or policy.reference is None:
         return run

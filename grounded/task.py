@@ -46,6 +46,8 @@ class Task:
         safety_low: (n,) lower bounds on predicted states; -inf for no bound.
         safety_high: (n,) upper bounds on predicted states; inf for no bound.
         smoothing: width over which the PLANNING model blends non-smooth terms (`np.where`, `abs`).
+        fed_back: (m,) number of past inputs that policies feed back at least, for those made with a
+            longer latency; empty for as many as the latency needs.
 
     Raises:
         GroundedError: if shapes do not match, lower limits are not below the upper ones, the held
@@ -66,6 +68,7 @@ class Task:
     safety_low: Array | None = None
     safety_high: Array | None = None
     smoothing: float = 0.05
+    fed_back: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         for name, kind in (("model", Model), ("reward", Reward)):
@@ -219,6 +222,7 @@ class Task:
             high=self.high,
             angles=model.angle_mask,
             smoothing=0.0 if exact else self.smoothing,
+            fed_back=self.fed_back,
         )
 
     def policy(self, ubar: Array, gain: Array | None, reference: Array | None) -> Policy:

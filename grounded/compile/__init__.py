@@ -25,6 +25,7 @@ from grounded.compile.problem import (
     Status,
     Swarm,
     System,
+    deepest,
     history_depths,
 )
 from grounded.compile.run.traced import TracedSystem
@@ -40,6 +41,7 @@ __all__ = [
     "Status",
     "Swarm",
     "System",
+    "deepest",
     "history_depths",
     "system_of",
 ]

@@ -63,6 +63,11 @@ def history_depths(delay: Array) -> tuple[int, ...]:
     return tuple(max(1, int(np.ceil(d - 1e-9))) for d in delay)
 
 
+def deepest(depths: tuple[int, ...], others: tuple[int, ...]) -> tuple[int, ...]:
+    """For each input the larger of two depths; without `others`, those given."""
+    return tuple(map(max, depths, others)) if others else depths
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """Sizes: n states, m inputs, k parameters, H steps, D = sum of the history depths."""
@@ -85,6 +90,7 @@ class Problem:
     input_shift: Array | None = None  # (H, m) off what the actuators receive, see `bias`
     age: float = 0.0  # [s] of the samples that a policy acts on, see `rollout.seen_late`
     smoothing: float = 0.0  # width of the smoothed indicator terms; 0: exact
+    fed_back: tuple[int, ...] = ()  # past inputs of each that a policy feeds back at most
 
     @property
     def horizon(self) -> int:
@@ -93,8 +99,8 @@ class Problem:
 
     @cached_property
     def depths(self) -> tuple[int, ...]:
-        """Past inputs in z for each input."""
-        return history_depths(self.delay)
+        """Past inputs in z for each input: those on their way, and those that are fed back."""
+        return deepest(history_depths(self.delay), self.fed_back)
 
     @cached_property
     def input_scale(self) -> Array:

@@ -103,6 +103,7 @@ def propose(
         return Proposal(now, None, is_new=False)
     if options.refit and now.incumbent is not None:
         planner = planner.with_model((refit or refitted)(planner.plan, trials))
+    planner = planner.feeding_back(tried.candidate.policy for tried in now.history)
     make = Maker(planner, now, identity or f"c{len(candidates) + 1:04d}", fingerprint)
     if now.incumbent is None:
         policy, plan = planner.first_policy(now.caution, tick)

@@ -77,7 +77,7 @@ class About:
     ) -> None:
         self.make, self.incumbent, self.options, self.way = make, incumbent, options, way
         self.original = original
-        planner, plan = make.planner, make.planner.plan
+        planner, plan = make.planner, make.planner.engaged
         own = planner.lift(begun_at(planner.task, incumbent.trials))
         plan.model.system.check(own.states[:-1], own.inputs, plan.model.values, plan.dt)
         matched = options.match_inputs and way != "recorded inputs"
@@ -87,8 +87,8 @@ class About:
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
         # without a bias: independent of noise and start
         age = sample_age(planner.task, incumbent.candidate, incumbent.trials)
-        self.plain = replace(plan.problem(exact=True), age=age)
-        self.real = exact.on(self.plain)
+        self.plain = replace(planner.plan.problem(exact=True), age=age)
+        self.real = exact.on(replace(plan.problem(exact=True), age=age))
         self.theta = planner.widened(incumbent.candidate.policy)
         self.run = (own.states[:, : planner.task.model.n], own.inputs)
         self.corrected: Corrected | None = None

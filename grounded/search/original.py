@@ -64,7 +64,7 @@ def keeping_promises(about: About) -> About:
         about: the current model grounded on the incumbent's trial.
     """
     make, planner = about.make, about.make.planner
-    if planner.plan is planner.task:
+    if planner.as_given:
         return about
     history = make.now.history
     stopped = [t.candidate.id for t in history if stopped_on_path(planner.task, t, history)]
@@ -72,7 +72,8 @@ def keeping_promises(about: About) -> About:
     much = adopted.promised >= LITTLE * -about.incumbent.utility
     if not (much and adopted.broken and adopted.share < original.share):
         return about
-    crude = replace(make, planner=Planner(planner.task, planner.task))
+    bare = Planner(planner.task, planner.task)
+    crude = replace(make, planner=bare.feeding_back(t.candidate.policy for t in history))
     original_one = About(crude, about.incumbent, about.options, about.way, original=True)
     off = abs(original_one.already - about.incumbent.utility)
     return original_one if off < FORETOLD * -about.incumbent.utility else about

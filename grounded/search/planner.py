@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.compile import Problem
+from grounded.compile import Problem, deepest
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.model import Model
@@ -48,16 +48,24 @@ class Planner:
         plan: has the planning model, whose first states are the task's.
         widths: names of parameters of the planning model that are speeds over which a dry friction
             builds up.
+        plays: names of its parameters that are widths of a play.
     """
 
     task: Task
     plan: Task
     widths: tuple[str, ...] = ()
+    plays: tuple[str, ...] = ()
 
     @cached_property
     def fingerprint(self) -> str:
         """Fingerprint of the planning model, see `model_fingerprint`."""
         return model_fingerprint(self.plan)
+
+    @property
+    def as_given(self) -> bool:
+        """Whether nothing was adopted: plans are made with the task's own model and latency."""
+        latencies = np.array([self.plan.latency, self.task.latency])
+        return self.plan.model is self.task.model and not np.ptp(latencies, axis=0).any()
 
     @property
     def needs_margin(self) -> bool:
@@ -67,21 +75,38 @@ class Planner:
         return remembers or bool(self.plan.latency.any() or self.widths)
 
     def loosened(self, problem: Problem) -> Problem | None:
-        """Return the problem with dry friction that builds up slowly; None if there is none."""
-        return dataclasses.replace(problem, p=self.loose.model.values) if self.widths else None
+        """Return the problem without play, and with dry friction that builds up slowly.
+
+        None if it has neither.
+        """
+        kinked = self.widths or self.plays
+        return dataclasses.replace(problem, p=self.loose.model.values) if kinked else None
 
     def dearer(self, problem: Problem, factor: float) -> Problem:
-        """Return the problem, loosened if it has dry friction, with `factor` the input weights."""
+        """Return the problem, loosened, with `factor` the input weights."""
         easier = self.loosened(problem) or problem
         weight = factor * easier.input_weight + (factor - 1) * easier.change_weight
         return dataclasses.replace(easier, input_weight=weight)
 
     @cached_property
     def loose(self) -> Task:
-        """The planning task with dry friction that builds up slowly; unchanged if it has none."""
-        model = self.plan.model
+        """The planning task without play, and with dry friction that builds up slowly."""
+        model = self.engaged.model
         slow = {name: LOOSE * model.params[name].value for name in self.widths}
-        return self.plan.with_model(model.with_values(slow)) if slow else self.plan
+        return self.engaged.with_model(model.with_values(slow)) if slow else self.engaged
+
+    @cached_property
+    def engaged(self) -> Task:
+        """The planning task without play, which plans are made with.
+
+        Within a play an input has no slope: gains vanish at most steps and are huge at a few, so
+        that the feedback is nearly switched off. Such plans cost a car with 20 mrad of play four
+        times as much as plans without it. A trial's bias replays what the play did.
+        """
+        if not self.plays:
+            return self.plan
+        model = self.plan.model.with_values(dict.fromkeys(self.plays, 0.0))
+        return self.plan.with_model(model)
 
     @cached_property
     def aim(self) -> Task:
@@ -94,7 +119,7 @@ class Planner:
         """
         n, names = self.task.model.n, self.plan.model.state_names
         if len(names) == n:
-            return self.plan
+            return self.engaged
         from grounded.places import true_values
 
         terminal, target = self.plan.reward.terminal.copy(), self.plan.target.copy()
@@ -103,7 +128,7 @@ class Planner:
                 terminal[true] = terminal[logged]
                 target[:, true] = target[:, logged]
         goals = dataclasses.replace(self.plan.reward, terminal=terminal)
-        return dataclasses.replace(self.plan, target=target, reward=goals)
+        return dataclasses.replace(self.engaged, target=target, reward=goals)
 
     def lift(self, trial: Trial) -> Trial:
         """Return a trial with the planning model's memory states added."""
@@ -121,7 +146,21 @@ class Planner:
         """Return a robot's policy over the planning model's z."""
         model = self.plan.model
         angles = tuple(bool(a) for a in model.angle_mask)
-        return policy.laid_out(model.state_names, angles, self.plan.problem().depths)
+        depths = deepest(self.plan.problem().depths, policy.depths)
+        return policy.laid_out(model.state_names, angles, depths)
+
+    def feeding_back(self, policies: Iterable[Policy]) -> Planner:
+        """Return the planner with as many past inputs in z as any of the policies feeds back.
+
+        They may have been made with a longer latency. Without the gains on the oldest inputs such a
+        loop would seem unstable.
+        """
+        own = depths = self.plan.problem().depths
+        for policy in policies:
+            depths = deepest(depths, policy.depths)
+        if depths == own:
+            return self
+        return dataclasses.replace(self, plan=dataclasses.replace(self.plan, fed_back=depths))
 
     def narrowed(self, policy: Policy) -> Policy:
         """Return a planned policy over the states that the robot measures and the inputs sent."""
@@ -198,7 +237,8 @@ def fixed_draws(count: int) -> Array:
 def predicted(problem: Problem, policy: Policy) -> Rollout:
     """Simulate a robot's policy in a model that may have more states than the robot measures."""
     angles = tuple(map(bool, problem.angles))
-    return simulate(problem, policy.laid_out(problem.system.states, angles, problem.depths))
+    depths = deepest(problem.depths, policy.depths)
+    return simulate(problem, policy.laid_out(problem.system.states, angles, depths))
 
 
 Given = Mapping[str, float]  # an effect's quantities by name
@@ -260,7 +300,13 @@ def planner_with(
         model = wrap(effect, checked(effect, values), task.dt)
     latency -= part
     widths = tuple(param_name(name, "width") for name, values in effects if "width" in values)
-    return dataclasses.replace(planner_for(task, model, latency), widths=widths)
+    plays = tuple(
+        param_name(name, "b")
+        for (name, _), family in zip(effects, families, strict=True)
+        if family.name == "backlash"
+    )
+    made = planner_for(task, model, latency)
+    return dataclasses.replace(made, widths=widths, plays=plays)
 
 
 WHOLE = 1e-6  # tolerance, as a fraction of a step, for whole numbers of steps

@@ -380,8 +380,8 @@ class Check:
         from grounded.trial import mean_trial
 
         planner, made = self.workspace.planner, self.candidate
-        plan, horizon = planner.plan, planner.task.horizon
-        problem = replace(plan.problem(exact=True), age=made.sample_age)
+        plan, horizon = planner.engaged, planner.task.horizon
+        problem = replace(planner.plan.problem(exact=True), age=made.sample_age)
         for identity in (made.id, made.base):
             ran = [t.until(horizon) for t in self._trials(identity)] if identity else []
             whole = [t for t in ran if t.finite_steps == horizon]
@@ -389,7 +389,8 @@ class Check:
                 own = planner.lift(mean_trial(whole, planner.task.model.angle_mask))
                 matched = self.workspace.config.search.match_inputs
                 shift = ground(plan, own, match_inputs=matched).shift
-                problem = ground(plan, own, exact=True, shift=shift).on(problem)
+                engaged = replace(plan.problem(exact=True), age=made.sample_age)
+                problem = ground(plan, own, exact=True, shift=shift).on(engaged)
                 break
         run = simulate(problem, planner.widened(made.policy))
         states = run.states[:, : planner.task.model.n]
