@@ -1,0 +1,67 @@
+"""Plans with an adopted play, and policies that feed back older inputs than a new model's z has."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded.search.planner import Planner, planner_with, predicted
+from small_tasks import rover_task
+
+LATE = ("delay:turn", {"d": 0.12})  # with TASK, 2.8 steps: without play, z has three past inputs
+TASK = rover_task()
+
+
+def with_play(width):
+    return planner_with(TASK, [("backlash:turn", {"b": width}), LATE])
+
+
+@pytest.fixture(scope="module")
+def late():
+    planner = planner_with(TASK, [LATE])
+    return planner, planner.first_policy()[0]
+
+
+def from_aside(planner, policy):
+    """The predicted utility of a run that starts 0.2 m and 0.3 rad off."""
+    problem = planner.plan.problem(exact=True)
+    start = problem.start.copy()
+    start[:3] += [0.1, -0.2, 0.3]
+    return predicted(replace(problem, start=start), policy).utility
+
+
+def test_a_model_with_less_latency_feeds_back_what_the_policy_does(late):
+    """A play splits a latency: the gains on the oldest input were dropped, and -0.028 was -11.9."""
+    planner, policy = late
+    play = with_play(1e-9)
+    assert policy.depths == (1, 3) and play.plan.problem().depths == (1, 2)
+    assert np.abs(policy.gain[:, 1, -1]).max() > 0.05
+    assert from_aside(play, policy) == pytest.approx(from_aside(planner, policy), rel=1e-3)
+    wide = play.widened(policy)
+    assert wide.depths == (1, 3) and (wide.gain[:, :, -1] == policy.gain[:, :, -1]).all()
+
+
+def test_a_planner_remembers_what_earlier_policies_feed_back(late):
+    planner, policy = late
+    play = with_play(0.1)
+    more = play.feeding_back([policy])
+    assert more.plan.problem().depths == more.aim.problem().depths == (1, 3)
+    assert more.fingerprint == play.fingerprint and more.plays == play.plays
+    assert planner.feeding_back([policy]) is planner
+    bare = Planner(TASK, TASK)
+    assert bare.as_given and bare.feeding_back([policy]).as_given and not play.as_given
+
+
+@pytest.mark.parametrize("width", [0.05, 0.5])
+def test_gains_do_not_vanish_within_a_play(late, width):
+    """Steering gains on the heading fell from 2.9 to 0.09, with 69 at single steps."""
+    planner, policy = late
+    play = with_play(width)
+    made, _ = play.first_policy()
+    own, other = (np.abs(one.gain[:, :, :3]) for one in (made, policy))
+    assert np.median(own[:, 1, 2]) == pytest.approx(np.median(other[:, 1, 2]), rel=0.1)
+    assert own.max() < 2 * other.max()
+    assert play.plan.model.params[play.plays[0]].value == width
+    assert play.engaged.model.params[play.plays[0]].value == 0.0
+    assert play.loosened(play.plan.problem()) is not None
+    assert planner.engaged is planner.plan and planner.loosened(planner.plan.problem()) is None
