@@ -8,7 +8,8 @@ model, and even thousands of nats are not conclusive. So the likeliest hypothese
 under every other noise structure, are compared by the `ruler`:
 
     1. A rival replaces the likeliest hypothesis only if it predicts clearly better.
-    2. A cause is dropped if predictions without it are as good within their scatter. A further
+    2. A cause is dropped if predictions without it are as good within their scatter, or to half a
+       per cent of their errors in the mean (other trials gain nothing by it). A further
        effect with very high evidence, beside white innovations only, is dropped only if predictions
        gain nothing.
     3. An effect that a parameter's shift undoes is dropped; the parameter alone describes both.
@@ -55,6 +56,7 @@ WHITE = 0.9  # tempering factor above which the innovations count as white
 OVERRULES = (3.0, 0.1)  # the same for a rival that is likely under another noise structure only
 FROM_NONE = (3.0, 0.3)  # the same if the likeliest hypothesis has no cause: that noise is all
 SEEN = 0.08  # log gain of a claim, in some channel at some horizon, below which it is not made
+NO_HELP = 0.005  # mean log gain below which predictions are as good without a cause
 SLIGHT = 0.02  # smallest share of the total gain, in some channel, of a cause that is named
 AMOUNTS = 0.1  # a rival's advantage must be this part of what the likeliest gains,
 FAR = 1.5  # of at most this log gain (errors down to a quarter) if it has another noise structure
@@ -319,6 +321,7 @@ def _pruned(
             return fit, without, doubtful
         gains = {name: ruler.gain(less, fit) for name, less in without.items()}
         least = SLIGHT * ruler.since_outset(fit)
+        some = search.data.count > 1  # of one log, all pieces but one may miss a rare motion
         undone = counterparts(search.predictor, fit.hypothesis)
         repeated = {n: repeats(search, fit, without[n], n) for n in equations(fit)}
         repeated |= {n: 0 for n, k in repeated.items() if k and _whole(search, fit, without[n], n)}
@@ -329,7 +332,9 @@ def _pruned(
             or [
                 name
                 for name, less in without.items()
-                if gains[name].channels.max() < least or not _pays(search, ruler, less, fit, white)
+                if gains[name].channels.max() < least
+                or (some and gains[name].mean < NO_HELP)
+                or not _pays(search, ruler, less, fit, white)
             ]
         )
         if not undone:  # what loses nothing is not needed, whatever its evidence
