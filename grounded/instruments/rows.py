@@ -61,6 +61,7 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
         model: any; a simulator that can't take a short step has no such rows.
         shown: indices of the states with a sensor.
     """
+    model = places.direct(model)
     dt = places.probe(model, SHORT)
     if dt > SHORT:
         return []
