@@ -106,11 +106,10 @@ def _late_message(workspace: Folder, one: Finding, meta: Mapping[str, str]) -> s
     whole = {_keys(meta, name).get("delay_s", 0.0) - one.delay_s for name in names}
     if one.signal in names or not {*where} <= {*names} or len(whole) > 1:
         return ""
-    fed = ", and let the robot's program, which gets them late too, predict them ahead by as much"
+    ahead = " and let the robot's program predict them ahead by as much"
     return (
-        f"more likely the message with {listed(names)} is late by that: set delay_s = "
-        f"{whole.pop():.3g} for each of them in [log.state]"
-        f"{fed * workspace.config.task.feedback}"
+        f"{listed(names)} are in one message, more likely late: set delay_s = {whole.pop():.3g} "
+        f"for each in [log.state]{ahead * workspace.config.task.feedback}"
     )
 
 
