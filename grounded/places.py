@@ -152,6 +152,12 @@ def samples(model: Model, count: int = 3) -> tuple[Array, Array]:
     return x, rng.uniform(0.2, 1.0, (count, model.m))
 
 
+def within_limits(model: Model, count: int = 3) -> tuple[Array, Array]:
+    """Return samples, and the same with small inputs, within limits that a model has of its own."""
+    x, u = samples(model, count)
+    return np.concatenate([x, x]), np.concatenate([u, 0.01 * u])
+
+
 def probe(model: Model, dt: float) -> float:
     """Return a step for probing a model [s]: dt, or the nearest that its simulator supports."""
     own = float(getattr(model.step, "timestep", 0.0))
@@ -177,7 +183,7 @@ def integrated(model: Model) -> dict[str, tuple[str, float]]:
     is the velocity after the step.
     """
     model = direct(model)
-    (x, u), dt = samples(model), probe(model, 1e-8)
+    (x, u), dt = within_limits(model), probe(model, 1e-8)
     after = model.system.step(x, u, model.values, dt)
     moved, names, found = (after - x) / dt, model.state_names, {}
     if dt > SHORT:

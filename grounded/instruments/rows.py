@@ -65,7 +65,7 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
     dt = places.probe(model, SHORT)
     if dt > SHORT:
         return []
-    x, u = places.samples(model, 8)
+    x, u = places.within_limits(model, 8)
     f_x, f_u = model.system.linearise(x, u, model.values, dt)
     slopes = (f_x - np.eye(model.n)) / dt
     fast = np.array([unit.endswith("/s") for unit in model.states.values()])

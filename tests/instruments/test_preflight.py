@@ -730,6 +730,25 @@ def test_what_an_adopted_effect_hides_of_an_input_is_no_relation_of_sensors(hide
     assert [one.finding for one in found.findings] == []
 
 
+@pytest.mark.parametrize("limit", [0.1, 0.45])
+def test_an_input_beyond_the_models_own_limits_makes_no_relation_of_sensors(limit):
+    """A steering that the crude model itself limits to 0.45 rad was probed beyond that only."""
+
+    def within(s, a, p):
+        steering = np.minimum(np.maximum(a.steering, -limit), limit)
+        return {
+            "v": a.push - s.v,
+            "x": s.v * np.cos(s.psi),
+            "y": s.v * np.sin(s.psi),
+            "psi": s.v * np.tan(steering) / 0.5,
+        }
+
+    limited = replace(TRUCK, derivative=within)
+    assert not integrals(limited)
+    rows = kinematic_rows(limited, range(limited.n))
+    assert [limited.state_names[row.i] for row in rows] == ["x", "y"]
+
+
 def test_a_relation_of_sensors_outlasts_effects_on_the_inputs():
     arm_late = adopted(ARM, ("dead_zone:u", {"c": 0.1}), ("first_order_lag:u", {"tau": 0.1}))
     assert integrals(arm_late) == integrals(ARM) != []
