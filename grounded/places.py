@@ -9,7 +9,7 @@ Effects whose targets can't be determined are not candidates.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -152,18 +152,38 @@ def samples(model: Model, count: int = 3) -> tuple[Array, Array]:
     return x, rng.uniform(0.2, 1.0, (count, model.m))
 
 
+def within_limits(model: Model, count: int = 3) -> tuple[Array, Array]:
+    """Return samples, and the same with small inputs, within limits that a model has of its own."""
+    x, u = samples(model, count)
+    return np.concatenate([x, x]), np.concatenate([u, 0.01 * u])
+
+
 def probe(model: Model, dt: float) -> float:
     """Return a step for probing a model [s]: dt, or the nearest that its simulator supports."""
     own = float(getattr(model.step, "timestep", 0.0))
     return max(1, round(dt / own)) * own if own else dt
 
 
+def direct(model: Model) -> Model:
+    """Return the model without adopted effects on its inputs, with the current parameters.
+
+    Its states are the first ones of the model. What an input moves shows in its slopes: a delay, a
+    dead zone or a saturation that was adopted would hide it.
+    """
+    found = getattr(model.step, "direct", None)
+    if not isinstance(found, Model):
+        return model
+    return replace(found, params={name: model.params[name] for name in found.params})
+
+
 def integrated(model: Model) -> dict[str, tuple[str, float]]:
     """Return states whose rate is c times another state: {angle: (angular velocity, c)}.
 
-    For a simulator with a fixed time step, this is the velocity after the step.
+    No input moves such a rate, at once or late. For a simulator with a fixed time step, the rate
+    is the velocity after the step.
     """
-    (x, u), dt = samples(model), probe(model, 1e-8)
+    model = direct(model)
+    (x, u), dt = within_limits(model), probe(model, 1e-8)
     after = model.system.step(x, u, model.values, dt)
     moved, names, found = (after - x) / dt, model.state_names, {}
     if dt > SHORT:

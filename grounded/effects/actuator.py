@@ -237,8 +237,8 @@ def _backlash(site: Site) -> tuple[Quantity, ...]:
 
 
 def _advance_delay(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tuple[Any, ...]]:
-    steps = c["d"] / dt
     queue = (u, *z)
+    steps = np.minimum(c["d"] / dt, len(z))  # what is older than the queue is not known
     received: Any = 0.0
     for i, past in enumerate(queue):
         received = received + np.maximum(1 - np.abs(steps - i), 0.0) * past

@@ -97,6 +97,8 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
         vars(step)["shell"] = _Shell(effect, whole, dt)
     if isinstance(family, InputFamily | MemoryFamily) and (late := behind_logs(model)):
         vars(step)["behind"] = late.lifted(model)
+    if isinstance(family, InputFamily | MemoryFamily):
+        vars(step)["direct"] = getattr(model.step, "direct", model)
     vars(step)["medium"] = effect if isinstance(family, MediumFamily) else medium_of(model)
     written = model.step or model.derivative
     vars(step)["__wrapped__"] = getattr(written, "__wrapped__", written)  # `where`: the user's

@@ -61,10 +61,11 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
         model: any; a simulator that can't take a short step has no such rows.
         shown: indices of the states with a sensor.
     """
+    model = places.direct(model)
     dt = places.probe(model, SHORT)
     if dt > SHORT:
         return []
-    x, u = places.samples(model, 8)
+    x, u = places.within_limits(model, 8)
     f_x, f_u = model.system.linearise(x, u, model.values, dt)
     slopes = (f_x - np.eye(model.n)) / dt
     fast = np.array([unit.endswith("/s") for unit in model.states.values()])

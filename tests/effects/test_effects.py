@@ -230,6 +230,16 @@ def test_several_effects_wrap_one_another():
     assert memory_of(model, car, TRIAL).shape == (TRIAL.steps + 1, 4)
 
 
+def test_a_delay_passes_its_oldest_input_on_in_steps_shorter_than_its_own():
+    """Its queue holds inputs of control steps; in a shorter one nothing of the input was left."""
+    late = wrap(Library().effect(f"delay:{pendulum.input_names[0]}", pendulum), {"d": 0.03}, 0.02)
+    x, short = np.zeros((1, late.n)), 1e-5
+    x[0, -1] = 2.0
+    after = late.system.step(x, np.zeros((1, 1)), late.values, short)[:, : pendulum.n]
+    at_once = pendulum.system.step(x[:, : pendulum.n], [[2.0]], pendulum.values, short)
+    np.testing.assert_allclose(after, at_once)
+
+
 def test_sensor_delay():
     """A logged heading that is 0.1 s old is the true heading two steps ago."""
     effect = Library().effect("sensor_delay:psi", car, sizes(TRIAL))

@@ -8,12 +8,14 @@ import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
+from grounded.effects import Library, wrap
 from grounded.errors import GroundedError, NextCommand
 from grounded.instruments.constant import constant_of
 from grounded.instruments.dead import dead_rates
 from grounded.instruments.kinematics import turned
 from grounded.instruments.lag import at_samples, lag_between
 from grounded.instruments.preflight import preflight
+from grounded.instruments.rows import kinematic_rows
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
 from grounded.places import integrals
@@ -680,3 +682,73 @@ def test_two_rates_in_rpm_are_no_clock():
         ("w2", "degrees", True),
     ]
     np.testing.assert_allclose(looked.trials[0].states[:, 2], trials[0].states[:, 2] / factor)
+
+
+TRUCK = Model(
+    states={"v": "m/s", "x": "m", "y": "m", "psi": "rad"},
+    inputs={"steering": "rad", "push": "m/s^2"},
+    params={"L": Param(0.5, "m", std=0.02)},
+    angles=("psi",),
+    derivative=lambda s, a, p: {
+        "v": a.push - s.v,
+        "x": s.v * np.cos(s.psi),
+        "y": s.v * np.sin(s.psi),
+        "psi": s.v * np.tan(a.steering) / p.L,
+    },
+)
+CROOKED = ("coupling:psi<-v", {"k": 0.04})
+LATE = ("delay:steering", {"d": 0.008})
+PLAY = ("backlash:steering", {"b": 0.02})
+SHORT_OF = ("saturation:steering", {"c": 0.1})
+
+
+def adopted(model, *effects):
+    """Return a model with effects, the innermost first."""
+    for name, values in effects:
+        effect = Library().effect(name, model)
+        model = wrap(effect, values, DT)
+    return model
+
+
+@pytest.mark.parametrize("hides", [(LATE, PLAY), (PLAY, LATE), (SHORT_OF,), (SHORT_OF, LATE)])
+def test_what_an_adopted_effect_hides_of_an_input_is_no_relation_of_sensors(hides):
+    truck = adopted(TRUCK, CROOKED, *hides)
+    assert not integrals(truck)
+    rows = kinematic_rows(truck, range(TRUCK.n))
+    assert [truck.state_names[row.i] for row in rows] == ["x", "y"]
+
+    rng, start = np.random.default_rng(0), np.zeros((1, truck.n))
+    t = np.arange(400) * DT
+    inputs = np.stack([0.3 * np.sin(1.3 * t), 1.5 + 0.5 * np.sin(0.7 * t)], axis=1)
+    states = [start[0]]
+    for u in inputs:
+        states.append(truck.system.step(states[-1][None], u[None], truck.values, DT)[0])
+    x = np.array(states) + 1e-3 * rng.standard_normal((401, truck.n))
+    x[:, TRUCK.n :] = np.nan
+    trial = Trial(x, inputs, DT, truck.state_names, truck.input_names)
+    found = preflight(truck, [trial], hidden=truck.state_names[TRUCK.n :])
+    assert [one.finding for one in found.findings] == []
+
+
+@pytest.mark.parametrize("limit", [0.1, 0.45])
+def test_an_input_beyond_the_models_own_limits_makes_no_relation_of_sensors(limit):
+    """A steering that the crude model itself limits to 0.45 rad was probed beyond that only."""
+
+    def within(s, a, p):
+        steering = np.minimum(np.maximum(a.steering, -limit), limit)
+        return {
+            "v": a.push - s.v,
+            "x": s.v * np.cos(s.psi),
+            "y": s.v * np.sin(s.psi),
+            "psi": s.v * np.tan(steering) / 0.5,
+        }
+
+    limited = replace(TRUCK, derivative=within)
+    assert not integrals(limited)
+    rows = kinematic_rows(limited, range(limited.n))
+    assert [limited.state_names[row.i] for row in rows] == ["x", "y"]
+
+
+def test_a_relation_of_sensors_outlasts_effects_on_the_inputs():
+    arm_late = adopted(ARM, ("dead_zone:u", {"c": 0.1}), ("first_order_lag:u", {"tau": 0.1}))
+    assert integrals(arm_late) == integrals(ARM) != []

@@ -1,6 +1,9 @@
 """What a sensor does is mended in [log], or in the program that writes grounded's own trials."""
 
+import json
+import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.config import read_config
 from grounded_trials.workspace.diagnosing import instruments_in
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import READ_BY
 from grounded_trials.workspace.intake.ingest import ingest_log
 from grounded_trials.workspace.intake.where_to_mend import one_message, where_to_mend
 from workspaces import make
@@ -86,6 +90,41 @@ psi = { path = "TOPIC.pose.orientation.@rpy.yaw" }
     toml = w.folder / "grounded.toml"
     toml.write_text(toml.read_text() + table)
     assert one_message(Folder(w.folder)) == (() if alone else ("x", "y", "psi"))
+
+
+def early_speed(tmp_path, psi="/mocap", v="/wheels.speed", late=("", "", ""), feedback=True):
+    """Return the advice on a speed 11 ms earlier than the motion of a car's position."""
+    w = make(tmp_path / "w", "car-turn")
+    table = f"""
+[log.state]
+v = {{ path = "{v}" }}
+x = {{ path = "/mocap.pose.position.x"{late[0]} }}
+y = {{ path = "/mocap.pose.position.y"{late[1]} }}
+psi = {{ path = "{psi}.pose.orientation.@rpy.yaw"{late[2]} }}
+"""
+    text = (w.folder / "grounded.toml").read_text() + table
+    fed = f"[task]\nfeedback = {str(feedback).lower()}\n"
+    text = re.sub("^feedback = .*\n", "", text, flags=re.M).replace("[task]\n", fed)
+    (w.folder / "grounded.toml").write_text(text)
+    keys = zip(("x", "y", "psi"), late, strict=True)
+    read = {n: {"delay_s": float(said.split()[-1])} for n, said in keys if said}
+    w, used = Folder(w.folder), SimpleNamespace(id="t0001")
+    meta = {"source_sha256": "0", READ_BY: json.dumps(read)}
+    w.trials = lambda: [SimpleNamespace(stored=used, meta=meta)]
+    finding = Finding("v", "0.011 s earlier than the motion of x+y", "delay", -0.011)
+    return where_to_mend(w, [used], [finding])[0].advice
+
+
+def test_a_speed_that_is_early_shows_a_late_message(tmp_path):
+    """`v: 0.011 s earlier than the motion of x+y` said neither which is wrong nor what to do."""
+    said = early_speed(tmp_path / "1")
+    assert holds(said, "x, y and psi are in one message", "delay_s = 0.011", "program", "ahead")
+    alone = early_speed(tmp_path / "2", psi="/imu", feedback=False)
+    assert holds(alone, "x and y are", "delay_s = 0.011") and "program" not in alone
+    again = early_speed(tmp_path / "3", late=(", delay_s = 0.004",) * 3)
+    assert "delay_s = 0.015" in again
+    apart = early_speed(tmp_path / "4", late=(", delay_s = 0.004", "", ""))
+    assert not apart and not early_speed(tmp_path / "5", v="/mocap.twist.linear.x")
 
 
 def test_sensors_that_nothing_is_held_against_are_named_and_not_called_right(tmp_path):

@@ -16,6 +16,7 @@ import numpy as np
 
 from grounded.instruments.finding import AS_LATE, Finding, late_effects
 from grounded.places import heading, position
+from grounded.result import listed
 from grounded_trials.workspace.identity import READ_BY
 from grounded_trials.workspace.task_file import seen_in
 
@@ -61,7 +62,7 @@ def where_to_mend(
                 log=_whole(one, read[-1]),
                 advice=ahead.format(f"sensor_delay:{one.signal}")
                 if feedback and one.kind == "delay" and one.corrected and AS_LATE not in one.finding
-                else one.advice,
+                else one.advice or _late_message(workspace, one, read[-1]),
             )
             for one in findings
         )
@@ -87,8 +88,33 @@ def one_message(workspace: Folder) -> tuple[str, ...]:
     pose = [*position(model), *filter(None, [heading(model)])]
     if mapping is None or len(pose) < 2 or not set(pose) <= set(mapping.states):
         return ()
-    topics = {mapping.states[name].path.partition(".")[0] for name in pose}
+    topics = {_topic(mapping.states[name].path) for name in pose}
     return tuple(pose) if len(topics) == 1 else ()
+
+
+def _late_message(workspace: Folder, one: Finding, meta: Mapping[str, str]) -> str:
+    """Return what to set if a speed is early: no sensor is, so the message of the position is late.
+
+    "" for other findings, if both come in one message, or if its states were read differently.
+    """
+    where, mapping = position(workspace.base_model), workspace.log_mapping
+    states = mapping.states if mapping else {}
+    if one.kind != "delay" or one.delay_s >= 0 or not {*where, one.signal} <= {*states}:
+        return ""
+    topic = _topic(states[where[0]].path)
+    names = [name for name, spec in states.items() if _topic(spec.path) == topic]
+    whole = {_keys(meta, name).get("delay_s", 0.0) - one.delay_s for name in names}
+    if one.signal in names or not {*where} <= {*names} or len(whole) > 1:
+        return ""
+    ahead = " and let the robot's program predict them ahead by as much"
+    return (
+        f"{listed(names)} are in one message, more likely late: set delay_s = {whole.pop():.3g} "
+        f"for each in [log.state]{ahead * workspace.config.task.feedback}"
+    )
+
+
+def _topic(path: str) -> str:
+    return path.partition(".")[0]
 
 
 def in_time_now(workspace: Folder, findings: Sequence[Finding]) -> dict[str, float]:
