@@ -54,8 +54,8 @@ def refuse_degrees(columns: Mapping[str, Array], model: Model) -> None:
     most = float(np.abs(columns[name]).max())
     raise GroundedError(
         f"the target's {name} goes to {most:.4g} rad, which does not fit the course of its "
-        f"positions ({', '.join(position)}); divided by 57.3 it does, so it is in degrees: multiply "
-        f"it by pi / 180 = {1 / DEGREES:.8g}"
+        f"positions ({', '.join(position)}); divided by 57.3 it does, so it is in degrees: "
+        f"multiply it by pi / 180 = {1 / DEGREES:.8g}"
     )
 
 
