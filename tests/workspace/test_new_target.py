@@ -171,9 +171,9 @@ def test_a_target_beside_an_adopted_bias_is_told_to_be_in_readings(w):
 @pytest.mark.parametrize(
     ("table", "named"),
     [
-        ("[reward]\nposition = 1.0\n", "'position'"),
+        ("[reward]\nposition = 1.0\n", "[reward] position"),
         ("[reward]\nstate = { theta = -1.0 }\n", "negative"),
-        ("[limits]\ntork = [-1, 1]\n", "'tork'"),
+        ("[limits]\ntork = [-1, 1]\n", "[limits] tork"),
     ],
 )
 def test_a_broken_grounded_toml_is_told_before_a_target_is_written(w, table, named):
@@ -215,12 +215,12 @@ def test_a_heading_in_degrees_beside_its_positions_is_refused(path, heading, ok)
     """A lane change "psi 0 to 33.81 rad" became the target: the weight on psi was 8.7e-4."""
     if ok:
         return refuse_degrees({**path, "psi": heading}, rover)
-    with pytest.raises(GroundedError, match=holding("psi", "rad", "degrees", "0.01745")):
+    with pytest.raises(GroundedError, match=holding("psi", "rad", "degrees", "pi / 180")):
         refuse_degrees({**path, "psi": heading}, rover)
 
 
 def test_a_table_with_its_heading_in_degrees_is_no_target(tmp_path):
-    w = Workspace.create(tmp_path / "w", example="buggy")
+    w = Workspace.create(tmp_path / "w", example="car-turn")
     columns = {**S_CURVE, "psi": np.degrees(COURSE)}
     table = np.column_stack([w.task.dt * np.arange(len(T)), *columns.values()])
     file = tmp_path / "lane.csv"
