@@ -68,7 +68,7 @@ def worse_costs(models: Sequence[Problem], policy: Policy) -> Array:
         models: the first one predicts the run.
         policy: the policy as a robot runs it, over the models' z or fewer states.
     """
-    return all_worse_costs(models, [policy])[0]
+    return np.asarray(all_worse_costs(models, [policy])[0], np.float64)
 
 
 def all_worse_costs(models: Sequence[Problem], policies: Sequence[Policy]) -> Array:
