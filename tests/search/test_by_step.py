@@ -12,6 +12,7 @@ from grounded.search.by_step import PRICES, Told, believed_by_step, worth
 from grounded.search.candidate import BY_STEP, Tried
 from grounded.search.corrected import Corrected
 from grounded.search.making import About, Maker
+from grounded.search.margin import worse_costs
 from grounded.search.mispredictions import Seen, seen
 from grounded.search.planner import Planner, predicted
 from grounded.search.standing import standing
@@ -141,6 +142,7 @@ def test_runs_together_are_those_one_by_one_in_a_fraction_of_the_steps(grounded,
     assert len(steps) - one_by_one < 0.3 * one_by_one
     np.testing.assert_allclose(states, [one.states for one in alone], atol=1e-9)
     np.testing.assert_allclose(costs, [-one.utility for one in alone], rtol=1e-9)
+    assert worse_costs([late], replace(policy, gain=None, reference=None)).min() == np.inf
 
 
 def test_doubt_is_a_cost_with_the_derivatives_of_its_steps(grounded):
