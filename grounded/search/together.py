@@ -18,6 +18,8 @@ from grounded.rollout import SETTLED, seen_late
 from grounded.search.corrected import Corrected
 from grounded.search.planner import predicted
 
+MOST = 2**22  # gains held at once
+
 
 def runs(problem: Problem, policies: Sequence[Policy]) -> tuple[Array, Array]:
     """Return the states (P, H + 1, n) and costs (P,) of predicted runs, see `predicted`.
@@ -29,6 +31,11 @@ def runs(problem: Problem, policies: Sequence[Policy]) -> tuple[Array, Array]:
     if not isinstance(problem.system, Corrected):
         each = [predicted(problem, policy) for policy in policies]
         return np.array([one.states for one in each]), np.array([-one.utility for one in each])
+    room = max(1, MOST // (problem.horizon * problem.nz * problem.system.m))
+    if len(policies) > room:  # long horizons
+        parts = [runs(problem, policies[i : i + room]) for i in range(0, len(policies), room)]
+        states, costs = zip(*parts, strict=True)
+        return np.concatenate(states), np.concatenate(costs)
     angles = tuple(map(bool, problem.angles))
     laid = [p.laid_out(problem.system.states, angles, problem.depths) for p in policies]
     sent = np.array([p.feedforward for p in laid])
