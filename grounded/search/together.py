@@ -7,10 +7,11 @@ needs hundreds of runs, which took a minute of CPU one after the other.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from grounded.compile import Problem
+from grounded.compile import Problem, deepest
 from grounded.compile.run.interpreted import trajectory_cost
 from grounded.frozen import Array, wrapped
 from grounded.policy import Policy
@@ -28,27 +29,30 @@ def runs(problem: Problem, policies: Sequence[Policy]) -> tuple[Array, Array]:
         problem: the problem that predicts the runs.
         policies: of one horizon, with feedback, over the problem's z or fewer states.
     """
-    if not isinstance(problem.system, Corrected):
+    system = problem.system
+    if not isinstance(system, Corrected):
         each = [predicted(problem, policy) for policy in policies]
         return np.array([one.states for one in each]), np.array([-one.utility for one in each])
-    room = max(1, MOST // (problem.horizon * problem.nz * problem.system.m))
+    room = max(1, MOST // (problem.horizon * problem.nz * system.m))
     if len(policies) > room:  # long horizons
         parts = [runs(problem, policies[i : i + room]) for i in range(0, len(policies), room)]
         states, costs = zip(*parts, strict=True)
         return np.concatenate(states), np.concatenate(costs)
+    for policy in policies:  # z holds all past inputs that any of them feeds back
+        problem = replace(problem, fed_back=deepest(problem.depths, policy.depths))
     angles = tuple(map(bool, problem.angles))
-    laid = [p.laid_out(problem.system.states, angles, problem.depths) for p in policies]
+    laid = [p.laid_out(system.states, angles, problem.depths) for p in policies]
     sent = np.array([p.feedforward for p in laid])
     K, aim = np.array([p.gain for p in laid]), np.array([p.reference for p in laid])
-    z, found = _run(problem, problem.system, sent, K, aim)
-    left, n = np.arange(len(laid) if problem.age else 0), problem.system.n
+    z, found = _run(problem, system, sent, K, aim)
+    left, n = np.arange(len(laid) if problem.age else 0), system.n
     for _ in range(problem.horizon):  # as in `simulate`, each until it agrees with what was seen
         if not len(left):
             break
         late = [seen_late(run[:-1, :n], problem.age / problem.dt, angles) for run in z[left]]
         seen = aim[left].copy()
         seen[:, :, :n] -= late
-        again, found[left] = _run(problem, problem.system, sent[left], K[left], seen)
+        again, found[left] = _run(problem, system, sent[left], K[left], seen)
         scale = 1.0 + np.abs(again).max(axis=1, keepdims=True)
         moved = (np.abs(again - z[left]) > SETTLED * scale).any(axis=(1, 2))
         z[left] = again

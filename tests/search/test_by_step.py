@@ -133,6 +133,10 @@ def test_runs_together_are_those_one_by_one_in_a_fraction_of_the_steps(grounded,
         replace(policy, feedforward=policy.feedforward + 0.03 * i, gain=(1 - 0.1 * i) * policy.gain)
         for i in range(6)
     ]
+    deep = policy.laid_out(policy.state_names, policy.angles, tuple(d + 2 for d in policy.depths))
+    gain = deep.gain.copy()
+    gain[:, :, -1] = 0.05  # on inputs that this model forgets
+    tried.append(replace(deep, gain=gain))
     stepped = Corrected.stepped
     monkeypatch.setattr(
         Corrected, "stepped", lambda *given: steps.append(given[3]) or stepped(*given)
