@@ -87,7 +87,7 @@ def next_trial(
     if not claims.names and not claims.blamed:
         return "None is needed: nothing is tied and nothing needs adopting."
     if worse:
-        return f"Adopt nothing yet: {worse}. Run another trial and diagnose again."
+        return f"Adopt nothing yet: {worse}. To settle that, run another trial and diagnose again."
     if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names):
         return "None is needed yet: give the model a parameter for a load and diagnose again."
     if ended:

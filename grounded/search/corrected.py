@@ -129,15 +129,25 @@ class Corrected(System):
         alphas: Array | None = None,
     ) -> Swarm:
         """See `System.rollout`."""
-        angles = problem.angles[: self.base.n]
 
         def step(x: Array, sent: Array, t: int) -> Array:
-            state, settings = self._own(x), (problem.dt, problem.smoothing)
-            moved = self.base.step(state, np.ascontiguousarray(sent), problem.p, *settings)
-            shift = 0.0 if problem.input_shift is None else problem.input_shift[t]
-            return self._next(moved, x, sent + shift, t, angles)
+            return self.stepped(problem, x, sent, t)
 
         return rolled_out(problem, step, ubar, K, zbar, k, alphas)
+
+    def stepped(self, problem: Problem, x: Array, sent: Array, t: int) -> Array:
+        """Return the states after step t of a problem, without its bias.
+
+        Args:
+            problem: in this system.
+            x: states (N, 2 n + m + q).
+            sent: received inputs (N, m), less the input shift.
+            t: index of the step.
+        """
+        state, settings = self._own(x), (problem.dt, problem.smoothing)
+        moved = self.base.step(state, np.ascontiguousarray(sent), problem.p, *settings)
+        shift = 0.0 if problem.input_shift is None else problem.input_shift[t]
+        return self._next(moved, x, sent + shift, t, problem.angles[: self.base.n])
 
     def _own(self, x: Array) -> Array:
         """Return the base's states (N, n) of x (N, 2 n + m + q)."""
@@ -158,6 +168,8 @@ class Corrected(System):
         before = x[:, 2 * n : 2 * n + m] - self.before[t]
         d = np.concatenate([away, u - self.u[t], before, x[:, n : 2 * n]], axis=1)
         y = np.einsum("...nq,...q->...n", self.law[t], d)
+        if not self.doubt.shape[1]:
+            return np.concatenate([moved + y, y, u], axis=1)
         e = np.einsum("...pq,...q->...p", self.doubt[t], d[:, : n + m])
         return np.concatenate([moved + y, y, u, e], axis=1)
 

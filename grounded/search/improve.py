@@ -152,10 +152,9 @@ def _run_again(before: Standing, now: Standing, last: Trial, made: Candidate) ->
     )
     if best.candidate.id != own:
         return f"{mean}: {best.candidate.id} is the best now, and the search goes on from there"
-    return (
-        f"{mean}: the model replays their mean, and promises {figure(made.promised_over(best))} "
-        "from there, so the search goes on"
-    )
+    gain = made.promised_over(best)
+    promise = f", and promises {figure(gain)} from there" * (gain > 0)
+    return f"{mean}: the model replays their mean{promise}, so the search goes on"
 
 
 def refitted(task: Task, trials: Sequence[Trial]) -> Model:
@@ -247,13 +246,15 @@ def _below_noise(
     if not (options.damps and lost and made.grounded and gain < error):
         return None
     own = best.candidate.id
-    sentence = (
-        f"{len(lost)} step{'s' * (len(lost) > 1)} from {own} did not improve, and the next "
-        f"promises {figure(gain)}, less than the standard error of a trial's gain, {error:.2g}"
-    )
+    sentence = f"{len(lost)} step{'s' * (len(lost) > 1)} from {own} did not improve, and the next "
     if gain > 0:
         runs = runs_to_show(gain, best)
-        sentence += f" (it takes {runs} runs of each candidate to show such a gain)"
+        sentence += (
+            f"promises {figure(gain)}, less than the standard error of a trial's gain, "
+            f"{error:.2g} (it takes {runs} runs of each candidate to show such a gain)"
+        )
+    else:
+        sentence += "promises no gain over its runs"
     sentence += f": {own} is the result"
     ended = replace(make.now, phase="converged", step=None, ending="below the noise", doubt="")
     return let_down(replace(ended, sentence=sentence, then=None, missed=""), make.fingerprint)

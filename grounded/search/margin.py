@@ -23,6 +23,7 @@ from grounded.compile import Problem
 from grounded.frozen import Array
 from grounded.policy import Policy, z_difference
 from grounded.search.planner import predicted
+from grounded.search.together import runs
 
 AGES = (0.0, 0.3, 0.6)  # age of the samples, as a fraction of a step
 NOISE, SEEDS = 0.1, 3  # noise, as a fraction of each state's rms motion in a step; number of draws
@@ -49,8 +50,9 @@ def steadied(
     own = worse_costs(models, policy)
     if own.max() <= WORSE * -predicted(problem, policy).utility:
         return policy
-    tried = [(own, policy), *((worse_costs(models, one), one) for one in map(gently, CAUTIONS))]
-    on_average = [np.log(np.maximum(costs, np.finfo(float).tiny)).mean() for costs, _ in tried]
+    gentler = [gently(caution) for caution in CAUTIONS]
+    tried = [(own, policy), *zip(all_worse_costs(models, gentler), gentler, strict=True)]
+    on_average = [np.log(np.maximum(found, np.finfo(float).tiny)).mean() for found, _ in tried]
     enough = min(on_average) + np.log(LITTLE)
     if on_average[0] <= enough:
         return policy
@@ -66,19 +68,42 @@ def worse_costs(models: Sequence[Problem], policy: Policy) -> Array:
         models: the first one predicts the run.
         policy: the policy as a robot runs it, over the models' z or fewer states.
     """
+    return np.asarray(all_worse_costs(models, [policy])[0], np.float64)
+
+
+def all_worse_costs(models: Sequence[Problem], policies: Sequence[Policy]) -> Array:
+    """Return the costs of policies as `worse_costs` does, (P, M, A) for P policies."""
+    found = np.full((len(policies), len(models), len(AGES), SEEDS), np.inf)
+    fed_back = [one for one, policy in enumerate(policies) if policy.gain is not None]
+    if not fed_back:
+        return np.asarray(found.mean(axis=3), np.float64)
+    states, _ = runs(models[0], [policies[one] for one in fed_back])
+    noisy = [_noisy(policies[one], x) for one, x in zip(fed_back, states, strict=True)]
+    known = [one for one, some in zip(fed_back, noisy, strict=True) if some]
+    for i, model in enumerate(models if known else ()):
+        for j, age in enumerate(AGES):
+            late = replace(model, delay=model.delay + age)
+            _, costs = runs(late, [run for some in noisy for run in some])
+            found[known, i, j] = costs.reshape(len(known), SEEDS)
+    return np.asarray(found.mean(axis=3), np.float64)
+
+
+def _noisy(policy: Policy, states: Array) -> list[Policy]:
+    """Return a policy with draws of noise fed back; none if its run diverges.
+
+    Args:
+        policy: with feedback.
+        states: its predicted run (H + 1, n or more).
+    """
+    assert policy.gain is not None
     n = len(policy.state_names)
-    run = predicted(models[0], policy)
-    moved = z_difference(run.states[:-1, :n], run.states[1:, :n], policy.angles[:n])
+    moved = z_difference(states[:-1, :n], states[1:, :n], policy.angles[:n])
     size = NOISE * np.sqrt(np.mean(moved**2, axis=0))
-    costs = np.full((len(models), len(AGES), SEEDS), np.inf)
-    if policy.gain is None or not np.isfinite(size).all():
-        return np.asarray(costs.mean(axis=2), np.float64)
+    if not np.isfinite(size).all():
+        return []
+    found = []
     for seed in range(SEEDS):
         noise = size * np.random.default_rng(seed).normal(size=(policy.horizon, n))
         by_noise = np.einsum("tij,tj->ti", policy.gain[:, :, :n], noise)
-        noisy = replace(policy, feedforward=policy.feedforward + by_noise)
-        for i, model in enumerate(models):
-            for j, age in enumerate(AGES):
-                late = replace(model, delay=model.delay + age)
-                costs[i, j, seed] = -predicted(late, noisy).utility
-    return np.asarray(costs.mean(axis=2), np.float64)
+        found.append(replace(policy, feedforward=policy.feedforward + by_noise))
+    return found

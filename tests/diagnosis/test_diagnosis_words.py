@@ -120,6 +120,7 @@ def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt
     )
     said = next_trial(claims, "", (), worse=why)
     assert why in said and not said.endswith("adopt the claimed effects.")
+    assert "Run" not in said  # "None is needed: the search has ended" may precede it
     look = "Run c0001 twice more, to see whether the gap in v repeats."
     said = next_trial(claims, look, ())  # the verdict speaks of a gap
     assert holds(said, "adopt the claimed effects and diagnose again", "run c0001 twice more")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import tomllib
 from pathlib import Path
 
@@ -199,3 +200,29 @@ def test_an_input_in_volts_is_sought_by_its_unit_too(tmp_path):
     units = {"theta": "rad", "volts": "V"}
     (theta,), (volts,) = guess_mapping(inspect_log(log), ["theta"], ["volts"], units)
     assert (theta.path, volts.path) == ("/csv.tilt", "/csv.motor_voltage")
+
+
+@pytest.mark.parametrize(
+    ("others", "found"),
+    [
+        ([], "motor_voltage"),
+        (["motor_voltage_rate"], "motor_voltage"),
+        (["pump_voltage"], ""),
+        (["voltage"], "voltage"),
+    ],
+)
+def test_a_command_that_has_an_input_s_word_in_its_name_is_that_input(tmp_path, others, found):
+    """The only other number of a cart's only command topic was "UNSURE no name in the log fits"."""
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    channel = writer.register_channel("/cart/command", "json", 0)
+    for i in range(50):
+        known = {"steering_angle": np.sin(i), "motor_voltage": i % 7}
+        body = json.dumps(known | dict.fromkeys(others, i % 5)).encode()
+        writer.add_message(channel, i * 10**8, body, i * 10**8)
+    writer.finish()
+    path = tmp_path / "log.mcap"
+    path.write_bytes(stream.getvalue())
+    _, (_, voltage) = guess_mapping(inspect_log(path), [], ["steering", "voltage"])
+    assert voltage.path.rpartition(".")[2] == found and voltage.sure == bool(found)

@@ -7,15 +7,18 @@ import pytest
 
 from grounded.model import Model
 from grounded.plant import Plant
+from grounded.search import together
 from grounded.search.ask_tell import Search, learn
 from grounded.search.by_step import PRICES, Told, believed_by_step, worth
 from grounded.search.candidate import BY_STEP, Tried
 from grounded.search.corrected import Corrected
 from grounded.search.making import About, Maker
+from grounded.search.margin import worse_costs
 from grounded.search.mispredictions import Seen, seen
 from grounded.search.planner import Planner, predicted
 from grounded.search.standing import standing
 from grounded.search.step_size import SearchOptions, Step
+from grounded.search.together import runs
 from grounded.solve.bias import ground
 from small_tasks import cart_task, drive
 
@@ -113,6 +116,40 @@ def test_a_single_trial_is_explained_and_says_nothing_about_other_directions(gro
     step = np.einsum("tnq,tq->tn", law[:, :, : n + 1] - told.whole[:, :, : n + 1], across)
     known = np.einsum("tnq,tq->tn", law[:, :, : n + 1] - told.whole[:, :, : n + 1], d)
     assert np.abs(step).mean() < np.abs(known).mean()
+
+
+@pytest.mark.parametrize("age", [0.0, 0.013])
+def test_runs_together_are_those_one_by_one_in_a_fraction_of_the_steps(grounded, age, monkeypatch):
+    """`status` of a search that ended took 67 s of CPU: 3000 runs of 421 steps, in Python."""
+    _, best, problem = grounded
+    own = seen(Planner(TASK, TASK), best, problem)
+    _, others = turning(own, 3)
+    told = Told.by(others, own, problem)
+    law, R = told.law(0.1), told.doubt(0.1, worth(own, problem))
+    corrected = Corrected(problem.system, law, own.x, own.u, own.before, R)
+    late = replace(corrected.on(problem), age=age)
+    policy, steps = best.candidate.policy, []
+    tried = [
+        replace(policy, feedforward=policy.feedforward + 0.03 * i, gain=(1 - 0.1 * i) * policy.gain)
+        for i in range(6)
+    ]
+    deep = policy.laid_out(policy.state_names, policy.angles, tuple(d + 2 for d in policy.depths))
+    gain = deep.gain.copy()
+    gain[:, :, -1] = 0.05  # on inputs that this model forgets
+    tried.append(replace(deep, gain=gain))
+    stepped = Corrected.stepped
+    monkeypatch.setattr(
+        Corrected, "stepped", lambda *given: steps.append(given[3]) or stepped(*given)
+    )
+    alone = [predicted(late, one) for one in tried]
+    one_by_one = len(steps)
+    states, costs = runs(late, tried)
+    assert len(steps) - one_by_one < 0.3 * one_by_one
+    np.testing.assert_allclose(states, [one.states for one in alone], atol=1e-9)
+    np.testing.assert_allclose(costs, [-one.utility for one in alone], rtol=1e-9)
+    monkeypatch.setattr(together, "MOST", 1)  # a long horizon: one at a time
+    np.testing.assert_allclose(runs(late, tried)[1], costs, rtol=1e-9)
+    assert worse_costs([late], replace(policy, gain=None, reference=None)).min() == np.inf
 
 
 def test_doubt_is_a_cost_with_the_derivatives_of_its_steps(grounded):

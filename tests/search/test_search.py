@@ -11,6 +11,7 @@ from facts import holding, holds
 from grounded.errors import GroundedError, NextCommand
 from grounded.plant import Noise, Plant
 from grounded.search.ask_tell import learn
+from grounded.search.candidate import Candidate
 from grounded.search.improve import propose
 from grounded.search.making import About, Maker
 from grounded.search.planner import Planner, fixed_draws, model_fingerprint
@@ -207,6 +208,17 @@ def test_after_a_loss_no_trial_is_spent_on_a_gain_below_the_noise(
         ended = proposal.standing
         assert (ended.phase, ended.ending) == ("converged", "below the noise")
         assert holds(ended.sentence, ended.incumbent.candidate.id, "runs of each")
+
+
+def test_a_negative_promise_is_none(monkeypatch):
+    """A cart's search "promises -0.003610, less than the standard error of a trial's gain"."""
+    story = Story().add().add().add(bad)
+    noisy = lambda h: tuple(replace(one, deviation=1e3) for one in h)  # noqa: E731
+    monkeypatch.setattr("grounded.search.certainty.with_errors", noisy)
+    monkeypatch.setattr(Candidate, "promised_over", lambda *_: -0.00361)
+    ended = story.propose().standing
+    assert ended.ending == "below the noise" and "0.0036" not in ended.sentence
+    assert holds(ended.sentence, "promises no gain", ended.incumbent.candidate.id)
 
 
 def test_a_step_like_one_that_an_earlier_best_lost_by_is_as_doubtful():

@@ -10,6 +10,8 @@ from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace import new_target
+from grounded_trials.workspace.heading_of_path import refuse_degrees
+from small_tasks import rover
 
 LINE = np.linspace(0, 1, 21)
 
@@ -164,3 +166,64 @@ def test_a_target_beside_an_adopted_bias_is_told_to_be_in_readings(w):
     np.savetxt(w.folder / "there.csv", there, "%.6f", ",", header="t,theta", comments="")
     drawn = grounded("-C", w.folder, "target", str(w.folder / "there.csv"))
     assert holds(drawn.err, "but the target ends at 0 rad. If") and "start is" not in drawn.err
+
+
+@pytest.mark.parametrize(
+    ("table", "named"),
+    [
+        ("[reward]\nposition = 1.0\n", "[reward] position"),
+        ("[reward]\nstate = { theta = -1.0 }\n", "negative"),
+        ("[limits]\ntork = [-1, 1]\n", "[limits] tork"),
+    ],
+)
+def test_a_broken_grounded_toml_is_told_before_a_target_is_written(w, table, named):
+    """`target` wrote, and said `next: propose`, which then refused an unknown key."""
+    head, _, rest = table.partition("\n")
+    text = w.config.file.read_text()
+    start = text.index(head)
+    end = text.index("\n[", start)
+    w.config.file.write_text(f"{text[:start]}{head}\n{rest}{text[end:]}")
+    before = files(w)
+    with pytest.raises(GroundedError, match=holding(named)):
+        w.target({"theta": LINE})
+    assert files(w) == before
+
+
+T = np.linspace(0.0, 1.0, 201)
+S_CURVE = {"x": 12 * T, "y": 2.5 * T**3 * (10 - 15 * T + 6 * T**2)}
+COURSE = np.arctan2(np.gradient(S_CURVE["y"]), np.gradient(S_CURVE["x"]))
+CIRCLE = {"x": np.sin(2 * np.pi * T), "y": 1 - np.cos(2 * np.pi * T)}
+
+
+@pytest.mark.parametrize(
+    ("path", "heading", "ok"),
+    [
+        (S_CURVE, COURSE, True),
+        (S_CURVE, np.pi / 2 - COURSE, True),  # a compass
+        (S_CURVE, COURSE + np.pi, True),  # backwards
+        (S_CURVE, 1.5 + 0 * T, True),  # sideways
+        ({"x": 12 * T, "y": 0 * T}, 1.5 + 0 * T, True),
+        (S_CURVE, 3 * T, True),
+        (S_CURVE, np.degrees(COURSE), False),
+        (S_CURVE, 90 - np.degrees(COURSE), False),
+        (CIRCLE, 2 * np.pi * T, True),
+        (CIRCLE, 360 * T, False),
+        (CIRCLE, (360 * T + 180) % 360 - 180, False),
+    ],
+)
+def test_a_heading_in_degrees_beside_its_positions_is_refused(path, heading, ok):
+    """A lane change "psi 0 to 33.81 rad" became the target: the weight on psi was 8.7e-4."""
+    if ok:
+        return refuse_degrees({**path, "psi": heading}, rover)
+    with pytest.raises(GroundedError, match=holding("psi", "rad", "degrees", "pi / 180")):
+        refuse_degrees({**path, "psi": heading}, rover)
+
+
+def test_a_table_with_its_heading_in_degrees_is_no_target(tmp_path):
+    w = Workspace.create(tmp_path / "w", example="car-turn")
+    columns = {**S_CURVE, "psi": np.degrees(COURSE)}
+    table = np.column_stack([w.task.dt * np.arange(len(T)), *columns.values()])
+    file = tmp_path / "lane.csv"
+    np.savetxt(file, table, "%.6f", ",", header="t,x,y,psi", comments="")
+    done = grounded("-C", w.folder, "target", file)
+    assert done.code == 1 and holds(done.err, "psi", "degrees")

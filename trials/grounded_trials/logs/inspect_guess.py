@@ -149,7 +149,46 @@ def guess_mapping(
         rest.append(guess if guess.path or guess.others else commands_of(log, guess, taken))
     if len(rest) == 1:
         rest = [_only_command(log, rest[0], units.get(rest[0].name, ""))]
-    return found, tuple(rest)
+    return found, tuple(_by_words(log, rest, units))
+
+
+def _by_words(log: LogReport, inputs: Sequence[Guess], units: Mapping[str, str]) -> list[Guess]:
+    """Assign inputs without a fitting name to the only command whose name has all of their words.
+
+    So `voltage` is `motor_voltage`, but not `voltage_rate`. Guesses are unchanged where several
+    commands have them, and where another input has that command.
+    """
+    taken = {guess.path for guess in inputs}
+    fits = {
+        guess.name: [
+            path
+            for path in _moving_commands(log, taken)
+            if _has_words(path, guess.name) and _may_be(path, units.get(guess.name, ""))
+        ]
+        for guess in inputs
+        if not guess.path and guess.reasons
+    }
+    claimed = [path for paths in fits.values() for path in paths]
+    found = []
+    for guess in inputs:
+        paths = fits.get(guess.name, [])
+        if len(paths) != 1 or claimed.count(paths[0]) > 1:
+            found.append(guess)
+            continue
+        why = ("the only command in the log with this word in its name",)
+        topic, field = next((t, f) for t in log.topics for f in t.fields if f.path == paths[0])
+        now = replace(guess, path=paths[0], field=field, clock=_clock(log, topic), reasons=why)
+        found.append(replace(now, sure=True, others=()))
+    return found
+
+
+def _has_words(path: str, name: str) -> bool:
+    """Return whether the last name of a path has all words of a name, and is not their rate."""
+    last = re.split(r"[./]", path.lower())[-1]
+    said = {*_WORD.findall(last), *_WORD.findall(in_english(last))}
+    words = {*_WORD.findall(name.lower())}
+    long = bool(words) and all(len(word) > 1 for word in words)
+    return long and words <= said and not (said - words) & _RATES
 
 
 def _commanded(log: LogReport, name: str) -> list[_Candidate]:
@@ -223,11 +262,16 @@ def _only_command(log: LogReport, guess: Guess, unit: str) -> Guess:
 
 def commands_of(log: LogReport, guess: Guess, taken: set[str]) -> Guess:
     """Give an input without a matching name the changing numbers of command topics."""
-    commands = [t for t in log.topics if COMMAND_TOPIC.search(t.topic.lower())]
-    moving = [f.path for t in commands for f in t.fields if f.low != f.high]
-    others = tuple(path for path in moving if path not in taken and not path.endswith(_QUATERNION))
+    others = _moving_commands(log, taken)
     why = ("no name matches; these are commands",) if others else ()
     return replace(guess, others=others[:8], reasons=why)
+
+
+def _moving_commands(log: LogReport, taken: set[str]) -> tuple[str, ...]:
+    """Return the changing numbers of command topics, without those that are taken."""
+    commands = [t for t in log.topics if COMMAND_TOPIC.search(t.topic.lower())]
+    moving = [f.path for t in commands for f in t.fields if f.low != f.high]
+    return tuple(path for path in moving if path not in taken and not path.endswith(_QUATERNION))
 
 
 def _meanings(log: LogReport, name: str, states: Sequence[str]) -> tuple[str, ...]:

@@ -15,7 +15,9 @@ from grounded.model import Model
 from grounded.task import MAX_HORIZON
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import Config, set_target
+from grounded_trials.workspace.heading_of_path import refuse_degrees
 from grounded_trials.workspace.task_file import (
+    check_tables,
     limited_changes,
     read_target,
     write_target,
@@ -28,12 +30,14 @@ def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -
     Both files are kept as they were, with `.bak` behind their names.
 
     Raises:
-        GroundedError: if the columns are no target of the model, see `checked`; or a file can't be
-            written. The files are then as before.
+        GroundedError: if the columns are no target of the model, see `checked`; if grounded.toml
+            has other errors; or if a file can't be written. The files are then as before.
     """
     from grounded_trials.workspace.off_target import usual_weights
 
     columns = checked(columns, model)
+    refuse_degrees(columns, model)
+    check_tables(config, model, len(next(iter(columns.values()))))
     each = usual_weights(model, columns)
     weights = {name: float(f"{w:.6g}") for name, w in each.items()}  # a range may be 1800 mm
     rows = len(next(iter(columns.values())))

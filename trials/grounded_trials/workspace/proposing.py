@@ -217,16 +217,28 @@ def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
 
 def _proposal(workspace: Folder, without: Collection[str]) -> Proposal:
     """Ask the search for a proposal as if some (void) candidates had never been proposed."""
-    from grounded.search.improve import propose
+    contents = workspace.read()
+    candidates = tuple(c for c in contents.candidates if c.id not in without)
+    return _planned(workspace, replace(contents, candidates=candidates))
 
-    return propose(
-        workspace.task,
-        [c for c in workspace.read().candidates if c.id not in without],
-        workspace.task_trials(),
-        workspace.config.search,
-        identity=workspace.next_id(),
-        planner=workspace.planner,
-    )
+
+def _planned(workspace: Folder, contents: Contents) -> Proposal:
+    """Ask the search for a proposal, unless it is known to have ended with these contents."""
+    from grounded.search.improve import propose
+    from grounded.search.standing import Proposal, standing
+    from grounded_trials.workspace.known_end import known_end, remember_end
+
+    task, options, planner = workspace.task, workspace.config.search, workspace.planner
+    trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
+    now = standing(task, contents.candidates, trials, options, planner.fingerprint)
+    planning = now.phase == "propose" and now.incumbent is not None
+    if planning and (ended := known_end(workspace, contents, now)) is not None:
+        return Proposal(ended, None, is_new=False)
+    name = workspace.next_id()
+    made = propose(task, contents.candidates, trials, options, identity=name, planner=planner)
+    if planning and made.candidate is None:
+        remember_end(workspace, contents, made.standing)
+    return made
 
 
 def _not_run(workspace: Folder, before: Sequence[str]) -> tuple[Candidate, dict[str, str]] | None:
@@ -306,11 +318,7 @@ def standing_in(
     now = standing(task, contents.candidates, trials, options, planner.fingerprint)
     workspace.save_index()
     if ahead and now.phase == "propose" and now.incumbent is not None:
-        from grounded.search.improve import propose
-
-        name = workspace.next_id()
-        made = propose(task, contents.candidates, trials, options, identity=name, planner=planner)
-        now = made.standing
+        now = _planned(workspace, contents).standing
     return _answered(workspace, now)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from io import TextIOWrapper
 from pathlib import Path
 
@@ -44,6 +45,21 @@ def build_task(config: Config, model: Model, folder: Path, read: Reader | None =
         named = str(error).startswith((config.file.name, str(folder), config.task.target))
         where = "" if named else f"{config.file.name}: "
         raise GroundedError(f"{where}{error}", error.then) from None
+
+
+def check_tables(config: Config, model: Model, rows: int) -> None:
+    """Check all of grounded.toml that a task is built from, whatever its target will be.
+
+    Args:
+        config: the checked grounded.toml.
+        model: the model whose states and inputs the file names.
+        rows: of the new target.
+
+    Raises:
+        GroundedError: as `build_task`.
+    """
+    untracked = replace(config, task=replace(config.task, target="", horizon=rows - 1))
+    build_task(untracked, model, config.file.parent)
 
 
 def _build(config: Config, model: Model, folder: Path, read: Reader) -> Task:
@@ -105,15 +121,16 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
         given = table.numbers(kind, names)
         weights[kind] = np.array([given.get(name, 0.0) for name in names])
     table.finish()
-    tracked = any(w.any() for w in (weights["state"], weights["terminal"]))
+    reward = Reward(**weights)
     if not config.task.target:  # nothing to follow: weights on errors have no meaning
-        weights |= {kind: np.zeros(len(states)) for kind in ("state", "terminal")}
-    elif not tracked:
+        none = np.zeros(len(states))
+        return replace(reward, state=none, terminal=none)
+    if not (reward.state.any() or reward.terminal.any()):
         raise GroundedError(
             "[reward] weighs no state, so there is nothing to follow; add for example "
             f"state = {{ {states[0]} = 1.0 }}"
         )
-    return Reward(**weights)
+    return reward
 
 
 DRAW = ": draw the manoeuvre, or write one row per control step, with columns t and states"

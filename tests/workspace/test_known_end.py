@@ -1,0 +1,78 @@
+"""The end of a search is planned once, not by every command."""
+
+from dataclasses import replace
+
+import pytest
+
+from cli import grounded
+from grounded.errors import NextCommand
+from grounded.search import improve
+from grounded.search.standing import Proposal, standing
+from grounded_trials import Workspace
+from workspaces import make
+
+ENDED = {"phase": "stopped", "ending": "too doubtful", "sentence": "no; ask", "missed": "; ask"}
+
+
+@pytest.fixture
+def w(tmp_path):
+    folder = make(tmp_path / "w").folder
+    assert grounded("-C", folder, "learn", "--trials", "1").code == 0
+    return Workspace(folder)
+
+
+@pytest.fixture
+def planned(monkeypatch):
+    """Each planning of a next candidate, which takes a minute of CPU and finds none."""
+    calls = []
+
+    def propose(task, candidates, trials, options, *, identity, planner):
+        calls.append(identity)
+        now = standing(task, candidates, trials, options, planner.fingerprint)
+        ended = replace(now, step=None, then=NextCommand("diagnose"), **ENDED)
+        return Proposal(ended, None, is_new=False)
+
+    monkeypatch.setattr(improve, "propose", propose)
+    return calls
+
+
+def test_an_end_is_planned_once_for_all_commands(w, planned):
+    """`status` took 67 s of CPU each time, and `next` twice that."""
+    before = sorted(path.name for path in w.folder.rglob("*"))
+    first, second, third = w.status(), w.status(), Workspace(w.folder).propose()
+    assert planned == ["c0002"] and third.candidate is None
+    for found in (second.standing, third.standing):
+        assert found.to_json() == first.standing.to_json()
+        assert (found.then, found.missed) == (NextCommand("diagnose"), "; ask")
+    assert sorted(path.name for path in w.folder.rglob("*")) == before
+
+
+def _option(w):
+    text = w.config.file.read_text()
+    w.config.file.write_text(text.replace("[search]", "[search]\ntolerance = 0.02"))
+
+
+def _safety(w):
+    text = w.config.file.read_text()
+    w.config.file.write_text(f"{text}\n[safety]\nv = [-50.0, 50.0]\n")
+
+
+def _trial(w):
+    assert grounded("-C", w.folder, "run", "best").code == 0
+    (log,) = (w.folder / "runs").glob("c0001*")
+    assert grounded("-C", w.folder, "ingest", log).code == 0
+
+
+@pytest.mark.parametrize("change", [_option, _safety, _trial])
+def test_an_end_is_planned_again_after_a_change(w, planned, change):
+    w.status()
+    change(w)
+    w.status()
+    assert len(planned) == 2
+
+
+def test_without_a_cache_an_end_is_planned_each_time(w, planned, monkeypatch):
+    monkeypatch.setenv("GROUNDED_CACHE", "")
+    w.status()
+    w.status()
+    assert len(planned) == 2
