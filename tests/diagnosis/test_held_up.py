@@ -59,23 +59,40 @@ def test_what_keeps_a_parameter_off_its_bound_is_told(inside, without, nats, hel
 @pytest.mark.parametrize(("gain", "kept"), [(0.01, True), (0.0, False), (-0.02, False)])
 def test_what_predictions_lose_nothing_without_is_not_claimed(monkeypatch, gain, kept):
     """It keeps the inertia off its bound, but a claim has to help on data it has not seen."""
-    fit, less, bare = fitted(0.005, "delay:u"), fitted(0.02), fitted(0.003)
+    found, fit, doubtful = pruned(monkeypatch, gain, pays=False, trials=4)
+    assert (found is fit) is kept
+    assert [one.name for one in doubtful] == ([] if kept else ["delay:u"])  # told as unconfirmed
+
+
+@pytest.mark.parametrize(
+    ("gain", "trials", "kept"), [(0.03, 4, True), (0.003, 4, False), (0.003, 1, True)]
+)
+def test_what_pays_in_one_state_has_to_help_in_the_mean(monkeypatch, gain, trials, kept):
+    """A circle's verdict named a tracked point 11 mm off its place: `+0.0 %`."""
+    found, fit, _ = pruned(monkeypatch, gain, pays=True, trials=trials, rest=0.004)
+    assert (found is fit) is kept
+
+
+def pruned(monkeypatch, gain, pays, trials, rest=0.02):
+    """What `_pruned` makes of a delay with such a mean gain."""
+    fit, less, bare = fitted(0.005, "delay:u"), fitted(rest), fitted(0.003)
     fits = {"delay:u": less, "calibration": bare}
     monkeypatch.setattr(decide, "fit_without", lambda search, f, name, ruler: fits[name])
     monkeypatch.setattr(decide, "counterparts", lambda *_: [])
     monkeypatch.setattr(decide, "repeats", lambda *_: 0)
     monkeypatch.setattr(decide, "of_no_size", lambda *_: [])
     monkeypatch.setattr(decide, "folds", lambda data: None)
-    monkeypatch.setattr(decide, "_pays", lambda search, ruler, rest, f, white: rest is bare)
+    monkeypatch.setattr(decide, "_pays", lambda search, ruler, rest, *_: pays or rest is bare)
 
     def gained(before, after):
         by = gain if before is less else 0.5
-        return Gain(by, 0.1, by, np.array([by]), np.array([0.1]))
+        return Gain(by, 0.1, by, np.array([max(by, 0.03 * pays)]), np.array([0.1]))
 
     ruler = SimpleNamespace(held_out=True, gain=gained, since_outset=lambda f: 1.0)
     search = SimpleNamespace(
-        data=SimpleNamespace(model=MODEL), predictor=None, score=lambda f: 766.0 * (f is fit)
+        data=SimpleNamespace(model=MODEL, count=trials),
+        predictor=None,
+        score=lambda f: 766.0 * (f is fit),
     )
     found, _, doubtful = decide._pruned(search, fit, ruler, True)
-    assert (found is fit) is kept
-    assert [one.name for one in doubtful] == ([] if kept else ["delay:u"])  # told as unconfirmed
+    return found, fit, doubtful

@@ -102,9 +102,8 @@ def information(predictor: Predictor, fit: Fitted) -> Array:
 
     The k values of the effects come first; parameters are in units of their priors.
     """
-    columns, of_log = base_columns(
-        predictor, replace(fit, hypothesis=replace(fit.hypothesis, spread=1.0))
-    )
+    free = replace(fit, hypothesis=replace(fit.hypothesis, spread=1.0))
+    columns, of_log = base_columns(predictor, free, whole=True)
     if not columns.shape[-1]:
         return np.zeros((0, 0))
     white = kalman.innovations(filter_of(predictor, fit), columns, of_log)[0]
