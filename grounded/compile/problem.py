@@ -90,7 +90,7 @@ class Problem:
     input_shift: Array | None = None  # (H, m) off what the actuators receive, see `bias`
     age: float = 0.0  # [s] of the samples that a policy acts on, see `rollout.seen_late`
     smoothing: float = 0.0  # width of the smoothed indicator terms; 0: exact
-    fed_back: tuple[int, ...] = ()  # past inputs of each that a policy feeds back at most
+    fed_back: tuple[int, ...] = ()  # past inputs of each that z holds at least, for policies
 
     @property
     def horizon(self) -> int:

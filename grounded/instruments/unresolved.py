@@ -17,7 +17,7 @@ from grounded.model import Model
 from grounded.trial import Trial
 
 MISSES = 0.1  # of a state's spread in other trials: error of one step against two half steps
-BEYOND = 5.0  # times as far from the mean as in any sample of most other trials
+BEYOND = 5.0  # times as large as any sample of most other trials
 
 
 def judge_resolution(

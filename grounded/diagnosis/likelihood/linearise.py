@@ -110,10 +110,10 @@ def linearise(
     r[..., 0] = model.difference(y - here, np.asarray(offset))
     if (begun := predictor.begun(h)) is not None:
         r[0, ..., 0] += begun
-    exact = not (whole and adds_to_steps(h)) or simulated(model)
+    carried = not (whole and adds_to_steps(h)) or simulated(model)
     F, f_p = (
         sensitivities_of(predictor, h, x, u, after)
-        if h.spread and exact
+        if h.spread and carried
         else (step_jacobian(predictor, h, x, after), None)
     )
     theta, near = h.theta, tangent(predictor, h, x, u) if h.effects else predictor

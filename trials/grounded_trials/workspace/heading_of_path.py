@@ -9,10 +9,10 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array
+from grounded.instruments.finding import DEGREES
 from grounded.model import Model
 from grounded.places import role
 
-DEGREES = 180 / math.pi
 MOVING = 0.1  # of the fastest step: slower ones have no course
 TURNS = 0.05  # rad: a course that changes less, in rms, shows no unit
 FITS = 0.2  # of that change: rms difference up to which a heading in degrees follows the course
