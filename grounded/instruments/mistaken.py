@@ -20,6 +20,7 @@ import numpy as np
 from grounded import places
 from grounded.frozen import Array
 from grounded.instruments.finding import DEGREES, Finding
+from grounded.instruments.input_signs import LEAST, how_inputs_act
 from grounded.instruments.inputs import OVER
 from grounded.instruments.other_units import unusable
 from grounded.instruments.short_runs import Ahead, Fit
@@ -297,7 +298,29 @@ def _each(
             yield change, None
         elif gain > HINT:
             fits = _compared(model, logged, mended, change)
+            if fits is None and _act_exchanged(model, trial, change, known):
+                before = logged.best([*_signed(model, change), *_odd_signs(model, change)])
+                after = mended.best([np.ones(model.m)])
+                fits = (before, after) if before.score - after.score > HINT else None
             yield change, fits
+
+
+def _act_exchanged(model: Model, trial: Trial, change: Mistake, known: Sequence[int]) -> bool:
+    """Check whether two inputs act as in the model only if their columns are exchanged.
+
+    A model that lacks a lag or a dead zone predicts little better with the right columns, but how
+    the robot answers each command is measured to a few percent.
+    """
+    if not change.inputs or not change.swap:
+        return False
+    logged, mended = (
+        [how_inputs_act(model, one, known)[j] for j in change.inputs]
+        for one in (trial, change.mended(trial))
+    )
+    return all(one.sign > 0 for one in mended) and all(
+        one.share < LEAST and one.share < HALF * other.share
+        for one, other in zip(logged, mended, strict=True)
+    )
 
 
 def _compared(

@@ -1,21 +1,26 @@
-"""Detect positions in another unit where no velocity is logged, such as those of a wheeled robot.
+"""Detect lengths in another unit that only the model reveals: positions alone, or all of them.
 
 A kinematic model (a unicycle, a bicycle) has no speeds among its states, so only the commands say
 how far the robot moves. If its positions move as the commands say, but a power of ten as far, while
 the heading turns as they say, no physics explains it: weak motors and slip change the distance by a
 part of it, and a robot that stands still has positions that follow nothing.
+
+If positions and their velocities are all in mm, they agree with each other. Then gravity, gains and
+torques accelerate the robot a thousand times as much as in the model, whose calibrated predictions
+explain almost nothing of it, but most of it once all lengths are divided (`_lengths`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from grounded.frozen import Array
 from grounded.instruments.odd_trial import predicted
 from grounded.instruments.other_units import unusable
+from grounded.instruments.short_runs import Ahead
 from grounded.model import Model
 from grounded.result import listed
 from grounded.trial import Trial
@@ -25,21 +30,48 @@ NEAR = 1.25  # factor within which the ratio is one of these
 SHAPE, FOLLOWS = 0.9, 0.8  # least correlation with the predicted motion: of positions, of the rest
 SIZED = 2.0  # factor within which the rest must move as far as predicted
 LEAST = 20  # fewest predictions
+UNITS = {1e3: "mm", 1e2: "cm", 1e-3: "km"}  # in which a length in m is so many times too large
+SAMPLES = 120  # of a trial that calibrated predictions start from
+ALL = (1e3, 1e2, 1e-2, 1e-3)  # times too large that all lengths may be
+MISSED, EXPLAINED = 0.8, 0.7  # share of a velocity's change that is missed: as logged, and divided
+TIED = 0.1  # by how much more of another velocity's change may be missed
+ALIKE = 0.6  # least correlation of its change with that prediction
+ACROSS = 4.0  # factor within which the uncalibrated model must then predict its size
 
 
 @dataclass(frozen=True)
 class Positions:
-    """Positions that move `factor` times as far as the commands say; `ratio` is as measured."""
+    """Lengths that change `factor` times as much as the commands say; `ratio` is as measured.
+
+    Args:
+        names: of the states.
+        factor: how many times too large they are.
+        ratio: how many times as far as predicted they move.
+        missed: share of the change of the velocity `of` that predictions miss as it is logged and
+            divided by the factor, for lengths with their velocities.
+        of: that velocity; "" for positions alone.
+    """
 
     names: tuple[str, ...]
     factor: float
     ratio: float
+    missed: tuple[float, float] = (0.0, 0.0)
+    of: str = ""
 
     @property
     def described(self) -> str:
         """One clause: what is wrong, and the evidence."""
         one, large = len(self.names) == 1, self.factor > 1
         size = self.factor if large else 1 / self.factor
+        if self.of:
+            unit = f" (in {UNITS[self.factor]}?)" * (self.factor in UNITS)
+            with_it, without = (f"{100 * share:.0f} %" for share in reversed(self.missed))
+            way = f"divided by {size:g}" if large else f"times {size:g}"
+            return (
+                f"{listed(self.names)} look{'s' * one} {size:g} times too "
+                f"{'large' if large else 'small'}{unit}: {way}, the model misses {with_it} of how "
+                f"{self.of} changes in 0.25 s, instead of {without}"
+            )
         return (
             f"{listed(self.names)} look{'s' * one} {size:.6g} times too "
             f"{'large' if large else 'small'}: {'it moves' if one else 'they move'} "
@@ -66,8 +98,10 @@ def positions_off(model: Model, trial: Trial, shown: Sequence[int]) -> Positions
     """
     units = list(model.states.values())
     known = [i for i in shown if np.isfinite(trial.states[:, i]).any()]
+    if any(units[i] == "m/s" for i in known):
+        return _lengths(model, trial, known)
     lengths = [i for i in known if units[i] == "m"]
-    if len(lengths) < 2 or len(lengths) == len(known) or any(units[i] == "m/s" for i in known):
+    if len(lengths) < 2 or len(lengths) == len(known):
         return None
     with np.errstate(all="ignore"):
         ahead = predicted(model, trial, known) if np.isfinite(trial.inputs).all() else None
@@ -83,6 +117,59 @@ def positions_off(model: Model, trial: Trial, shown: Sequence[int]) -> Positions
             if factor and alike > SHAPE and fits:
                 return Positions(tuple(model.state_names[i] for i in group), factor, ratio)
     return None
+
+
+def _lengths(model: Model, trial: Trial, known: Sequence[int]) -> Positions | None:
+    """Return all lengths and velocities of a trial if all are in another unit; None if not.
+
+    The inputs must not be lengths themselves, which would be in that unit, too.
+
+    Args:
+        model: however crude.
+        trial: of its states and inputs.
+        known: indices of the states with values.
+    """
+    units = list(model.states.values())
+    lengths = [i for i in known if units[i].partition("/")[0] == "m"]
+    fast = [i for i in known if units[i] == "m/s"]
+    if any(unit.partition("/")[0] == "m" for unit in model.inputs.values()):
+        return None
+    with np.errstate(all="ignore"):
+        logged = _missed(model, trial, known, fast)
+        if logged is None:
+            return None
+        for factor in ALL:
+            states = np.array(trial.states)
+            states[:, lengths] /= factor
+            other = replace(trial, states=states)
+            divided, ahead = _missed(model, other, known, fast), predicted(model, other, known)
+            if divided is None or ahead is None or not len(fast):
+                continue
+            k = int(np.argmax(logged - divided))
+            start, then, seen = (x[:, [fast[k]]] for x in ahead)
+            ratio, alike = _followed(then - start, seen - start)
+            right = divided[k] < EXPLAINED < MISSED < logged[k] and alike > ALIKE
+            if right and (divided < logged + TIED).all() and 1 / ACROSS < ratio < ACROSS:
+                names = tuple(model.state_names[i] for i in lengths)
+                shares = float(logged[k]), float(divided[k])
+                of = model.state_names[fast[k]]
+                return Positions(names, factor, ratio * factor, shares, of)
+    return None
+
+
+def _missed(
+    model: Model, trial: Trial, known: Sequence[int], some: Sequence[int]
+) -> Array | None:
+    """Return the share of some states' changes that the calibrated model misses; None if unknown.
+
+    Parameters may move within their bounds, and commands may act late.
+    """
+    ahead = Ahead(model, trial, known, SAMPLES)
+    if not ahead.enough or not np.isfinite(trial.inputs).all():
+        return None
+    fit = ahead.best([np.ones(model.m)], free=False)
+    found: Array = (fit.rms / np.maximum(ahead.moved, 1e-12))[list(some)]
+    return found
 
 
 def judge_positions(model: Model, trials: Sequence[Trial], hidden: Sequence[str] = ()) -> None:

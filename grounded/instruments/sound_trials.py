@@ -43,7 +43,9 @@ def sound_trials(
     model = subject.model if isinstance(subject, Task) else subject
     names = (model.state_names, model.input_names)
     if all((trial.state_names, trial.input_names) == names for trial in trials):
-        judge_exchanged(model, [t.until(t.known_steps) for t in trials], hidden)
+        known = [t.until(t.known_steps) for t in trials]
+        judge_exchanged(model, known, hidden)
+        judge_positions(model, known, hidden)  # preflight may leave out a velocity
     looked = preflight(subject, trials, hidden, one_message)
     fit = [(trial.state_names, trial.input_names) == names for trial in looked.trials]
     if fit and all(fit):

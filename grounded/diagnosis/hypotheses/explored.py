@@ -158,6 +158,7 @@ PARAM_PRIOR = 0.2  # prior standard deviation of a blamed parameter, relative to
 BRIEF = 0.1  # of a control step: shorter delays and lags may be errors of the time stamps
 TIMES = {"delay": "d", "sensor_delay": "d", "first_order_lag": "tau", "sensor_lag": "tau"}
 LEFT = 0.25  # effects cancel if together they do less than this fraction of what each does alone
+WINDOW, OFTEN, TOO_SLOW = 0.25, 0.9, 0.5  # [s], quantile of changes, share of it: see _seen_rate
 SAME = 0.05  # a dead zone is a mere offset if they differ by less than this part of its power
 
 
@@ -184,12 +185,29 @@ def price(
         return math.inf
     if any(abs(values.get(q.name, 0.0)) > q.absurd for q in effect.free):
         return math.inf
+    if effect.family.name == "slew_limit" and values.get("r", math.inf) < _seen_rate(data, effect):
+        return math.inf
     numbers = len(effect.free) + sum(q.tuned for q in effect.quantities)
     cost = 0.5 * numbers * math.log(max(data.steps, 2)) + effect.family.vague
     cost += _of_less_friction(effect, values)
     if not _mere_offset(predictor, effect, values):
         cost += math.log(effect.places)
     return cost + math.log(targets)
+
+
+def _seen_rate(data: Data, effect: Effect) -> float:
+    """Return a rate at which the log shows the state to change: a limit can't be below it.
+
+    With two commands exchanged a limit of 0 is likely: the model then turns the robot the wrong
+    way, and is better without.
+    """
+    i, steps = data.model.state_names.index(effect.site.target), max(1, round(WINDOW / data.dt))
+    if len(data.y) <= steps:
+        return 0.0
+    moved = data.model.difference(data.y[:-steps], data.y[steps:])[..., i]
+    known = np.asarray(data.valid.T > 0)[steps - 1 :] & np.isfinite(moved)
+    rates = np.abs(moved[known]) / (steps * data.dt)
+    return float(TOO_SLOW * np.quantile(rates, OFTEN)) if len(rates) else 0.0
 
 
 def cancelling(predictor: Predictor, h: Hypothesis) -> bool:

@@ -32,7 +32,8 @@ def _table(kind: str, guess: Guess, clock: str) -> list[str]:
         return [f"# {head}  # nothing in the log fits"]
     if not guess.path:
         rest = f"  # or {', '.join(guess.others[1:FEW])}" * (len(guess.others) > 1)
-        more = [f"# {line}" for line in (_scale(guess), _unwrap(guess.others[0])) if line]
+        keys = (_scale(guess), _clock(guess, clock), _unwrap(guess.others[0]))
+        more = [f"# {line}" for line in keys if line]
         what = f"no name in the log fits; to use one of these, remove all {len(more) + 2} #"
         what = what if more else what.replace("all 2", "both")
         return [f"# {head}  # {what}", f"# path = {_quote(guess.others[0])}{rest}", *more]
@@ -44,11 +45,11 @@ def _table(kind: str, guess: Guess, clock: str) -> list[str]:
         lines.insert(1, f"# {'; '.join(guess.reasons)}")
     if scale := _scale(guess):
         lines.append(scale)
-    if guess.clock != clock:
-        lines.append(f'clock = "{guess.clock}"')
-    if unwrap := _unwrap(guess.path):
-        lines.append(unwrap)
-    return lines
+    return lines + [line for line in (_clock(guess, clock), _unwrap(guess.path)) if line]
+
+
+def _clock(guess: Guess, usual: str) -> str:
+    return f'clock = "{guess.clock}"' * (guess.clock != usual)
 
 
 def _scale(guess: Guess) -> str:

@@ -177,7 +177,7 @@ def _by_words(log: LogReport, inputs: Sequence[Guess], units: Mapping[str, str])
             continue
         why = ("the only command in the log with this word in its name",)
         topic, field = next((t, f) for t in log.topics for f in t.fields if f.path == paths[0])
-        now = replace(guess, path=paths[0], field=field, clock=_clock(log, topic), reasons=why)
+        now = replace(guess, path=paths[0], field=field, clock=clock_of(log, topic), reasons=why)
         found.append(replace(now, sure=True, others=()))
     return found
 
@@ -256,7 +256,7 @@ def _only_command(log: LogReport, guess: Guess, unit: str) -> Guess:
     if not _may_be(path, unit):
         return guess
     why = ("no name matches; the only command in the log that changes",)
-    clock = _clock(log, topic)
+    clock = clock_of(log, topic)
     return replace(guess, path=path, clock=clock, others=(), field=field, reasons=why)
 
 
@@ -373,7 +373,7 @@ def _choose(
         why = f"{still.field.path} never changes in this log"
         rest = tuple(c.field.path for c in ranked if c is not best)[:3]
         return Guess(
-            name, best.field.path, _clock(log, best.topic), False, rest, best.field, (why,)
+            name, best.field.path, clock_of(log, best.topic), False, rest, best.field, (why,)
         )
     value = best.score + homes.get(best.topic.topic, 0.0)
     near = [c for c in ranked[1:] if c.score + homes.get(c.topic.topic, 0.0) > value - SURE]
@@ -385,7 +385,7 @@ def _choose(
         )
         best, near = measured, [best, *(c for c in near if c is not measured)]
     others = tuple(c.field.path for c in near[:3])
-    clock = _clock(log, best.topic)
+    clock = clock_of(log, best.topic)
     return Guess(name, best.field.path, clock, not near, others, best.field, reasons)
 
 
@@ -403,7 +403,7 @@ def _alike(path: str, other: str) -> bool:
     return path.split(".")[-2:] == other.split(".")[-2:] or unit_of(path) in ("", unit_of(other))
 
 
-def _clock(log: LogReport, topic: TopicReport) -> str:
+def clock_of(log: LogReport, topic: TopicReport) -> str:
     return "header" if topic.stamped and not is_simulated(log) else "log"
 
 

@@ -26,25 +26,28 @@ from grounded_trials.logs.inspect_pairs import COMBINATIONS, Signals, moved_to
 WINDOW = 0.05  # [s] length of a step: in shorter ones noise dominates
 PIECES = 8  # pieces of the log, evaluated separately
 LEAST = 20  # steps of a piece; short logs have fewer pieces
-BETTER = 0.2  # [nats] lead of the best in squared error: 10 % of the error
+BETTER = 0.2  # [nats] lead of the best in a state's squared error: 10 % of the error
 USE = 0.1  # [nats] lead over no input at all
 SCATTER = 2.0  # standard errors over the pieces by which the lead must be significant
 MOST = 0.75  # share of the pieces that must agree
-SAME = 1e-6  # of the squares: with less difference a state does not distinguish assignments
+TELLS = 0.05  # [nats] with less difference a state does not distinguish assignments
 Paths = tuple[str, ...]
 
 
 def by_steps(model: Model, guesses: Mapping[str, Guess], signals: Signals) -> dict[str, Guess]:
     """Decide unsure inputs by the model's steps if they are conclusive; else list the rivals.
 
+    Inputs that no name fits, such as two thrusters in an unnamed array, are assigned only if all
+    unsure ones can be decided.
+
     Args:
         model: however crude.
         guesses: of all its states and inputs.
         signals: the samples of all candidates.
     """
-    unsure = [n for n in model.input_names if guesses[n].path and guesses[n].others]
+    unsure = [n for n in model.input_names if guesses[n].others]
     known = [*model.state_names, *model.input_names]
-    if not unsure or not all(guesses[name].path for name in known):
+    if not unsure or not all(guesses[name].path for name in known if name not in unsure):
         return {}
     units = {**model.states, **model.inputs}
     fixed = {guesses[name].path for name in known if name not in unsure}
@@ -67,6 +70,8 @@ def by_steps(model: Model, guesses: Mapping[str, Guess], signals: Signals) -> di
     rivals = [one for one in left if one != best and not _clearly(left[best], left[one])]
     if len(tried) > COMBINATIONS:  # not all could be tried
         rivals = [one for one in left if one != best]
+    if rivals and not all(guesses[n].path for n in unsure):
+        return {}
     if rivals:
         first = tuple(guesses[n].path for n in unsure)
         said = first if first in left else best
@@ -157,14 +162,19 @@ def _gains(effects: Array, y: Array) -> Array:
 
 
 def _clearly(best: Array, other: Array) -> bool:
-    """Check whether one assignment leaves less of every state that distinguishes the two."""
+    """Check whether one assignment leaves less of every state that distinguishes the two.
+
+    Two thrusters exchanged turn a boat the other way, but push it ahead alike: of its speed, only
+    what their own gains explain differs.
+    """
     if best.shape != other.shape:
         return False
     gained, used = other[..., 0] - best[..., 0], best[..., 1] - best[..., 0]
-    tells = np.abs(gained).max(axis=0) > SAME
+    error = gained.std(axis=0) / np.sqrt(max(len(gained) - 1, 1))
+    mean = gained.mean(axis=0)
+    tells = (np.abs(mean) > TELLS) | (mean < -SCATTER * np.maximum(error, 1e-9))
     if not tells.any():
         return False
-    gained, used = gained[:, tells], used[:, tells]
-    error = gained.std(axis=0) / np.sqrt(max(len(gained) - 1, 1))
+    gained, used, error = gained[:, tells], used[:, tells], error[tells]
     sure = (gained.mean(axis=0) > SCATTER * error) & ((gained > 0).mean(axis=0) >= MOST)
-    return bool(sure.all() and gained.mean(axis=0).sum() > BETTER and used.mean(axis=0).min() > USE)
+    return bool(sure.all() and gained.mean(axis=0).min() > BETTER and used.mean(axis=0).min() > USE)

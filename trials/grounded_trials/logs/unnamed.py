@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from grounded_trials.logs.inspect_evidence import as_stated
-from grounded_trials.logs.inspect_guess import Guess
+from grounded_trials.logs.inspect_guess import Guess, clock_of
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.stated_units import Stated, factor_between, may_be, unit_of
 
@@ -61,21 +61,22 @@ def from_the_rest(
             found.append(replace(guess, others=rest[:MOST]))
         else:
             found.append(guess)
-    return tuple(_scaled(guess, units[guess.name], stated) for guess in found)
+    return tuple(_offering(guess, units[guess.name], stated, log) for guess in found)
 
 
-def _scaled(guess: Guess, wanted: str, stated: Stated) -> Guess:
-    """Give a guess without a path the factor of the first number that is offered for it."""
+def _offering(guess: Guess, wanted: str, stated: Stated, log: LogReport) -> Guess:
+    """Give a guess without a path the factor and clock of the first number offered for it."""
     if guess.path or not guess.others:
         return guess
-    return replace(guess, scale=stated.factor(guess.others[0], wanted))
+    topic = next(t for t in log.topics for f in t.fields if f.path == guess.others[0])
+    scale = stated.factor(guess.others[0], wanted)
+    return replace(guess, scale=scale, clock=clock_of(log, topic))
 
 
 def _by_unit(guess: Guess, path: str, log: LogReport) -> Guess:
     topic, field = next((t, f) for t in log.topics for f in t.fields if f.path == path)
     why = "no name matches; of the remaining numbers only this one has a unit that fits"
-    clock = "header" if topic.stamped else "log"
-    return replace(guess, path=path, field=field, clock=clock, reasons=(why,))
+    return replace(guess, path=path, field=field, clock=clock_of(log, topic), reasons=(why,))
 
 
 def _goes_with(said: str, wanted: str) -> bool:
