@@ -147,7 +147,7 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
     own += f", {number(abs(same - best.utility))} {better} than measured"
     if not math.isfinite(candidate.base_as_run):
         return own
-    elsewhere = began_elsewhere(task, best.trials, estimated)
+    elsewhere = began_elsewhere(task, best.trials, best.candidate.predicted_states, estimated)
     start = same - candidate.base_as_run if elsewhere else 0.0
     each = [task.utility(trial) for trial in best.trials]
     mean = task.utility(mean_trial(best.trials, task.model.angle_mask)) - sum(each) / len(each)

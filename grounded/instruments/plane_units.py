@@ -157,9 +157,7 @@ def _lengths(model: Model, trial: Trial, known: Sequence[int]) -> Positions | No
     return None
 
 
-def _missed(
-    model: Model, trial: Trial, known: Sequence[int], some: Sequence[int]
-) -> Array | None:
+def _missed(model: Model, trial: Trial, known: Sequence[int], some: Sequence[int]) -> Array | None:
     """Return the share of some states' changes that the calibrated model misses; None if unknown.
 
     Parameters may move within their bounds, and commands may act late.

@@ -242,7 +242,7 @@ def owed_to_start(before: Tried, after: Tried, history: Sequence[Tried]) -> floa
     def worth(one: Tried) -> float:
         s_0 = one.candidate.predicted_states[0]
         off = np.array([trial.states[0] - s_0 for trial in one.trials])
-        if not beyond_noise(one.trials, off, s_0).any():
+        if not beyond_noise(one.trials, off, s_0, one.candidate.predicted_states).any():
             return 0.0
         found = [c for t in history if (c := t.candidate).base == one.candidate.id]
         starts = [c.expected_of_base - c.base_as_run for c in found]
@@ -265,9 +265,10 @@ def _began_apart(one: Tried, other: Tried) -> bool:
         squares = sum(len(starts) * starts.var(axis=0) for starts in (first, second)) / freedom
         error = np.sqrt(squares * (1 / len(first) + 1 / len(second)))
         apart = np.abs(first.mean(axis=0) - second.mean(axis=0)) > LUCK * error
-    return bool(
-        (apart & beyond_noise(one.trials, first - second.mean(axis=0), s_0)).any()
-        and (apart & beyond_noise(other.trials, second - first.mean(axis=0), s_0)).any()
+    pairs = ((one, first - second.mean(axis=0)), (other, second - first.mean(axis=0)))
+    return all(
+        (apart & beyond_noise(tried.trials, off, s_0, tried.candidate.predicted_states)).any()
+        for tried, off in pairs
     )
 
 

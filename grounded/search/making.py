@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.compile import Problem
+from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.rollout import Rollout, Run, apart, for_late_samples
 from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Slopes, Tried, Way
@@ -43,7 +44,7 @@ ALIKE = 0.05  # of the incumbent's cost: promises of two plans that differ by le
 FORETOLD = 0.2  # largest error of the plain model at the incumbent, as a fraction of its cost
 
 
-def begun_at(task: Task, trials: Sequence[Trial]) -> Trial:
+def begun_at(task: Task, trials: Sequence[Trial], predicted: Array) -> Trial:
     """Return the mean of a candidate's trials, begun at s_0 where noise alone may differ from it.
 
     Otherwise the bias of the first step would take the error of that sample for motion, and apply
@@ -51,7 +52,7 @@ def begun_at(task: Task, trials: Sequence[Trial]) -> Trial:
     """
     mean = mean_trial(trials, task.model.angle_mask)
     off = np.array([task.model.difference(t.states[0], task.start) for t in trials])
-    near = np.logical_not(beyond_noise(trials, off, task.start))
+    near = np.logical_not(beyond_noise(trials, off, task.start, predicted))
     states = np.array(mean.states)
     states[0, near] -= off.mean(axis=0)[near]
     return replace(mean, states=states)
@@ -78,7 +79,8 @@ class About:
         self.make, self.incumbent, self.options, self.way = make, incumbent, options, way
         self.original = original
         planner, plan = make.planner, make.planner.engaged
-        own = planner.lift(begun_at(planner.task, incumbent.trials))
+        said = incumbent.candidate.predicted_states
+        own = planner.lift(begun_at(planner.task, incumbent.trials, said))
         plan.model.system.check(own.states[:-1], own.inputs, plan.model.values, plan.dt)
         matched = options.match_inputs and way != "recorded inputs"
         from grounded.solve.bias import ground

@@ -74,20 +74,45 @@ def by_states(task: Task, trials: Sequence[Trial]) -> Array:
 
 
 CHANCE = 3.0  # standard deviations of sensor noise by which one sample may differ
+SLOW_S, SLOWER = 0.1, 3.0  # [s] of second differences; times the white noise, at most
+WHITE = 0.6745 * 6**0.5  # median of absolute second differences of white noise of std 1
+FEWEST = 10  # least number of second differences
 NOTHING = 1e-9  # difference treated as zero, in the state's unit or relative to its value
 
 
-def beyond_noise(trials: Sequence[Trial], off: Array, start: Array) -> Array:
+def beyond_noise(trials: Sequence[Trial], off: Array, start: Array, predicted: Array) -> Array:
     """Return which start states differ from s_0 by more than the sensor noise, (n,) bool.
 
     Args:
         trials: N trials of one candidate.
         off: first state of each trial less s_0, (N, n).
         start: s_0 of the task (n,).
+        predicted: their candidate's predicted states (H+1, n).
     """
-    noise = np.sqrt(np.mean([white_noise(t.states) ** 2 for t in trials], axis=0) / len(trials))
+    each = [sample_noise(trial, predicted) ** 2 for trial in trials]
+    noise = np.sqrt(np.mean(each, axis=0) / len(trials))
     least = np.maximum(CHANCE * noise, NOTHING * np.maximum(1.0, np.abs(start)))
     return np.asarray(np.abs(np.mean(off, axis=0)) > least)
+
+
+def sample_noise(trial: Trial, predicted: Array) -> Array:
+    """Return the noise (std) of single samples of a run, (n,), also of filtered signals.
+
+    The noise of a filtered speed changes little from sample to sample, so that second differences
+    of neighbours don't show it. Those over SLOW_S show it, of what differs from the prediction, as
+    the motion bends, too. They are bounded, since an error of the model bends as well.
+
+    Args:
+        trial: a run of a candidate.
+        predicted: its predicted states (H+1, n).
+    """
+    white, lag = white_noise(trial.states), max(1, round(SLOW_S / trial.dt))
+    T = min(len(predicted), trial.finite_steps + 1)
+    if 2 * lag + FEWEST > T:
+        return white
+    off = trial.states[:T] - predicted[:T]
+    bends = np.abs(off[2 * lag :] - 2 * off[lag:-lag] + off[: -2 * lag])
+    return np.asarray(np.clip(median(bends) / WHITE, white, SLOWER * white))
 
 
 def sensor_noise(trials: Sequence[Trial], n: int) -> Array:

@@ -187,7 +187,7 @@ def test_what_a_start_is_worth_is_no_improvement():
             id=name, base=base, expected_of_base=-4.0, base_as_run=as_run, model="m"
         )
         candidate.predicted_states = np.zeros((30, 1))
-        trials = tuple(SimpleNamespace(states=states) for _ in range(2))
+        trials = tuple(SimpleNamespace(states=states, dt=0.05, finite_steps=29) for _ in range(2))
         return Tried(candidate, trials, (utility, utility + 0.01), True)
 
     first = ran("c0001", "", -6.0, off=0.07)
@@ -214,7 +214,10 @@ def test_starts_that_scatter_as_much_are_not_different_ones():
             id=name, base=base, expected_of_base=-4.0, base_as_run=as_run, model="m"
         )
         candidate.predicted_states = np.zeros((30, 1))
-        trials = tuple(SimpleNamespace(states=np.linspace(o, 0.0, 30)[:, None]) for o in offs)
+        trials = tuple(
+            SimpleNamespace(states=np.linspace(o, 0.0, 30)[:, None], dt=0.05, finite_steps=29)
+            for o in offs
+        )
         return Tried(candidate, trials, tuple(utility for _ in offs), True)
 
     first = ran("c0001", "", -6.0, (-3.1, 0.0, 1.5, 1.5, -3.1, -3.1))

@@ -190,7 +190,8 @@ def test_what_the_incumbent_lost_by_its_start_is_known(noisy):
     run = about.candidate(about.theta, Step(), "")
     trial = noisy.now.incumbent.trials
     assert np.isfinite(run.base_as_run) and len(trial) >= 1
-    began = begun_at(about.make.planner.task, trial).states[0]
+    said = noisy.now.incumbent.candidate.predicted_states
+    began = begun_at(about.make.planner.task, trial, said).states[0]
     start = about.real.start.copy()
     start[:2] = began
     told = predicted(replace(about.real, start=start), noisy.now.incumbent.candidate.policy)
@@ -202,10 +203,10 @@ def test_the_noise_of_a_first_sample_is_no_motion():
     task = cart_task()
     rows = [begun(task, noise=0.02, seed=seed) for seed in range(3)]
     assert np.abs(np.mean([run.states[0] for run in rows], axis=0) - task.start).max() > 0
-    found = begun_at(task, rows)
+    found = begun_at(task, rows, begun(task).states)
     assert np.allclose(found.states[0], task.start)
     assert np.array_equal(found.states[1:], mean_trial(rows).states[1:])
-    away = begun_at(task, [begun(task, off=0.1, noise=0.02)]).states[0]
+    away = begun_at(task, [begun(task, off=0.1, noise=0.02)], begun(task).states).states[0]
     assert away[0] > 0.05  # where it really began elsewhere, that is kept
 
 
@@ -245,7 +246,10 @@ def test_of_what_the_model_gives_otherwise_only_known_reasons_are_told(as_run, e
     made = promise("c0001", -8.0, 1.0, as_run)
     task = cart_task()
     best = SimpleNamespace(
-        candidate=SimpleNamespace(id="c0001"), utility=-9.0, standard_error=error, noise_cost=0.0
+        candidate=SimpleNamespace(id="c0001", predicted_states=np.zeros((0, 1))),
+        utility=-9.0,
+        standard_error=error,
+        noise_cost=0.0,
     )
     best.trials = [begun(task, off=0.02)]
     text = _so_far(made, best, task)
@@ -268,7 +272,7 @@ def test_what_the_scatter_of_runs_costs_is_not_called_unexplained():
     each = [task.utility(run) for run in runs]
     mean = task.utility(mean_trial(runs, task.model.angle_mask))
     best = SimpleNamespace(
-        candidate=SimpleNamespace(id="c0001"),
+        candidate=SimpleNamespace(id="c0001", predicted_states=np.zeros((0, 1))),
         utility=np.mean(each),
         standard_error=1e-4,
         noise_cost=0.0,
@@ -286,7 +290,7 @@ def test_a_difference_with_one_reason_has_one_number():
     runs = [begun(task, noise=0.02, seed=seed) for seed in range(2)]
     costs = [-task.utility(run) for run in runs]
     best = SimpleNamespace(
-        candidate=SimpleNamespace(id="c0001"),
+        candidate=SimpleNamespace(id="c0001", predicted_states=np.zeros((0, 1))),
         utility=-np.mean(costs),
         standard_error=1.0,
         noise_cost=0.0,
@@ -323,7 +327,7 @@ def test_a_start_within_a_step_of_its_encoder_is_not_elsewhere(off, told):
     read = np.array(run.states)
     read[:, 0] = step * (np.arange(len(read)) // 6 + off)
     read[6::6, 0] -= 0.5 * step + 1e-4 * np.arange(len(read[6::6]))  # interpolated
-    found = began_elsewhere(task, [replace(run, states=read)])
+    found = began_elsewhere(task, [replace(run, states=read)], begun(task).states)
     assert found == ({"x": "+0.12 m in x"} if told else {})
 
 
@@ -333,16 +337,20 @@ def test_the_noise_of_a_first_row_is_no_start_elsewhere():
 
     task = cart_task()
     rows = [begun(task, noise=0.02, seed=seed) for seed in range(40)]
+    said = begun(task).states
     assert max(abs(run.states[0, 0]) for run in rows) > 0.03
-    assert sum(began_elsewhere(task, [run]) != {} for run in rows) <= 1
-    assert began_elsewhere(task, [begun(task, off=0.02)]) == {"x": "+0.02 m in x"}
-    assert began_elsewhere(task, [begun(task, off=0.1, noise=0.02)]).keys() == {"x"}
-    assert began_elsewhere(task, rows) == {}
+    assert sum(began_elsewhere(task, [run], said) != {} for run in rows) <= 1
+    assert began_elsewhere(task, [begun(task, off=0.02)], said) == {"x": "+0.02 m in x"}
+    assert began_elsewhere(task, [begun(task, off=0.1, noise=0.02)], said).keys() == {"x"}
+    assert began_elsewhere(task, rows, said) == {}
     shifted = [begun(task, off=0.02, noise=0.02, seed=seed) for seed in range(40)]
-    assert began_elsewhere(task, shifted).keys() == {"x"}  # the mean of many is more precise
+    assert began_elsewhere(task, shifted, said).keys() == {"x"}  # the mean of many is more precise
     made = promise("c0001", -8.0, 0.5, -10.0)
     best = SimpleNamespace(
-        candidate=SimpleNamespace(id="c0001"), utility=-10.0, standard_error=0.1, noise_cost=0.0
+        candidate=SimpleNamespace(id="c0001", predicted_states=np.zeros((0, 1))),
+        utility=-10.0,
+        standard_error=0.1,
+        noise_cost=0.0,
     )
     best.trials = [begun(task, noise=0.02)]
     text = _so_far(made, best, task)

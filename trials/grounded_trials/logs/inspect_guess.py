@@ -404,6 +404,7 @@ def _alike(path: str, other: str) -> bool:
 
 
 def clock_of(log: LogReport, topic: TopicReport) -> str:
+    """Return the clock by which a topic's numbers are read."""
     return "header" if topic.stamped and not is_simulated(log) else "log"
 
 

@@ -241,7 +241,7 @@ def cost_of_inputs(task: Task, run: Trial) -> float:
 
 
 def began_elsewhere(
-    task: Task, trials: Sequence[Trial], estimated: Collection[str] = ()
+    task: Task, trials: Sequence[Trial], predicted: Array, estimated: Collection[str] = ()
 ) -> dict[str, str]:
     """Return how far from [task] start runs of one candidate began, `{"x": "+0.02 m in x"}`.
 
@@ -250,7 +250,7 @@ def began_elsewhere(
     """
     off = np.array([task.model.difference(t.states[0], task.start) for t in trials])
     mean = off.mean(axis=0)
-    told = beyond_noise(trials, off, task.start) & (np.abs(mean) > _resolution(trials))
+    told = beyond_noise(trials, off, task.start, predicted) & (np.abs(mean) > _resolution(trials))
     return {
         name: f"{with_unit(f'{mean[i]:+.2g}', unit)} in {name}"
         for i, (name, unit) in enumerate(task.model.states.items())

@@ -13,8 +13,8 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.result import listed
 from grounded.search.planner import predicted
-from grounded.search.returned.who_drove import LEAST, second_differences
-from grounded.search.scatter import Repeats
+from grounded.search.returned.who_drove import LEAST
+from grounded.search.scatter import Repeats, sample_noise
 from grounded.search.standing import standing
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
@@ -28,7 +28,6 @@ SURE = 3.0  # the start must also be off by this many std of sensor noise and of
 MUCH = 1.0  # share of a mean step's cost from which earlier starts that scatter are no excuse
 SPOILT = 0.2  # share of the run's cost by which the start changes it too much
 FEWEST = 2  # smallest number of earlier runs from which the scatter of starts is estimated
-WHITE = 0.6745 * 6**0.5  # median of absolute second differences of white noise of std 1
 
 
 @dataclass(frozen=True)
@@ -67,8 +66,8 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     states = _inside(task, trial.states[: trial.finite_steps + 1])
     failed = len(states) <= trial.finite_steps
     usual = np.ptp(states, axis=0)
-    jumps = np.abs(second_differences(states, task.model.angle_mask))
-    noise = np.median(jumps, axis=0) / WHITE if len(jumps) else np.zeros(len(usual))
+    predicted = workspace.candidate(trial.candidate)[0].predicted_states
+    noise = sample_noise(trial.until(len(states) - 1), predicted)
     known = -task.rewards(trial)[: len(states)]
     known = known[np.isfinite(known)]
     usually = known.sum() / max(len(known), 1)
