@@ -154,3 +154,13 @@ def test_a_dead_zone_in_which_nothing_rests_was_not_searched_for(cars):
     steady[..., 0] += 0.2 * data.commands[..., 0]
     driven = Predictor(replace(data, commands=steady))
     assert price(driven, zone, {"c": 0.1}) == pytest.approx(wide - np.log(zone.places))
+
+
+def test_a_limit_of_a_rate_is_not_below_the_rates_in_the_log(cars):
+    """With two commands exchanged, a limit of 0 rad/s^2 was claimed, and advised for adoption."""
+    _, data = cars
+    predictor, limit = Predictor(data), effect(data, "slew_limit:v")
+    assert price(predictor, limit, {"r": 0.0}) == price(predictor, limit, {"r": 1e-3}) == np.inf
+    i = data.model.state_names.index("v")
+    fastest = np.abs(np.diff(data.y[..., i], axis=0)).max() / data.dt
+    assert np.isfinite(price(predictor, limit, {"r": fastest}))

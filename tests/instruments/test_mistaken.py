@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import grounded as gr
+from cli import grounded
 from facts import holding, holds
 from grounded import Model, Param
 from grounded.errors import GroundedError
@@ -20,6 +21,7 @@ from grounded.instruments.mistaken import (
 )
 from grounded.instruments.short_runs import Ahead, Fit
 from grounded.trial import Trial
+from ros_bags import thruster_bag
 
 
 def vessel(gain=1.0, arm=0.6, drag=0.8, **params):
@@ -100,6 +102,17 @@ def test_exchanged_commands_are_named_and_a_crude_model_is_no_exchange(crude, la
     assert told.mended < told.logged / 2 and not told.others
     said = described(crude, told)
     assert holds(said, "port and starboard", "r, east and psi")  # the mirror image does it, too
+
+
+def test_an_exchange_behind_a_lag_and_a_dead_zone_is_named(tmp_path):
+    """A diagnosis claimed that the turn rate can't change faster than 0 rad/s^2."""
+    for folder, swapped in (("right", False), ("crossed", True)):
+        w = tmp_path / folder
+        log = thruster_bag(tmp_path / f"{folder}-bag", swapped=swapped, names=True)
+        assert grounded("init", w, "--from", log).code == 0
+        said = grounded("-C", w, "ingest", "--data", log)
+        assert said.code == 0
+        assert ("columns of left and right look exchanged" in " ".join(said.err.split())) == swapped
 
 
 def rover(tau=0.3, k_w=1.0):

@@ -79,3 +79,57 @@ def test_a_diagnosis_stops_at_the_trial():
     judge_positions(MODEL, trials[:1])
     with pytest.raises(GroundedError, match=r"trial number 2 x and y.*by 1000"):
         sound_trials(MODEL, trials)
+
+
+def rolling(s, a, p):
+    """A ball on a beam that follows its servo with a lag."""
+    return {
+        "x": s.v,
+        "v": 5 / 7 * p.g * np.sin(s.beam) - p.c * s.v,
+        "beam": (a.servo - s.beam) / p.tau,
+    }
+
+
+BALL = Model(
+    states={"x": "m", "v": "m/s", "beam": "rad"},
+    inputs={"servo": "rad"},
+    params={"g": Param(9.81, "m/s^2"), "tau": Param(0.05, "s", 0.01, 0.3), "c": Param(0.1, "1/s")},
+    derivative=rolling,
+)
+
+
+def rolled(factor=1.0, speed_too=True, seed=0, steps=1500):
+    """A log of a ball on a beam that is slower and not level; the speed is a late, filtered one."""
+    rng = np.random.default_rng(seed)
+    sent = np.repeat(rng.uniform(-0.2, 0.2, (steps // 30, 1)), 30, axis=0)
+    x, v, beam, old, rows = 0.0, 0.0, 0.0, 0.0, []
+    for k in range(steps + 1):
+        old += DT / 0.09 * (v - old)
+        rows.append([x, old, beam])
+        pulled = sent[min(k, steps - 1), 0] - 0.4 * x - 0.5 * v  # by hand, so that it stays there
+        sent[min(k, steps - 1), 0] = np.clip(pulled, -0.35, 0.35)
+        beam += DT / 0.09 * (sent[min(k, steps - 1), 0] - beam)
+        v += DT * (5 / 7 * 9.81 * np.sin(beam + 0.008) - 0.15 * v - 0.035 * np.sign(v))
+        x += DT * v
+    noisy = np.array(rows) + rng.normal(0, [2e-3, 8e-3, 1e-3], (steps + 1, 3))
+    noisy[:, : 1 + speed_too] *= factor
+    return Trial(noisy, sent, DT, BALL.state_names, BALL.input_names)
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1000.0, "in mm"), (100.0, "in cm"), (0.001, "in km")]
+)
+def test_lengths_and_speeds_in_another_unit_are_named_together(factor, unit):
+    """A ball logged in mm was accelerated by 6930 m/s^2 per rad, the diagnosis said."""
+    found = positions_off(BALL, rolled(factor), range(3))
+    assert found is not None and found.names == ("x", "v") and found.factor == factor
+    assert unit in found.described and "[log.state.v]" in found.mend
+    with pytest.raises(GroundedError, match="x and v look"):
+        sound_trials(BALL, [rolled(factor)])
+
+
+def test_a_ball_in_metres_is_right_also_with_a_crude_model():
+    assert positions_off(BALL, rolled(), range(3)) is None
+    for g in (1.0, 40.0):
+        crude = BALL.with_values({"g": g})
+        assert positions_off(crude, rolled(), range(3)) is None

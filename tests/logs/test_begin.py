@@ -26,7 +26,7 @@ from grounded_trials.starting.shapes import Drive, hinges, path_target, swing_up
 from grounded_trials.workspace.exporting import void_exports
 from grounded_trials.workspace.off_target import rates_beside
 from grounded_trials.workspace.task_file import equal_weights, read_target, without_range
-from ros_bags import arm_bag, boat_bag, car_bag, commanded_arm_bag, rover_bag
+from ros_bags import arm_bag, boat_bag, car_bag, commanded_arm_bag, rover_bag, thruster_bag
 from shared_data import data
 
 
@@ -467,6 +467,44 @@ def test_a_boat_with_two_thrusters_is_no_drone(tmp_path, left, right):
     x = model.system.step(np.zeros((1, 6)), np.array([[0.0, 1.0]]), model.values, 0.01)[0]
     moved = dict(zip(model.states, x, strict=True))
     assert moved["u"] > 0 and moved["r"] > 0  # the right thruster alone turns it to the left
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_two_thrusters_in_an_unnamed_array_are_told_by_which_way_they_turn(tmp_path, swapped):
+    """The kind was unknown, and neither thruster was found: exchanged, both push ahead alike."""
+    found = begin(tmp_path / "w", thruster_bag(tmp_path / "bag", swapped))
+    assert found.kind == "boat" and not found.unsure
+    order = [f"/thrusters/cmd.data[{k}]" for k in ((1, 0) if swapped else (0, 1))]
+    assert [guess.path for guess in found.inputs] == order
+    assert grounded("-C", tmp_path / "w", "ingest", "--data", tmp_path / "bag").code == 0
+
+
+def test_a_number_offered_in_a_comment_comes_with_its_clock(tmp_path):
+    """A Float64MultiArray has no stamp: ingest refused the table after its # were removed."""
+    found = begin(tmp_path / "w", thruster_bag(tmp_path / "bag"), kind="car")
+    assert not any(guess.path for guess in found.inputs)
+    path = tmp_path / "w/grounded.toml"
+    text = path.read_text()
+    assert '# clock = "log"' in text and "remove all 3 #" in text
+    used = {"steering": 0, "speed": 1}
+    for name, k in used.items():
+        head, _, rest = text.partition(f"# [log.input.{name}]")
+        block, _, after = rest.partition("\n\n")
+        lines = [line.removeprefix("# ") for line in f"[log.input.{name}]{block}".splitlines()]
+        lines[1] = lines[1].replace("data[0]", f"data[{k}]")
+        text = head + "\n".join(lines) + "\n\n" + after
+    path.write_text(text)
+    assert grounded("-C", tmp_path / "w", "ingest", "--data", tmp_path / "bag").code == 0
+
+
+def test_a_generic_model_has_each_of_its_numbers_once(tmp_path):
+    """Its states were w and z, parts of the quaternion, read from a speed that is constant."""
+    found = begin(tmp_path / "w", thruster_bag(tmp_path / "bag"), kind="generic")
+    paths = {guess.name: guess.path for guess in (*found.states, *found.inputs)}
+    assert len(set(paths.values())) == len(paths) and "" not in paths.values()
+    assert paths["x"].endswith("position.x") and paths["linear_x"].endswith("linear.x")
+    assert paths["angular_z"].endswith("angular.z") and paths["data_1"].endswith("data[1]")
+    assert not any(".orientation." in path and "@" not in path for path in paths.values())
 
 
 def test_a_measured_rate_is_no_input(tmp_path):

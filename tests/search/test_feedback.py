@@ -210,6 +210,25 @@ def test_the_noise_of_a_first_sample_is_no_motion():
     assert away[0] > 0.05  # where it really began elsewhere, that is kept
 
 
+def test_the_noise_of_a_filtered_speed_is_no_start_elsewhere():
+    """A ball at rest read -0.031 m/s: `discard` its best run, it was said."""
+    task, false = cart_task(), 0
+    said = begun(task).states
+    for seed in range(20):
+        rng, states, slow = np.random.default_rng(seed), np.array(said), 0.0
+        noise = []
+        for white in rng.standard_normal(len(states) + 50):
+            slow += task.dt / 0.08 * (white - slow)
+            noise.append(slow)
+        states[:, 1] += 0.03 * np.array(noise[50:]) / np.std(noise)
+        run = replace(begun(task), states=states)
+        false += bool(began_elsewhere(task, [run], said).get("v"))
+    assert false <= 1
+    states = np.array(said)
+    states[:, 1] += 0.3 * np.exp(-np.arange(len(states)) * task.dt)
+    assert "v" in began_elsewhere(task, [replace(begun(task), states=states)], said)
+
+
 @pytest.mark.parametrize(
     ("as_run", "error", "parts", "never"),
     [

@@ -309,3 +309,46 @@ def crane_bag(folder, joint="trolley", load="/sway/state"):
             x, v = x + DT / 5 * v, v + DT / 5 * a
             th, w = th + DT / 5 * w, w - DT / 5 * (a * np.cos(th) + 9.81 * np.sin(th)) / 0.85
     return bag(folder, topics, messages)
+
+
+def thruster_bag(folder, swapped=False, names=False):
+    """Write a bag of a boat whose two thrusters lag by 0.2 s, commanded in one array.
+
+    Args:
+        folder: of the bag.
+        swapped: the array is [right, left].
+        names: the thrusters' commands are on a topic each, /thruster/left and /thruster/right.
+    """
+    rng, h = np.random.default_rng(3), 0.02
+    array, number = T["std_msgs/msg/Float64MultiArray"], T["std_msgs/msg/Float64"]
+    layout = T["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
+    topics = {"/odom": "nav_msgs/msg/Odometry"}
+    if names:
+        topics |= dict.fromkeys(("/thruster/left", "/thruster/right"), "std_msgs/msg/Float64")
+    else:
+        topics["/thrusters/cmd"] = "std_msgs/msg/Float64MultiArray"
+    messages, (x, y, psi, u, v, r), felt, sent = [], np.zeros(6), np.zeros(2), np.zeros(2)
+    for k in range(3000):
+        t = START + k * 20_000_000
+        if k % 60 == 0:
+            sent = rng.uniform(-0.6, 1.0, 2)
+        if k % 5 == 0:
+            told = sent[::-1] if swapped else sent
+            if names:
+                for side, one in zip(("left", "right"), told, strict=True):
+                    messages.append((f"/thruster/{side}", t, number(data=float(one))))
+            else:
+                messages.append(("/thrusters/cmd", t, array(layout=layout, data=np.array(told))))
+        seen = np.array([x, y, psi, u, r]) + rng.normal(0, [8e-3, 8e-3, 4e-3, 0.015, 6e-3])
+        pose = odometry(t, *seen)
+        pose.twist.twist.linear.y = v + 0.015 * rng.normal()
+        messages.append(("/odom", t, pose))
+        felt += h / 0.2 * (np.where(np.abs(sent) > 0.06, sent, 0.0) - felt)
+        push = np.where(felt > 0, 20.0, 12.0) * felt * [1.0, 0.92]
+        u += h * (push.sum() + 24 * v * r - 3 * u - 6.5 * u * abs(u)) / 16.5
+        v += h * (-16.5 * u * r - 8 * v - 45 * v * abs(v)) / 24
+        r += h * (0.2 * (push[1] - push[0]) - 7.5 * u * v - 1.2 * r - 1.5 * r * abs(r)) / 2.5
+        psi += h * r
+        x += h * (u * np.cos(psi) - v * np.sin(psi))
+        y += h * (u * np.sin(psi) + v * np.cos(psi))
+    return bag(folder, topics, messages)

@@ -22,7 +22,7 @@ from grounded.result import Result, listed
 from grounded_trials.formats.text_tables import column_units, states_time_unit
 from grounded_trials.logs.guessed_table import mapping_toml
 from grounded_trials.logs.inspect_evidence import as_stated, weigh
-from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated
+from grounded_trials.logs.inspect_guess import Guess, clock_of, guess_mapping, is_simulated
 from grounded_trials.logs.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.inspect_pairs import rates_among, velocities
 from grounded_trials.logs.joint_names import joint_names, joint_units, wide_joints
@@ -204,7 +204,8 @@ def _begin(
         states, inputs = _matched(report, found, joints)
     if chosen == "generic" and not own:
         states, inputs = (
-            tuple(_only_named(g, of) for g in s) for s, of in ((states, "state"), (inputs, "input"))
+            tuple(_only_named(report, g, of) for g in s)
+            for s, of in ((states, "state"), (inputs, "input"))
         )
         notes = (*notes, *_left_out(report, found), TO_COMPLETE)
     units = {**found.states, **found.inputs}
@@ -311,9 +312,13 @@ def _model_in(folder: Path, text: str) -> Model:
     return model_in(load_module(folder, "model.py"))
 
 
-def _only_named(guess: Guess, of: str) -> Guess:
-    """Mark a generic skeleton's signal as a guess: only its name comes from the log."""
-    why = f"a guess that it is a{'n' * (of == 'input')} {of}"
+def _only_named(report: LogReport, guess: Guess, of: str) -> Guess:
+    """Mark a generic skeleton's signal as a guess: only its name and path come from the log."""
+    why, own = f"a guess that it is a{'n' * (of == 'input')} {of}", moving(report).get(guess.name)
+    if own is not None and own.path != guess.path:
+        topic = next(t for t in report.topics if own in t.fields)
+        clock = clock_of(report, topic)
+        guess = Guess(guess.name, own.path, clock, sure=False, others=(), field=own)
     return replace(guess, sure=False, reasons=(*guess.reasons, why)) if guess.path else guess
 
 

@@ -42,6 +42,8 @@ ACTUATOR = re.compile("servo|actuator")  # either a command or a measured positi
 EFFORT = re.compile("force|thrust|power")  # an input if nothing else looks like one
 EFFORT_UNITS = NAMES_BY_UNIT.keys() - {"A"}  # a current in a log is mostly a measured one
 
+# no signals by themselves
+NO_SIGNALS = re.compile(r"covariance|layout|(orientation|rotation|quaternion)\.[xyzw]$")
 HEADING = re.compile(r"(^|[/._])(yaw|psi|heading|theta|th|orientation)([/._\d]|$)")
 SENSED = re.compile(
     "encoder|tick|position|current|effort|bumper|cliff|range|sonar|feedback|measured"
@@ -57,10 +59,22 @@ FLYING = re.compile(
 
 
 def moving(log: LogReport) -> dict[str, FieldReport]:
-    """Return the numbers of a log that change, by their names in a generic model."""
+    """Return the numbers of a log that change, by their names in a generic model.
+
+    Of several with one name, such as the x of a position and of a speed, the others are named after
+    their group, too: linear_x.
+    """
     fields = [one for t in log.topics for one in t.fields if one.low != one.high]
-    fields = [one for one in fields if not re.search(r"covariance|layout", one.path)]
-    return {_word(one.path): one for one in reversed(fields)}
+    fields = [one for one in fields if not NO_SIGNALS.search(one.path)]
+    found: dict[str, FieldReport] = {}
+    for one in fields:
+        name, grouped = _word(one.path), _in_group(one.path)
+        name = grouped if grouped.startswith("angular_") else name
+        if name not in found:
+            found[name] = one
+        elif not (one.path.count("@") or grouped in found):
+            found[grouped] = one
+    return dict(reversed(found.items()))
 
 
 def called_input(name: str, path: str) -> bool:
@@ -143,6 +157,12 @@ def _rates(log: LogReport, paths: Mapping[str, str]) -> dict[str, str]:
     }
 
 
+def _in_group(path: str) -> str:
+    """Return the end of a message path with the name before it, as a Python name: linear_x."""
+    last = re.sub(r"\W+", "_", ".".join(path.rsplit(".", 2)[-2:])).strip("_")
+    return last if last.isidentifier() else f"s_{last}"
+
+
 def _word(path: str) -> str:
     """Return the end of a message path as a Python name."""
     last = path.replace("@", "").rsplit(".", 1)[-1].strip('"')
@@ -180,10 +200,11 @@ def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
     if flying is not None:
         return "drone", f"{flying} is named like a drone"
     both = _both_sides(log)
-    afloat = next((t.topic for t in log.topics if AFLOAT.search(t.topic.lower())), None)
-    if both and afloat is not None:
-        named = f"{afloat} is named like a boat's"
-        return "boat", f"{named}, and there are the commands {' and '.join(both)}, and a heading"
+    afloat = [t for t in log.topics if AFLOAT.search(t.topic.lower())]
+    pairs = both or next(filter(None, map(_two_unnamed, afloat)), ())
+    if afloat and pairs and (both or _headed(log)):
+        named = f"{afloat[0].topic} is named like a boat's"
+        return "boat", f"{named}, and there are the commands {' and '.join(pairs)}, and a heading"
     for wanted, kind, what in (
         (("steer",), "car", "has a steering signal"),
         (
@@ -252,10 +273,22 @@ def _crane(log: LogReport, units: Units) -> Skeleton:
     return replace(CRANE, inputs={sent[0]: unit}, before=before, params=params)
 
 
+def _headed(log: LogReport) -> bool:
+    """Return whether a log has a heading that changes."""
+    moving_paths = (f.path for t in log.topics for f in t.fields if f.low != f.high)
+    return any(HEADING.search(path.lower()) for path in moving_paths)
+
+
+def _two_unnamed(topic: TopicReport) -> tuple[str, ...]:
+    """Return the two changing numbers of a topic that is an unnamed array; else ()."""
+    found = tuple(f.path for f in topic.fields if f.low != f.high)
+    return found if len(found) == 2 and all(f.endswith("]") for f in found) else ()
+
+
 def _both_sides(log: LogReport) -> tuple[str, ...]:
     """Return the names of a left and a right command; () without both, or without a heading."""
     paths = {f.path for t in log.topics for f in t.fields if f.low != f.high}
-    if not any(HEADING.search(path.lower()) for path in paths):
+    if not _headed(log):
         return ()
     for left in sorted(paths):
         right = re.sub("left|Left|LEFT", lambda m: OTHER[m[0]], left)

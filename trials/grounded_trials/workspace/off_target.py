@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.frozen import Array
+from grounded.frozen import Array, white_noise
 from grounded.model import Model
 from grounded.result import Document, measured_alike
 from grounded.search.scatter import beyond_noise
@@ -34,6 +34,7 @@ FARTHER = 1.1  # of the error before: a better candidate's larger error is expla
 STEPS, STEPPED = 3, 0.3  # values that a sensor repeats, their share of its rows: it has steps
 NARROW = 0.25  # of the median gap of repeated values: one beside an interpolated value is smaller
 RATES = ("speed", "heading_rate", "rates")  # roles of velocities
+WITHIN = "within its noise of"  # of an error at the end that a single sample can't show
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
 
 
@@ -49,6 +50,7 @@ class OffTarget(Document):
         at_s: when the largest error occurred, in seconds of the run.
         end: rms of the errors at the last state; NaN if a run ended early, or if the end has no
             weight of its own and nothing is to be reached (see `reaches`).
+        noise: std of the noise of a single sample, below which an error at the end says nothing.
     """
 
     what: str
@@ -57,16 +59,18 @@ class OffTarget(Document):
     most: float = float("nan")
     at_s: float = float("nan")
     end: float = float("nan")
+    noise: float = 0.0
 
     def summary(self) -> str:
         """Return a text such as `position 2.1 mm rms, 7.3 mm at most (at 7.95 s)`."""
         told = []
         at_end = 0.0 if self.end < EXACT * self.most else self.end  # of a plan
-        rms, most, end = measured_alike([self.rms, self.most, at_end], self.unit)
+        least = max(at_end, self.noise)
+        rms, most, end = measured_alike([self.rms, self.most, least], self.unit)
         if np.isfinite(self.rms):
             told += [f"{rms} rms", f"{most} at most (at {self.at_s:.4g} s)"]
         if np.isfinite(self.end):
-            told.append(f"{end} at the end")
+            told.append(f"{end} at the end" if at_end == least else f"at the end {WITHIN} {end}")
         return f"{self.what} {', '.join(told)}"
 
 
@@ -94,7 +98,7 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
             continue
         running, terminal = task.reward.state[states], task.reward.terminal[states]
         cost = sum(float((e**2 @ running).sum() + e[-1] ** 2 @ terminal) for e in each)
-        values: dict[str, float] = {}
+        values = {"noise": single_sample_noise(whole, states)}
         if running.any() or ended:
             far = [np.linalg.norm(e, axis=1) for e in each]
             worst = max(far, key=lambda d: float(d.max()))
@@ -108,6 +112,12 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
     dear = MOST * sum(cost for _, cost, _ in ranked)
     told += [k for _, cost, k in ranked if cost < dear and k not in told]
     return tuple(found[k] for k in told)
+
+
+def single_sample_noise(trials: Sequence[Trial], states: Sequence[int]) -> float:
+    """Return the noise (std) of one sample of the distance that some states have, by its runs."""
+    each = [white_noise(trial.states[: trial.finite_steps + 1])[list(states)] for trial in trials]
+    return float(np.sqrt(np.mean([noise @ noise for noise in each])))
 
 
 def rates_among(task: Task, groups: Sequence[tuple[Sequence[str], str]]) -> list[bool]:
