@@ -192,6 +192,31 @@ def test_what_holds_the_start_is_held_before_it_or_asked_for(tmp_path):
     assert not notes("{ v = 1.0 }")  # in motion, which no input holds
 
 
+BALL = """
+import numpy as np
+from grounded import Model
+
+def rate(s, a, p):
+    return {"x": s.v, "v": 7.0 * np.sin(s.beam) + 0.07, "beam": (a.servo - s.beam) / 0.1}
+
+model = Model(states={"x": "m", "v": "m/s", "beam": "rad"}, inputs={"servo": "rad"},
+              derivative=rate)
+"""
+
+
+def test_how_a_start_moves_is_told_of_the_robot_not_of_a_filter(tmp_path):
+    """A speed's filter hid a beam that is not level: 0.00566 instead of 0.056 m/s^2."""
+    (tmp_path / "ball.py").write_text(BALL)
+    w = Workspace.create(tmp_path / "w", model=tmp_path / "ball.py", dt=0.02)
+    w.target({"x": np.linspace(0.0, 0.3, 101)})
+    file = w.folder / "grounded.toml"
+    lag = '[[model.effects]]\nname = "sensor_lag:v"\ntau = 0.1\n'
+    file.write_text(file.read_text() + lag)
+    notes = Workspace(w.folder).propose().proposal.notes
+    (note,) = [one for one in notes if "the plan assumes" in one]
+    assert "v changes at once, by 0.07 m/s per second" in note
+
+
 FAN = """
 from grounded import Model, Param
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.model import is_clock
-from grounded.places import integrals
+from grounded.places import integrals, true_values
 from grounded.task import Task
 from grounded_trials.wording import with_unit
 from grounded_trials.workspace.config import FILE
@@ -69,8 +69,11 @@ def held_before(workspace: Folder, again: bool = False) -> list[str]:
     stands[np.abs(stands) < NOTHING * span] = 0.0
     if not (np.abs(stands - given) > (MOVED if chosen else NOTHING) * span).any():
         return []
-    rate = moved_at_start(task, task.past) / task.dt
-    k = int(np.argmax(np.abs(rate[:n])))
+    moved = moved_at_start(task, task.past) / task.dt
+    rate = moved[:n].copy()  # of a state that is logged through a filter, the true rate
+    for memory_state, own in true_values(states, states[n:]).items():
+        rate[own] = max(rate[own], moved[memory_state], key=abs)
+    k = int(np.argmax(np.abs(rate)))
     other = {
         name: to
         for name, at, to in zip(units, given, stands, strict=True)
