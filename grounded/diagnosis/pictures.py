@@ -14,14 +14,13 @@ from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
 from grounded.result import figure, measured, measured_alike, number, percent, shown
 
 MOST = 12  # bars
+BEFORE = "before these causes"  # also where they were adopted since, or others before
 APART = 0.01  # relative difference of errors below which curves coincide
 WHOLE = "whole trial"
 APART_BY = 2.0  # where errors over whole trials are drawn, in units of the longest horizon
 SHOWS = 1.02  # ratio of errors without and with a cause from which bars show its worth
-SPARED = (
-    "All but: with every cause of this diagnosis except one, fitted again. Causes may offset each "
-    "other, so that all but one are worse than the model as it is."
-)
+SPARED = "All but: with every cause of this diagnosis except one, fitted again."
+OFFSET = f" Causes may offset each other: all but one are worse than the model {BEFORE}."
 CREDIT_S = 1.0  # horizon at which an effect's worth is measured [s]
 MODELS = {  # keys of a prediction error: role, name
     "outset": ("limit", "model.py"),
@@ -153,7 +152,7 @@ def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
     panels = [Bars("Errors without each, mean of all (logarithmic)", bars)]
     for name in _improved(known)[:channels] if known else ():
         panels += worth_of([name], name, diagnosis)
-    caption = SPARED if len(panels) > 1 else ""
+    caption = (SPARED + OFFSET * _longer(panels[1:])) if len(panels) > 1 else ""
     return Figure("credit", "What each is worth", caption, tuple(panels))
 
 
@@ -186,7 +185,7 @@ def worth_figure(
             hidden.append(credit.of)
     panels = [panel for names, what in drawn for panel in worth_of(names, what, diagnosis)]
     known = [_loss(c, error, names) for c in diagnosis.credit[:MOST] for names, _ in drawn]
-    caption = SPARED * bool(diagnosis.credit)
+    caption = (SPARED + OFFSET * _longer(panels)) * bool(diagnosis.credit)
     caption += (
         " A cause is claimed for the mean over all states and horizons. If predictions of one "
         "state are better without it, its bar is shorter than that of all."
@@ -195,6 +194,16 @@ def worth_figure(
         f" The improvement by {', '.join(hidden)} shows at other horizons, in no state 1 s ahead."
     ) * bool(hidden)
     return Figure("credit", "", caption.strip(), tuple(panels)) if panels else None
+
+
+def _longer(panels: Sequence[Bars]) -> bool:
+    """Check whether a bar of all but one cause is longer than that of the model before them."""
+    for panel in panels:
+        by = {bar.label: bar.value for bar in panel.bars}
+        without = [value for name, value in by.items() if name.startswith("all but")]
+        if max(without, default=0.0) > by.get(f"model {BEFORE}", math.inf):
+            return True
+    return False
 
 
 def _loss(credit: Credit, error: RulerRow, names: Sequence[str]) -> float:
@@ -224,8 +233,9 @@ def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars
     if error is None or not set(names) <= set(error.crude):
         return []
     unit = error.unit_by_channel.get(names[0], "")
+    said = BEFORE if diagnosis.credit else "with what was adopted" if error.outset else "as it is"
     rows = [((MODELS["outset"][0], "model.py, nothing adopted"), error.outset)]  # {} if it is so
-    rows += [(("model", "model as it is"), error.crude)]
+    rows += [(("model", f"model {said}"), error.crude)]
     if diagnosis.credit:  # else nothing was found: the same error once more
         rows += [(("best", "with all causes"), error.with_effects)]
     rows += [(("limit", f"all but {c.of}"), c.without_it) for c in diagnosis.credit[:MOST]]

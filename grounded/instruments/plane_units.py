@@ -20,6 +20,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.instruments.odd_trial import predicted
 from grounded.instruments.other_units import unusable
+from grounded.instruments.rate_ratios import ratios_of
 from grounded.instruments.short_runs import Ahead
 from grounded.model import Model
 from grounded.result import listed
@@ -32,6 +33,7 @@ SIZED = 2.0  # factor within which the rest must move as far as predicted
 LEAST = 20  # fewest predictions
 UNITS = {1e3: "mm", 1e2: "cm", 1e-3: "km"}  # in which a length in m is so many times too large
 SAMPLES = 120  # of a trial that calibrated predictions start from
+ALONE = 3.0  # factor within which positions must move as their velocities say
 ALL = (1e3, 1e2, 1e-2, 1e-3)  # times too large that all lengths may be
 MISSED, EXPLAINED = 0.8, 0.7  # share of a velocity's change that is missed: as logged, and divided
 TIED = 0.1  # by how much more of another velocity's change may be missed
@@ -64,7 +66,7 @@ class Positions:
         one, large = len(self.names) == 1, self.factor > 1
         size = self.factor if large else 1 / self.factor
         if self.of:
-            unit = f" (in {UNITS[self.factor]}?)" * (self.factor in UNITS)
+            unit = f" (in {UNITS[self.factor]}?)" if self.factor in UNITS else ""
             with_it, without = (f"{100 * share:.0f} %" for share in reversed(self.missed))
             way = f"divided by {size:g}" if large else f"times {size:g}"
             return (
@@ -134,6 +136,9 @@ def _lengths(model: Model, trial: Trial, known: Sequence[int]) -> Positions | No
     fast = [i for i in known if units[i] == "m/s"]
     if any(unit.partition("/")[0] == "m" for unit in model.inputs.values()):
         return None
+    exact = [ratio for one, ratio in ratios_of(model, [trial], known)[0] if one.exact]
+    if not all(1 / ALONE < ratio < ALONE for ratio in exact):
+        return None  # one signal alone is off: see `other_units`
     with np.errstate(all="ignore"):
         logged = _missed(model, trial, known, fast)
         if logged is None:

@@ -232,6 +232,15 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
     )
 
 
+def _steps_lost(make: Maker, own: str) -> str:
+    """Return how many steps from a candidate lost, with the model as it is now."""
+    history = make.now.history
+    lost = len(losers_of(history, own, make.fingerprint))
+    each = sum(t.accepted is False and t.candidate.base == own for t in history)
+    now = " with the model as it is now" * (each > lost)
+    return f"{lost} step{'s' * (lost > 1)} from {own}{now}"
+
+
 def _below_noise(
     make: Maker, best: Tried, made: Candidate, options: SearchOptions
 ) -> Standing | None:
@@ -246,7 +255,7 @@ def _below_noise(
     if not (options.damps and lost and made.grounded and gain < error):
         return None
     own = best.candidate.id
-    sentence = f"{len(lost)} step{'s' * (len(lost) > 1)} from {own} did not improve, and the next "
+    sentence = f"{_steps_lost(make, own)} did not improve, and the next "
     if gain > 0:
         runs = runs_to_show(gain, best)
         sentence += (
@@ -319,7 +328,7 @@ def _ended(
     if doubted is not None:
         phase, then, ending = "converged", None, "no step improved"
         sentence = (
-            f"{lost} steps from {own} did not improve, and the next promises "
+            f"{_steps_lost(make, own)} did not improve, and the next promises "
             f"{doubted.predicted_gain:.3g} with a likely error of {doubted.likely_off:.3g}: {own} "
             "is the result"
         )
@@ -345,7 +354,7 @@ def _ended(
     elif lost:
         phase, then, ending = "converged", None, "no step improved"
         sentence = (
-            f"{lost} step{'s' * (lost > 1)} from {own} did not improve, and the model promises "
+            f"{_steps_lost(make, own)} did not improve, and the model promises "
             f"less than {100 * tolerance:g} % from smaller steps: {own} is the result"
         )
     else:

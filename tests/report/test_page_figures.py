@@ -354,15 +354,18 @@ def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
     assert share.bars[0].text == "2.4 times"
     assert worth.title == "v: error 1 s ahead"  # what predictions improved most
     assert [bar.value for bar in worth.bars] == [0.5, 0.05, 0.4, 0.04]
-    names = ["model as it is", "with all causes", "all but delay:u", "noise alone"]
+    names = ["model before these causes", "with all causes", "all but delay:u", "noise alone"]
     assert [bar.label for bar in worth.bars] == names and worth.bars[2].text == "0.40 m/s"
-    assert "except one" in figure.caption  # such a bar may be longer than the model's
+    assert "except one" in figure.caption and "offset" not in figure.caption
+    worse = replace(credit[0], without_it={"x": 0.15, "v": 0.6})
+    figure = credit_figure(replace(found, credit=(worse,)))  # longer than the model's
+    assert "offset each other" in figure.caption
     later = replace(row, outset={"x": 0.7, "v": 1.4}, crude=row.with_effects)
     settled = replace(found, credit=(), prediction_error=(later,))
     (bars,) = worth_figure(settled, [(["v"], "v")]).panels  # was `1.2 mm` twice, without 142 mm
     assert [bar.label for bar in bars.bars] == [
         "model.py, nothing adopted",
-        "model as it is",
+        "model with what was adopted",
         "noise alone",
     ]
     assert [bar.value for bar in bars.bars] == [1.4, 0.05, 0.04]

@@ -31,6 +31,7 @@ LONGEST_RUN, SHORTER_RUN = 200, 150  # most steps of a run; the second applies t
 PIECES, SHORTEST_PIECE = 5, 50  # a single log is held out in pieces of at least this many steps
 MOST_NUMBERS = 1.2e6  # size of one (L, B, N, N) array above which only informative runs are kept
 SIMULATED = 800  # total steps kept for a simulator, since each is evaluated thousands of times
+SESSION, ROOMY = 16, 2.5  # runs of a session at the robot, all kept up to ROOMY times that size
 BEGINNINGS = 8  # most runs kept only because a trial begins with them
 
 
@@ -192,11 +193,13 @@ def prepare(
     steps = np.concatenate([trial.inputs[:T] for trial, T in used])
     slow = simulated(model)
     state_at, step_at, valid, trial_of = _cut(lengths, SHORTER_RUN if slow else LONGEST_RUN)
-    most = max(1, int(MOST_NUMBERS / (step_at.shape[1] * model.n**2 * 4)))
+    some = MOST_NUMBERS / (step_at.shape[1] * model.n**2 * 4)
+    # runs of a few trials are kept if possible: repeats, which show the noise, are among them
+    most = max(1, len(step_at) if len(step_at) <= min(SESSION, ROOMY * some) else int(some))
     begins = np.flatnonzero(np.diff(trial_of, prepend=-1))
     if slow:
-        some = max(PIECES, min(len(begins), BEGINNINGS), SIMULATED // step_at.shape[1])
-        most = min(most, some)
+        few = max(PIECES, min(len(begins), BEGINNINGS), SIMULATED // step_at.shape[1])
+        most = min(most, few)
     keep = _informative([_filled(states)[state_at], steps[step_at]], begins, most)
     return Data(
         model=model,

@@ -21,7 +21,13 @@ from grounded.search.safety import coasting
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import with_unit
-from grounded_trials.workspace.off_target import rates_among, reaches, weighed_groups
+from grounded_trials.workspace.off_target import (
+    position_axes,
+    rates_among,
+    reaches,
+    roles_of,
+    weighed_groups,
+)
 
 AWAY = 0.02  # drift after a run, relative to the target's extent, above which it is reported
 DEAR = 0.2  # of the run's cost: what its end would cost more where the robot came to be after it
@@ -197,6 +203,8 @@ def _to_stay(task: Task, states: Sequence[int]) -> str:
 
     end = task.target[-max(2, len(task.target) // 20) :, states]
     rates = [one.j for one in integrals(task.model) if one.exact and one.i in states]
+    if {*states} & {*position_axes(task.model)}:
+        rates += roles_of(task.model).get("speed", [])  # of a boat or car, along its own axes
     ways = ["let the target rest at its end (target --hold)"] * bool(np.ptp(end, axis=0).any())
     if not rates or not (task.reward.terminal[rates] > 0).all():
         ways.append("weigh the rates at the end ([reward] terminal)")
