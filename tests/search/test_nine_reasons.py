@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from grounded import Model
-from grounded.instruments.odd_trial import all_in_degrees
+from grounded.instruments.units.odd_trial import all_in_degrees
 from grounded.plant import Plant
 from grounded.search import first_policy as starts
 from grounded.search import making, mispredictions

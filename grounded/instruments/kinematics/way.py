@@ -15,10 +15,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.frozen import Array
-from grounded.instruments.finding import Finding, put_right
-from grounded.instruments.kinematics import TURNED_AWAY, Turned, lag_of, turned
-from grounded.instruments.other_units import unusable
-from grounded.instruments.rows import LEAST, STRETCH, Row, per_step
+from grounded.instruments.finding import Finding, put_right, unusable
+from grounded.instruments.kinematics.relations import (
+    TURNED_AWAY,
+    Turned,
+    lag_of,
+    turned,
+)
+from grounded.instruments.kinematics.rows import (
+    LEAST,
+    STRETCH,
+    Row,
+    per_step,
+)
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.result import listed

@@ -18,9 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.frozen import Array
-from grounded.instruments.odd_trial import predicted
-from grounded.instruments.other_units import unusable
-from grounded.instruments.short_runs import Ahead
+from grounded.instruments.finding import unusable
+from grounded.instruments.predictions.short_runs import Ahead, predicted
 from grounded.model import Model
 from grounded.result import listed
 from grounded.trial import Trial

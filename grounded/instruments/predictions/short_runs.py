@@ -1,6 +1,7 @@
-"""Calibrated predictions of one trial a quarter of a second ahead, from many samples at once.
+"""Predictions of one trial a quarter of a second ahead, from many samples at once.
 
-Uncertain parameters, a gain on every input and a common delay of the commands are fitted, and a
+The model predicts as it is (`predicted`, `missed`), or calibrated on the trial itself (`Ahead`):
+uncertain parameters, a gain on every input and a common delay of the commands are fitted, and a
 constant rate of each state is removed. The remaining error is what no plain calibration explains.
 On request everything linear in the states (unmodelled friction, back-EMF, springs) or in the
 commands is removed as well.
@@ -15,11 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.frozen import Array
-from grounded.instruments.odd_trial import AHEAD, FAR
 from grounded.model import Model
 from grounded.rollout import each_stepped
 from grounded.trial import Trial
 
+AHEAD = 0.25  # [s]
+FAR = 1e9  # bound on predicted states
+STARTS = 200  # samples that the model as it is predicts from
 DELAYS = (0.0, 0.05, 0.1, 0.2)  # [s] command delays tried
 LEAST = 20  # fewest samples
 LITTLE, TINY = 1e-3, 1e-12  # smallest error that counts: of a state's spread, and in its unit
@@ -28,6 +31,62 @@ SAME = 1e-6  # singular values below this share of the largest count as zero
 ENOUGH = 0.01  # [nats] smallest gain of an iteration: below it the fit stops
 
 Steps = NDArray[np.intp]
+
+
+def predicted(
+    model: Model, trial: Trial, shown: Sequence[int], horizon: float = AHEAD
+) -> tuple[Array, Array, Array] | None:
+    """Predict a trial by a horizon [s] ahead, from many of its samples.
+
+    Args:
+        model: that predicts.
+        trial: of this model's states.
+        shown: indices of the states with a sensor; the others are taken as 0.
+        horizon: [s].
+
+    Returns:
+        The states (N, n) logged at the start, those predicted, and those logged at the horizon;
+        None if too little is known.
+    """
+    steps = max(1, round(horizon / trial.dt))
+    logged = np.array(trial.states)
+    logged[:, [i for i in range(model.n) if i not in shown]] = 0.0  # unknown
+    good = np.asarray(np.isfinite(logged).all(axis=1))
+    at = np.flatnonzero(good[:-steps] & good[steps:])
+    if len(at) < 5:
+        return None
+    at = at[:: max(1, len(at) // STARTS)]
+    x = logged[at]
+    for j in range(steps):
+        x = model.system.step(x, trial.inputs[at + j], model.values, trial.dt)
+        x = np.fmax(np.fmin(x, FAR), -FAR)
+    return logged[at], x, logged[at + steps]
+
+
+def missed(
+    model: Model, trial: Trial, some: Sequence[int], shown: Sequence[int], unit: Array | float = 1.0
+) -> float:
+    """Return the rms error of predictions a quarter of a second ahead, over the states `some`.
+
+    Args:
+        model: that predicts.
+        trial: of this model's states.
+        some: indices of the states that count.
+        shown: indices of the states with a sensor.
+        unit: divides the error of each state.
+
+    Returns:
+        NaN if too little of the trial is known.
+    """
+    if (ahead := predicted(model, trial, shown)) is None:
+        return float("nan")
+    _, x, logged = ahead
+    return size_of(model.difference(x, logged)[:, some] / unit)
+
+
+def size_of(x: Array) -> float:
+    """Return the root mean square of x, of any shape, ignoring NaN; 0 if it is empty."""
+    return float(np.sqrt(np.nanmean(x**2))) if x.size else 0.0
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,9 @@ from itertools import combinations
 
 import numpy as np
 
-from grounded.instruments.mistaken import (
+from grounded.instruments.finding import unusable
+from grounded.instruments.kinematics.swapped import swapped_columns
+from grounded.instruments.predictions.mistaken import (
     FEWER,
     HALF,
     HINT,
@@ -24,9 +26,7 @@ from grounded.instruments.mistaken import (
     Told,
     described,
 )
-from grounded.instruments.other_units import unusable
-from grounded.instruments.short_runs import Ahead, Fit
-from grounded.instruments.swapped import swapped_columns
+from grounded.instruments.predictions.short_runs import Ahead, Fit
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial

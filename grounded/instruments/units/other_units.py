@@ -18,8 +18,17 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
-from grounded.instruments.odd_trial import AHEAD, NEAR, SIMILAR, STAMPS, Odd, missed, predicted
-from grounded.instruments.rate_ratios import Ratios, ratios_of, size_of, spread
+from grounded.instruments.finding import unusable
+from grounded.instruments.predictions.short_runs import AHEAD, missed, predicted, size_of
+from grounded.instruments.units.odd_trial import (
+    NEAR,
+    SIMILAR,
+    STAMPS,
+    Odd,
+    Ratios,
+    ratios_of,
+    spread,
+)
 from grounded.model import Model
 from grounded.places import Integral
 from grounded.trial import Trial
@@ -58,7 +67,7 @@ def judge_units(
     Args:
         model: however crude.
         trials: of this model's states.
-        ratios: of each trial, see `rate_ratios.ratios_of`.
+        ratios: of each trial, see `odd_trial.ratios_of`.
         shown: indices of the states with a sensor.
 
     Raises:
@@ -87,54 +96,6 @@ def units_apart(model: Model, trial: Trial, shown: Sequence[int]) -> list[str]:
     ratios = ratios_of(model, [trial], shown)
     found = list(_found(ratios))
     return [_clause(model, [trial], ratios, one, found, shown) for one in found]
-
-
-class UnusableTrials(GroundedError):
-    """Raised for trials that must be corrected.
-
-    Args:
-        message: the whole message.
-        clauses: only what is wrong with them.
-        mend: what to do before their logs are ingested again.
-        in_program: only what is wrong with them, for a program that has no [log].
-        then: the command that discards them.
-    """
-
-    def __init__(
-        self,
-        message: str,
-        clauses: str,
-        mend: str,
-        in_program: str,
-        then: NextCommand | None = None,
-    ) -> None:
-        super().__init__(message, then)
-        self.clauses, self.mend, self.in_program = clauses, mend, in_program
-
-
-def unusable(
-    trials: Sequence[Trial], odd: Sequence[int], clauses: str, mend: str, in_program: str = ""
-) -> UnusableTrials:
-    """Return the error that some trials must be corrected and ingested again, with its command.
-
-    Args:
-        trials: all of them.
-        odd: indices of those affected.
-        clauses: what is wrong with them.
-        mend: what to do before the log is ingested again.
-        in_program: the clauses for a program, if they name keys of [log].
-    """
-    names = [trials[k].id or f"number {k + 1}" for k in odd]
-    one, every = len(odd) == 1, len(odd) == len(trials) > 1
-    where = "in every trial" if every else f"in trial{'s' * (not one)} {', '.join(names)}"
-    return UnusableTrials(
-        f"{where} {clauses}. {mend}; then discard {'this trial' if one else 'these trials'} and "
-        "ingest the log again",
-        clauses,
-        mend,
-        in_program or clauses,
-        then=NextCommand("discard", tuple(names)) if trials[0].id else None,
-    )
 
 
 def _found(ratios: Sequence[Ratios]) -> Iterator[_Off]:
@@ -270,7 +231,7 @@ def judge_stamps(model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios]
     Args:
         model: however crude.
         trials: of this model's states.
-        ratios: of each trial, see `rate_ratios.ratios_of`.
+        ratios: of each trial, see `odd_trial.ratios_of`.
 
     Raises:
         GroundedError: naming the trial, a state and the factor.

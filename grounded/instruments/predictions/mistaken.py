@@ -19,11 +19,10 @@ import numpy as np
 
 from grounded import places
 from grounded.frozen import Array
-from grounded.instruments.finding import DEGREES, Finding
-from grounded.instruments.input_signs import LEAST, how_inputs_act
+from grounded.instruments.finding import DEGREES, Finding, unusable
 from grounded.instruments.inputs import OVER
-from grounded.instruments.other_units import unusable
-from grounded.instruments.short_runs import Ahead, Fit
+from grounded.instruments.predictions.input_signs import SHOWN, how_inputs_act
+from grounded.instruments.predictions.short_runs import Ahead, Fit
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.result import listed, with_unit
@@ -318,7 +317,7 @@ def _act_exchanged(model: Model, trial: Trial, change: Mistake, known: Sequence[
         for one in (trial, change.mended(trial))
     )
     return all(one.sign > 0 for one in mended) and all(
-        one.share < LEAST and one.share < HALF * other.share
+        one.share < SHOWN and one.share < HALF * other.share
         for one, other in zip(logged, mended, strict=True)
     )
 

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.frozen import Array
-from grounded.instruments.kinematics import turned
+from grounded.instruments.kinematics.relations import turned
+from grounded.instruments.kinematics.rows import Row, per_step
 from grounded.instruments.lag import BLOCKS, SURE, Lag, at_samples, lag_between
-from grounded.instruments.rows import Row, per_step
 from grounded.model import Model
 from grounded.trial import Trial
 

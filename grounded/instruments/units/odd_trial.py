@@ -1,11 +1,12 @@
 """Find trials in other units than the rest: degrees for radians, thousandths of a command.
 
-If one state of a trial is in degrees, the rate of a position is a constant multiple of the
-velocity; the sizes in sound trials show which of the two is off. If all angles and their rates are
-in degrees, they agree with each other. Commands of the usual size then seem to move the body tens
-of times as far, and the model's error is tens of times as large; divided by 57.3 it is as in the
-other trials. Commands in thousandths are tens of times smaller than in other trials, and the model
-predicts the motion with a thousand times as much, but not with a third or three times of that.
+If one state of a trial is in degrees, the rate of a position is a constant multiple of the velocity
+(`ratios_of`); the sizes in sound trials show which of the two is off. If all angles and their rates
+are in degrees, they agree with each other. Commands of the usual size then seem to move the body
+tens of times as far, and the model's error is tens of times as large; divided by 57.3 it is as in
+the other trials. Commands in thousandths are tens of times smaller than in other trials, and the
+model predicts the motion with a thousand times as much, but not with a third or three times of
+that.
 """
 
 from __future__ import annotations
@@ -17,13 +18,12 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.instruments.finding import DEGREES
-from grounded.instruments.rate_ratios import Ratios, size_of, spread
+from grounded.instruments.kinematics.relations import over_steps, pieces
+from grounded.instruments.predictions.short_runs import Ahead, missed, predicted, size_of
 from grounded.model import Model
-from grounded.places import integrals
+from grounded.places import Integral, integrals
 from grounded.trial import Trial
 
-AHEAD = 0.25  # [s]
-STARTS = 200
 LARGE = 20.0  # times as large as in other trials
 SIMILAR = 3.0  # within this factor sizes count as similar
 BETTER = 0.9  # of the error with the commands as logged, or a third or three times the corrected
@@ -31,7 +31,6 @@ STAMPS = 1000.0  # factor between time stamps in milliseconds and in seconds
 NEAR = 0.1  # relative tolerance of these factors
 LIKE = 10.0  # factor within which corrected commands must match those of other trials
 MANY = 8  # number of trials examined
-FAR = 1e9  # bound on predicted states
 PREDICTED = 1.0  # error relative to the motion, below which a prediction is informative
 FULL_TURNS = 4 * np.pi  # [rad] range of an angle that suggests degrees (or a wheel, or a heading)
 SOON = 0.1  # [s] horizon: a very crude model soon diverges
@@ -40,6 +39,56 @@ SMALL = 1.0  # [rad] angles that stay below it are not in degrees
 SEEN = 0.5  # of a motion: a prediction that misses by less sees it
 FEW, CLEAR = 120, 1.0  # samples of a trial to predict from, and gain [nats] of the calibrated model
 WHOLE = 0.3  # least concordance of each angle with the motion by its rate
+TOGETHER = 0.95  # cosine between displacements by position and by velocity, in the best window
+TURNS = (2 * np.pi, 360.0)  # jumps of a wrapped angle
+LEAST = 8  # windows that a trial must hold
+
+Ratios = Sequence[tuple[Integral, float]]  # of a trial's positions, see `ratios_of`
+
+
+def ratios_of(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Ratios]:
+    """Return for each trial the rate of each position over its velocity.
+
+    The ratio is 1 where the two do not correlate, and no ratio can be given.
+    """
+    relations = [one for one in integrals(model) if {one.i, one.j} <= set(shown)]
+    return [_ratios(relations, trial) for trial in trials]
+
+
+def _ratios(relations: Sequence[Integral], trial: Trial) -> Ratios:
+    """Return the ratios over the window with the best agreement; longer ones suppress noise."""
+    found = []
+    for relation in relations:
+        some = [
+            (_unturned(x[:, 0])[1:-1], np.cumsum([0.0, *over_steps(relation.c * x[:, 1])]))
+            for x in pieces([trial], (relation.i, relation.j))
+        ]
+        best, ratio, steps = TOGETHER, 1.0, 1
+        while usable := [pair for pair in some if len(pair[0]) > LEAST * steps]:
+            parts = [[z[steps:] - z[:-steps] for z in pair] for pair in usable]
+            moved, said = (np.concatenate(z) for z in zip(*parts, strict=True))
+            same = abs(moved @ said) / max(size_of(moved) * size_of(said) * len(said), 1e-300)
+            if same > best:
+                best, ratio = same, size_of(moved) / (size_of(said) * trial.dt)
+            steps *= 2
+        if some:
+            found.append((relation, ratio))
+    return found
+
+
+def _unturned(q: Array) -> Array:
+    """Remove the jumps of a wrapped angle."""
+    steps = np.diff(q)
+    for turn in TURNS:
+        jumps = np.abs(np.abs(steps) - turn) < 0.1 * turn
+        if np.median(np.abs(steps)) < 0.05 * turn:
+            steps -= np.where(jumps, np.sign(steps) * turn, 0.0)
+    return np.concatenate([[q[0]], q[0] + np.cumsum(steps)])
+
+
+def spread(trial: Trial, some: Sequence[int]) -> Array:
+    """Return the standard deviations of some states (len(some),), in their units."""
+    return np.asarray(np.nanstd(trial.states[:, some], axis=0) + 1e-300)
 
 
 @dataclass(frozen=True)
@@ -71,7 +120,7 @@ def odd_states(
     Args:
         model: however crude.
         trials: several.
-        ratios: of each trial, see `rate_ratios.ratios_of`.
+        ratios: of each trial, see `ratios_of`.
         shown: indices of the states with a sensor in every trial.
 
     Yields:
@@ -208,8 +257,6 @@ def _calibrated_as_degrees(model: Model, trial: Trial, shown: Sequence[int], odd
     linear, inputs of another strength explain the log as well as degrees do: that strength must
     then be about 57.3 times the model's.
     """
-    from grounded.instruments.short_runs import Ahead
-
     units, usual = list(model.states.values()), np.ones(model.m)
     angles = np.abs(trial.states[:, [i for i in odd.states if units[i] == "rad"]])
     if not (angles > SMALL).any() or not np.isfinite(trial.inputs).all():
@@ -275,54 +322,3 @@ def odd_commands(model: Model, trials: Sequence[Trial], shown: Sequence[int]) ->
             sound = mended < SIMILAR * float(np.median([left(t) for t in rest]))
             if sound and mended < BETTER * min(left(trials[k]), *others):
                 yield odd
-
-
-def missed(
-    model: Model, trial: Trial, some: Sequence[int], shown: Sequence[int], unit: Array | float = 1.0
-) -> float:
-    """Return the rms error of predictions a quarter of a second ahead, over the states `some`.
-
-    Args:
-        model: that predicts.
-        trial: of this model's states.
-        some: indices of the states that count.
-        shown: indices of the states with a sensor.
-        unit: divides the error of each state.
-
-    Returns:
-        NaN if too little of the trial is known.
-    """
-    if (ahead := predicted(model, trial, shown)) is None:
-        return float("nan")
-    _, x, logged = ahead
-    return size_of(model.difference(x, logged)[:, some] / unit)
-
-
-def predicted(
-    model: Model, trial: Trial, shown: Sequence[int], horizon: float = AHEAD
-) -> tuple[Array, Array, Array] | None:
-    """Predict a trial by a horizon [s] ahead, from many of its samples.
-
-    Args:
-        model: that predicts.
-        trial: of this model's states.
-        shown: indices of the states with a sensor; the others are taken as 0.
-        horizon: [s].
-
-    Returns:
-        The states (N, n) logged at the start, those predicted, and those logged at the horizon;
-        None if too little is known.
-    """
-    steps = max(1, round(horizon / trial.dt))
-    logged = np.array(trial.states)
-    logged[:, [i for i in range(model.n) if i not in shown]] = 0.0  # unknown
-    good = np.asarray(np.isfinite(logged).all(axis=1))
-    at = np.flatnonzero(good[:-steps] & good[steps:])
-    if len(at) < 5:
-        return None
-    at = at[:: max(1, len(at) // STARTS)]
-    x = logged[at]
-    for j in range(steps):
-        x = model.system.step(x, trial.inputs[at + j], model.values, trial.dt)
-        x = np.fmax(np.fmin(x, FAR), -FAR)
-    return logged[at], x, logged[at + steps]

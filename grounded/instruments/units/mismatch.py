@@ -15,13 +15,23 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import wrapped
-from grounded.instruments.finding import DEGREES, Finding
-from grounded.instruments.kinematics import AGREE, TURNED_AWAY, Turned, travelled
-from grounded.instruments.odd_trial import Odd, missed
-from grounded.instruments.other_units import FACTORS, described, unusable
-from grounded.instruments.rate_ratios import spread
-from grounded.instruments.rows import Gap, Row, gaps, per_step
-from grounded.instruments.swapped import exchanged
+from grounded.instruments.finding import DEGREES, Finding, unusable
+from grounded.instruments.kinematics.relations import (
+    AGREE,
+    TURNED_AWAY,
+    Turned,
+    travelled,
+)
+from grounded.instruments.kinematics.rows import (
+    Gap,
+    Row,
+    gaps,
+    per_step,
+)
+from grounded.instruments.kinematics.swapped import exchanged
+from grounded.instruments.predictions.short_runs import missed
+from grounded.instruments.units.odd_trial import Odd, spread
+from grounded.instruments.units.other_units import FACTORS, described
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.result import listed

@@ -26,9 +26,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.frozen import Array
-from grounded.instruments.finding import Finding
-from grounded.instruments.other_units import unusable
-from grounded.instruments.short_runs import Ahead, Fit
+from grounded.instruments.finding import Finding, unusable
+from grounded.instruments.predictions.short_runs import Ahead, Fit
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.result import listed

@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded import places
 from grounded.frozen import Array, wrapped
-from grounded.instruments.kinematics import SHORT, pieces
+from grounded.instruments.kinematics.relations import SHORT, pieces
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial

@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
-from grounded.instruments.kinematics import over_steps, pieces
+from grounded.instruments.kinematics.relations import over_steps, pieces
 from grounded.model import Model
 from grounded.places import Integral, integrals
 from grounded.trial import Trial
