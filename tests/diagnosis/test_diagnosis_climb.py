@@ -29,7 +29,7 @@ from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
 from grounded.plant import Noise, Plant
 from grounded.search.ask_tell import learn
-from grounded.search.step_size import SearchOptions
+from grounded.search.step.step_size import SearchOptions
 
 
 @pytest.mark.parametrize("seed", range(5))

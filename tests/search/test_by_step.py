@@ -7,18 +7,16 @@ import pytest
 
 from grounded.model import Model
 from grounded.plant import Plant
-from grounded.search import together
 from grounded.search.ask_tell import Search, learn
-from grounded.search.by_step import PRICES, Told, believed_by_step, worth
 from grounded.search.candidate import BY_STEP, Tried
-from grounded.search.corrected import Corrected
+from grounded.search.feedback.margin import worse_costs
 from grounded.search.making import About, Maker
-from grounded.search.margin import worse_costs
-from grounded.search.mispredictions import Seen, seen
 from grounded.search.planner import Planner, predicted
 from grounded.search.standing import standing
-from grounded.search.step_size import SearchOptions, Step
-from grounded.search.together import runs
+from grounded.search.step.by_step import PRICES, Told, believed_by_step, worth
+from grounded.search.step.corrected import Corrected, runs
+from grounded.search.step.mispredictions import Seen, seen
+from grounded.search.step.step_size import SearchOptions, Step
 from grounded.solve.bias import ground
 from small_tasks import cart_task, drive
 
@@ -147,7 +145,7 @@ def test_runs_together_are_those_one_by_one_in_a_fraction_of_the_steps(grounded,
     assert len(steps) - one_by_one < 0.3 * one_by_one
     np.testing.assert_allclose(states, [one.states for one in alone], atol=1e-9)
     np.testing.assert_allclose(costs, [-one.utility for one in alone], rtol=1e-9)
-    monkeypatch.setattr(together, "MOST", 1)  # a long horizon: one at a time
+    monkeypatch.setattr("grounded.search.step.corrected.MOST", 1)  # a long horizon: one at a time
     np.testing.assert_allclose(runs(late, tried)[1], costs, rtol=1e-9)
     assert worse_costs([late], replace(policy, gain=None, reference=None)).min() == np.inf
 

@@ -16,7 +16,7 @@ from grounded.search.improve import propose
 from grounded.search.making import About, Maker, begun_at
 from grounded.search.planner import Planner, model_fingerprint, planner_for, predicted
 from grounded.search.standing import Proposal, standing
-from grounded.search.step_size import SearchOptions, Step
+from grounded.search.step.step_size import SearchOptions, Step
 from grounded.trial import Trial, mean_trial
 from grounded.utility import Reward
 from grounded_trials.workspace.adopted import planner_of

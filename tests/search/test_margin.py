@@ -8,9 +8,9 @@ from test_limited_plans import rover, task
 
 from grounded.model import Model
 from grounded.policy import Policy
+from grounded.search.feedback.margin import AGES, worse_costs
 from grounded.search.improve import SearchOptions, propose
 from grounded.search.making import Maker
-from grounded.search.margin import AGES, worse_costs
 from grounded.search.planner import Planner, planner_with, predicted
 from grounded.search.standing import standing
 from grounded.task import Task

@@ -8,13 +8,13 @@ import pytest
 
 from grounded.plant import Plant
 from grounded.rollout import simulate
-from grounded.search import mispredictions
 from grounded.search.ask_tell import Search
+from grounded.search.feedback.margin import AGES, worse_costs
 from grounded.search.making import About, Maker
-from grounded.search.margin import AGES, worse_costs
-from grounded.search.mispredictions import apart, believed, shared
 from grounded.search.planner import Planner, predicted
-from grounded.search.step_size import SearchOptions
+from grounded.search.step import mispredictions
+from grounded.search.step.mispredictions import apart, believed, shared
+from grounded.search.step.step_size import SearchOptions
 from grounded.solve import ddp
 from grounded.solve.bias import ground
 from small_tasks import cart_task, drive, other, rover_task

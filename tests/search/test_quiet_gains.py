@@ -8,11 +8,11 @@ import pytest
 
 from grounded.plant import Noise, Plant
 from grounded.search import making
+from grounded.search.feedback.oscillation import calm_ranges, quiet_gains
 from grounded.search.improve import propose
 from grounded.search.planner import Planner
-from grounded.search.quiet_gains import calm_ranges, quiet_gains
 from grounded.search.standing import standing
-from grounded.search.step_size import SearchOptions
+from grounded.search.step.step_size import SearchOptions
 from small_tasks import cart_task, drive, scara, scara_task
 
 OPTIONS = SearchOptions()

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from grounded.search import improve
-from grounded.search.step_size import LEAST, MOST, Step, after_failure, after_success
+from grounded.search.step.step_size import LEAST, MOST, Step, after_failure, after_success
 
 
 def test_a_kept_promise_lowers_the_damping_and_a_broken_one_raises_it():

@@ -16,18 +16,8 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.instruments.finding import Finding, put_right, unusable
-from grounded.instruments.kinematics.relations import (
-    TURNED_AWAY,
-    Turned,
-    lag_of,
-    turned,
-)
-from grounded.instruments.kinematics.rows import (
-    LEAST,
-    STRETCH,
-    Row,
-    per_step,
-)
+from grounded.instruments.kinematics.relations import TURNED_AWAY, Turned, lag_of, turned
+from grounded.instruments.kinematics.rows import LEAST, STRETCH, Row, per_step
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.result import listed

@@ -16,18 +16,8 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import wrapped
 from grounded.instruments.finding import DEGREES, Finding, unusable
-from grounded.instruments.kinematics.relations import (
-    AGREE,
-    TURNED_AWAY,
-    Turned,
-    travelled,
-)
-from grounded.instruments.kinematics.rows import (
-    Gap,
-    Row,
-    gaps,
-    per_step,
-)
+from grounded.instruments.kinematics.relations import AGREE, TURNED_AWAY, Turned, travelled
+from grounded.instruments.kinematics.rows import Gap, Row, gaps, per_step
 from grounded.instruments.kinematics.swapped import exchanged
 from grounded.instruments.predictions.short_runs import missed
 from grounded.instruments.units.odd_trial import Odd, spread

@@ -231,12 +231,7 @@ def _clocks_apart(workspace: Folder, trial: Trial) -> list[Fault]:
 
 def mistaken_in(model: Model, known: Trial) -> list[Fault]:
     """Return a fault if the model explains the log better with exchanged columns or other units."""
-    from grounded.instruments.predictions.mistaken import (
-        as_logged,
-        described,
-        mended_by,
-        mistaken,
-    )
+    from grounded.instruments.predictions.mistaken import as_logged, described, mended_by, mistaken
     from grounded.instruments.preflight import preflight
 
     told = mistaken(model, [known], range(model.n))

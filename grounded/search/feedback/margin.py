@@ -23,7 +23,7 @@ from grounded.compile import Problem
 from grounded.frozen import Array
 from grounded.policy import Policy, z_difference
 from grounded.search.planner import predicted
-from grounded.search.together import runs
+from grounded.search.step.corrected import runs
 
 AGES = (0.0, 0.3, 0.6)  # age of the samples, as a fraction of a step
 NOISE, SEEDS = 0.1, 3  # noise, as a fraction of each state's rms motion in a step; number of draws

@@ -32,8 +32,9 @@ import numpy as np
 from grounded.compile import Problem
 from grounded.frozen import Array
 from grounded.search.candidate import Tried
-from grounded.search.corrected import Corrected
-from grounded.search.mispredictions import (
+from grounded.search.planner import Planner
+from grounded.search.step.corrected import Corrected
+from grounded.search.step.mispredictions import (
     ASKED,
     Believed,
     Seen,
@@ -44,7 +45,6 @@ from grounded.search.mispredictions import (
     unforetold,
     with_law,
 )
-from grounded.search.planner import Planner
 
 PRICES = (1e-3, 1e-2, 0.1, 1.0, 10.0)  # ridge penalties
 

@@ -10,13 +10,13 @@ import numpy as np
 from grounded.compile import DescentOptions, Problem
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.search.step_size import SearchOptions
+from grounded.search.step.step_size import SearchOptions
 from grounded.solve import ddp
 from grounded.solve.measured import measured_gains
 from grounded.task import Task
 
 if TYPE_CHECKING:
-    from grounded.search.corrected import Corrected
+    from grounded.search.step.corrected import Corrected
     from grounded.solve.bias import Grounding
 
 PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # precise enough for a direction
@@ -42,8 +42,8 @@ def direction(
         corrected: the model with derivatives corrected by trials; None for the original model.
         measured: number of leading states that the robot measures; None for all of the task's.
             Gains on the memory of an adopted effect are replaced by gains on those
-            (`measured_gains`). Gains on the memory of a corrected model are dropped (`feedback`
-            checks the effect).
+            (`measured_gains`). Gains on the memory of a corrected model are dropped
+            (`feedback.margin` checks the effect).
     """
     if options.method == "policy-gradient":
         from grounded.solve.policy_gradient import ascent
