@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_limited_plans import rover, task
 
 from grounded.model import Model
 from grounded.policy import Policy
@@ -15,6 +14,7 @@ from grounded.search.planner import Planner, planner_with, predicted
 from grounded.search.standing import standing
 from grounded.task import Task
 from grounded.utility import Reward
+from small_tasks import speed_rover, speed_rover_task
 
 LATE = [
     ("rate_limit:linear", {"r": 0.7}),
@@ -47,7 +47,7 @@ def joint(effects: list[tuple[str, dict[str, float]]], change: float) -> Planner
 
 @pytest.fixture(scope="module")
 def planner():
-    return planner_with(task(rover()), LATE)
+    return planner_with(speed_rover_task(speed_rover()), LATE)
 
 
 def made_by(planner: Planner) -> Policy:
@@ -103,7 +103,7 @@ def test_gains_do_not_count_on_a_joint_that_sticks():
 
 def test_a_policy_of_the_task_s_own_model_is_as_it_was():
     """Without adopted effects the check is skipped, and the same trials give the same candidate."""
-    plain = planner_with(task(rover()), [])
+    plain = planner_with(speed_rover_task(speed_rover()), [])
     own, _ = plain.first_policy()
     made = propose(plain.task, [], [], SearchOptions(), planner=plain).candidate
     np.testing.assert_array_equal(made.policy.gain, plain.narrowed(own).gain)
@@ -111,7 +111,7 @@ def test_a_policy_of_the_task_s_own_model_is_as_it_was():
 
 def test_a_command_at_its_limit_tells_nothing_of_what_no_sensor_shows():
     """A gain on it, a quotient of rounding errors, could reach 1e27, and the plan was refused."""
-    plain = task(rover())
+    plain = speed_rover_task(speed_rover())
     reward = replace(plain.reward, input_change=np.array([0.01, 0.003]))
     slow = replace(plain, low=np.array([-0.3, -0.3]), high=np.array([1.5, 0.3]), reward=reward)
     planner = planner_with(slow, LATE)

@@ -5,8 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_diagnosis import DT, cart
-from test_diagnosis_split import task_of
 
 from grounded import Trial
 from grounded.diagnosis.likelihood import data as diagnosis_data
@@ -15,6 +13,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.held_out import utility_prediction
 from grounded.diagnosis.validation.ruler import Ruler, folds, repeated
+from small_tasks import DT, pushed_cart, pushed_cart_task
 
 STEPS = 450  # three runs of 150 steps
 
@@ -22,7 +21,7 @@ STEPS = 450  # three runs of 150 steps
 @pytest.fixture
 def known(monkeypatch):
     """A predictor of four trials without noise, of whose 12 runs 7 are kept; its fit."""
-    model, _ = cart(trials=1)
+    model, _ = pushed_cart(trials=1)
     found = []
     for k in range(4):
         u = np.sin((1 + 0.2 * (k % 2)) * np.arange(STEPS) * DT)[:, None]  # 0 and 2, 1 and 3 repeat
@@ -41,7 +40,7 @@ def known(monkeypatch):
 
 def test_a_utility_is_predicted_from_the_trials_own_start(known):
     predictor, fit, trials = known
-    task = task_of(predictor.data.model, STEPS)
+    task = pushed_cart_task(predictor.data.model, STEPS)
     found = utility_prediction(predictor, fit, fit.states, task, trials)
     assert len(found.real) == 3  # of trial 2 the beginning was left out
     np.testing.assert_allclose(found.before, found.real, rtol=1e-9)
@@ -111,7 +110,7 @@ def test_a_trial_that_holds_most_is_left_out_piece_by_piece(known):
 
 
 def test_of_long_data_the_runs_are_kept_in_which_most_happens(monkeypatch):
-    model, _ = cart(trials=1)
+    model, _ = pushed_cart(trials=1)
     monkeypatch.setattr(diagnosis_data, "MOST_NUMBERS", 6.5 * 200 * model.n**2 * 4)
     busy = {3, 7, 11, 15, 19}  # of twenty runs of 200 steps, of four trials
     found = []
@@ -132,7 +131,7 @@ def test_of_long_data_the_runs_are_kept_in_which_most_happens(monkeypatch):
 def test_a_long_log_that_ran_no_candidate_is_no_run_of_the_task(known):
     """A 40 s drive by hand of a 3.5 s task had a utility, which the model "missed by 368"."""
     predictor, fit, trials = known
-    task = task_of(predictor.data.model, STEPS // 3)
+    task = pushed_cart_task(predictor.data.model, STEPS // 3)
     assert not len(utility_prediction(predictor, fit, fit.states, task, trials).real)
     own = [replace(trial, candidate="c0001") for trial in trials]  # recorded for longer
     assert len(utility_prediction(predictor, fit, fit.states, task, own).real) == 3

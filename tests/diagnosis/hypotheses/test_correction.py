@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from test_diagnosis import cart
 
 from grounded import GroundedError
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
@@ -13,6 +12,7 @@ from grounded.diagnosis.report import Diagnosis, Verdict
 from grounded.effects import Library, wrap
 from grounded_trials import Workspace
 from grounded_trials.store.documents import write_document
+from small_tasks import pushed_cart
 
 FEW = ("offset", "delay", "slope")  # families, so that none has a threshold
 
@@ -29,7 +29,7 @@ def one_second(model, trials):
 
 
 def test_a_curve_predicts_what_no_effect_of_the_library_does():
-    model, trials = cart(dead=0.25, trials=5, seed=1)
+    model, trials = pushed_cart(dead=0.25, trials=5, seed=1)
     others = [f.name for f in Library().families if f.name not in FEW]
     found = diagnose(model, trials, DiagnosisOptions(library=Library().without(others)))
     left = found.correction
@@ -44,12 +44,12 @@ def test_a_curve_predicts_what_no_effect_of_the_library_does():
     for curve in left.curves:
         assert found.values(curve.effect) == curve.quantities
         better = wrap(Library().effect(curve.effect, better), curve.quantities, trials[0].dt)
-    fresh = cart(dead=0.25, trials=4, seed=9)[1]
+    fresh = pushed_cart(dead=0.25, trials=4, seed=9)[1]
     assert one_second(better, fresh) < 0.7 * one_second(calibrated, fresh)
 
 
 def test_where_nothing_is_left_there_is_no_correction():
-    model, trials = cart(trials=4)
+    model, trials = pushed_cart(trials=4)
     assert diagnose(model, trials).correction is None
 
 

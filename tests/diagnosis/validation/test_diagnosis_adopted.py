@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_diagnosis import DT, cart
 
 from cli import grounded
 from grounded import Model, Trial
@@ -35,13 +34,14 @@ from grounded_trials.workspace.diagnosing import _chosen
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import diagnosable, read_diagnosis
 from grounded_trials.workspace.next_step import to_adopt
+from small_tasks import DT, pushed_cart
 
 LAG = 0.12
 
 
 def lagging(friction, trials=4):
     """Trials of a cart whose push lags and that has dry friction; its crude model."""
-    model, found = cart(trials=1, steps=2)
+    model, found = pushed_cart(trials=1, steps=2)
     true = wrap(Library().effect("first_order_lag:u", model), {"tau": LAG}, DT)
     effect = Library().effect("coulomb_friction:v", true)
     true = wrap(effect, {"c": friction, "width": 0.01}, DT)
@@ -172,7 +172,7 @@ def late(trials, steps=400, delay=1.5 * DT):
 
     The cart moves on and on, so that its place where a run begins is no place where a trial began.
     """
-    model, runs = cart(trials=trials, steps=steps, noise=0.0)
+    model, runs = pushed_cart(trials=trials, steps=steps, noise=0.0)
     rng, found = np.random.default_rng(3), []
     for run in runs:
         t, u = np.arange(steps + 1) * DT, run.inputs + 0.5

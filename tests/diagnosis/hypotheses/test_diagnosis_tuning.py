@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from test_diagnosis import cart
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
@@ -10,6 +9,7 @@ from grounded.diagnosis.hypotheses.attribution import attribute
 from grounded.diagnosis.hypotheses.explored import price
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.effects import Library
+from small_tasks import pushed_cart
 
 DT, FRICTION, WIDTH = 0.05, 0.4, 0.15
 
@@ -20,7 +20,7 @@ def rate_of(x, u, friction):
 
 def pushed(friction, trials=4, steps=120, seed=0):
     """A cart whose friction builds up over WIDTH, and its crude model."""
-    model, _ = cart(trials=1, steps=2)
+    model, _ = pushed_cart(trials=1, steps=2)
     rng, found = np.random.default_rng(seed), []
     for _ in range(trials):
         t, x, states = np.arange(steps) * DT, np.zeros(2), [np.zeros(2)]

@@ -174,7 +174,7 @@ def test_a_candidate_says_that_it_may_well_lose():
 @pytest.mark.slow
 def test_a_plan_with_dry_friction_is_followed_from_a_wider_kink(monkeypatch):
     """A cart that sticks has no slope: its plan stopped half a per cent short of the best."""
-    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2]))
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[3]))
     task = importlib.import_module("benchmarks.foreign.mechanisms").cart_task("gentle")
     friction = {"name": "joint_friction:force<-x_vel", "c": 0.8, "b": 0.0, "width": 0.005}
     planner = planner_of(task, [friction])

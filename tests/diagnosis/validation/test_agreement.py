@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_diagnosis import cart
 
 from cli import grounded
 from facts import holds
@@ -18,6 +17,7 @@ from grounded.diagnosis.validation.ruler import repeated
 from grounded.diagnosis.verdict import BOTH, UNEXPLAINED, verdict
 from grounded.effects import Library
 from grounded_trials.report.diagnosis_words import agreement_lines, verdict_lines
+from small_tasks import pushed_cart
 
 FEW = (
     *("coulomb_friction", "viscous_friction", "dead_zone"),
@@ -28,7 +28,7 @@ OPTIONS = DiagnosisOptions(library=Library(tuple(map(Library().family, FEW))))
 
 @pytest.mark.slow
 def test_trials_of_one_system_agree():
-    model, trials = cart(friction=0.3, trials=5)
+    model, trials = pushed_cart(friction=0.3, trials=5)
     found = diagnose(model, trials, OPTIONS)
     assert [one.effect for one in found.agreement] == ["coulomb_friction:v"]
     assert found.agreement[0].agrees and found.agreement[0].chance > 1e-3
@@ -39,8 +39,8 @@ def test_trials_of_one_system_agree():
 
 @pytest.mark.slow
 def test_a_value_that_differs_by_trial_is_told_with_what_it_goes_with():
-    trials = [cart(friction=0.25 + 0.05 * k, trials=1, seed=k)[1][0] for k in range(6)]
-    found = diagnose(cart()[0], trials, OPTIONS)
+    trials = [pushed_cart(friction=0.25 + 0.05 * k, trials=1, seed=k)[1][0] for k in range(6)]
+    found = diagnose(pushed_cart()[0], trials, OPTIONS)
     (one,) = (a for a in found.agreement if a.effect == "coulomb_friction:v")
     assert not one.agrees and one.goes_with == "rises with the order of the trials"
     values = [v.value for v in found.per_trial if v.effect == one.effect]
@@ -58,7 +58,10 @@ def test_a_value_that_differs_by_trial_is_told_with_what_it_goes_with():
     ],
 )
 def test_what_changed_between_two_groups(first, second, effect, values):
-    (model, before), (_, after) = cart(**first, trials=3, seed=1), cart(**second, trials=3, seed=2)
+    (model, before), (_, after) = (
+        pushed_cart(**first, trials=3, seed=1),
+        pushed_cart(**second, trials=3, seed=2),
+    )
     found = diagnose(model, before, OPTIONS, compare=after)
     assert found.trials == 6 and found.changed is not None
     assert [one.effect for one in found.changed] == ([effect] if effect else [])
@@ -127,7 +130,7 @@ def test_a_compared_value_of_an_adopted_effect_has_its_name_and_unit():
 
 
 def test_trials_of_two_groups_are_no_repeats():
-    _, trials = cart(trials=1)
+    _, trials = pushed_cart(trials=1)
     trials = [replace(trials[0], candidate="c0001")] * 4
     data = SimpleNamespace(lengths=np.array([trial.steps for trial in trials]))
     assert repeated(trials, data, 4) == [[0, 1, 2, 3]]

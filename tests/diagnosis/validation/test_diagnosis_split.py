@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_diagnosis import DT, cart
 
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import Split
@@ -12,23 +11,9 @@ from grounded.diagnosis.likelihood.noise import DOF, NoiseModel, Structure
 from grounded.diagnosis.pictures import where_figure
 from grounded.diagnosis.validation.split import shares, split
 from grounded.effects import Library
-from grounded.task import Task
-from grounded.utility import Reward
+from small_tasks import DT, pushed_cart, pushed_cart_task
 
 HORIZONS = ("one_step", "horizon", "whole_run")
-
-
-def task_of(model, steps=120):
-    return Task(
-        model=model,
-        dt=DT,
-        target=np.zeros((steps + 1, 2)),
-        reward=Reward(np.ones(2), np.zeros(2), np.zeros(1), np.zeros(1)),
-        start=np.zeros(2),
-        past=np.zeros(1),
-        low=np.array([-1.0]),
-        high=np.array([1.0]),
-    )
 
 
 def parts(row):
@@ -52,8 +37,8 @@ def repeats_of(trial, count):
 
 @pytest.mark.slow
 def test_an_effect_that_is_found_explains_the_error():
-    model, trials = cart(friction=0.4)
-    document = diagnose(task_of(model), trials).to_json()
+    model, trials = pushed_cart(friction=0.4)
+    document = diagnose(pushed_cart_task(model), trials).to_json()
     split = document["where"]["split"]
     assert tuple(split) == HORIZONS
     for row in split.values():
@@ -70,7 +55,7 @@ def test_an_effect_that_is_found_explains_the_error():
 
 
 def test_without_an_effect_the_error_is_noise():
-    model, trials = cart()
+    model, trials = pushed_cart()
     found = diagnose(model, trials)
     row = found.where.split["horizon"]
     assert row.whole.explained == 0
@@ -84,17 +69,17 @@ def test_without_an_effect_the_error_is_noise():
 
 
 def test_what_no_effect_explains_stays_unexplained_and_is_not_white():
-    model, trials = cart(asymmetric=0.8, trials=6)
+    model, trials = pushed_cart(asymmetric=0.8, trials=6)
     poor = DiagnosisOptions(
         library=Library((Library().family("trend"),))
     )  # nothing that could explain it
-    found = diagnose(task_of(model), trials, poor)
+    found = diagnose(pushed_cart_task(model), trials, poor)
     assert found.leftover and found.where.whiteness["v"] < 0.01
     assert found.where.split["horizon"].channels[1].explained < 1
 
 
 def test_repeats_of_a_candidate_tell_the_noise():
-    model, trials = cart(trials=1)
+    model, trials = pushed_cart(trials=1)
     same = repeats_of(trials[0], 4)
     row = diagnose(model, same).where.split["horizon"]
     assert row.irreducible_from == "repeats"
@@ -136,7 +121,7 @@ def test_noise_with_its_outliers_comes_to_its_variance():
 
 
 def test_a_copy_counts_once():
-    model, trials = cart(trials=1)
+    model, trials = pushed_cart(trials=1)
     same = [replace(t, id=f"t{k}") for k, t in enumerate(repeats_of(trials[0], 3))]
     alone, beside = diagnose(model, same), diagnose(model, [*same, replace(same[0], id="t9")])
     assert (beside.trials, beside.kind) == (3, alone.kind) and not beside.leftover
@@ -146,7 +131,7 @@ def test_a_copy_counts_once():
 
 
 def test_a_trial_beside_itself_confirms_nothing():
-    model, trials = cart(friction=0.4, trials=1)
+    model, trials = pushed_cart(friction=0.4, trials=1)
     few = DiagnosisOptions(library=Library((Library().family("coulomb_friction"),)))
     found = diagnose(model, [trials[0], trials[0]], few)
     assert found.no_cause and not found.effects and found.trials == 1
@@ -154,12 +139,12 @@ def test_a_trial_beside_itself_confirms_nothing():
 
 @pytest.mark.slow
 def test_without_repeats_noise_is_a_bound_unless_what_is_left_is_white():
-    model, trials = cart(asymmetric=0.8, trials=4)
+    model, trials = pushed_cart(asymmetric=0.8, trials=4)
     poor = DiagnosisOptions(library=Library((Library().family("trend"),)))
     found = diagnose(model, trials, poor)
     assert all(row.floor_at_most for row in found.prediction_error)
     assert found.leftover[0].floor_at_most and "at most" in found.sentence
     assert found.where.split["horizon"].irreducible_from == "at most"
-    white = diagnose(*cart())
+    white = diagnose(*pushed_cart())
     assert not any(row.floor_at_most for row in white.prediction_error)
     assert white.kind == "none" and "at most" not in white.sentence
