@@ -1,8 +1,7 @@
-"""Options that commands share, opening the workspace of -C, and formatting the next command."""
+"""The option -C: a command's workspace, and the next command to type for it."""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -47,46 +46,6 @@ def given(ctx: click.Context | None = None) -> str | None:
 def located(folder: str) -> None:
     """Print the running command's further commands with the -C of a folder that it made."""
     click.get_current_context().meta[_KEY] = folder
-
-
-def as_json(function: F) -> F:
-    """Add the option --json, passed as `json_`."""
-    return click.option("--json", "json_", is_flag=True, help="Print one JSON document.")(function)
-
-
-def anyway(function: F) -> F:
-    """Add the option --anyway, for commands that hand a candidate over."""
-    text = "Hand the candidate over even if [limits], [safety], task or model changed since."
-    return click.option("--anyway", is_flag=True, help=text)(function)
-
-
-def parallel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of a command that can run in parallel, passed as `engine`."""
-
-    @functools.wraps(function)
-    def call(*args: Any, jobs: int, engine: str, address: str | None, **others: Any) -> Any:
-        from grounded.engine import Engine
-
-        return function(*args, engine=Engine(jobs=jobs, name=engine, address=address), **others)
-
-    for option in (
-        click.option("--address", metavar="URL", help="Scheduler of a Dask cluster."),
-        click.option(
-            "--engine",
-            type=click.Choice(["local", "dask"]),
-            default="local",
-            help="Where: on this machine (default) or on a Dask cluster that sees this disk.",
-        ),
-        click.option(
-            "--jobs",
-            type=click.IntRange(1),
-            metavar="N",
-            default=1,
-            help="Workers on this machine (default: 1).",
-        ),
-    ):
-        call = option(call)
-    return call
 
 
 def open_workspace() -> Workspace:

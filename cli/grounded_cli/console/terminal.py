@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from typing import Any, TextIO
 
 from grounded.result import plain
-from grounded_cli.options import given
+from grounded_cli.console.workspace_option import given
 from grounded_trials.wording import MARKS, columns, figure, glued, placed, wrapped
 
 number = figure

@@ -12,8 +12,8 @@ from pathlib import Path
 import click
 from click.shell_completion import CompletionItem, get_completion_class
 
-from grounded_cli.options import given
-from grounded_cli.terminal import show
+from grounded_cli.console.terminal import show
+from grounded_cli.console.workspace_option import given
 
 SHELLS = ("bash", "zsh", "fish")
 
