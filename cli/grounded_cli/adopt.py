@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded_cli import completion as complete
-from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
-from grounded_cli.terminal import LABEL, field, number, remark, sentence, show, show_json
+from grounded_cli.console import completion as complete
+from grounded_cli.console.options import as_json
+from grounded_cli.console.terminal import LABEL, field, number, remark, sentence, show, show_json
+from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
 from grounded_trials.wording import ALONE, misread, moved, with_unit
 
 if TYPE_CHECKING:

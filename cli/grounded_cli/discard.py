@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded_cli import completion as complete
-from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
-from grounded_cli.terminal import field, names_in, show, show_json
+from grounded_cli.console import completion as complete
+from grounded_cli.console.options import as_json
+from grounded_cli.console.terminal import field, names_in, show, show_json
+from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
 
 if TYPE_CHECKING:
     from grounded_trials.workspace.identity import SetAside

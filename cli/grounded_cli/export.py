@@ -7,9 +7,10 @@ from pathlib import Path
 import click
 
 from grounded.errors import NextCommand
-from grounded_cli import completion as complete
-from grounded_cli.options import anyway, as_json, in_workspace, next_line, open_workspace
-from grounded_cli.terminal import remark, show, show_json
+from grounded_cli.console import completion as complete
+from grounded_cli.console.options import anyway, as_json
+from grounded_cli.console.terminal import remark, show, show_json
+from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
 
 # each format and how to use it
 USES = {

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded.result import listed
-from grounded_cli.chosen_trials import chosen_trials
-from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, parallel
-from grounded_cli.terminal import (
+from grounded_cli.console.options import as_json, chosen_trials, parallel
+from grounded_cli.console.terminal import (
     field,
     lines,
     names_in,
@@ -22,6 +21,7 @@ from grounded_cli.terminal import (
     stages,
     table,
 )
+from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
 from grounded_trials.wording import count, shown
 
 if TYPE_CHECKING:

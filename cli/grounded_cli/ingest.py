@@ -8,9 +8,19 @@ import click
 
 from grounded.errors import NextCommand
 from grounded.result import listed
-from grounded_cli import completion as complete
-from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
-from grounded_cli.terminal import field, number, progress, remark, sentence, show, show_json, table
+from grounded_cli.console import completion as complete
+from grounded_cli.console.options import as_json
+from grounded_cli.console.terminal import (
+    field,
+    number,
+    progress,
+    remark,
+    sentence,
+    show,
+    show_json,
+    table,
+)
+from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
 from grounded_trials.wording import with_unit
 
 if TYPE_CHECKING:

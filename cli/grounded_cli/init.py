@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded_cli import completion as complete
-from grounded_cli.options import as_json, next_line
-from grounded_cli.terminal import (
+from grounded_cli.console import completion as complete
+from grounded_cli.console.options import as_json
+from grounded_cli.console.terminal import (
     LABEL,
     field,
     names_in,
@@ -21,6 +21,7 @@ from grounded_cli.terminal import (
     show,
     show_json,
 )
+from grounded_cli.console.workspace_option import next_line
 
 if TYPE_CHECKING:
     from grounded_trials.logs.inspect_guess import Guess

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded_cli.options import as_json, given, in_workspace, next_line, typed
-from grounded_cli.terminal import number, progress, remark, show, show_json, table
+from grounded_cli.console.options import as_json
+from grounded_cli.console.terminal import number, progress, remark, show, show_json, table
+from grounded_cli.console.workspace_option import given, in_workspace, next_line, typed
 from grounded_trials.wording import count
 
 if TYPE_CHECKING:

@@ -6,10 +6,20 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded_cli import completion as complete
-from grounded_cli.options import anyway, as_json, in_workspace, next_line, open_workspace
+from grounded_cli.console import completion as complete
+from grounded_cli.console.options import anyway, as_json
+from grounded_cli.console.terminal import (
+    number,
+    progress,
+    remark,
+    say,
+    show,
+    show_json,
+    stages,
+    tinted,
+)
+from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
 from grounded_cli.status import summary
-from grounded_cli.terminal import number, progress, remark, say, show, show_json, stages, tinted
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Candidate

@@ -23,7 +23,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: thread
 import click
 
 from grounded import __version__
-from grounded_cli.options import in_workspace
+from grounded_cli.console.workspace_option import in_workspace
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
@@ -52,7 +52,7 @@ COMMANDS = {
     "demo": ("studies.demo", "Run a whole example in a new folder: learn, diagnose, report."),
     "experiment": ("studies.experiment", "Reproduce the paper's studies."),
     "challenge": ("studies.challenge", "Make, diagnose and score blind cases for the diagnosis."),
-    "completion": ("completion", "Print the shell's completion script."),
+    "completion": ("console.completion", "Print the shell's completion script."),
 }
 
 ABOUT = 0.1  # difference in likeness of two spellings that is hardly one
@@ -106,7 +106,7 @@ class LazyGroup(click.Group):
 
             if not isinstance(error, GroundedError):
                 raise
-            from grounded_cli.options import given, next_line
+            from grounded_cli.console.workspace_option import given, next_line
             from grounded_trials.wording import placed
 
             then = "" if error.then is None else f"\n{next_line(error.then)}"
@@ -114,7 +114,7 @@ class LazyGroup(click.Group):
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Complete command names without importing any command."""
-        from grounded_cli.completion import commands
+        from grounded_cli.console.completion import commands
 
         options = click.Command.shell_complete(self, ctx, incomplete)
         return [*commands(COMMANDS, incomplete), *options]
@@ -163,7 +163,7 @@ def main() -> NoReturn:
     try:
         code, words = _run()
         if words:
-            from grounded_cli.terminal import say
+            from grounded_cli.console.terminal import say
 
             say(words)
         if sys.stdout is not None:
@@ -199,7 +199,7 @@ def _run() -> tuple[int, str]:
         raise
     except Exception as error:
         from grounded.errors import GroundedError
-        from grounded_cli.terminal import ALARM, style
+        from grounded_cli.console.terminal import ALARM, style
 
         if isinstance(error, OSError) and error.strerror:
             named = f"{error.filename}: " if error.filename else ""

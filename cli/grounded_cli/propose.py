@@ -10,9 +10,10 @@ import click
 
 from grounded.result import listed, measured_alike
 from grounded.search.candidate import BY_STEP, LITTLE, UNLIKE
-from grounded.search.step_size import Step
-from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
-from grounded_cli.terminal import LABEL, field, number, progress, remark, show, show_json
+from grounded.search.step.step_size import Step
+from grounded_cli.console.options import as_json
+from grounded_cli.console.terminal import LABEL, field, number, progress, remark, show, show_json
+from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
 from grounded_trials.wording import count, percent, with_unit
 
 if TYPE_CHECKING:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from grounded_cli.options import as_json, open_workspace, typed
-from grounded_cli.terminal import field, progress, say, show, show_json
+from grounded_cli.console.options import as_json
+from grounded_cli.console.terminal import field, progress, say, show, show_json
+from grounded_cli.console.workspace_option import open_workspace, typed
 from grounded_trials.wording import count
 
 if TYPE_CHECKING:

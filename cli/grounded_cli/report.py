@@ -10,8 +10,18 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded.errors import GroundedError
-from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
-from grounded_cli.terminal import number, progress, remark, say, show, show_json, sparkline, table
+from grounded_cli.console.options import as_json
+from grounded_cli.console.terminal import (
+    number,
+    progress,
+    remark,
+    say,
+    show,
+    show_json,
+    sparkline,
+    table,
+)
+from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
 from grounded_trials.wording import count
 
 if TYPE_CHECKING:

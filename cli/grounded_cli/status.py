@@ -7,9 +7,19 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
+from grounded_cli.console.options import as_json
+from grounded_cli.console.terminal import (
+    field,
+    number,
+    progress,
+    remark,
+    show,
+    show_json,
+    sparkline,
+    table,
+)
+from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
 from grounded_cli.propose import noise_share
-from grounded_cli.terminal import field, number, progress, remark, show, show_json, sparkline, table
 from grounded_trials.wording import count, legend, rendered, wrapped
 
 if TYPE_CHECKING:

@@ -42,7 +42,7 @@ from grounded.experiments.jobs import Running, StudyTable, every, run_study
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.search.first_policy import first_policy
-from grounded.search.step_size import SearchOptions
+from grounded.search.step.step_size import SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 

@@ -29,7 +29,7 @@ from grounded.policy import Policy, z_difference
 from grounded.search.ask_tell import learn
 from grounded.search.candidate import Candidate
 from grounded.search.improve import propose
-from grounded.search.step_size import SearchOptions
+from grounded.search.step.step_size import SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial
 

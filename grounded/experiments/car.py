@@ -25,7 +25,7 @@ from grounded.experiments.real_car import LATENCY, real_car, real_plant
 from grounded.models.car import model as car
 from grounded.search.ask_tell import learn
 from grounded.search.candidate import Candidate
-from grounded.search.step_size import SearchOptions
+from grounded.search.step.step_size import SearchOptions
 from grounded.trial import Trial
 
 PAPER = {"turn": 0.97, "circle": 0.88, "figure8": 0.63}

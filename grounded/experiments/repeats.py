@@ -27,7 +27,7 @@ from grounded.experiments.bench import bench, optimum, scaled, searched, true_ut
 from grounded.experiments.jobs import Running, StudyTable, every, mean_se, run_study
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.search.step_size import SearchOptions
+from grounded.search.step.step_size import SearchOptions
 
 LEVELS = (0.5, 1.0, 2.0, 3.0)
 MANOEUVRES = ("turn", "figure8")

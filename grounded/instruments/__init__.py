@@ -2,7 +2,12 @@
 
 Delays, scales, wrong units and signs, stuck or dead signals. Read `preflight` first: it checks
 trials against the model's kinematics, returns a `Finding` for each fault, and corrects the trials
-where that is certain. `single` checks one signal at a time, `kinematics` a position against its
-velocity and a heading against the course travelled, `mismatch` a position against every state that
-its rate depends on (`rows`). `lag` measures the delay between two signals.
+where that is certain. `sound_trials` runs these checks and those by the model's predictions.
+
+single        one signal at a time
+inputs        commands: copies, limits
+lag           the delay between two signals of one quantity
+kinematics/   what positions, velocities and headings imply about each other, whatever the physics
+predictions/  what only the model's predictions show: exchanged commands, signs, clocks
+units/        degrees, millimetres, percent: in one trial, one signal, or all of them
 """

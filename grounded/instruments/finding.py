@@ -1,10 +1,15 @@
-"""Finding: one fault of a sensor or command, with the values needed to correct it."""
+"""Finding: one fault of a sensor or command, with the values needed to correct it.
+
+`Preflight` holds all findings with the corrected trials; `UnusableTrials` is raised if they can't
+be corrected.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
+from grounded.errors import GroundedError, NextCommand
 from grounded.result import Document
 from grounded.trial import Trial
 
@@ -153,3 +158,51 @@ class Preflight:
             for name in self.in_step | mended
             for family in ("sensor_delay", "sensor_lag")
         )
+
+
+class UnusableTrials(GroundedError):
+    """Raised for trials that must be corrected.
+
+    Args:
+        message: the whole message.
+        clauses: only what is wrong with them.
+        mend: what to do before their logs are ingested again.
+        in_program: only what is wrong with them, for a program that has no [log].
+        then: the command that discards them.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        clauses: str,
+        mend: str,
+        in_program: str,
+        then: NextCommand | None = None,
+    ) -> None:
+        super().__init__(message, then)
+        self.clauses, self.mend, self.in_program = clauses, mend, in_program
+
+
+def unusable(
+    trials: Sequence[Trial], odd: Sequence[int], clauses: str, mend: str, in_program: str = ""
+) -> UnusableTrials:
+    """Return the error that some trials must be corrected and ingested again, with its command.
+
+    Args:
+        trials: all of them.
+        odd: indices of those affected.
+        clauses: what is wrong with them.
+        mend: what to do before the log is ingested again.
+        in_program: the clauses for a program, if they name keys of [log].
+    """
+    names = [trials[k].id or f"number {k + 1}" for k in odd]
+    one, every = len(odd) == 1, len(odd) == len(trials) > 1
+    where = "in every trial" if every else f"in trial{'s' * (not one)} {', '.join(names)}"
+    return UnusableTrials(
+        f"{where} {clauses}. {mend}; then discard {'this trial' if one else 'these trials'} and "
+        "ingest the log again",
+        clauses,
+        mend,
+        in_program or clauses,
+        then=NextCommand("discard", tuple(names)) if trials[0].id else None,
+    )

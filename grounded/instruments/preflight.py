@@ -1,20 +1,20 @@
 """START HERE: check sensors and commands from their signals, before any physics is identified.
 
-odd_trial     a trial in other units than the rest
-clocks        stamps at a wrong rate behind several scale errors; states that respond too early
-other_units   a position in mm beside a velocity in m/s
-swapped       two exchanged columns
-way           speeds in world axes or in knots, compass headings
-mismatch      a position that doesn't move as velocities and angles imply
-unresolved    a trial that becomes too fast for the model's time step
-single        each state on its own
-dead          a velocity that shows nothing while its position moves
-constant      a velocity with a constant bias against its position
-kinematics    velocities against the rates of their positions, headings against courses
-late_position both positions of a plane later than velocities and heading
-mistaken      commands exchanged or in percent, checked after the rest is corrected
-exchanged_states  two states exchanged, by the model's predictions, checked before the rest
-inputs        copies of one another, at or beyond their limits, constant within each trial
+single                    each state on its own
+inputs                    copies of one another, at or beyond their limits, constant within a trial
+units/odd_trial           a trial in other units than the rest
+units/other_units         a position in mm beside a velocity in m/s
+units/mismatch            a position that doesn't move as velocities and angles imply
+kinematics/relations      velocities against the rates of positions, headings against courses
+kinematics/velocities     a velocity that is dead, computed from its position, or biased
+kinematics/swapped        two exchanged columns
+kinematics/way            speeds in world axes or in knots, compass headings
+kinematics/late_position  both positions of a plane later than velocities and heading
+predictions/clocks        stamps at a wrong rate behind several scale errors
+predictions/unresolved    a trial that becomes too fast for the model's time step
+
+`sound_trials` adds those that need the model's predictions: exchanged states before these, other
+units of positions, clocks, exchanged commands and signs of inputs after them.
 
 Faults that are certain from the sensors alone are corrected in the trials passed on to the
 diagnosis: a delayed signal is shifted, a wrong sign or unit undone, invalid samples become missing.
@@ -30,10 +30,6 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.frozen import Array
-from grounded.instruments.clocks import told_by_the_clock
-from grounded.instruments.constant import constant_of
-from grounded.instruments.dead import judge_dead
-from grounded.instruments.derived import Derived, derived
 from grounded.instruments.finding import (
     A_SECOND,
     AS_LATE,
@@ -49,7 +45,8 @@ from grounded.instruments.finding import (
     scaled,
 )
 from grounded.instruments.inputs import judge_inputs
-from grounded.instruments.kinematics import (
+from grounded.instruments.kinematics.late_position import late_positions
+from grounded.instruments.kinematics.relations import (
     AGREE,
     OFF,
     TURNED_AWAY,
@@ -60,23 +57,30 @@ from grounded.instruments.kinematics import (
     own_lag,
     travelled,
 )
+from grounded.instruments.kinematics.rows import kinematic_rows, tied
+from grounded.instruments.kinematics.swapped import judge_columns
+from grounded.instruments.kinematics.velocities import Derived, constant_of, derived, judge_dead
+from grounded.instruments.kinematics.way import judge_way, rate_agrees
 from grounded.instruments.lag import LEAST_S, SAME, SURE, SURELY, Lag, earlier
-from grounded.instruments.late_position import late_positions
-from grounded.instruments.mismatch import (
+from grounded.instruments.predictions.clocks import told_by_the_clock
+from grounded.instruments.predictions.unresolved import judge_resolution
+from grounded.instruments.single import judge_signal, signal_of
+from grounded.instruments.units.mismatch import (
     Mismatch,
     explained,
     stop_at,
     stop_at_folded,
     unexplained,
 )
-from grounded.instruments.odd_trial import Odd, all_in_degrees, odd_commands, odd_states
-from grounded.instruments.other_units import judge_stamps, judge_units
-from grounded.instruments.rate_ratios import Ratios, ratios_of
-from grounded.instruments.rows import kinematic_rows, tied
-from grounded.instruments.single import judge_signal, signal_of
-from grounded.instruments.swapped import judge_columns
-from grounded.instruments.unresolved import judge_resolution
-from grounded.instruments.way import judge_way, rate_agrees
+from grounded.instruments.units.odd_trial import (
+    Odd,
+    Ratios,
+    all_in_degrees,
+    odd_commands,
+    odd_states,
+    ratios_of,
+)
+from grounded.instruments.units.other_units import judge_stamps, judge_units
 from grounded.model import Model
 from grounded.places import Integral, integrals, speed
 from grounded.task import Task

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from grounded.instruments.clocks import judge_clocks
-from grounded.instruments.exchanged_states import judge_exchanged
 from grounded.instruments.finding import Preflight
-from grounded.instruments.input_signs import judge_signs
-from grounded.instruments.mistaken import judge_commands
-from grounded.instruments.plane_units import judge_positions
+from grounded.instruments.predictions.clocks import judge_clocks
+from grounded.instruments.predictions.exchanged_states import judge_exchanged
+from grounded.instruments.predictions.input_signs import judge_signs
+from grounded.instruments.predictions.mistaken import judge_commands
 from grounded.instruments.preflight import preflight
+from grounded.instruments.units.plane_units import judge_positions
 from grounded.model import Model
 from grounded.task import Task
 from grounded.trial import Trial

@@ -26,7 +26,7 @@ from grounded.task import Task
 from grounded.trial import Trial, scattered
 
 if TYPE_CHECKING:
-    from grounded.search.step_size import SearchOptions
+    from grounded.search.step.step_size import SearchOptions
 
 PART = 0.3  # share of a gain due to different start states from which on it is reported
 ANOTHER = 99.0  # ratio of a state's costs in two runs that is no scatter, see `another_kind`

@@ -14,24 +14,23 @@ from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.rollout import Rollout, Run, apart, for_late_samples
 from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Slopes, Tried, Way
-from grounded.search.directions import base_columns, direction
-from grounded.search.limit_cycle import between_limits, limit_cycle
-from grounded.search.margin import steadied
+from grounded.search.feedback.margin import steadied
+from grounded.search.feedback.oscillation import Quiet, between_limits, limit_cycle, quiet_gains
+from grounded.search.feedback.sample_age import sample_age
 from grounded.search.planner import Planner, predicted
-from grounded.search.quiet_gains import Quiet, quiet_gains
 from grounded.search.safety import objections, spread
-from grounded.search.sample_age import sample_age
 from grounded.search.scatter import beyond_noise
 from grounded.search.standing import LOST, Proposal, Standing, wild
-from grounded.search.step_size import KEPT, SearchOptions, Step, losers_of
+from grounded.search.step.directions import base_columns, direction
+from grounded.search.step.step_size import KEPT, SearchOptions, Step, losers_of
 from grounded.solve import ddp
 from grounded.solve.measured import measured_gains
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 
 if TYPE_CHECKING:
-    from grounded.search.corrected import Corrected
-    from grounded.search.mispredictions import Alternative
+    from grounded.search.step.corrected import Corrected
+    from grounded.search.step.mispredictions import Alternative
 
 GENTLER = 1e3  # factor on the input weights for each unit of caution
 HALF, FINE = 0.5, 12  # share of the mean gain to fall below; parts of a unit of caution
@@ -97,13 +96,13 @@ class About:
         self.missed = 0.0  # likely error of the model's movements, as a share of them
         self.alternatives: tuple[Alternative, ...] = ()
         if way == BY_STEP:
-            from grounded.search.by_step import believed_by_step
+            from grounded.search.step.by_step import believed_by_step
 
             if found := believed_by_step(planner, incumbent, make.now.history, self.real):
                 self.real, self.corrected = found.problem, found.corrected
                 self.missed = found.missed
         elif options.damps and len(make.now.history) > 1 and not self._kept():
-            from grounded.search.mispredictions import believed
+            from grounded.search.step.mispredictions import believed
 
             trusted = not plainly and self._refuted() < REFUTED
             found = believed(planner, incumbent, make.now.history, self.real, trusted)
@@ -154,7 +153,7 @@ class About:
         return self._steadied(made) if made.predicted_gain > self.least else made
 
     def _steadied(self, made: Candidate) -> Candidate:
-        """Return the same run with the incumbent's gains if the new ones cost more (`feedback`).
+        """Return the same run with the incumbent's gains if the new ones cost more.
 
         The own plan of a changed model keeps its gains: the incumbent's were designed in a model
         that lacked what was found since, such as a delay.

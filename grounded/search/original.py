@@ -25,7 +25,7 @@ from grounded.search.candidate import LITTLE, Tried
 from grounded.search.certainty import LUCK, error_between
 from grounded.search.making import FORETOLD, About
 from grounded.search.planner import Planner
-from grounded.search.step_size import BROKEN
+from grounded.search.step.step_size import BROKEN
 from grounded.task import Task
 from grounded.trial import Trial
 

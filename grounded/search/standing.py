@@ -26,7 +26,7 @@ from grounded.result import Result, document, figure, html_table, spread
 from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Tried, Way
 from grounded.search.certainty import LUCK, error_between, judged, last_improvement
 from grounded.search.scatter import Repeats
-from grounded.search.step_size import SearchOptions, Step, losers_of
+from grounded.search.step.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
 from grounded.trial import Trial
 

@@ -20,7 +20,7 @@ from facts import holding
 from grounded.compile.run import jit
 from grounded.errors import GroundedError
 from grounded.trusted import TRUST, check_own, suspicion
-from grounded_cli.terminal import harmless, show, show_json, style, table
+from grounded_cli.console.terminal import harmless, show, show_json, style, table
 from grounded_trials.store.store import Store, write_atomically
 from workspaces import make
 

@@ -8,8 +8,8 @@ import pytest
 
 from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.report import Diagnosis, Verdict
-from grounded_cli import terminal
-from grounded_cli.terminal import field, harmless, names_in, remark, sparkline, table
+from grounded_cli.console import terminal
+from grounded_cli.console.terminal import field, harmless, names_in, remark, sparkline, table
 
 
 def test_a_narrow_table_has_one_line_of_names():

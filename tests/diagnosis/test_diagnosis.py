@@ -28,39 +28,7 @@ from grounded.models.pendulum import model as pendulum
 from grounded.policy import Policy
 from grounded.task import Task
 from grounded.utility import Reward
-
-DT = 0.05
-
-
-def cart(friction=0.0, dead=0.0, asymmetric=0.0, trials=4, steps=120, noise=1.0, seed=0):
-    """A cart that is pushed: v' = k u - v / tau, with noise; and its crude model."""
-    model = Model(
-        states={"x": "m", "v": "m/s"},
-        inputs={"u": "1"},
-        params={"k": Param(2.0, "m/s^2", 0.1, 10.0), "tau": Param(1.0, "s", 0.1, 10.0)},
-        roles={"position": ("x",), "speed": "v"},
-        derivative=lambda s, a, p: {"x": s.v, "v": p.k * a.u - s.v / p.tau},
-        name="cart",
-    )
-    rng, found = np.random.default_rng(seed), []
-    for _ in range(trials):
-        t = np.arange(steps) * DT
-        u = 0.6 * np.sin(rng.uniform(1, 3) * t + rng.uniform(0, 6)) + 0.4 * np.sin(
-            rng.uniform(3, 6) * t
-        )
-        x, states = np.zeros(2), [np.zeros(2)]
-        for value in u:
-            force = np.sign(value) * max(abs(value) - dead, 0)
-            force *= 1 + (asymmetric if force > 0 else 0)
-            for _ in range(10):
-                v = x[1]
-                rate = 2.0 * force - v - friction * np.tanh(v / 0.01)
-                x = x + DT / 10 * np.array([v, rate])
-            x = x + noise * np.array([0.0003, 0.003]) * rng.standard_normal(2)
-            states.append(x)
-        y = np.array(states) + noise * np.array([0.002, 0.01]) * rng.standard_normal((steps + 1, 2))
-        found.append(Trial(y, u[:, None], DT, ("x", "v"), ("u",), start_inputs=np.zeros(1)))
-    return model, found
+from small_tasks import DT, pushed_cart
 
 
 def random_filter(rng, L=4, B=2, n=2):
@@ -161,7 +129,7 @@ def test_whiteness_is_the_chance_that_white_noise_is_as_correlated():
     ],
 )
 def test_one_effect_is_named_with_its_size(truth, name, quantity, value):
-    model, trials = cart(**truth)
+    model, trials = pushed_cart(**truth)
     found = diagnose(model, trials)
     assert found.ranking[0].effect == name
     assert found.kind == "effect", found.sentence
@@ -174,7 +142,7 @@ def test_one_effect_is_named_with_its_size(truth, name, quantity, value):
 @pytest.mark.slow
 def test_no_effect_is_claimed_where_there_is_none():
     for seed in range(3):
-        model, trials = cart(seed=seed)
+        model, trials = pushed_cart(seed=seed)
         found = diagnose(model, trials)
         assert found.kind == "none", found.sentence
         assert found.effects == ()
@@ -183,7 +151,7 @@ def test_no_effect_is_claimed_where_there_is_none():
 
 @pytest.mark.slow
 def test_a_parameter_that_is_off_is_blamed_as_a_parameter():
-    model, trials = cart()
+    model, trials = pushed_cart()
     found = diagnose(model.with_values({"tau": 1.2}), trials)
     assert "parameter:tau" in [r.effect for r in found.ranking[:3]]
     assert found.gap.after < 1.2
@@ -191,7 +159,7 @@ def test_a_parameter_that_is_off_is_blamed_as_a_parameter():
 
 @pytest.mark.slow
 def test_parameters_that_are_off_are_named_most_important_first():
-    model, trials = cart(trials=6)
+    model, trials = pushed_cart(trials=6)
     found = diagnose(model.with_values({"k": 1.9, "tau": 0.88}), trials)
     named = {f"parameter:{name}" for name in ("k", "tau")}
     assert set(found.effects) & named, found.sentence
@@ -271,7 +239,7 @@ def test_sentences_are_english():
 
 @pytest.mark.slow
 def test_what_no_effect_explains_is_left_over():
-    model, trials = cart(asymmetric=0.6, trials=6)
+    model, trials = pushed_cart(asymmetric=0.6, trials=6)
     found = diagnose(model, trials, DiagnosisOptions(library=Library().without(["input_curve"])))
     assert found.leftover or found.gap.after < 1.3
     if found.leftover:
@@ -420,7 +388,7 @@ def test_a_part_of_what_was_driven_is_no_place_unless_the_gap_is_clearly_denser_
 
 @pytest.mark.slow
 def test_without_the_family_a_look_alike_is_marked_by_what_it_leaves():
-    model, trials = cart(dead=0.25, trials=6)
+    model, trials = pushed_cart(dead=0.25, trials=6)
     library = Library().without(["dead_zone", "stall", "backlash", "stiction", "coulomb_friction"])
     found = diagnose(model, trials, DiagnosisOptions(library=library))
     assert found.kind == "unknown" or found.leftover or found.gap.after < 1.3
@@ -428,7 +396,7 @@ def test_without_the_family_a_look_alike_is_marked_by_what_it_leaves():
 
 @pytest.mark.slow
 def test_one_trial_names_no_cause():
-    model, trials = cart(friction=0.5, trials=1)
+    model, trials = pushed_cart(friction=0.5, trials=1)
     found = diagnose(model, trials)
     assert found.kind == "unknown"
     assert found.effects == ()
@@ -437,7 +405,7 @@ def test_one_trial_names_no_cause():
 
 @pytest.mark.slow
 def test_a_constant_input_is_not_blamed():
-    model, trials = cart(friction=0.5)
+    model, trials = pushed_cart(friction=0.5)
     flat = [
         Trial(t.states, np.full_like(t.inputs, 0.3), t.dt, t.state_names, t.input_names)
         for t in trials
@@ -449,7 +417,7 @@ def test_a_constant_input_is_not_blamed():
 
 
 def test_no_trials_and_foreign_trials_are_refused():
-    model, trials = cart()
+    model, trials = pushed_cart()
     with pytest.raises(GroundedError, match="no trials"):
         diagnose(model, [])
     with pytest.raises(GroundedError, match="states"):
@@ -458,7 +426,7 @@ def test_no_trials_and_foreign_trials_are_refused():
 
 @pytest.mark.slow
 def test_gaps_in_the_log_are_bridged_by_the_filter():
-    model, trials = cart(friction=0.4)
+    model, trials = pushed_cart(friction=0.4)
     holed = []
     for t in trials:
         states = t.states.copy()
@@ -472,7 +440,7 @@ def test_gaps_in_the_log_are_bridged_by_the_filter():
 
 @pytest.mark.slow
 def test_the_document_is_plain_json():
-    model, trials = cart(friction=0.4, trials=2, steps=80)
+    model, trials = pushed_cart(friction=0.4, trials=2, steps=80)
     document = diagnose(model, trials).to_json()
     again = json.loads(json.dumps(document, allow_nan=False))
     for key in ("verdict", "where", "ranking", "indistinguishable", "gap", "next_trial"):
@@ -484,7 +452,7 @@ def test_the_document_is_plain_json():
 
 @pytest.mark.slow
 def test_a_probe_tells_two_explanations_apart():
-    model, trials = cart(dead=0.1, steps=60, trials=3)
+    model, trials = pushed_cart(dead=0.1, steps=60, trials=3)
     H = 100
     task = Task(
         model=model,

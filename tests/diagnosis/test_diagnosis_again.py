@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_diagnosis import cart
 
 from grounded import Model, Param, Reward, Task, Trial
 from grounded.diagnosis.cause_words import meaning
@@ -23,6 +22,7 @@ from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.effects import Library
 from grounded.effects.actuator import delay_again
 from grounded_trials.workspace.adopting import joined
+from small_tasks import pushed_cart
 
 
 def axis(gain):
@@ -121,7 +121,7 @@ def test_predictions_start_from_filtered_states_wherever_the_track_lies():
 
 
 def test_constants_that_data_chose_stay_when_the_values_move():
-    model, _ = cart(trials=1, steps=2)
+    model, _ = pushed_cart(trials=1, steps=2)
     effect = Library().effect("coulomb_friction:v", model)
     width = 3 * effect.fixed["width"]
     h = Hypothesis().plus(effect, {"c": 0.2, "width": width})

@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_diagnosis import cart
-from test_diagnosis_split import task_of
 
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import Gap, Region, Remainder, UtilityPrediction, Where
@@ -18,6 +16,7 @@ from grounded.effects import Library
 from grounded.errors import GroundedError
 from grounded.result import Document
 from reported import DIAGNOSIS
+from small_tasks import pushed_cart, pushed_cart_task
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True)
 NAMES = st.text(max_size=8)
@@ -34,10 +33,10 @@ def again(found: Document) -> Any:
     [("effect", 4, {"friction": 0.4}), ("none", 4, {}), ("unknown", 1, {"friction": 0.4})],
 )
 def test_a_real_diagnosis_is_read_back_as_it_was(kind, trials, changes):
-    model, runs = cart(trials=trials, steps=120, **changes)
+    model, runs = pushed_cart(trials=trials, steps=120, **changes)
     few = ("coulomb_friction", "viscous_friction", "input_gain", "delay", "offset")
     library = Library(tuple(Library().family(name) for name in few))
-    found = diagnose(task_of(model), runs, DiagnosisOptions(library=library))
+    found = diagnose(pushed_cart_task(model), runs, DiagnosisOptions(library=library))
     assert found.kind == kind
     read = again(found)
     assert read == found and read.to_json() == found.to_json()

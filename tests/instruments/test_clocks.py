@@ -9,7 +9,7 @@ import grounded as gr
 from facts import holds
 from grounded import Model, Param
 from grounded.errors import GroundedError
-from grounded.instruments.clocks import answers_early, judge_clocks
+from grounded.instruments.predictions.clocks import answers_early, judge_clocks
 from grounded.trial import Trial
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from grounded import Model, Param, Trial
 from grounded.instruments.finding import DEGREES
-from grounded.instruments.odd_trial import all_in_degrees
 from grounded.instruments.preflight import preflight
+from grounded.instruments.units.odd_trial import all_in_degrees
 
 DT, FINE = 0.02, 20  # [s], and parts of a step
 ARM = Model(

@@ -9,9 +9,9 @@ import pytest
 
 from cli import grounded
 from facts import holds
-from grounded.instruments.exchanged_states import exchanged_states, judge_exchanged
-from grounded.instruments.mistaken import Mistake
-from grounded.instruments.other_units import UnusableTrials
+from grounded.instruments.finding import UnusableTrials
+from grounded.instruments.predictions.exchanged_states import exchanged_states, judge_exchanged
+from grounded.instruments.predictions.mistaken import Mistake
 from grounded.instruments.sound_trials import sound_trials
 from grounded.trial import Trial
 from grounded_trials import Workspace

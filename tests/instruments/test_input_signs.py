@@ -9,7 +9,7 @@ import pytest
 from facts import holds
 from grounded import Model, Param
 from grounded.errors import GroundedError
-from grounded.instruments.input_signs import how_inputs_act, judge_signs
+from grounded.instruments.predictions.input_signs import how_inputs_act, judge_signs
 from grounded.instruments.sound_trials import sound_trials
 from grounded.models import arm, cart_pole
 from grounded.trial import Trial

@@ -10,7 +10,7 @@ from cli import grounded
 from facts import holding, holds
 from grounded import Model, Param
 from grounded.errors import GroundedError
-from grounded.instruments.mistaken import (
+from grounded.instruments.predictions.mistaken import (
     ODD_FROM,
     Mistake,
     _best,
@@ -19,7 +19,7 @@ from grounded.instruments.mistaken import (
     mended_by,
     mistaken,
 )
-from grounded.instruments.short_runs import Ahead, Fit
+from grounded.instruments.predictions.short_runs import Ahead, Fit
 from grounded.trial import Trial
 from ros_bags import thruster_bag
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from grounded import GroundedError, Model, Param, Trial
-from grounded.instruments.plane_units import judge_positions, positions_off
 from grounded.instruments.sound_trials import sound_trials
+from grounded.instruments.units.plane_units import judge_positions, positions_off
 
 DT = 0.02
 

@@ -10,12 +10,11 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.effects import Library, wrap
 from grounded.errors import GroundedError, NextCommand
-from grounded.instruments.constant import constant_of
-from grounded.instruments.dead import dead_rates
-from grounded.instruments.kinematics import turned
+from grounded.instruments.kinematics.relations import turned
+from grounded.instruments.kinematics.rows import kinematic_rows
+from grounded.instruments.kinematics.velocities import constant_of, dead_rates
 from grounded.instruments.lag import at_samples, lag_between
 from grounded.instruments.preflight import preflight
-from grounded.instruments.rows import kinematic_rows
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
 from grounded.places import integrals

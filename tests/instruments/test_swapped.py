@@ -6,8 +6,8 @@ import pytest
 from facts import holding
 from grounded import Model, Param
 from grounded.errors import GroundedError
+from grounded.instruments.kinematics.swapped import swapped_columns
 from grounded.instruments.preflight import preflight
-from grounded.instruments.swapped import swapped_columns
 from grounded.trial import Trial
 
 PLANE = Model(

@@ -9,11 +9,11 @@ from facts import holding, holds
 from grounded import Model
 from grounded.errors import GroundedError
 from grounded.frozen import Array
-from grounded.instruments.kinematics import lag_of
-from grounded.instruments.mistaken import mistaken
+from grounded.instruments.kinematics.relations import lag_of
+from grounded.instruments.kinematics.rows import kinematic_rows, tied
+from grounded.instruments.kinematics.way import plane_of, stop_at_axes
+from grounded.instruments.predictions.mistaken import mistaken
 from grounded.instruments.preflight import preflight
-from grounded.instruments.rows import kinematic_rows, tied
-from grounded.instruments.way import plane_of, stop_at_axes
 from grounded.places import integrals
 from grounded.trial import Trial
 from grounded_trials.workspace.intake.log_faults import way_faults

@@ -63,7 +63,10 @@ def test_what_is_there_is_imported():
     [
         ("grounded_trials.report.page.page", ("grounded.diagnosis.likelihood", "grounded.effects")),
         ("grounded_trials.workspace.proposing", ("grounded.diagnosis", "grounded.search.improve")),
-        ("grounded.search.improve", ("grounded.search.first_policy", "grounded.search.mispred")),
+        (
+            "grounded.search.improve",
+            ("grounded.search.first_policy", "grounded.search.step.mispred"),
+        ),
     ],
 )
 def test_a_command_imports_what_it_needs(module, never):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded_cli.terminal import sparkline, table
+from grounded_cli.console.terminal import sparkline, table
 from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import all_figures
 from grounded_trials.report.gathering import _drawable

@@ -10,7 +10,7 @@ import click
 import pytest
 
 from cli import grounded, process
-from grounded_cli import completion
+from grounded_cli.console import completion
 from grounded_cli.main import COMMANDS, cli
 from reported import cart
 

@@ -19,11 +19,11 @@ from grounded.models import car, pendulum
 from grounded.plant import Plant
 from grounded.rollout import simulate
 from grounded.search.ask_tell import learn
-from grounded.search.directions import damped, direction
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
 from grounded.search.planner import model_fingerprint
-from grounded.search.step_size import SearchOptions
+from grounded.search.step.directions import damped, direction
+from grounded.search.step.step_size import SearchOptions
 from grounded.solve.bias import ground
 from grounded.task import Task
 from grounded.trial import Trial

@@ -15,17 +15,18 @@ import numpy as np
 import pytest
 
 from grounded import Model
-from grounded.instruments.odd_trial import all_in_degrees
+from grounded.instruments.units.odd_trial import all_in_degrees
 from grounded.plant import Plant
 from grounded.search import first_policy as starts
-from grounded.search import making, mispredictions
+from grounded.search import making
 from grounded.search.ask_tell import Search, learn
 from grounded.search.first_guess import filled_target
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
-from grounded.search.mispredictions import Believed
 from grounded.search.planner import planner_for
-from grounded.search.step_size import SearchOptions
+from grounded.search.step import mispredictions
+from grounded.search.step.mispredictions import Believed
+from grounded.search.step.step_size import SearchOptions
 from grounded.solve import ddp
 from small_tasks import cart_task, drive, other
 

@@ -11,7 +11,7 @@ from grounded.search.improve import propose
 from grounded.search.original import Promises, promises
 from grounded.search.planner import Planner, planner_with
 from grounded.search.scatter import PIECES
-from grounded.search.step_size import SearchOptions
+from grounded.search.step.step_size import SearchOptions
 from small_tasks import cart_task, drive, other, rover_task
 
 

@@ -14,10 +14,10 @@ import pytest
 from grounded.model import Model, Param
 from grounded.plant import Noise, Plant
 from grounded.search import making
+from grounded.search.feedback.oscillation import between_limits, limit_cycle
 from grounded.search.improve import propose
-from grounded.search.limit_cycle import between_limits, limit_cycle
 from grounded.search.planner import Planner
-from grounded.search.step_size import SearchOptions
+from grounded.search.step.step_size import SearchOptions
 from grounded.task import Task
 from grounded.utility import Reward
 from grounded_trials.workspace.adopted import planner_of

@@ -9,7 +9,7 @@ from grounded.plant import Noise, Plant
 from grounded.search import original
 from grounded.search.improve import propose
 from grounded.search.planner import planner_with
-from grounded.search.step_size import SearchOptions
+from grounded.search.step.step_size import SearchOptions
 from grounded.utility import Reward
 from small_tasks import cart_task, drive
 

@@ -20,7 +20,7 @@ from grounded.search.scatter import (
     with_errors,
 )
 from grounded.search.standing import standing
-from grounded.search.step_size import SearchOptions
+from grounded.search.step.step_size import SearchOptions
 from grounded.trial import Trial
 from grounded.utility import Reward
 from small_tasks import cart_task, drive, other

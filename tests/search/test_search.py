@@ -16,7 +16,7 @@ from grounded.search.improve import propose
 from grounded.search.making import About, Maker
 from grounded.search.planner import Planner, fixed_draws, model_fingerprint
 from grounded.search.standing import MAX_CAUTION, standing
-from grounded.search.step_size import OTHER_WAY, SearchOptions, Step, losers_of
+from grounded.search.step.step_size import OTHER_WAY, SearchOptions, Step, losers_of
 from grounded.trial import Trial, mean_trial
 from grounded.utility import Reward
 from small_tasks import cart_task, drive, other, rover_task

@@ -11,7 +11,7 @@ from grounded.experiments.real_car import real_plant
 from grounded.models.car import model as car
 from grounded.search.ask_tell import learn
 from grounded.search.first_policy import first_policy
-from grounded.search.step_size import SearchOptions
+from grounded.search.step.step_size import SearchOptions
 from grounded.solve.bias import ground
 from grounded.solve.levenberg_marquardt import LeastSquares, solve
 

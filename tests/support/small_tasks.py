@@ -1,4 +1,4 @@
-"""Small models and tasks on which the loop runs in milliseconds, and differing real systems."""
+"""Small models, tasks and trials: a search takes milliseconds on them, a diagnosis seconds."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import Reward
+
+DT = 0.05  # [s]
 
 
 def cart_dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
@@ -93,6 +95,96 @@ def rover_task(**changes: Any) -> Task:
         "latency": np.array([0.05, 0.02]),
     }
     return Task(**fields | changes)
+
+
+def speed_rover() -> Model:
+    """Return a robot driven by speed commands, in NumPy."""
+    return Model(
+        states={"x": "m", "y": "m", "psi": "rad", "v": "m/s", "w": "rad/s"},
+        inputs={"linear": "m/s", "angular": "rad/s"},
+        params={"lag": Param(0.12, "s", 0.05, 0.5)},
+        angles=("psi",),
+        derivative=lambda s, a, p: {
+            "x": s.v * np.cos(s.psi),
+            "y": s.v * np.sin(s.psi),
+            "psi": s.w,
+            "v": (a.linear - s.v) / p.lag,
+            "w": (a.angular - s.w) / p.lag,
+        },
+    )
+
+
+def speed_rover_task(model: Model) -> Task:
+    """Return a task for it: accelerate at 0.5 m/s^2 to 1 m/s, in a gentle turn."""
+    t = DT * np.arange(81)
+    v, w = np.minimum(0.5 * t, 1.0), 0.4 * np.sin(0.8 * t)
+    psi = np.cumsum(w) * DT
+    x, y = np.cumsum(v * np.cos(psi)) * DT, np.cumsum(v * np.sin(psi)) * DT
+    return Task(
+        model=model,
+        dt=DT,
+        target=np.column_stack([x, y, psi, v, w]),
+        reward=Reward(
+            np.array([1.0, 1.0, 1.0, 1.0, 0.0]), np.zeros(5), np.zeros(2), np.full(2, 0.01)
+        ),
+        start=np.zeros(5),
+        past=np.zeros(2),
+        low=np.array([-0.3, -1.8]),
+        high=np.array([1.5, 1.8]),
+    )
+
+
+def pushed_cart(
+    friction: float = 0.0,
+    dead: float = 0.0,
+    asymmetric: float = 0.0,
+    trials: int = 4,
+    steps: int = 120,
+    noise: float = 1.0,
+    seed: int = 0,
+) -> tuple[Model, list[Trial]]:
+    """Return a crude model, v' = k u - v / tau, and noisy trials of a cart that differs."""
+    model = Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"u": "1"},
+        params={"k": Param(2.0, "m/s^2", 0.1, 10.0), "tau": Param(1.0, "s", 0.1, 10.0)},
+        roles={"position": ("x",), "speed": "v"},
+        derivative=lambda s, a, p: {"x": s.v, "v": p.k * a.u - s.v / p.tau},
+        name="cart",
+    )
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(trials):
+        t = np.arange(steps) * DT
+        u = 0.6 * np.sin(rng.uniform(1, 3) * t + rng.uniform(0, 6)) + 0.4 * np.sin(
+            rng.uniform(3, 6) * t
+        )
+        x, states = np.zeros(2), [np.zeros(2)]
+        for value in u:
+            force = np.sign(value) * max(abs(value) - dead, 0)
+            force *= 1 + (asymmetric if force > 0 else 0)
+            for _ in range(10):
+                v = x[1]
+                rate = 2.0 * force - v - friction * np.tanh(v / 0.01)
+                x = x + DT / 10 * np.array([v, rate])
+            x = x + noise * np.array([0.0003, 0.003]) * rng.standard_normal(2)
+            states.append(x)
+        y = np.array(states) + noise * np.array([0.002, 0.01]) * rng.standard_normal((steps + 1, 2))
+        found.append(Trial(y, u[:, None], DT, ("x", "v"), ("u",), start_inputs=np.zeros(1)))
+    return model, found
+
+
+def pushed_cart_task(model: Model, steps: int = 120) -> Task:
+    """Return a task of a pushed cart that only bounds its inputs."""
+    return Task(
+        model=model,
+        dt=DT,
+        target=np.zeros((steps + 1, 2)),
+        reward=Reward(np.ones(2), np.zeros(2), np.zeros(1), np.zeros(1)),
+        start=np.zeros(2),
+        past=np.zeros(1),
+        low=np.array([-1.0]),
+        high=np.array([1.0]),
+    )
 
 
 def scara(friction: float) -> Model:

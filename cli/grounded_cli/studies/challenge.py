@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from grounded.errors import GroundedError, NextCommand
-from grounded_cli.options import as_json, parallel, typed
-from grounded_cli.terminal import bar, names_in, number, say, show, show_json, table
+from grounded_cli.console.options import as_json, parallel
+from grounded_cli.console.terminal import bar, names_in, number, say, show, show_json, table
+from grounded_cli.console.workspace_option import typed
 from grounded_trials.wording import count
 
 if TYPE_CHECKING:

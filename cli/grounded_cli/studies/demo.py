@@ -10,10 +10,20 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from grounded.errors import GroundedError, NextCommand
+from grounded_cli.console.options import as_json
+from grounded_cli.console.terminal import (
+    field,
+    number,
+    progress,
+    remark,
+    say,
+    show,
+    show_json,
+    stages,
+)
+from grounded_cli.console.workspace_option import located, next_line
 from grounded_cli.learn import narrated
-from grounded_cli.options import as_json, located, next_line
 from grounded_cli.status import summary
-from grounded_cli.terminal import field, number, progress, remark, say, show, show_json, stages
 from grounded_trials.wording import count, rendered
 
 if TYPE_CHECKING:

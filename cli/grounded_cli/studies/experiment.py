@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from grounded_cli.options import as_json, parallel
-from grounded_cli.terminal import bar, show, show_json, table
+from grounded_cli.console.options import as_json, parallel
+from grounded_cli.console.terminal import bar, show, show_json, table
 
 if TYPE_CHECKING:
     from grounded.engine import Engine

@@ -11,8 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.instruments.finding import in_the_log
-from grounded.instruments.other_units import UnusableTrials
+from grounded.instruments.finding import UnusableTrials, in_the_log
 from grounded.instruments.sound_trials import sound_trials
 from grounded.model import Model
 from grounded.result import listed, with_unit

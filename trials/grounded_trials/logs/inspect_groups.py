@@ -16,8 +16,8 @@ from itertools import islice, permutations, product
 import numpy as np
 
 from grounded.frozen import Array
-from grounded.instruments.mistaken import CLEAR, HALF
-from grounded.instruments.short_runs import Ahead
+from grounded.instruments.predictions.mistaken import CLEAR, HALF
+from grounded.instruments.predictions.short_runs import Ahead
 from grounded.model import Model
 from grounded.trial import Trial
 from grounded_trials.logs.inspect_guess import Guess

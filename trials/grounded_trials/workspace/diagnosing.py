@@ -232,7 +232,7 @@ def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Findi
 
 def unheld_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the logged states that no other sensor in the trials can check, see `unheld`."""
-    from grounded.instruments.rows import unheld
+    from grounded.instruments.kinematics.rows import unheld
 
     return unheld(workspace.planner.task.model, _chosen(workspace, trials))
 

@@ -329,7 +329,7 @@ def _extent(task: Task, states: Sequence[int]) -> float:
 
 def _thrown(task: Task, first: Candidate) -> list[str]:
     """Return notes on inputs that often jump over more than half their [limits] in one step."""
-    from grounded.search.limit_cycle import jumps
+    from grounded.search.feedback.oscillation import jumps
 
     times = jumps(first.predicted_inputs, task.high - task.low)
     return [

@@ -28,7 +28,7 @@ from grounded.policy import Policy
 from grounded.rollout import seen_late
 from grounded.search.candidate import Candidate
 from grounded.search.certainty import beyond_one_trial
-from grounded.search.quiet_gains import quiet_gains
+from grounded.search.feedback.oscillation import quiet_gains
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.store.store import Stored

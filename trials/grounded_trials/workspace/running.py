@@ -22,7 +22,7 @@ from grounded.plant import Noise, Plant
 from grounded.result import Result
 from grounded.search.ask_tell import learn
 from grounded.search.candidate import Candidate
-from grounded.search.step_size import SearchOptions
+from grounded.search.step.step_size import SearchOptions
 from grounded.trial import Trial
 from grounded.trusted import check_own
 from grounded_trials.store.store import made_folder

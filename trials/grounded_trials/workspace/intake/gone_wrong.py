@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.search.mispredictions import STRAYED
+from grounded.search.step.mispredictions import STRAYED
 from grounded_trials.wording import ranges
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import diagnosable

@@ -2,7 +2,7 @@
 
 A policy takes what it is given for where the robot is now. At 1.8 m/s a pose that is 6.8 ms old is
 12 mm behind, so the robot runs 12 mm ahead of its target, in every run. The first plan doesn't know
-that; later ones allow for the age that the commands show (`grounded.search.sample_age`).
+that; later ones allow for the age that the commands show (`grounded.search.feedback.sample_age`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.result import listed, measured_alike
 from grounded.search.candidate import Candidate
-from grounded.search.sample_age import sample_age
+from grounded.search.feedback.sample_age import sample_age
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
 

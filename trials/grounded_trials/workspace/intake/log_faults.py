@@ -100,7 +100,7 @@ def _with_limits(task: Task, known: Trial, fault: Fault) -> Fault:
 
 
 def _exchanged(model: Model, known: Trial) -> Iterator[Fault]:
-    from grounded.instruments.swapped import exchanged, swapped_columns
+    from grounded.instruments.kinematics.swapped import exchanged, swapped_columns
     from grounded.places import integrals
 
     if pair := swapped_columns(model, known, relations=integrals(model)):
@@ -109,9 +109,9 @@ def _exchanged(model: Model, known: Trial) -> Iterator[Fault]:
 
 def _by_model(model: Model, known: Trial) -> tuple[Fault, ...]:
     """Return a fault for two exchanged states that only the model reveals."""
-    from grounded.instruments.exchanged_states import exchanged_states
-    from grounded.instruments.mistaken import SWAP_BACK, described
-    from grounded.instruments.swapped import swapped_columns
+    from grounded.instruments.kinematics.swapped import swapped_columns
+    from grounded.instruments.predictions.exchanged_states import exchanged_states
+    from grounded.instruments.predictions.mistaken import SWAP_BACK, described
 
     if swapped_columns(model, known):
         return ()
@@ -121,7 +121,7 @@ def _by_model(model: Model, known: Trial) -> tuple[Fault, ...]:
 
 def dead_sensors(model: Model, trial: Trial) -> list[Fault]:
     """Return faults for velocities that do not follow the motion of their positions."""
-    from grounded.instruments.dead import dead_rates
+    from grounded.instruments.kinematics.velocities import dead_rates
 
     return [
         Fault(
@@ -134,7 +134,7 @@ def dead_sensors(model: Model, trial: Trial) -> list[Fault]:
 
 def _thousands(model: Model, known: Trial) -> list[Fault]:
     """Return faults for positions or velocities that are too large by powers of a thousand."""
-    from grounded.instruments.other_units import MEND, units_apart
+    from grounded.instruments.units.other_units import MEND, units_apart
 
     with np.errstate(all="ignore"):
         apart = units_apart(model, known, range(model.n)) if known.steps > 1 else []
@@ -143,9 +143,9 @@ def _thousands(model: Model, known: Trial) -> list[Fault]:
 
 def way_faults(model: Model, known: Trial) -> list[Fault]:
     """Return faults of heading and speeds found from the path: other axes, a compass, knots."""
-    from grounded.instruments.other_units import UnusableTrials
-    from grounded.instruments.rows import kinematic_rows, tied
-    from grounded.instruments.way import judge_way
+    from grounded.instruments.finding import UnusableTrials
+    from grounded.instruments.kinematics.rows import kinematic_rows, tied
+    from grounded.instruments.kinematics.way import judge_way
 
     rows = tied(kinematic_rows(model, range(model.n)))
     try:
@@ -161,7 +161,7 @@ def way_faults(model: Model, known: Trial) -> list[Fault]:
 
 def positions_faults(model: Model, known: Trial) -> list[Fault]:
     """Return a fault for positions that move a power of ten as far as the commands say."""
-    from grounded.instruments.plane_units import positions_off
+    from grounded.instruments.units.plane_units import positions_off
 
     off = positions_off(model, known, range(model.n))
     return [Fault(off.described, off.mend, "write positions in the model's unit")] if off else []
@@ -214,7 +214,7 @@ def _beyond_safety(task: Task, trial: Trial) -> list[Fault]:
 
 def _clocks_apart(workspace: Folder, trial: Trial) -> list[Fault]:
     """Return a fault if measured states respond to commands before they are sent."""
-    from grounded.instruments.clocks import answers_early, one_clock, too_soon
+    from grounded.instruments.predictions.clocks import answers_early, one_clock, too_soon
 
     model, table = workspace.base_model, workspace.config.estimate
     measured: Collection[str] = model.state_names
@@ -231,7 +231,7 @@ def _clocks_apart(workspace: Folder, trial: Trial) -> list[Fault]:
 
 def mistaken_in(model: Model, known: Trial) -> list[Fault]:
     """Return a fault if the model explains the log better with exchanged columns or other units."""
-    from grounded.instruments.mistaken import as_logged, described, mended_by, mistaken
+    from grounded.instruments.predictions.mistaken import as_logged, described, mended_by, mistaken
     from grounded.instruments.preflight import preflight
 
     told = mistaken(model, [known], range(model.n))

@@ -8,8 +8,7 @@ import numpy as np
 
 from grounded.result import figure, listed
 from grounded.search.candidate import Tried
-from grounded.search.limit_cycle import SWINGS, swings
-from grounded.search.quiet_gains import calm_ranges
+from grounded.search.feedback.oscillation import SWINGS, calm_ranges, swings
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import with_unit

@@ -1,0 +1,75 @@
+"""Options that several commands share: --json, --anyway, --trials, and those of parallel work."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import click
+
+from grounded.errors import GroundedError
+from grounded_cli.console import completion as complete
+from grounded_cli.console.terminal import names_in
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def as_json(function: F) -> F:
+    """Add the option --json, passed as `json_`."""
+    return click.option("--json", "json_", is_flag=True, help="Print one JSON document.")(function)
+
+
+def anyway(function: F) -> F:
+    """Add the option --anyway, for commands that hand a candidate over."""
+    text = "Hand the candidate over even if [limits], [safety], task or model changed since."
+    return click.option("--anyway", is_flag=True, help=text)(function)
+
+
+def parallel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of a command that can run in parallel, passed as `engine`."""
+
+    @functools.wraps(function)
+    def call(*args: Any, jobs: int, engine: str, address: str | None, **others: Any) -> Any:
+        from grounded.engine import Engine
+
+        return function(*args, engine=Engine(jobs=jobs, name=engine, address=address), **others)
+
+    for option in (
+        click.option("--address", metavar="URL", help="Scheduler of a Dask cluster."),
+        click.option(
+            "--engine",
+            type=click.Choice(["local", "dask"]),
+            default="local",
+            help="Where: on this machine (default) or on a Dask cluster that sees this disk.",
+        ),
+        click.option(
+            "--jobs",
+            type=click.IntRange(1),
+            metavar="N",
+            default=1,
+            help="Workers on this machine (default: 1).",
+        ),
+    ):
+        call = option(call)
+    return call
+
+
+def chosen_trials(function: F) -> F:
+    """Add the option --trials, passed as a tuple of names; empty if it was not given."""
+    return click.option(
+        "--trials",
+        metavar="T1,T2,...",
+        shell_complete=complete.trials,
+        callback=_trial_names,
+        help="Only these trials (default: all).",
+    )(function)
+
+
+def _trial_names(ctx: click.Context, option: click.Parameter, text: str | None) -> tuple[str, ...]:
+    chosen = tuple(names_in(text))
+    if text is not None and not chosen:
+        raise GroundedError(
+            "--trials names no trial: expected some, like t0001,t0002; omit it to use all"
+        )
+    return chosen

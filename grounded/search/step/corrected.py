@@ -1,0 +1,253 @@
+"""Corrected: a System whose derivatives along a trial are corrected (see `mispredictions`).
+
+    x_{t+1} = f(x_t, u_t) + bias_t + y_t,      y_t = C_t [dx_t, du_t, du_{t-1}, y_{t-1}]
+
+where dx, du are the differences from the incumbent's trial. Along that trial y is zero, so it is
+still replayed exactly. y and the previous input are not measured; the state is [x, y, u before].
+Gains on them are dropped from a policy, their part of the feed-forward stays. If the law is
+uncertain (`by_step`), the state also contains e_{t+1} = R_t [dx_t, du_t], and e' e is a cost. f is
+the compiled model; the backward sweep and the rollouts run in NumPy (`interpreted`).
+
+Each step of such a system takes as long for twenty runs as for one. A check of gains needs hundreds
+of runs, which took a minute of CPU one after the other; `runs` makes them together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from grounded.compile import Backward, Problem, Swarm, System, deepest
+from grounded.compile.run.interpreted import linearised, rolled_out, sweep, trajectory_cost
+from grounded.frozen import Array, wrapped
+from grounded.policy import Policy
+from grounded.rollout import SETTLED, seen_late
+from grounded.search.planner import predicted
+
+MOST = 2**22  # gains held at once
+Flags = NDArray[np.bool_]
+
+
+class Corrected(System):
+    """A system of n states and m inputs, with 2 n + m + q states.
+
+    Rows of `step`, `linearise` and `sensitivities` are the steps of the horizon, in order.
+
+    Args:
+        base: the system f.
+        law: C (H, n, 2 n + 2 m).
+        x: states of the incumbent's trial (H, n).
+        u: what its actuators received (H, m).
+        before: the same, one step earlier (H, m).
+        doubt: R (H, q, n + m), whose square is the cost to be expected of the law's errors; None
+            for none, q = 0.
+    """
+
+    how, note = "corrected", ""
+
+    def __init__(
+        self,
+        base: System,
+        law: Array,
+        x: Array,
+        u: Array,
+        before: Array,
+        doubt: Array | None = None,
+    ) -> None:
+        self.base, self.law, self.x, self.u, self.before = base, law, x, u, before
+        n, m = base.n, base.m
+        self.doubt = np.zeros((len(x), 0, n + m)) if doubt is None else doubt
+        self.priced = slice(2 * n + m, 2 * n + m + self.doubt.shape[1])
+        self.n, self.m, self.k, self.source = self.priced.stop, m, base.k, base.source
+        self.inputs = base.inputs
+        missed = (f"{name} mispredicted" for name in base.states)
+        doubts = (f"doubt {i}" for i in range(self.doubt.shape[1]))
+        self.states = (*base.states, *missed, *(f"input {i} before" for i in range(m)), *doubts)
+
+    def on(self, problem: Problem) -> Problem:
+        """Return the base's grounded problem in this system."""
+
+        def padded(a: Array) -> Array:
+            return np.concatenate([a, np.zeros((*a.shape[:-1], self.n - self.base.n))], axis=-1)
+
+        nothing, unsure = np.zeros(self.base.n), np.zeros(self.doubt.shape[1])
+        weight = padded(problem.state_weight)
+        weight[:, self.priced] = 1.0
+        return replace(
+            problem,
+            system=self,
+            start=np.concatenate([problem.start, nothing, self.before[0], unsure]),
+            bias=padded(problem.bias),
+            target=padded(problem.target),
+            state_weight=weight,
+            angles=np.append(problem.angles, np.zeros(self.n - self.base.n, bool)),
+        )
+
+    def along(self, z: Array) -> Array:
+        """Convert the incumbent's trial, z (H + 1, nz) of the base, to this system's z."""
+        n = self.base.n
+        before = np.vstack([self.before, self.u[-1:]])
+        nothing, unsure = np.zeros((len(z), n)), np.zeros((len(z), self.doubt.shape[1]))
+        return np.hstack([z[:, :n], nothing, before, unsure, z[:, n:]])
+
+    def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
+        """See `System.step`; u is what the actuators received, without an input shift."""
+        moved = self.base.step(self._own(x), u, p, dt, smoothing)
+        return self._next(moved, x, u, slice(None), np.zeros(self.base.n, bool))
+
+    def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
+        """See `System.check`."""
+        self.base.check(self._own(x), u, p, dt)
+
+    def linearise(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+    ) -> tuple[Array, Array]:
+        """See `System.linearise`."""
+        n, m = self.base.n, self.m
+        f_x, f_u = self.base.linearise(self._own(x), u, p, dt, smoothing)
+        F, G = np.zeros((len(x), self.n, self.n)), np.zeros((len(x), self.n, m))
+        by_x, by_u, by_before, by_y = np.split(self.law, np.cumsum([n, m, m]), axis=2)
+        F[:, n : 2 * n, : 2 * n + m] = np.concatenate([by_x, by_y, by_before], axis=2)
+        G[:, n : 2 * n] = by_u
+        F[:, :n], G[:, :n] = F[:, n : 2 * n], by_u + f_u
+        F[:, :n, :n] += f_x
+        G[:, 2 * n : 2 * n + m] = np.eye(m)
+        F[:, self.priced, :n], G[:, self.priced] = self.doubt[:, :, :n], self.doubt[:, :, n:]
+        return F, G
+
+    def sensitivities(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+    ) -> tuple[Array, Array, Array]:
+        """See `System.sensitivities`."""
+        f_p = self.base.sensitivities(self._own(x), u, p, dt, smoothing)[2]
+        by_p = np.zeros((len(x), self.n, self.k))
+        by_p[:, : self.base.n] = f_p
+        return *self.linearise(x, u, p, dt, smoothing), by_p
+
+    def rollout(
+        self,
+        problem: Problem,
+        ubar: Array,
+        K: Array | None = None,
+        zbar: Array | None = None,
+        k: Array | None = None,
+        alphas: Array | None = None,
+    ) -> Swarm:
+        """See `System.rollout`."""
+
+        def step(x: Array, sent: Array, t: int) -> Array:
+            return self.stepped(problem, x, sent, t)
+
+        return rolled_out(problem, step, ubar, K, zbar, k, alphas)
+
+    def stepped(self, problem: Problem, x: Array, sent: Array, t: int) -> Array:
+        """Return the states after step t of a problem, without its bias.
+
+        Args:
+            problem: in this system.
+            x: states (N, 2 n + m + q).
+            sent: received inputs (N, m), less the input shift.
+            t: index of the step.
+        """
+        state, settings = self._own(x), (problem.dt, problem.smoothing)
+        moved = self.base.step(state, np.ascontiguousarray(sent), problem.p, *settings)
+        shift = 0.0 if problem.input_shift is None else problem.input_shift[t]
+        return self._next(moved, x, sent + shift, t, problem.angles[: self.base.n])
+
+    def _own(self, x: Array) -> Array:
+        """Return the base's states (N, n) of x (N, 2 n + m + q)."""
+        return np.ascontiguousarray(x[:, : self.base.n])
+
+    def _next(self, moved: Array, x: Array, u: Array, t: int | slice, angles: Flags) -> Array:
+        """Return the next [x, y, u before, e] (N, 2 n + m + q).
+
+        Args:
+            moved: the base's next states (N, n).
+            x: states (N, 2 n + m + q).
+            u: inputs (N, m).
+            t: index of the step, or all steps.
+            angles: (n,) which states are angles.
+        """
+        n, m = self.base.n, self.m
+        away = wrapped(x[:, :n] - self.x[t], angles)
+        before = x[:, 2 * n : 2 * n + m] - self.before[t]
+        d = np.concatenate([away, u - self.u[t], before, x[:, n : 2 * n]], axis=1)
+        y = np.einsum("...nq,...q->...n", self.law[t], d)
+        if not self.doubt.shape[1]:
+            return np.concatenate([moved + y, y, u], axis=1)
+        e = np.einsum("...pq,...q->...p", self.doubt[t], d[:, : n + m])
+        return np.concatenate([moved + y, y, u, e], axis=1)
+
+    def backward(
+        self, problem: Problem, z: Array, u: Array, damping: Array, into: Backward | None = None
+    ) -> Backward:
+        """See `System.backward`."""
+        with np.errstate(all="ignore"):
+            return sweep(problem, u, linearised(self, problem, z, u), damping)
+
+
+def runs(problem: Problem, policies: Sequence[Policy]) -> tuple[Array, Array]:
+    """Return the states (P, H + 1, n) and costs (P,) of predicted runs, see `predicted`.
+
+    Args:
+        problem: the problem that predicts the runs.
+        policies: of one horizon, with feedback, over the problem's z or fewer states.
+    """
+    system = problem.system
+    if not isinstance(system, Corrected):
+        each = [predicted(problem, policy) for policy in policies]
+        return np.array([one.states for one in each]), np.array([-one.utility for one in each])
+    room = max(1, MOST // (problem.horizon * problem.nz * system.m))
+    if len(policies) > room:  # long horizons
+        parts = [runs(problem, policies[i : i + room]) for i in range(0, len(policies), room)]
+        states, costs = zip(*parts, strict=True)
+        return np.concatenate(states), np.concatenate(costs)
+    for policy in policies:  # z holds all past inputs that any of them feeds back
+        problem = replace(problem, fed_back=deepest(problem.depths, policy.depths))
+    angles = tuple(map(bool, problem.angles))
+    laid = [p.laid_out(system.states, angles, problem.depths) for p in policies]
+    sent = np.array([p.feedforward for p in laid])
+    K, aim = np.array([p.gain for p in laid]), np.array([p.reference for p in laid])
+    z, found = _run(problem, system, sent, K, aim)
+    left, n = np.arange(len(laid) if problem.age else 0), system.n
+    for _ in range(problem.horizon):  # as in `simulate`, each until it agrees with what was seen
+        if not len(left):
+            break
+        late = [seen_late(run[:-1, :n], problem.age / problem.dt, angles) for run in z[left]]
+        seen = aim[left].copy()
+        seen[:, :, :n] -= late
+        again, found[left] = _run(problem, system, sent[left], K[left], seen)
+        scale = 1.0 + np.abs(again).max(axis=1, keepdims=True)
+        moved = (np.abs(again - z[left]) > SETTLED * scale).any(axis=(1, 2))
+        z[left] = again
+        left = left[moved]
+    return z[:, :, :n], np.where(np.isfinite(found), found, np.inf)
+
+
+def _run(
+    problem: Problem, system: Corrected, sent: Array, K: Array, aim: Array
+) -> tuple[Array, Array]:
+    """Return z (P, H + 1, nz) and the costs (P,) of closed loops.
+
+    Args:
+        problem: the problem that predicts the runs.
+        system: its system.
+        sent: feedforward inputs (P, H, m).
+        K: gains (P, H, m, nz).
+        aim: reference of z (P, H, nz).
+    """
+    queue, n, H = problem.queue, system.n, problem.horizon
+    z, u = np.empty((len(sent), H + 1, problem.nz)), np.empty((len(sent), H, system.m))
+    z[:, 0] = problem.z_start()
+    with np.errstate(all="ignore"):
+        for t in range(H):
+            off = wrapped(z[:, t] - aim[:, t], problem.angles)
+            fed_back = (K[:, t] @ off[:, :, None])[:, :, 0]
+            u[:, t] = np.clip(sent[:, t] + fed_back, problem.low, problem.high)
+            received = problem.received(z[:, t], u[:, t], t)
+            z[:, t + 1, :n] = system.stepped(problem, z[:, t, :n], received, t) + problem.bias[t]
+            z[:, t + 1, n:] = queue.after(z[:, t, n:], u[:, t])
+        return z, trajectory_cost(problem, z, u)

@@ -1,0 +1,339 @@
+"""Correct the DERIVATIVES of the grounded model from the mispredictions of earlier trials.
+
+The grounded model is exact along the incumbent's trial, but its derivatives there are the crude
+model's. Another trial j differs from that trial by x_j - x and u_j - u. The error of the grounded
+model's prediction of one of its steps,
+
+    y_jt = x_j,t+1 - (f(x_jt, u_jt) + bias_t),        zero for the incumbent itself,
+
+is, to first order, the effect of the error of the derivatives. A trial gives H such vectors, far
+more information than its utility alone. Two linear laws are fitted to them, each constant over the
+run, the second one to the residuals of the first:
+
+    1. y_t = f_u,t D [dx_t, du_t, du_t-1, v_t-1]   what acts where the inputs act: a lag, a gain, a
+                                                   load; v is y in units of the inputs
+    2. y_t = E [dx_t, du_t]                        what acts elsewhere
+
+Each is a ridge regression. Its penalty, and how fast the weight of trials decreases with their
+distance from the incumbent, are chosen by cross-validation over parts of the run (Stone,
+"Cross-validatory choice and assessment of statistical predictions", J. R. Stat. Soc. B 36, 1974).
+(A separate law for each step gains the last half per cent on cars but costs twice the trials.)
+
+The choice between the crude and the corrected derivatives is made by leaving out the nearest trials
+in turn. Each model, fitted to the others, runs the policy of the trial left out. `Believed.missed`
+is the share of that trial's difference from the incumbent's (`apart`, in units of the cost) that
+the model does not predict. The model with the lower value is used. The same share of a new step is
+likely to be mispredicted, so a step that might lose because of it is put last (`making.About`).
+Steps that were made with corrected derivatives and lost are also left out in turn, at any distance:
+laws that such a trial refutes still predict trials nearby. After two such losses from the incumbent
+by more than the likely error, the crude derivatives are used (`making.REFUTED`).
+With a single other trial nothing can be left out: the value is then at least the share of the
+mispredictions that law 1 leaves in the held-out parts of the run.
+
+Laws of first order hold in a neighbourhood. So runs that strayed from it (`strayed`) correct
+nothing: one run with a motor wired the wrong way round gave derivatives whose step lost six times
+the best cost. And corrected derivatives must still replay the incumbent from s_0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from grounded.compile import Problem
+from grounded.frozen import Array, wrapped
+from grounded.policy import Policy
+from grounded.rollout import Run, apart, augmented
+from grounded.search.candidate import Tried
+from grounded.search.planner import Planner, predicted
+from grounded.search.step.corrected import Corrected
+from grounded.solve.bias import input_span
+from grounded.trial import mean_trial
+
+PRICES = (1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)  # ridge penalties
+FADING = (0.0, 2.0)  # the weight of a trial is its distance to minus this power
+PARTS = 8  # parts of the run for cross-validation
+NEAREST = 12  # nearest trials that are used
+ASKED = 3  # nearest trials that are left out in turn
+LATEST = 100  # latest trials that these are chosen from
+DEAD = 1e-4  # regularisation, relative to the mean square effect of the inputs
+WORST = 1e12  # cost of a run that diverges
+STRAYED = 100.0  # factor on the costs promised and best so far: a run that misses by more strayed
+ASTRAY = 3.0  # a model that gives the incumbent more than this times its cost does not replay it
+
+
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """A model that replays the incumbent's trial, and its mispredictions of other trials.
+
+    A predicted run follows its own reference, so its utility does not show how good the gains are
+    under disturbances. New gains can be worse than those of the incumbent: gains on unmeasured
+    states (an effect's memory, `corrected`) are dropped, and corrected derivatives may have been
+    fitted to noise. So a policy is run in models that are disturbed by the mispredictions y_j of
+    OTHER trials,
+
+        x_{t+1} = f(x_t, u_t) + bias_t + y_jt,
+
+    with the same disturbances for all policies (Ng & Jordan, "PEGASUS", UAI 2000), once with the
+    corrected derivatives and once with the model's own. The smaller a model's error on held-out
+    trials, the larger its weight.
+    """
+
+    weight: float
+    problem: Problem
+    off: tuple[Array, ...]  # y_j (H, n)
+
+    def cost(self, policy: Policy) -> float:
+        """Return the mean cost of a policy over the disturbances, times the weight."""
+        if self.weight == 0:
+            return 0.0
+        return self.weight * float(np.mean([self._disturbed(y, policy) for y in self.off]))
+
+    def _disturbed(self, y: Array, policy: Policy) -> float:
+        bias = self.problem.bias.copy()
+        bias[:, : y.shape[1]] += y
+        cost = -predicted(replace(self.problem, bias=bias), policy).utility
+        return cost if cost < WORST else WORST
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A trial and its mispredictions by the grounded model; u is what the actuators received."""
+
+    x: Array  # (H, n)
+    u: Array  # (H, m)
+    before: Array  # (H, m) u one step earlier
+    y: Array  # (H, n) what was mispredicted
+    run: Run  # its states and the inputs as sent
+    policy: Policy
+
+
+@dataclass(frozen=True, eq=False)
+class Believed:
+    """A model that replays the incumbent's trial, and the share of movements it mispredicts."""
+
+    problem: Problem
+    corrected: Corrected | None = None
+    missed: float = 0.0
+    alternatives: tuple[Alternative, ...] = ()
+
+
+def believed(
+    planner: Planner,
+    incumbent: Tried,
+    history: Sequence[Tried],
+    grounded: Problem,
+    trusted: bool = True,
+) -> Believed:
+    """Return the grounded model, with corrected derivatives if they predict trials better.
+
+    Args:
+        planner: the task, and the task used for planning.
+        incumbent: the candidate whose trial the model replays.
+        history: all candidates with their trials.
+        grounded: the exact model with the incumbent's bias.
+        trusted: whether corrected derivatives may be chosen; if not, they only serve as an
+            alternative.
+    """
+    known = neighbours(planner, incumbent, history, grounded)
+    if known is None:
+        return Believed(grounded)
+    own, nearest = known
+    others = [o for o, _ in nearest]
+    refuting = [o for o, t in nearest[ASKED:] if t.candidate.of_corrected and t.lost]
+
+    crude, corrected = [], []
+    for other in others[:ASKED] + refuting[:ASKED]:
+        rest = [o for o in others if o is not other]
+        law, left = laws(own, rest or others, grounded)
+        crude.append(unforetold(grounded, own, other))
+        share = 1.0 if law is None else unforetold(with_law(law, own, grounded).problem, own, other)
+        corrected.append(share if rest else max(share, left))
+    law, _ = laws(own, others, grounded)
+    made, near = with_law(law, own, grounded), others[:ASKED]
+    off = unexplained = tuple(o.y for o in near)
+    if law is not None:
+        unexplained = tuple(
+            o.y - np.einsum("tnq,tq->tn", law, _features(own, o, grounded)) for o in near
+        )
+    misses = float(np.mean(crude)), float(np.mean(corrected))
+    share = misses[1] / (sum(misses) + 1e-300)
+    if not (replays := _replays(made.problem, incumbent, grounded)):
+        share = 1.0
+    both = (
+        Alternative(share, grounded, off),
+        Alternative(1.0 - share, made.problem, unexplained),
+    )
+    plain = misses[0] <= misses[1] or not (trusted and replays)
+    model, missed = (Believed(grounded), misses[0]) if plain else (made, misses[1])
+    return replace(model, missed=missed, alternatives=both)
+
+
+def neighbours(
+    planner: Planner, incumbent: Tried, history: Sequence[Tried], grounded: Problem
+) -> tuple[Seen, list[tuple[Seen, Tried]]] | None:
+    """Return the incumbent's trial and the other ones, nearest first; None if there are none."""
+    own = seen(planner, incumbent, grounded)
+    if own is None:
+        return None
+    told = [t for t in history[-LATEST:] if t is not incumbent and np.isfinite(t.utility)]
+    told = [t for t in told if not strayed(t, incumbent)]
+    ran = [(o, t) for t in told if (o := seen(planner, t, grounded)) is not None]
+    moved = [apart(grounded, o.run, own.run) for o, _ in ran]
+    nearest = [ran[j] for j in np.argsort(moved, kind="stable") if moved[j] > 0]
+    return (own, nearest) if nearest else None
+
+
+def strayed(tried: Tried, best: Tried) -> bool:
+    """Return whether runs left the neighbourhood in which mispredictions correct derivatives.
+
+    They did if they missed their promise by far more than the cost promised and the best one's.
+    """
+    cost = max(abs(tried.promised), abs(best.utility), 1e-9)
+    return tried.promised - tried.utility > STRAYED * cost
+
+
+def _replays(problem: Problem, incumbent: Tried, grounded: Problem) -> bool:
+    """Return whether corrected derivatives give the incumbent's policy about its cost from s_0."""
+    policy = incumbent.candidate.policy
+    cost = max(-incumbent.utility, -predicted(grounded, policy).utility)
+    return -predicted(problem, policy).utility <= ASTRAY * cost
+
+
+def with_law(law: Array | None, own: Seen, grounded: Problem) -> Believed:
+    """Return the grounded model with a law (H, n, 2 n + 2 m) added; None for no law."""
+    if law is None:
+        return Believed(grounded)
+    made = Corrected(grounded.system, law, own.x, own.u, own.before)
+    return Believed(made.on(grounded), made)
+
+
+def unforetold(problem: Problem, own: Seen, other: Seen) -> float:
+    """Return the share of a trial's difference from the incumbent's that a model mispredicts."""
+    found = predicted(problem, other.policy)
+    run = (found.states, found.inputs)
+    return min(1.0, apart(problem, run, other.run) / apart(problem, own.run, other.run))
+
+
+def seen(planner: Planner, tried: Tried, grounded: Problem) -> Seen | None:
+    """Return the mean trial of a candidate with its mispredictions; None if it is incomplete."""
+    H, mask = grounded.horizon, planner.task.model.angle_mask
+    trial = planner.lift(mean_trial(tried.trials, mask))
+    if trial.finite_steps < H:
+        return None
+    trial = trial.until(H)
+    past = grounded.past if trial.start_inputs is None else trial.start_inputs
+    z = augmented(grounded, trial.states, trial.inputs, past)
+    u = grounded.queue.effective(z[:-1], trial.inputs)
+    x = np.ascontiguousarray(trial.states[:-1])
+    moved = grounded.system.step(x, received(grounded, u), grounded.p, grounded.dt)
+    y = wrapped(trial.states[1:] - moved - grounded.bias, grounded.angles)
+    run = (trial.states, trial.inputs)
+    return Seen(x, u, np.vstack([u[:1], u[:-1]]), y, run, tried.candidate.policy)
+
+
+def received(problem: Problem, u: Array) -> Array:
+    """Return the inputs of the model for what the actuators received, u (H, m)."""
+    return np.ascontiguousarray(u if problem.input_shift is None else u - problem.input_shift)
+
+
+def laws(own: Seen, others: Sequence[Seen], grounded: Problem) -> tuple[Array | None, float]:
+    """Fit laws 1 and 2, the error of the derivatives with respect to [x, u, u before, y before].
+
+    Args:
+        own: the incumbent's trial.
+        others: other trials.
+        grounded: the exact model with the incumbent's bias.
+
+    Returns:
+        The sum of the laws (H, n, 2 n + 2 m), or None if no trial differs from the incumbent's; and
+        the share of the mispredictions that law 1 leaves in held-out parts of the run.
+    """
+    d, y, far = moved_near(own, others, grounded)
+    if not len(far):
+        return None, 1.0
+    n, m = own.x.shape[1], own.u.shape[1]
+    f_u, by_input = _matching(own, y / far[:, None, None], grounded, input_span(grounded, own.u))
+    v = np.einsum("tmn,jtn->jtm", by_input, y)
+    v_before = np.concatenate([np.zeros_like(v[:, :1]), v[:, :-1]], axis=1)
+    D, missed = shared(np.concatenate([d[:, :, : n + 2 * m], v_before], axis=2), v, far)
+    law = np.zeros((len(own.x), n, 2 * n + 2 * m))
+    law[:, :, : n + 2 * m] = f_u @ D[:, : n + 2 * m]
+    law[1:, :, n + 2 * m :] = f_u[1:] @ D[:, n + 2 * m :] @ by_input[:-1]
+    now = d[:, :, : n + m]
+    law[:, :, : n + m] += shared(now, y - np.einsum("tnq,jtq->jtn", law, d), far)[0]
+    return law, missed
+
+
+def moved_near(own: Seen, others: Sequence[Seen], grounded: Problem) -> tuple[Array, Array, Array]:
+    """Return what the nearest trials (j) that differ from the incumbent's show of the derivatives.
+
+    Returns:
+        Their differences in [x, u, u before, y before] (j, H, 2 n + 2 m), mispredictions (j, H, n),
+        and distances (j,), the nearest first.
+    """
+    span = input_span(grounded, own.u)
+    reach = np.ptp(own.x, axis=0) + 1e-9
+    moves = [_features(own, other, grounded) for other in others]
+    n, m = own.x.shape[1], own.u.shape[1]
+    far = np.array([_rms(d[:, :n] / reach) + _rms(d[:, n : n + m] / span) for d in moves])
+    near = [int(j) for j in np.argsort(far, kind="stable")[:NEAREST] if far[j] > 1e-9]
+    return np.array([moves[j] for j in near]), np.array([others[j].y for j in near]), far[near]
+
+
+def _features(own: Seen, other: Seen, grounded: Problem) -> Array:
+    """Return a trial's differences in [x, u, u before, y before], (H, 2 n + 2 m)."""
+    y_before = np.vstack([np.zeros_like(other.y[:1]), other.y[:-1]])
+    x = wrapped(other.x - own.x, grounded.angles)
+    return np.hstack([x, other.u - own.u, other.before - own.before, y_before])
+
+
+def _rms(a: Array) -> float:
+    return float(np.sqrt(np.mean(a**2)))
+
+
+def _matching(own: Seen, y: Array, grounded: Problem, span: Array) -> tuple[Array, Array]:
+    """Return f_u (H, n, m) along the incumbent, and its weighted pseudo-inverse (H, m, n)."""
+    scale = np.sqrt(np.mean(y**2, axis=(0, 1)))
+    scale = np.maximum(scale, 1e-6 * scale.max()) + 1e-300
+    _, f_u = grounded.system.linearise(own.x, received(grounded, own.u), grounded.p, grounded.dt)
+    B = f_u * span / scale[:, None]
+    gram = np.einsum("tni,tnj->tij", B, B)
+    dead = DEAD * float(np.trace(gram, axis1=1, axis2=2).mean()) / len(span) + 1e-300
+    back = np.linalg.solve(gram + dead * np.eye(len(span)), B.transpose(0, 2, 1))
+    return f_u, span[:, None] * back / scale
+
+
+def shared(d: Array, y: Array, far: Array) -> tuple[Array, float]:
+    """Fit the law y_t = C d_t, constant over the run, by ridge regression.
+
+    Args:
+        d: features of trials (j, H, q).
+        y: mispredictions to explain (j, H, k).
+        far: (j,) distance of each trial from the incumbent.
+
+    Returns:
+        C (k, q), and the share of y that it leaves in held-out parts of the run; zeros and 1 if no
+        law predicts those.
+    """
+    d, y = d / far[:, None, None], y / far[:, None, None]
+    scale = np.sqrt(np.mean(d**2, axis=(0, 1))) + 1e-12
+    d = d / scale
+    near = (far / far[0]) ** -2.0
+    size = np.einsum("j,jtk->k", near, y**2) * y.shape[2] + 1e-300
+    parts, best = np.array_split(np.arange(d.shape[1]), PARTS), 1.0
+    law = np.zeros((d.shape[2], y.shape[2]))
+    for fading in FADING:
+        weight = (far / far[0]) ** -fading
+        M = np.array([np.einsum("j,jtp,jtq->pq", weight, d[:, t], d[:, t]) for t in parts])
+        N = np.array([np.einsum("j,jtp,jtk->pk", weight, d[:, t], y[:, t]) for t in parts])
+        for price in PRICES:
+            ridge = price * np.eye(len(law))
+            each = np.linalg.solve(M.sum(axis=0) - M + ridge, N.sum(axis=0) - N)
+            off = [y[:, t] - d[:, t] @ C for t, C in zip(parts, each, strict=True)]
+            left = float(sum(np.einsum("j,jtk,k->", near, e**2, 1 / size) for e in off))
+            if left < best:
+                best, law = left, np.linalg.solve(M.sum(axis=0) + ridge, N.sum(axis=0))
+    return (law / scale[:, None]).T, best

@@ -1,0 +1,137 @@
+"""Runs that are left out for memory: a trial is told from its start, repeats at the same time."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from grounded import Trial
+from grounded.diagnosis.likelihood import data as diagnosis_data
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.validation.held_out import utility_prediction
+from grounded.diagnosis.validation.ruler import Ruler, folds, repeated
+from small_tasks import DT, pushed_cart, pushed_cart_task
+
+STEPS = 450  # three runs of 150 steps
+
+
+@pytest.fixture
+def known(monkeypatch):
+    """A predictor of four trials without noise, of whose 12 runs 7 are kept; its fit."""
+    model, _ = pushed_cart(trials=1)
+    found = []
+    for k in range(4):
+        u = np.sin((1 + 0.2 * (k % 2)) * np.arange(STEPS) * DT)[:, None]  # 0 and 2, 1 and 3 repeat
+        u = u * np.linspace(1, 2, STEPS)[:, None]  # so that more happens later
+        x = [np.zeros(2)]
+        for a in u:
+            x.append(model.system.step(x[-1][None], a[None], model.values, DT)[0])
+        names = (model.state_names, model.input_names)
+        found.append(Trial(np.array(x), u, DT, *names, start_inputs=np.zeros(1)))
+    monkeypatch.setattr(diagnosis_data, "MOST_NUMBERS", 7.5 * 150 * model.n**2 * 4)
+    predictor = Predictor(prepare(model, found))
+    assert predictor.data.time[0, :].tolist().count(0.0) == 3  # the beginnings of 0, 1 and 3
+    assert len(predictor.data.valid) == 7
+    return predictor, SimpleNamespace(hypothesis=Hypothesis(), states=predictor.data.y), found
+
+
+def test_a_utility_is_predicted_from_the_trials_own_start(known):
+    predictor, fit, trials = known
+    task = pushed_cart_task(predictor.data.model, STEPS)
+    found = utility_prediction(predictor, fit, fit.states, task, trials)
+    assert len(found.real) == 3  # of trial 2 the beginning was left out
+    np.testing.assert_allclose(found.before, found.real, rtol=1e-9)
+    np.testing.assert_allclose(found.after, found.real, rtol=1e-9)
+
+
+def test_repeats_are_compared_at_the_same_time(known):
+    predictor, fit, _ = known
+    fit.hypothesis = Hypothesis(shift=np.array([0.5, 0.0]))  # wrong alike in repeats
+    ruler = Ruler(predictor)
+    np.testing.assert_allclose(ruler.scatter(fit, [[0, 2], [1, 3]])[0], 0.0, atol=1e-9)
+    assert ruler.scatter(fit, [[1, 2]]) is None  # nothing that begins together
+
+
+def test_repeats_of_different_length_are_compared_where_they_begin_together(known, monkeypatch):
+    predictor, fit, trials = known
+    monkeypatch.setattr(diagnosis_data, "MOST_NUMBERS", 6e6)
+    short = replace(trials[2], states=trials[2].states[:351], inputs=trials[2].inputs[:350])
+    some = Predictor(prepare(predictor.data.model, [trials[0], short]))
+    fit = SimpleNamespace(hypothesis=Hypothesis(shift=np.array([0.5, 0.0])), states=some.data.y)
+    np.testing.assert_allclose(Ruler(some).scatter(fit, [[0, 1]])[0][:-1], 0.0, atol=1e-9)
+
+
+def test_short_repeats_say_nothing_of_longer_trials_and_little_of_long_horizons(known):
+    """Hand logs of 29 s were called 32 times noisier than the scatter of runs of 4 s."""
+    predictor, _, trials = known
+    short = [replace(t, states=t.states[:61], inputs=t.inputs[:60]) for t in trials[::2]]
+    for some, whole in ((short, True), ([*short, trials[1]], False)):
+        data = prepare(predictor.data.model, some)
+        fit = SimpleNamespace(hypothesis=Hypothesis(), states=data.y)
+        ruler = Ruler(Predictor(data))
+        floor, unsure = ruler.scatter(fit, [[0, 1]])
+        assert np.isfinite(floor[:-1]).all() and np.isfinite(floor[-1]).all() == whole
+        assert unsure[0] < unsure[len(ruler.steps) - 1] < unsure[-1]
+
+
+def test_a_repeat_in_another_unit_is_no_noise(known):
+    predictor, _, trials = known
+    odd = replace(trials[2], states=57.3 * trials[2].states)
+    some = Predictor(prepare(predictor.data.model, [trials[0], odd, trials[2]]))
+    fit = SimpleNamespace(hypothesis=Hypothesis(shift=np.array([0.5, 0.0])), states=some.data.y)
+    np.testing.assert_allclose(Ruler(some).scatter(fit, [[0, 1, 2]])[0], 0.0, atol=1e-9)
+    assert Ruler(some).scatter(fit, [[0, 1]]) is None
+
+
+def test_repeats_are_found_by_candidate_or_by_their_commands(known):
+    predictor, _, trials = known
+    assert repeated(trials, predictor.data, len(trials)) == [[0, 2], [1, 3]]
+    named = [replace(t, candidate="c0001" if k in (0, 1) else "") for k, t in enumerate(trials)]
+    assert [0, 1] in [group[:2] for group in repeated(named, predictor.data, len(trials))]
+
+
+def test_a_trial_that_holds_most_is_left_out_piece_by_piece(known):
+    predictor, _, trials = known
+    alike, longer = (
+        predictor.data,
+        [
+            trials[0],
+            replace(trials[1], states=trials[1].states[:101], inputs=trials[1].inputs[:100]),
+        ],
+    )
+    assert list(folds(alike)) == list(alike.trial_of)  # four trials, a quarter each
+    data = prepare(alike.model, longer)
+    one = folds(data)
+    assert len(set(one[data.trial_of == 0])) == (data.trial_of == 0).sum()
+    assert set(one[data.trial_of == 1]) == {1}
+
+
+def test_of_long_data_the_runs_are_kept_in_which_most_happens(monkeypatch):
+    model, _ = pushed_cart(trials=1)
+    monkeypatch.setattr(diagnosis_data, "MOST_NUMBERS", 6.5 * 200 * model.n**2 * 4)
+    busy = {3, 7, 11, 15, 19}  # of twenty runs of 200 steps, of four trials
+    found = []
+    for k in range(4):
+        u = np.zeros((1000, 1))
+        for run in range(5):
+            if 5 * k + run in busy:
+                u[200 * run : 200 * run + 200, 0] = np.sin(np.arange(200) * DT)
+        x = np.vstack([np.zeros((1, 2)), np.cumsum(np.hstack([u, u]), axis=0)])
+        found.append(Trial(x, u, DT, model.state_names, model.input_names))
+    data = prepare(model, found)
+    number = 5 * data.trial_of + np.rint(data.time[0] / (200 * DT)).astype(int)
+    assert data.skipped == 14
+    beginnings, busiest = {0, 5, 15}, {3, 11, 19}  # the busiest of each group of neighbours
+    assert set(number.tolist()) == beginnings | busiest
+
+
+def test_a_long_log_that_ran_no_candidate_is_no_run_of_the_task(known):
+    """A 40 s drive by hand of a 3.5 s task had a utility, which the model "missed by 368"."""
+    predictor, fit, trials = known
+    task = pushed_cart_task(predictor.data.model, STEPS // 3)
+    assert not len(utility_prediction(predictor, fit, fit.states, task, trials).real)
+    own = [replace(trial, candidate="c0001") for trial in trials]  # recorded for longer
+    assert len(utility_prediction(predictor, fit, fit.states, task, own).real) == 3
