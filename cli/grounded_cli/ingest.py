@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from grounded.model import Model
     from grounded.search.candidate import Tried
     from grounded_trials import Workspace
-    from grounded_trials.workspace.intake.ingested import Ingested
+    from grounded_trials.workspace.intake.ingest import Ingested
 
 CLOCKS = {"header": "header stamps", "log": "log times", "publish": "publish times"}
 AGAIN = "run again"  # a verdict

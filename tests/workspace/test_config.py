@@ -18,7 +18,7 @@ from grounded_trials.logs.log_table import log_mapping
 from grounded_trials.toml_table import Table
 from grounded_trials.workspace.config import ModelTable, SystemTable, TaskTable, read_config
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.estimating import EstimateTable, read_estimate
+from grounded_trials.workspace.intake.opening.estimating import EstimateTable, read_estimate
 from grounded_trials.workspace.running import simulated_plant
 from workspaces import CONFIG, make
 

@@ -9,7 +9,7 @@ import pytest
 from facts import holds
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.after_run import afterwards, kicked
+from grounded_trials.workspace.intake.remarks.after_run import afterwards, kicked
 from small_tasks import rover_task
 from workspaces import CONFIG, make
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.fitting import Fitted
     from grounded_trials.workspace.identity import SetAside
     from grounded_trials.workspace.inspecting import Inspected
-    from grounded_trials.workspace.intake.ingested import Ingested
+    from grounded_trials.workspace.intake.ingest import Ingested
     from grounded_trials.workspace.looping import NextRun
     from grounded_trials.workspace.proposing import Proposed, Status
     from grounded_trials.workspace.running import Ran

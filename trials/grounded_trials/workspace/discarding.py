@@ -32,7 +32,7 @@ def discard_in(workspace: Folder, trials: Sequence[str], why: str) -> SetAside:
 
 def _instead(workspace: Folder, name: str) -> NextCommand | None:
     """Return the command to type after a trial was discarded; None if `status` has to show it."""
-    from grounded_trials.workspace.intake.log_faults import log_faults
+    from grounded_trials.workspace.intake.remarks.log_faults import log_faults
 
     stored = workspace.store.find(name)
     trial, meta, _ = read_trial(workspace.store.read(stored), stored.path.name)
@@ -47,7 +47,7 @@ def _instead(workspace: Folder, name: str) -> NextCommand | None:
 
 def _found(workspace: Folder, meta: Mapping[str, str]) -> str:
     """Return the path of a trial's log if it is in or beside a folder in use, else LOG."""
-    from grounded_trials.workspace.intake.foreign import hashed
+    from grounded_trials.workspace.intake.opening.foreign import hashed
 
     name, home = Path(meta["source"]).name, workspace.folder.resolve()
     for folder in (Path.cwd(), home, home.parent):

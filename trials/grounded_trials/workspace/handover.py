@@ -326,7 +326,7 @@ class Check:
     def _coasting(self) -> str:
         """Return where the robot goes after the run, with the input held then; or ""."""
         from grounded.search.safety import coasts_out
-        from grounded_trials.workspace.intake.after_run import kicked
+        from grounded_trials.workspace.intake.remarks.after_run import kicked
 
         made, planner = self.candidate, self.workspace.planner
         run = planner.lift(made.predicted_run)

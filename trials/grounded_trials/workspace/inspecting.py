@@ -88,7 +88,7 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     from grounded_trials.logs.inspect_guess import guess_mapping, is_simulated
     from grounded_trials.logs.joint_names import joint_names, joint_units, wide_joints
     from grounded_trials.logs.unnamed import from_the_rest
-    from grounded_trials.workspace.intake.log_faults import no_angles
+    from grounded_trials.workspace.intake.opening.columns_by_name import no_angles
 
     refuse_ids(workspace, log, "inspect")
     report = inspect_log(log)

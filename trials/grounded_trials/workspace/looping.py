@@ -13,8 +13,7 @@ from grounded.result import Result
 from grounded.search.candidate import Candidate
 from grounded_trials.workspace.exporting import Exported, export_candidate, void_exports
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.intake.ingested import Ingested
+from grounded_trials.workspace.intake.ingest import Ingested, ingest_log
 from grounded_trials.workspace.proposing import (
     Proposed,
     Status,
@@ -91,7 +90,7 @@ def learn_in(
 
 def _odd_before(workspace: Folder) -> bool:
     """Return whether the last run's log had faults too, so that the user has chosen to go on."""
-    from grounded_trials.workspace.intake.log_faults import log_faults
+    from grounded_trials.workspace.intake.remarks.log_faults import log_faults
 
     runs = [trial for trial in workspace.task_trials() if trial.candidate]
     return bool(runs) and bool(log_faults(workspace, runs[-1]))

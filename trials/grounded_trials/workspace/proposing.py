@@ -134,7 +134,7 @@ def propose_in(workspace: Folder) -> Proposed:
 
         held = held_before(workspace, _other_model(workspace, before))
         notes += left_open(workspace, proposal, held)
-    from grounded_trials.workspace.intake.unanswered import unanswered
+    from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
     from grounded_trials.workspace.next_step import doubted, not_adopted, usable_ids
 
     status = status_of(workspace, proposal.standing)
@@ -374,7 +374,7 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
 
 def status_in(workspace: Folder) -> Status:
     """Return where the search stands; if its last trial should be discarded, say that first."""
-    from grounded_trials.workspace.intake.unanswered import unanswered
+    from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
 
     asked, then = unanswered(workspace)
     if then is None:

@@ -42,7 +42,7 @@ def where_to_mend(
     workspace: Folder, used: Sequence[Trial], findings: Sequence[Finding]
 ) -> tuple[Finding, ...]:
     """Complete findings with the whole key of [log], or with advice if no trial was read by it."""
-    from grounded_trials.workspace.intake.log_faults import no_angles  # a slow import
+    from grounded_trials.workspace.intake.opening.columns_by_name import no_angles  # a slow import
 
     about = {one.stored.id: one.meta for one in workspace.trials()}
     findings = _at_limits(workspace, used, findings)
