@@ -11,7 +11,7 @@ from grounded_cli.options import as_json, in_workspace, next_line, open_workspac
 from grounded_cli.terminal import field, names_in, show, show_json
 
 if TYPE_CHECKING:
-    from grounded_trials.workspace.identity import SetAside
+    from grounded_trials.workspace.discarding import SetAside
 
 _trials = click.argument(
     "trials", nargs=-1, required=True, metavar="TRIAL...", shell_complete=complete.trials

@@ -106,7 +106,7 @@ def _best(workspace: Workspace, one: Ingested) -> Tried | None:
     """Return the best candidate if it may be another than that of the log; else None."""
     if one.verdict != AGAIN and not one.known:
         return None
-    from grounded_trials.workspace.proposing import standing_in
+    from grounded_trials.workspace.candidates.search_state import standing_in
 
     return standing_in(workspace).incumbent
 

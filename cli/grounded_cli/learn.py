@@ -14,8 +14,8 @@ from grounded_cli.terminal import number, progress, remark, say, show, show_json
 if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
     from grounded_trials import Workspace
+    from grounded_trials.workspace.candidates.proposing import Status
     from grounded_trials.workspace.intake.ingest import Ingested
-    from grounded_trials.workspace.proposing import Status
 
 
 @click.command("run")

@@ -22,7 +22,7 @@ from grounded.diagnosis.validation.own_numbers import SURE
 from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.effects import Library
 from grounded.effects.actuator import delay_again
-from grounded_trials.workspace.adopting import joined
+from grounded_trials.workspace.adoptable import joined
 
 
 def axis(gain):

@@ -11,7 +11,7 @@ from grounded_trials import Workspace
 from grounded_trials.logs.signals import SignalSpec, read_signals
 from grounded_trials.starting.begin import begin
 from grounded_trials.starting.shapes import Drive, path_target
-from grounded_trials.workspace.model_file import load_module, model_in
+from grounded_trials.workspace.user_files.model_file import load_module, model_in
 
 ODOMETRY, COMMAND = "/mavros/local_position/odom", "/mavros/setpoint_raw/attitude"
 

@@ -13,12 +13,13 @@ from facts import holding, holds
 from grounded.errors import GroundedError
 from grounded.trial import Trial
 from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
+from grounded_trials.workspace.candidates.proposing import propose_in
+from grounded_trials.workspace.candidates.running import run_candidate
+from grounded_trials.workspace.candidates.search_state import standing_in
+from grounded_trials.workspace.discarding import set_aside
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import set_aside
 from grounded_trials.workspace.intake.ingest import ingest_log
 from grounded_trials.workspace.intake.remarks import initial_state
-from grounded_trials.workspace.proposing import propose_in, standing_in
-from grounded_trials.workspace.running import run_candidate
 from workspaces import CONFIG, make
 
 

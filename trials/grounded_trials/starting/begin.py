@@ -39,9 +39,9 @@ from grounded_trials.starting.kinds import KINDS, Joints, called_input, kind_in,
 from grounded_trials.starting.own_model import OwnModel, own_model
 from grounded_trials.store.store import write_atomically
 from grounded_trials.wording import count
-from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.model_file import load_module, model_in
+from grounded_trials.workspace.user_files.config import FILE
+from grounded_trials.workspace.user_files.model_file import load_module, model_in
 
 NONE: Mapping[str, Array] = {}  # no input was read
 SLOWEST = 0.5  # [Hz] smallest plausible row rate; below it, times may be in another unit

@@ -16,8 +16,8 @@ from grounded_trials.starting.shapes import in_steps
 from grounded_trials.store.own_files import TRIAL
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.task_file import read_target
 from grounded_trials.workspace.unknown_id import refuse_ids, unknown_trial
+from grounded_trials.workspace.user_files.task_file import read_target
 
 
 def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[str, Array]:

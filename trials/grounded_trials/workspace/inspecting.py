@@ -10,9 +10,9 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
 from grounded_trials.logs.inspect_log import LogReport, inspect_log
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
-from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.unknown_id import refuse_ids
+from grounded_trials.workspace.user_files.config import FILE
 
 
 @dataclass(frozen=True, eq=False, repr=False)

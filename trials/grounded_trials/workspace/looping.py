@@ -11,16 +11,11 @@ from grounded.errors import NextCommand
 from grounded.frozen import whole_number
 from grounded.result import Result
 from grounded.search.candidate import Candidate
-from grounded_trials.workspace.exporting import Exported, export_candidate, void_exports
+from grounded_trials.workspace.candidates.exporting import Exported, export_candidate, void_exports
+from grounded_trials.workspace.candidates.proposing import Proposed, Status, propose_in, status_of
+from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.ingest import Ingested, ingest_log
-from grounded_trials.workspace.proposing import (
-    Proposed,
-    Status,
-    propose_in,
-    standing_in,
-    status_of,
-)
 
 MOST_TRIALS = 100_000
 STOPS = (
@@ -62,7 +57,7 @@ def learn_in(
     each: Callable[[Candidate, Ingested], None] | None,
 ) -> Status:
     """Propose, run and ingest until the search ends, see `Workspace.learn`."""
-    from grounded_trials.workspace.running import run_candidate
+    from grounded_trials.workspace.candidates.running import run_candidate
 
     if trials is not None:
         whole_number("trials", trials, 0, MOST_TRIALS)

@@ -21,7 +21,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import with_unit
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.task_file import equal_weights
+from grounded_trials.workspace.user_files.task_file import equal_weights
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Tried

@@ -11,8 +11,8 @@ from grounded.model import Model
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.workspace.adopted import planner_of
-from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.intake.opening.estimating import EstimateTable, with_estimates
+from grounded_trials.workspace.user_files.config import set_in_model
 from workspaces import CONFIG, MODEL, make
 
 TABLE = EstimateTable({"x": 0.002}, {})

@@ -10,9 +10,9 @@ from facts import holding
 from grounded.errors import GroundedError
 from grounded.trial import Trial
 from grounded_trials.store.trial_file import write_trial
+from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.proposing import propose_in
 from recorded import record, waiting
 from workspaces import make
 

@@ -15,13 +15,13 @@ from grounded.search.returned.who_drove import evidence, follows, suspicion
 from grounded.trial import Trial
 from grounded_trials.formats.mcap_writer import LogWriter, encode_doubles
 from grounded_trials.store.trial_file import write_trial
+from grounded_trials.workspace.candidates.proposing import propose_in
+from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.intake.ingest import ingest_log
 from grounded_trials.workspace.intake.locating.acted_on import acted_on
 from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
 from grounded_trials.workspace.intake.recognising.sender import sender_of
 from grounded_trials.workspace.intake.remarks.control_loop import old_samples
-from grounded_trials.workspace.proposing import propose_in
-from grounded_trials.workspace.running import run_candidate
 from recorded import follow
 from workspaces import CONFIG, make
 

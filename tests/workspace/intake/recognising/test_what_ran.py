@@ -19,9 +19,10 @@ from grounded.search.returned.who_drove import suspicion
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
+from grounded_trials.workspace.candidates.proposing import propose_in
+from grounded_trials.workspace.candidates.running import run_candidate
+from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.proposing import propose_in, standing_in
-from grounded_trials.workspace.running import run_candidate
 from recorded import LOGGED as AS_TABLE
 from recorded import record
 from workspaces import CONFIG, make

@@ -13,7 +13,7 @@ from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.remarks.after_run import _to_stay
-from grounded_trials.workspace.intake.where_to_mend import where_to_mend
+from grounded_trials.workspace.where_to_mend import where_to_mend
 from recorded import LOGGED, record, waiting
 from workspaces import CONFIG, MODEL, make
 

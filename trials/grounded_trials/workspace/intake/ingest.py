@@ -24,6 +24,8 @@ from grounded_trials.logs.log_files import kind_of
 from grounded_trials.logs.signal_report import SignalReport
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.store.store import DIGITS, Added
+from grounded_trials.workspace.candidates.search_state import candidate_named, standing_in
+from grounded_trials.workspace.candidates.standing_without import no_longer, odd_run
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.intake.opening.reading import (
@@ -50,8 +52,6 @@ from grounded_trials.workspace.intake.remarks.log_faults import (
 from grounded_trials.workspace.intake.remarks.trial_check import warnings_about
 from grounded_trials.workspace.next_step import PROPOSE, after_log
 from grounded_trials.workspace.off_target import OffTarget, off_target_of, traded
-from grounded_trials.workspace.proposing import candidate_named, standing_in
-from grounded_trials.workspace.standing_without import no_longer, odd_run
 from grounded_trials.workspace.unknown_id import refuse_ids
 
 ASIDE = "set aside"  # the verdict on a run that does not count

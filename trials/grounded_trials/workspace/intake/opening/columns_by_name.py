@@ -15,7 +15,7 @@ from itertools import combinations
 from grounded.model import Model
 from grounded_trials.logs.log_table import LogMapping
 from grounded_trials.logs.stated_units import LENGTHS, bare_command, is_angle, unit_of
-from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.user_files.config import FILE
 
 UNNAMED = ("data", "value")  # field names without meaning: the topic is the name
 PART = re.compile(r"((?:^|[._])(?:orientation|rotation|quaternion))\.([xyzw])$")

@@ -27,7 +27,6 @@ from grounded_trials.logs.signals import Series, read_signals
 from grounded_trials.store.store import hash_file
 from grounded_trials.wording import count
 from grounded_trials.workspace.adopted import but_late_sensors, planner_of
-from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, StoredTrial, sha256
 from grounded_trials.workspace.intake.locating.run_start import Recording, recording
@@ -36,7 +35,8 @@ from grounded_trials.workspace.intake.opening.estimating import (
     read_estimate,
     with_estimates,
 )
-from grounded_trials.workspace.intake.where_to_mend import read_by
+from grounded_trials.workspace.user_files.config import FILE
+from grounded_trials.workspace.where_to_mend import read_by
 
 SLOWER = 1.5  # commands with intervals above this multiple of dt were sent on another grid
 FEW = 12  # largest number of a log's signals that a message lists

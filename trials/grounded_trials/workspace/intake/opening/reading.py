@@ -24,6 +24,8 @@ from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import FILE_LIMIT
 from grounded_trials.store.store import DIGITS
 from grounded_trials.store.trial_file import read_trial, trial_bytes
+from grounded_trials.workspace.candidates.search_state import standing_in
+from grounded_trials.workspace.candidates.standing_without import asked_again
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, ROWS, sha256
 from grounded_trials.workspace.intake.opening.columns_by_name import crossed, no_angles
@@ -33,8 +35,6 @@ from grounded_trials.workspace.intake.opening.stored_before import (
     same_recording,
     set_aside_of,
 )
-from grounded_trials.workspace.proposing import standing_in
-from grounded_trials.workspace.standing_without import asked_again
 
 if TYPE_CHECKING:
     from grounded_trials.workspace.intake.opening.foreign import ForeignLog

@@ -20,10 +20,10 @@ from grounded.trial import Trial, scattered
 from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.resample import ABSOLUTE_S
 from grounded_trials.store.trial_file import read_trial
+from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, StoredTrial, sha256
 from grounded_trials.workspace.intake.opening.foreign import ForeignLog
-from grounded_trials.workspace.proposing import standing_in
 
 EDGE = 2  # last rows of a cut log that are ignored, since its end affects them
 LEAST = 10  # rows that two recordings must share to count as the same

@@ -31,9 +31,9 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.logs.signals import Series
 from grounded_trials.wording import with_unit
-from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.intake.locating.missed_steps import begins_late
 from grounded_trials.workspace.intake.locating.run_start import TRIED, Recording, recording
+from grounded_trials.workspace.user_files.config import FILE
 
 PAIRS = 28  # largest number of pairs of states, and of inputs, that are tried exchanged
 WORSE = 2.0  # factor by which a log must follow a policy worse than with two columns exchanged

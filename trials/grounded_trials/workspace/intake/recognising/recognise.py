@@ -30,6 +30,7 @@ from grounded.search.returned.who_drove import (
 )
 from grounded.task import Task
 from grounded.trial import Trial
+from grounded_trials.workspace.candidates.search_state import latest_candidates, standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.locating.run_start import Recording, Start
 from grounded_trials.workspace.intake.opening.reading import (
@@ -55,7 +56,6 @@ from grounded_trials.workspace.intake.remarks.log_faults import (
     dead_sensors,
     mistaken_in,
 )
-from grounded_trials.workspace.proposing import latest_candidates, standing_in
 
 WHOLE = 0.9  # share of a run that a log must last to be one, or else the error says so
 EXACT = 0.1  # largest difference, relative to the resolution of commands, of an exact match

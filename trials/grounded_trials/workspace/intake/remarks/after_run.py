@@ -168,7 +168,7 @@ def _at_rest(planner: Planner, whole: Trial) -> Trial:
 
 def _to_hold(planner: Planner, whole: Trial, held: Array) -> str:
     """Return that the input sent after a run does not hold the robot, and what would."""
-    from grounded_trials.workspace.at_rest import resting
+    from grounded_trials.workspace.candidates.at_rest import resting
 
     model, memory = planner.task.model, np.arange(planner.plan.model.n) >= planner.task.model.n
     rest = _at_rest(planner, whole)

@@ -203,7 +203,7 @@ def unanswered(workspace: Folder) -> tuple[tuple[str, ...], NextCommand | None]:
     begun = begun_elsewhere(workspace, last.measured)
     told += [begun.told] if begun and begun.again else []
     if not told:
-        from grounded_trials.workspace.proposing import standing_in
+        from grounded_trials.workspace.candidates.search_state import standing_in
 
         history = standing_in(workspace).history
         tried = next((t for t in history if t.candidate.id == trial.candidate), None)

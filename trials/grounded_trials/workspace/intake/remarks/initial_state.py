@@ -18,8 +18,8 @@ from grounded.search.scatter import Repeats, sample_noise
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.wording import in_digits_apart, with_unit
+from grounded_trials.workspace.candidates.standing_without import standing_without
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.standing_without import standing_without
 
 # share of the mean cost of a step above which a start away from s_0 brings a warning; for a state
 # without weight along the way, share of its range in the run

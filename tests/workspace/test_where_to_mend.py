@@ -15,12 +15,12 @@ from grounded.errors import GroundedError
 from grounded.instruments.finding import Finding
 from grounded.trial import Trial
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.config import read_config
 from grounded_trials.workspace.diagnosing import instruments_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import READ_BY
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.intake.where_to_mend import one_message, where_to_mend
+from grounded_trials.workspace.user_files.config import read_config
+from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
 from workspaces import make
 
 LOG = """

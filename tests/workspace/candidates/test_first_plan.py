@@ -10,8 +10,8 @@ from cli import grounded
 from facts import holds
 from grounded_trials import Workspace
 from grounded_trials.starting.begin import begin
+from grounded_trials.workspace.candidates.first_plan import in_another_unit
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.wrong_units import in_another_unit
 
 LIFTED = """
 from grounded import Model, Param

@@ -20,13 +20,17 @@ from typing import Any
 import numpy as np
 
 from grounded import onboard
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.policy import Policy, to_arrays
 from grounded.result import Result
 from grounded_trials.store.store import write_atomically
+from grounded_trials.workspace.candidates.handover import (
+    Check,
+    checked_candidate,
+    intact,
+)
+from grounded_trials.workspace.candidates.search_state import candidate_named, standing_in
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.handover import Check, checked_candidate, intact
-from grounded_trials.workspace.proposing import candidate_named, standing_in
 
 RUNNER = "grounded_runner.py"
 LAW = "u_t = clip(feedforward_t + gain_t (z - reference_t), low, high); z = [state, past inputs]"
@@ -216,3 +220,24 @@ def _csv(policy: Policy, units: dict[str, str], about: dict[str, str]) -> bytes:
     for step, row in enumerate(values):
         writer.writerow([f"{step * policy.dt:.10g}", *(repr(float(v)) for v in row)])
     return stream.getvalue().encode()
+
+
+def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
+    """Return the command that runs a candidate: `run`, or `export` and then `next` if run by hand.
+
+    It counts as exported if a file with the contents of its export is in the workspace or in the
+    current folder; the name of a file alone proves nothing.
+
+    Args:
+        workspace: the workspace.
+        candidate: the candidate's id.
+        named: the name to use in the command; () for the outstanding candidate.
+    """
+    if workspace.config.system.reachable:
+        return NextCommand("run", named)
+
+    name = named[0] if named else candidate
+    files = (path for at in (workspace.folder, Path()) for path in at.glob(f"{name}.*"))
+    if any(is_export(workspace, candidate, path) for path in files):
+        return NextCommand("next", ("LOG", "--candidate", candidate) if named else ("LOG",))
+    return NextCommand("export", (name, "--runner"))

@@ -20,8 +20,8 @@ from grounded.model import Model
 from grounded.task import MAX_HORIZON, Task
 from grounded.utility import Reward
 from grounded_trials.plain_file import open_file
-from grounded_trials.workspace.config import Config
-from grounded_trials.workspace.model_file import check_names
+from grounded_trials.workspace.user_files.config import Config
+from grounded_trials.workspace.user_files.model_file import check_names
 
 Reader = Callable[[Path], tuple[list[str], Array]]  # reads a target, as `read_target` does
 

@@ -8,9 +8,10 @@ import pytest
 from facts import holds
 from grounded.errors import GroundedError
 from grounded_trials.store.trial_file import read_trial, write_trial
+from grounded_trials.workspace.candidates.proposing import propose_in
+from grounded_trials.workspace.candidates.running import run_candidate
+from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.proposing import propose_in, standing_in
-from grounded_trials.workspace.running import run_candidate
 from workspaces import make
 
 

@@ -24,6 +24,13 @@ FAR = 5.0  # standard deviations of a candidate's other runs by which a run coun
 LATEST = 4  # latest hand-outs that are looked at
 
 
+def standing_without(workspace: Folder, ids: Collection[str]) -> Standing:
+    """Return the standing of the search without some trials."""
+    trials = [t for t in workspace.task_trials() if t.id not in ids]
+    options, model = workspace.config.search, workspace.planner.fingerprint
+    return standing(workspace.task, workspace.read().candidates, trials, options, model)
+
+
 def odd_run(workspace: Folder, now: Standing, identity: str) -> tuple[str, ...]:
     """Return a note on a doubted run: that it counts, or how it changed its candidate's utility.
 
@@ -99,10 +106,3 @@ def no_longer(workspace: Folder, trial: str, now: Standing) -> list[str]:
         f"{name} need not be run once more: by this run, the loss of {doubt.candidate.id} is in "
         f"doubt no longer. If the robot has run {name} meanwhile, that log still counts"
     ]
-
-
-def standing_without(workspace: Folder, ids: Collection[str]) -> Standing:
-    """Return the standing of the search without some trials."""
-    trials = [t for t in workspace.task_trials() if t.id not in ids]
-    options, model = workspace.config.search, workspace.planner.fingerprint
-    return standing(workspace.task, workspace.read().candidates, trials, options, model)

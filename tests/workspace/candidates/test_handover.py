@@ -13,7 +13,7 @@ from grounded.search.planner import predicted
 from grounded_trials import Workspace
 from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
 from grounded_trials.store.trial_file import read_trial, write_trial
-from grounded_trials.workspace.handover import checked_candidate, intact, outside_limits
+from grounded_trials.workspace.candidates.handover import checked_candidate, intact, outside_limits
 from grounded_trials.workspace.identity import encoded
 from rewriting import with_metadata
 from workspaces import CONFIG, MODEL, make

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,8 +10,17 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
 from grounded.search.scatter import noise_cost, sensor_noise
 from grounded_trials.wording import ranges, rendered
-from grounded_trials.workspace.folder import Contents, Folder
-from grounded_trials.workspace.handover import Void, checked_candidate, outside_limits
+from grounded_trials.workspace.candidates.exporting import to_run
+from grounded_trials.workspace.candidates.handover import Void, checked_candidate, outside_limits
+from grounded_trials.workspace.candidates.search_state import answered, planned, standing_in
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.last_diagnosis import (
+    Since,
+    readable_diagnosis,
+    since_diagnosis,
+    usable_ids,
+)
+from grounded_trials.workspace.next_step import doubted, next_command, not_adopted
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
 
 if TYPE_CHECKING:
@@ -23,7 +31,6 @@ if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
     from grounded.search.standing import Proposal, Standing
     from grounded_trials.workspace.identity import StoredTrial
-    from grounded_trials.workspace.next_step import Since
 
 PROPOSE = NextCommand("propose")
 
@@ -115,7 +122,7 @@ def propose_in(workspace: Folder) -> Proposed:
         )
     before, told = workspace.candidate_ids(), bool(workspace.noted.since)
     proposal, void = _handed_over(workspace)
-    proposal = replace(proposal, standing=_answered(workspace, proposal.standing))
+    proposal = replace(proposal, standing=answered(workspace, proposal.standing))
     candidate = proposal.candidate
     notes = [f"{name} was not run and is void: {why}" for name, why in void.items()]
     left = _disowned(proposal.standing)
@@ -129,13 +136,12 @@ def propose_in(workspace: Folder) -> Proposed:
     notes = [f"{note}{instead}" for note in notes]
     held: list[str] = []
     if not proposal.standing.trials and (candidate is None or proposal.is_new):
-        from grounded_trials.workspace.at_rest import held_before
-        from grounded_trials.workspace.first_plan import left_open
+        from grounded_trials.workspace.candidates.at_rest import held_before
+        from grounded_trials.workspace.candidates.first_plan import left_open
 
         held = held_before(workspace, _other_model(workspace, before))
         notes += left_open(workspace, proposal, held)
     from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
-    from grounded_trials.workspace.next_step import doubted, not_adopted, usable_ids
 
     status = status_of(workspace, proposal.standing)
     if lacks := not_adopted(workspace, status.diagnosis) if candidate else "":
@@ -158,29 +164,6 @@ def propose_in(workspace: Folder) -> Proposed:
         cost = noise_cost(workspace.task, candidate.policy, noise)
     off_target = off_target_of(workspace.task, [candidate.predicted_run])
     return Proposed(proposal, path, then, cost, off_target, lacks)
-
-
-def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
-    """Return the command that runs a candidate: `run`, or `export` and then `next` if run by hand.
-
-    It counts as exported if a file with the contents of its export is in the workspace or in the
-    current folder; the name of a file alone proves nothing.
-
-    Args:
-        workspace: the workspace.
-        candidate: the candidate's id.
-        named: the name to use in the command; () for the outstanding candidate.
-    """
-    if workspace.config.system.reachable:
-        return NextCommand("run", named)
-
-    from grounded_trials.workspace.exporting import is_export
-
-    name = named[0] if named else candidate
-    files = (path for at in (workspace.folder, Path()) for path in at.glob(f"{name}.*"))
-    if any(is_export(workspace, candidate, path) for path in files):
-        return NextCommand("next", ("LOG", "--candidate", candidate) if named else ("LOG",))
-    return NextCommand("export", (name, "--runner"))
 
 
 def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
@@ -219,26 +202,7 @@ def _proposal(workspace: Folder, without: Collection[str]) -> Proposal:
     """Ask the search for a proposal as if some (void) candidates had never been proposed."""
     contents = workspace.read()
     candidates = tuple(c for c in contents.candidates if c.id not in without)
-    return _planned(workspace, replace(contents, candidates=candidates))
-
-
-def _planned(workspace: Folder, contents: Contents) -> Proposal:
-    """Ask the search for a proposal, unless it is known to have ended with these contents."""
-    from grounded.search.improve import propose
-    from grounded.search.standing import Proposal, standing
-    from grounded_trials.workspace.known_end import known_end, remember_end
-
-    task, options, planner = workspace.task, workspace.config.search, workspace.planner
-    trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
-    now = standing(task, contents.candidates, trials, options, planner.fingerprint)
-    planning = now.phase == "propose" and now.incumbent is not None
-    if planning and (ended := known_end(workspace, contents, now)) is not None:
-        return Proposal(ended, None, is_new=False)
-    name = workspace.next_id()
-    made = propose(task, contents.candidates, trials, options, identity=name, planner=planner)
-    if planning and made.candidate is None:
-        remember_end(workspace, contents, made.standing)
-    return made
+    return planned(workspace, replace(contents, candidates=candidates))
 
 
 def _not_run(workspace: Folder, before: Sequence[str]) -> tuple[Candidate, dict[str, str]] | None:
@@ -296,63 +260,14 @@ def _void(workspace: Folder, before: Sequence[str]) -> list[str]:
     return [f"{made.id} was not run and is void: {why}"]
 
 
-def standing_in(
-    workspace: Folder, *, ahead: bool = False, contents: Contents | None = None
-) -> Standing:
-    """Return the standing of the search in a workspace.
-
-    Args:
-        workspace: the workspace with the trials and candidates.
-        ahead: also plan the next candidate, without writing it, which shows whether the search has
-            anything left to gain.
-        contents: the contents of the folder, if they were read already.
-
-    Raises:
-        GroundedError: if a stored file is damaged, or the task can't be planned.
-    """
-    from grounded.search.standing import standing
-
-    contents = contents or workspace.read()
-    trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
-    task, options, planner = workspace.task, workspace.config.search, workspace.planner
-    now = standing(task, contents.candidates, trials, options, planner.fingerprint)
-    workspace.save_index()
-    if ahead and now.phase == "propose" and now.incumbent is not None:
-        now = _planned(workspace, contents).standing
-    return _answered(workspace, now)
-
-
-def _answered(workspace: Folder, now: Standing) -> Standing:
-    """Return the standing, which asks for no diagnosis if there is one of all that it knows."""
-    if not now.missed:
-        return now
-    from grounded_trials.workspace.last_diagnosis import read_diagnosis
-    from grounded_trials.workspace.next_step import since_diagnosis, usable_ids
-
-    try:
-        found = read_diagnosis(workspace.reports)
-    except GroundedError:  # a damaged one counts as none
-        return now
-    if found is None:
-        return now
-    since = since_diagnosis(workspace, found, usable_ids(workspace))
-    return now.answered() if since.settled else now
-
-
 def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()) -> Status:
     """Return a standing with the command to type next and the state of the last diagnosis.
 
     Raises:
         GroundedError: if a stored file is damaged.
     """
-    from grounded_trials.workspace.last_diagnosis import read_diagnosis
-    from grounded_trials.workspace.next_step import next_command, since_diagnosis, usable_ids
-
     usable = usable_ids(workspace)
-    try:
-        found = read_diagnosis(workspace.reports)
-    except GroundedError:  # a damaged one counts as none
-        found = None
+    found = readable_diagnosis(workspace.reports)
     since = since_diagnosis(workspace, found, usable) if found else None
     return Status(
         standing,
@@ -424,42 +339,3 @@ def _namesakes(workspace: Folder) -> list[str]:
         "for fit and diagnose"
         for name, ids in names.items()
     ]
-
-
-def candidate_named(workspace: Folder, name: str | None, now: Standing | None = None) -> str:
-    """Return the id of the named candidate, of the best for `best`, of the outstanding for None.
-
-    Args:
-        workspace: the workspace.
-        name: an id, "best" or None.
-        now: the standing of the search, if known.
-
-    Raises:
-        GroundedError: if there is none of that name, no best one yet, or none is outstanding.
-    """
-    if name is None:
-        waiting = standing_in(workspace).outstanding
-        if waiting is None:
-            raise GroundedError(
-                "no candidate is waiting to be run: make the next one with `propose`, or name a "
-                "candidate to run it again",
-                PROPOSE,
-            )
-        return waiting.id
-    if (name := name.lower()) != "best":
-        workspace.candidate_bytes(name)  # raises if there is none
-        return name
-    best = (now or standing_in(workspace)).incumbent
-    if best is None:
-        raise GroundedError("there is no best candidate yet: no trial was ingested")
-    return best.candidate.id
-
-
-def latest_candidates(workspace: Folder, most: int) -> list[Candidate]:
-    """Return the latest candidates of the task, including probes and void ones."""
-    found = []
-    for identity in workspace.candidate_ids()[-most:]:
-        with suppress(GroundedError):  # a damaged file can't have been run
-            candidate, meta = workspace.candidate(identity)
-            found += [candidate] * (meta.get("task") == workspace.task.hash)
-    return found

@@ -16,11 +16,11 @@ from facts import holding
 from grounded.errors import GroundedError
 from grounded.policy import load
 from grounded_trials.store.trial_file import read_trial, write_trial
-from grounded_trials.workspace.exporting import RUNNER, export_candidate
+from grounded_trials.workspace.candidates.exporting import RUNNER, export_candidate, to_run
+from grounded_trials.workspace.candidates.proposing import propose_in
+from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.proposing import propose_in, to_run
-from grounded_trials.workspace.running import run_candidate
 from workspaces import CONFIG, make
 
 

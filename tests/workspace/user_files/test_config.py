@@ -16,13 +16,18 @@ from grounded.errors import GroundedError
 from grounded.search.step_size import SearchOptions
 from grounded_trials.logs.log_table import log_mapping
 from grounded_trials.toml_table import Table
-from grounded_trials.workspace.config import ModelTable, SystemTable, TaskTable, read_config
+from grounded_trials.workspace.candidates.running import simulated_plant
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.opening.estimating import EstimateTable, read_estimate
-from grounded_trials.workspace.running import simulated_plant
+from grounded_trials.workspace.user_files.config import (
+    ModelTable,
+    SystemTable,
+    TaskTable,
+    read_config,
+)
 from workspaces import CONFIG, make
 
-REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "configuration.md"
+REFERENCE = Path(__file__).resolve().parents[3] / "docs" / "configuration.md"
 
 
 @pytest.mark.parametrize(
@@ -338,7 +343,7 @@ GOOD = tomllib.loads(CONFIG + LOG)
 @settings(max_examples=300, deadline=None)
 def test_any_value_at_any_key_is_valid_or_one_sentence(tmp_path_factory, at, value):
     """Whatever stands at a key: a task, or a GroundedError; never another exception."""
-    import grounded_trials.workspace.config as module
+    from grounded_trials.workspace.user_files import config as module
 
     folder = tmp_path_factory.getbasetemp() / "garbage"
     if not folder.exists():

@@ -27,11 +27,12 @@ from grounded.trial import Trial
 from grounded.trusted import check_own
 from grounded_trials.store.store import made_folder
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.candidates.exporting import to_run
+from grounded_trials.workspace.candidates.handover import Handed, checked_candidate
+from grounded_trials.workspace.candidates.search_state import candidate_named
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.handover import Handed, checked_candidate
-from grounded_trials.workspace.model_file import load_module, model_in
-from grounded_trials.workspace.proposing import candidate_named, to_run
+from grounded_trials.workspace.user_files.config import FILE
+from grounded_trials.workspace.user_files.model_file import load_module, model_in
 
 TRIALS = 30  # limit of the search for the optimum
 

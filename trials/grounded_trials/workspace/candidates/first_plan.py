@@ -2,11 +2,16 @@
 
 A task may name no limits, ask for more than they allow, or weigh inputs so much that errors hardly
 count or so little that sensor noise shakes them.
+
+It may also give values in another unit than the model's: a target of 90 rad was meant as 90
+degrees, a [safety] of 1500 m as millimetres. Nothing else tells: the plan goes there, or never
+leaves [safety]. Stored logs show how far the robot really moved.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -19,7 +24,6 @@ from grounded.search.scatter import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import rendered, with_unit
-from grounded_trials.workspace.config import made_changes
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import (
     cost_of_inputs,
@@ -29,8 +33,8 @@ from grounded_trials.workspace.off_target import (
     tracking_error,
     weighed_groups,
 )
-from grounded_trials.workspace.task_file import limited_changes, seen_in
-from grounded_trials.workspace.wrong_units import in_another_unit
+from grounded_trials.workspace.user_files.config import made_changes
+from grounded_trials.workspace.user_files.task_file import limited_changes, seen_in
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
@@ -48,6 +52,10 @@ OFTEN = 4  # jumps over half the range of an input; a quick manoeuvre has two or
 SOMEWHERE = 1.5  # ratio of the noise in one piece to the whole above which its time is reported
 FAR = 5.0  # times the largest command in any stored log: limits beyond it may be in another unit
 OTHER = 1.5  # ratio of weights above which a weight was made for other [limits]
+BEYOND = 20.0  # times as far as any log: from there on, the unit is doubted
+NEAR = (0.2, 10.0)  # times as far as the logs that a value reaches in the right unit
+TURN = 2 * math.pi  # angles up to a turn are not doubted
+SMALLER = {"m": ("mm", 1000.0), "rad": ("degrees", 180 / math.pi)}  # unit, factor; also a second
 
 
 def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> list[str]:
@@ -383,3 +391,48 @@ def _most_missed(task: Task, plan: Trial) -> str:
         found.append((float(far[k]) / max(asked, 1e-300), text))
     share, text = max(found, default=(0.0, ""))
     return text if share > MISSED else ""
+
+
+def in_another_unit(workspace: Folder) -> list[str]:
+    """Return a note on each state whose target, start or [safety] seems to be in another unit.
+
+    Args:
+        workspace: whose stored logs say how far each state moves.
+    """
+    task = workspace.task
+    logs = [one.trial for one in workspace.whole_trials() if workspace.fits(one.trial)]
+    found = []
+    for i, (name, unit) in enumerate(task.model.states.items() if logs else ()):
+        base, _, per = unit.partition("/")
+        if base not in SMALLER or per not in ("", "s"):
+            continue
+        other, factor = SMALLER[base]
+        moved = max(_largest(t.states[:, i]) for t in logs)
+        for what, most in _given(workspace, i):
+            far = most > max(BEYOND * moved, TURN * (base == "rad"))
+            if far and moved > 0 and NEAR[0] < most / factor / moved < NEAR[1]:
+                given, seen = (with_unit(f"{v:.4g}", unit) for v in (most, moved))
+                found.append(
+                    f"{what} of {name} is {given}, {most / moved:.3g} times as far as it moves in "
+                    f"any log ({seen}): if it is in {other}{per and ' a second'}, multiply it by "
+                    f"{1 / factor:.8g}"
+                )
+    return found
+
+
+def _given(workspace: Folder, i: int) -> Iterator[tuple[str, float]]:
+    """Yield what is given of a state, as the subject of a sentence, and its largest value."""
+    task = workspace.task
+    assert task.safety_low is not None and task.safety_high is not None
+    name = task.model.state_names[i]
+    columns, _ = workspace.read_target(workspace.folder / str(workspace.config.task.target))
+    if name in columns:
+        yield "the target", _largest(task.target[:, i])
+    if name in workspace.config.task.start:
+        yield "[task] start", abs(float(task.start[i]))
+    yield "[safety]", _largest(np.array([task.safety_low[i], task.safety_high[i]]))
+
+
+def _largest(values: np.ndarray) -> float:
+    """Return the largest absolute value that is finite; 0 without any."""
+    return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))

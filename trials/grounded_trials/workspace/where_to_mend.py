@@ -18,7 +18,7 @@ from grounded.instruments.finding import AS_LATE, Finding, late_effects
 from grounded.places import heading, position
 from grounded.result import listed
 from grounded_trials.workspace.identity import READ_BY
-from grounded_trials.workspace.task_file import seen_in
+from grounded_trials.workspace.user_files.task_file import seen_in
 
 if TYPE_CHECKING:
     from grounded.trial import Trial

@@ -18,7 +18,7 @@ from grounded.adapters.beside import beside
 from grounded.errors import GroundedError, nearest
 from grounded.model import Model
 from grounded.trusted import check_own
-from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.user_files.config import FILE
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
