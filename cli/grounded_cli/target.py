@@ -252,7 +252,7 @@ def _driven(model: Model, columns: dict[str, Array], dt: float) -> tuple[float, 
 
 def _rest_of(model: Model, free: list[str]) -> str:
     """Return the first free state that has a rate among the states, else the first free state."""
-    from grounded_trials.logs.inspect_pairs import velocities
+    from grounded_trials.logs.inspection.inspect_pairs import velocities
 
     return next((name for name in free if name in velocities(model)), free[0])
 

@@ -17,8 +17,8 @@ from grounded.errors import GroundedError
 from grounded.models.cart_pole import model as cart_pole
 from grounded.places import integrals
 from grounded_trials import Workspace
-from grounded_trials.logs.inspect_pairs import velocities
-from grounded_trials.logs.joint_names import from_base
+from grounded_trials.logs.inspection.inspect_pairs import velocities
+from grounded_trials.logs.inspection.joint_names import from_base
 from grounded_trials.starting.begin import begin
 from grounded_trials.starting.first_toml import held_first
 from grounded_trials.starting.kinds import KINDS

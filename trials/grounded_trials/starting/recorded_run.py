@@ -9,7 +9,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.frozen import Array
-from grounded_trials.logs.inspect_log import inspect_log
+from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
 from grounded_trials.starting.shapes import in_steps

@@ -225,7 +225,7 @@ def _not_held(workspace: Folder, refused: Candidate) -> list[str]:
 
 def _drawn(task: Task) -> NextCommand | None:
     """Return the `target` command for the line or step that a target appears to be; else None."""
-    from grounded_trials.logs.inspect_pairs import velocities
+    from grounded_trials.logs.inspection.inspect_pairs import velocities
 
     names, rates = task.model.state_names, set(velocities(task.model).values())
     given = [i for i in tracked(task) if names[i] not in rates]

@@ -18,7 +18,7 @@ from grounded.model import Model
 from grounded.result import listed
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.logs.inspect_log import inspect_log
+from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.log_files import kind_of, log_files, log_records
 from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signals
 from grounded_trials.logs.resample import Gridded, Span, to_grid

@@ -16,17 +16,17 @@ from types import MappingProxyType
 import numpy as np
 
 from grounded_trials.formats.message_path import AXES, WORLD
-from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
+from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport, TopicReport
 from grounded_trials.logs.stated_units import (
     bare_command,
     factor_between,
+    in_english,
     may_be,
     unit_in_name,
     unit_of,
     without_role,
     without_unit,
 )
-from grounded_trials.logs.words_abroad import in_english
 
 FEW = 8  # alternatives listed in [log]
 SURE = 1.5  # lead in score over the next candidate, to be sure

@@ -20,8 +20,8 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import probe
 from grounded_trials.formats.messages import Floats
-from grounded_trials.logs.inspect_guess import Guess
-from grounded_trials.logs.inspect_pairs import COMBINATIONS, Signals, moved_to
+from grounded_trials.logs.inspection.inspect_guess import Guess
+from grounded_trials.logs.inspection.inspect_pairs import COMBINATIONS, Signals, moved_to
 
 WINDOW = 0.05  # [s] length of a step: in shorter ones noise dominates
 PIECES = 8  # pieces of the log, evaluated separately

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded_trials.formats.mcap_records import Channel, Messages
-from grounded_trials.logs.inspect_guess import COMMAND_TOPIC, Guess
-from grounded_trials.logs.inspect_log import LogReport
+from grounded_trials.logs.inspection.inspect_guess import COMMAND_TOPIC, Guess
+from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.log_files import log_records
 from grounded_trials.logs.stated_units import SLIDING, TURNING
 
 if TYPE_CHECKING:
-    from grounded_trials.logs.inspect_pairs import Signals
+    from grounded_trials.logs.inspection.inspect_pairs import Signals
 
 LIMB = ("base", "waist", "torso", "shoulder", "upper", "elbow", "fore", "wrist", "hand", "finger")
 LEG = ("hip", "thigh", "knee", "shin", "ankle", "foot", "toe")

@@ -16,12 +16,11 @@ from grounded.errors import GroundedError
 from grounded_trials.formats.messages import Dynamic
 from grounded_trials.formats.path_walk import FIELD_LIMIT, number_paths
 from grounded_trials.formats.schemas import parse_ros
-from grounded_trials.logs.guessed_table import mapping_toml
-from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated
-from grounded_trials.logs.inspect_log import inspect_log
+from grounded_trials.logs.inspection.guessed_table import mapping_toml
+from grounded_trials.logs.inspection.inspect_guess import Guess, guess_mapping, is_simulated
+from grounded_trials.logs.inspection.inspect_log import find_twins, inspect_log
 from grounded_trials.logs.log_table import LogMapping, read_log
 from grounded_trials.logs.signals import SignalSpec
-from grounded_trials.logs.twins import find_twins
 from shared_data import data, files, needs_data
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from grounded_trials.logs.inspect_guess import FEW, Guess
+from grounded_trials.logs.inspection.inspect_guess import FEW, Guess
 from grounded_trials.toml_table import key
 
 DRIFT = 2e-4  # of a signal's range: the smallest standard deviation proposed for it

@@ -77,7 +77,7 @@ def test_the_velocity_in_the_world_needs_an_odometry(tmp_path):
 
 
 def test_a_robot_that_only_rolls_forwards_is_offered_no_velocity_in_the_world(tmp_path):
-    from grounded_trials.logs.inspect_log import inspect_log
+    from grounded_trials.logs.inspection.inspect_log import inspect_log
 
     report = inspect_log(ros_bags.car_bag(tmp_path / "bag"))
     assert not [f for t in report.topics for f in t.fields if "@world_velocity" in f.path]

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from grounded_trials.logs.inspect_guess import guess_mapping
-from grounded_trials.logs.inspect_log import inspect_log
+from grounded_trials.logs.inspection.inspect_guess import guess_mapping
+from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.starting.begin import begin
 from ros_bags import START, T, bag, header, odometry, vector
 

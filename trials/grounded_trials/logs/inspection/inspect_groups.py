@@ -20,8 +20,8 @@ from grounded.instruments.mistaken import CLEAR, HALF
 from grounded.instruments.short_runs import Ahead
 from grounded.model import Model
 from grounded.trial import Trial
-from grounded_trials.logs.inspect_guess import Guess
-from grounded_trials.logs.inspect_pairs import COMBINATIONS, Signals, rates_in
+from grounded_trials.logs.inspection.inspect_guess import Guess
+from grounded_trials.logs.inspection.inspect_pairs import COMBINATIONS, Signals, rates_in
 from grounded_trials.logs.stated_units import factor_between, may_be
 
 STARTS = 120  # samples to predict from

@@ -5,7 +5,7 @@ import pytest
 
 from cli import grounded
 from grounded_trials import Workspace
-from grounded_trials.logs.joint_names import joint_units, slides
+from grounded_trials.logs.inspection.joint_names import joint_units, slides
 from grounded_trials.starting.begin import begin
 from grounded_trials.workspace.next_step import to_plan
 from grounded_trials.workspace.off_target import logged_target

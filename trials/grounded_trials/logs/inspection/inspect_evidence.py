@@ -12,6 +12,14 @@ compared with its rivals by the samples:
 
 Every guess that is changed or confirmed states its reason; if the samples can't decide, it stays
 unsure.
+
+Refused as commands is what the robot measured: joint positions and speeds, or the path of a state.
+A model whose input is a state's own number explains that state by itself, and nothing else.
+
+Signals without a matching name get candidates among the numbers that are left (`from_the_rest`). A
+unit in a table's header, such as `boom_angle [deg]`, fits a state in rad, but not an input in N m.
+If exactly one number fits the unit of exactly one state or input, it is proposed; unsure, unless
+nothing else is left of either.
 """
 
 from __future__ import annotations
@@ -25,30 +33,39 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import listed
-from grounded_trials.logs.following import follows
-from grounded_trials.logs.inspect_groups import by_groups
-from grounded_trials.logs.inspect_guess import SIMULATED_S, Guess, commands_of
-from grounded_trials.logs.inspect_log import LogReport
-from grounded_trials.logs.inspect_pairs import (
+from grounded_trials.logs.inspection.inspect_groups import by_groups
+from grounded_trials.logs.inspection.inspect_guess import (
+    COMMAND_TOPIC,
+    SIMULATED_S,
+    Guess,
+    clock_of,
+    commands_of,
+)
+from grounded_trials.logs.inspection.inspect_log import LogReport, TopicReport
+from grounded_trials.logs.inspection.inspect_pairs import (
     COMBINATIONS,
     FOLLOWS,
     Signals,
     agreed,
+    follows,
     paired,
     velocities,
 )
-from grounded_trials.logs.inspect_steps import by_steps
-from grounded_trials.logs.joint_names import (
+from grounded_trials.logs.inspection.inspect_steps import by_steps
+from grounded_trials.logs.inspection.joint_names import (
     by_efforts,
     in_order,
     joint_names,
     joint_units,
     of_joint,
 )
-from grounded_trials.logs.measured import only_commands
-from grounded_trials.logs.stated_units import Stated, factor_between, unit_of, without_role
+from grounded_trials.logs.stated_units import Stated, factor_between, may_be, unit_of, without_role
 
 LATEST = 0.5  # s: a command is sought up to this long before the angle that follows it
+JOINT = re.compile(r"\.(position|velocity)\[\d+\]$")  # numbers of a JointState
+FEW = 3  # command topics named in a reason
+PARTS = re.compile(r"covariance|layout|(orientation|rotation)\.[xyzw]$")  # no signals by themselves
+MOST = 20  # largest number of candidates
 
 
 def weigh(
@@ -247,3 +264,112 @@ def _speed(guesses: Mapping[str, Guess], model: Model, signals: Signals) -> dict
     why = f"no name matches; it follows the speed of {listed(position)}, correlation "
     why += f"{best:.3f}, {slope:.3g} times as large"
     return {name: replace(guesses[name], path=path, others=rivals[:3], reasons=(why,))}
+
+
+def is_measured(topic: str, kind: str, path: str) -> bool:
+    """Check whether a number is a joint's position or speed, on a topic that is not of commands.
+
+    Args:
+        topic: name of the topic.
+        kind: the topic's message type.
+        path: of the number.
+    """
+    if not kind.endswith("/JointState") or COMMAND_TOPIC.search(topic.lower()):
+        return False
+    return JOINT.search(path) is not None
+
+
+def only_commands(
+    states: Sequence[Guess], inputs: Sequence[Guess], log: LogReport
+) -> tuple[Guess, ...]:
+    """Return the inputs without numbers that are measured, each with the reason.
+
+    Args:
+        states: guesses for the states.
+        inputs: guesses for the inputs.
+        log: an inspected log.
+    """
+    of_state = {guess.path: guess.name for guess in states if guess.path}
+    fields = [(t, f.path) for t in log.topics for f in t.fields]
+    refused = {path: "measured" for t, path in fields if is_measured(t.topic, t.type, path)}
+    refused |= {path: f"the state {name}" for path, name in of_state.items()}
+    found = []
+    for guess in inputs:
+        others = tuple(path for path in guess.others if path not in refused)
+        if guess.path in refused:
+            why = f"{guess.path} is {refused[guess.path]}, not a command"
+            guess = Guess(guess.name, "", "", False, others, None, (why,))
+        missing = () if guess.path else _not_recorded(log.topics)
+        reasons = tuple(dict.fromkeys((*guess.reasons, *missing)))
+        found.append(replace(guess, others=others, reasons=reasons))
+    return tuple(found)
+
+
+def _not_recorded(topics: Sequence[TopicReport]) -> tuple[str, ...]:
+    """Return a reason that names the command topics without messages."""
+    empty = [t.topic for t in topics if not t.messages and COMMAND_TOPIC.search(t.topic.lower())]
+    have = "has" if len(empty) == 1 else "have"
+    return (f"{listed(empty[:FEW])} {have} no messages: record the commands",) if empty else ()
+
+
+def from_the_rest(
+    guesses: Sequence[Guess],
+    units: Mapping[str, str],
+    log: LogReport,
+    joints: Mapping[str, str] | None = None,
+) -> tuple[Guess, ...]:
+    """Give guesses without a path candidates among the unassigned numbers of the log.
+
+    Args:
+        guesses: of states and inputs.
+        units: of the model, by name.
+        log: an inspected log.
+        joints: units of joints' numbers by path, see `joint_units`.
+    """
+    stated, taken = Stated.by(log.files), {guess.path for guess in guesses}
+    moving = [f.path for t in log.topics for f in t.fields if f.low != f.high]
+    left = [p for p in moving if p not in taken and not PARTS.search(p)]
+    lost = [guess for guess in guesses if not guess.path and not guess.others]
+    fits = {g.name: [p for p in left if _goes_with(stated.unit(p), units[g.name])] for g in lost}
+    alone = {
+        name: paths[0]
+        for name, paths in fits.items()
+        if len(paths) == 1 and sum(paths[0] in some for some in fits.values()) == 1
+    }
+    found = []
+    for guess in guesses:
+        name = guess.name
+        if name in alone:
+            one = replace(_alone_by_unit(guess, alone[name], log), sure=len(lost) == len(left) == 1)
+            found.append(as_stated(stated, units[name], one))
+        elif name in fits:
+
+            def named(path: str, unit: str = units[name]) -> bool:  # by ROS's conventions
+                return unit_of(path, joints) in ("", unit) and may_be(path, unit, joints)
+
+            unsaid = [path for path in left if not stated.unit(path) and named(path)]
+            known = [path for path in unsaid if unit_of(path, joints)]
+            rest = tuple(p for p in fits[name] or known or unsaid if p not in alone.values())
+            found.append(replace(guess, others=rest[:MOST]))
+        else:
+            found.append(guess)
+    return tuple(_offering(guess, units[guess.name], stated, log) for guess in found)
+
+
+def _offering(guess: Guess, wanted: str, stated: Stated, log: LogReport) -> Guess:
+    """Give a guess without a path the factor and clock of the first number offered for it."""
+    if guess.path or not guess.others:
+        return guess
+    topic = next(t for t in log.topics for f in t.fields if f.path == guess.others[0])
+    scale = stated.factor(guess.others[0], wanted)
+    return replace(guess, scale=scale, clock=clock_of(log, topic))
+
+
+def _alone_by_unit(guess: Guess, path: str, log: LogReport) -> Guess:
+    topic, field = next((t, f) for t in log.topics for f in t.fields if f.path == path)
+    why = "no name matches; of the remaining numbers only this one has a unit that fits"
+    return replace(guess, path=path, field=field, clock=clock_of(log, topic), reasons=(why,))
+
+
+def _goes_with(said: str, wanted: str) -> bool:
+    return bool(said) and factor_between(said, wanted) is not None

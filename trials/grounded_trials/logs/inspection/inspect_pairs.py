@@ -7,7 +7,7 @@ found by name does not follow, the unassigned numbers are tried. `Signals` reads
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice, permutations, product
 from pathlib import Path
 
@@ -17,9 +17,8 @@ from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.places import integrals
 from grounded_trials.formats.messages import Floats
-from grounded_trials.logs.following import DEGREE, SAME, Follows, follows, scale_of
-from grounded_trials.logs.inspect_guess import SIMULATED_S, Guess
-from grounded_trials.logs.inspect_log import LogReport
+from grounded_trials.logs.inspection.inspect_guess import SIMULATED_S, Guess
+from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.samples import Samples, tidy
 from grounded_trials.logs.signals import Series, SignalSpec, read_signals
 from grounded_trials.logs.stated_units import LENGTHS, Stated, factor_between, may_be
@@ -30,6 +29,8 @@ SURELY = 0.95  # the same, without matching names
 COMBINATIONS, LONGEST = 64, 20_000  # largest number of combinations tried; samples of a grid
 FEW = 8  # largest number of unnamed signals tried as a position or a rate
 MANY = 60  # largest number of signals tried in place of one that does not follow
+SAME, DEGREE = 0.15, 180 / np.pi
+SPAN = 5  # samples over which a slope is taken
 
 
 def velocities(model: Model) -> dict[str, str]:
@@ -307,3 +308,40 @@ def _one_by_one(files: Sequence[Path], specs: Mapping[str, SignalSpec]) -> dict[
         except GroundedError:
             continue
     return found
+
+
+@dataclass(frozen=True)
+class Follows:
+    """Correlation of two signals, and how many times as large the second is."""
+
+    correlation: float
+    slope: float
+
+
+def follows(q: Floats, w: Floats, step: float) -> Follows:
+    """Compare w with the derivative of q, both averaged over a few samples.
+
+    Args:
+        q: (N,) position.
+        w: (N,) rate.
+        step: sample time [s].
+    """
+    slope = (q[SPAN:] - q[:-SPAN]) / (SPAN * step)
+    mean = np.convolve(0.5 * (w[1:] + w[:-1]), np.ones(SPAN) / SPAN, "valid")
+    good = np.isfinite(slope) & np.isfinite(mean)
+    a, b = slope[good], mean[good]
+    if len(a) < 20 or a.std() < 1e-9 or b.std() < 1e-9:
+        return Follows(0.0, 1.0)
+    a, b = a - a.mean(), b - b.mean()
+    return Follows(float(a @ b / np.sqrt((a @ a) * (b @ b))), float(a @ b / (a @ a)))
+
+
+def scale_of(slope: float) -> tuple[float, str]:
+    """Return the factor that a rate must be multiplied by, and a phrase on sign and unit."""
+    sign, size = np.sign(slope), abs(slope)
+    opposite = " with the OPPOSITE SIGN" if sign < 0 else ""
+    if abs(size / DEGREE - 1) < SAME:
+        return float(sign / DEGREE), f"{opposite}, in DEGREES per second"
+    if abs(size * DEGREE - 1) < SAME:
+        return float(sign * DEGREE), f"{opposite}, whose values are in DEGREES"
+    return float(sign), opposite
