@@ -12,7 +12,7 @@ from grounded_cli.console.terminal import field, names_in, show, show_json
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
 
 if TYPE_CHECKING:
-    from grounded_trials.workspace.identity import SetAside
+    from grounded_trials.workspace.discarding import SetAside
 
 _trials = click.argument(
     "trials", nargs=-1, required=True, metavar="TRIAL...", shell_complete=complete.trials

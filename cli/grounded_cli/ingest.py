@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from grounded.model import Model
     from grounded.search.candidate import Tried
     from grounded_trials import Workspace
-    from grounded_trials.workspace.intake.ingested import Ingested
+    from grounded_trials.workspace.intake.ingest import Ingested
 
 CLOCKS = {"header": "header stamps", "log": "log times", "publish": "publish times"}
 AGAIN = "run again"  # a verdict
@@ -116,7 +116,7 @@ def _best(workspace: Workspace, one: Ingested) -> Tried | None:
     """Return the best candidate if it may be another than that of the log; else None."""
     if one.verdict != AGAIN and not one.known:
         return None
-    from grounded_trials.workspace.proposing import standing_in
+    from grounded_trials.workspace.candidates.search_state import standing_in
 
     return standing_in(workspace).incumbent
 

@@ -24,7 +24,7 @@ from grounded_cli.console.terminal import (
 from grounded_cli.console.workspace_option import next_line
 
 if TYPE_CHECKING:
-    from grounded_trials.logs.inspect_guess import Guess
+    from grounded_trials.logs.inspection.inspect_guess import Guess
     from grounded_trials.starting.begin import Begun
 
 FEW = 8  # alternative signals listed for an unsure state or input
@@ -128,7 +128,7 @@ def _ask(guess: Guess) -> str:
 
 def _tell(begun: Begun) -> None:
     from grounded.result import listed
-    from grounded_trials.logs.guessed_table import estimating
+    from grounded_trials.logs.inspection.guessed_table import estimating
 
     what = f"skeleton of kind '{begun.kind}': {begun.why}" if begun.kind else begun.why
     sentence(f"{begun.workspace} is a workspace for {begun.log}")

@@ -14,7 +14,7 @@ from grounded_trials.wording import count
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from grounded_trials.logs.inspect_log import FieldReport, TopicReport
+    from grounded_trials.logs.inspection.inspect_log import FieldReport, TopicReport
     from grounded_trials.workspace.inspecting import Inspected
 
 MANY = 9  # constant fields of one array (an IMU's covariance has 9) that are folded into one line

@@ -24,8 +24,8 @@ from grounded_cli.status import summary
 if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
     from grounded_trials import Workspace
-    from grounded_trials.workspace.intake.ingested import Ingested
-    from grounded_trials.workspace.proposing import Status
+    from grounded_trials.workspace.candidates.proposing import Status
+    from grounded_trials.workspace.intake.ingest import Ingested
 
 
 @click.command("run")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from grounded.search.standing import Standing
     from grounded.task import Task
     from grounded_trials import Workspace
-    from grounded_trials.workspace.proposing import Proposed
+    from grounded_trials.workspace.candidates.proposing import Proposed
 
 
 MOST = 3  # target states whose range is shown at most

@@ -99,7 +99,7 @@ def _of_foreign(found: Recovery, target: str) -> NextCommand:
     from grounded.errors import GroundedError, NextCommand
     from grounded_trials.formats.message_path import parse_path
     from grounded_trials.logs.log_table import log_mapping
-    from grounded_trials.workspace.proposing import standing_in
+    from grounded_trials.workspace.candidates.search_state import standing_in
 
     try:
         workspace = open_workspace()

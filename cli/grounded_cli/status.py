@@ -24,7 +24,7 @@ from grounded_trials.wording import count, legend, rendered, wrapped
 
 if TYPE_CHECKING:
     from grounded.search.standing import Standing
-    from grounded_trials.workspace.proposing import Status
+    from grounded_trials.workspace.candidates.proposing import Status
 
 LEGEND = "damp: penalty on leaving the last trial's inputs; +-: standard error"
 
@@ -44,7 +44,7 @@ def command(json_: bool) -> None:
     settled, model = None, workspace.config.model
     if model.effects or model.params:  # else nothing was adopted, and slow imports are saved
         from grounded_trials.report.settled import settled_in
-        from grounded_trials.workspace.next_step import Since
+        from grounded_trials.workspace.last_diagnosis import Since
 
         settled = settled_in(workspace, status.diagnosis, status.since or Since())
     for note in status.notes:

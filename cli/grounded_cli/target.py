@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from grounded.frozen import Array
     from grounded.model import Model
     from grounded_trials import Workspace
-    from grounded_trials.workspace.config import TaskTable
+    from grounded_trials.workspace.user_files.config import TaskTable
 
 SECONDS = 5.0  # default duration of a step or a swing-up
 REACHED = 0.95  # of --speed: a path that stays below it brings a note
@@ -91,10 +91,10 @@ def command(
         step_target,
         swing_up,
     )
-    from grounded_trials.workspace.config import set_start
+    from grounded_trials.workspace.candidates.at_rest import rest_of_trials
     from grounded_trials.workspace.off_target import rates_beside
-    from grounded_trials.workspace.rests_at import rest_of_trials
-    from grounded_trials.workspace.task_file import without_range
+    from grounded_trials.workspace.user_files.config import set_start
+    from grounded_trials.workspace.user_files.task_file import without_range
 
     workspace = open_workspace()
     model, dt = workspace.base_model, workspace.config.task.dt
@@ -253,7 +253,7 @@ def _driven(model: Model, columns: dict[str, Array], dt: float) -> tuple[float, 
 
 def _rest_of(model: Model, free: list[str]) -> str:
     """Return the first free state that has a rate among the states, else the first free state."""
-    from grounded_trials.logs.inspect_pairs import velocities
+    from grounded_trials.logs.inspection.inspect_pairs import velocities
 
     return next((name for name in free if name in velocities(model)), free[0])
 

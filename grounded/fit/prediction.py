@@ -80,14 +80,14 @@ def _windows(
     """Return the rms errors after one step and after `steps`, and the number of windows."""
     first, trial = np.nonzero(batch.valid)
     error = _error(model, batch, measurement, x, first, trial, 1)
-    one = _rms(error)
+    one = rms(error)
     whole = first + steps <= batch.lengths[trial]
     first, trial = first[whole], trial[whole]
     if len(first) == 0:
         return one, np.full(measurement.ny, np.nan), 0
     every = max(1, len(first) // STARTS)
     first, trial = first[::every], trial[::every]
-    return one, _rms(_error(model, batch, measurement, x, first, trial, steps)), len(first)
+    return one, rms(_error(model, batch, measurement, x, first, trial, steps)), len(first)
 
 
 def _error(
@@ -113,7 +113,8 @@ def _error(
     return np.where(batch.seen[first + steps, trial], e, np.nan)
 
 
-def _rms(error: Array) -> Array:
+def rms(error: Array) -> Array:
+    """Return the rms along the first axis, NaN for a channel without a known error."""
     count = np.sum(~np.isnan(error), axis=0)
     total = np.nansum(error**2, axis=0)
     return np.asarray(np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan))

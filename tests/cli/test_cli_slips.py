@@ -12,7 +12,7 @@ from grounded.errors import NextCommand
 from grounded_trials import Workspace
 from grounded_trials.store.documents import write_document
 from grounded_trials.store.trial_file import read_trial
-from grounded_trials.workspace.next_step import usable_ids
+from grounded_trials.workspace.last_diagnosis import usable_ids
 from reported import DIAGNOSIS, cart, copied
 from workspaces import make
 

@@ -14,7 +14,7 @@ from facts import holds
 from grounded.result import listed
 from grounded_cli.ingest import _tell
 from grounded_trials import Workspace
-from grounded_trials.workspace.intake.ingested import Ingested
+from grounded_trials.workspace.intake.ingest import Ingested
 from reported import cart, copied
 from workspaces import CONFIG, MODEL, make
 

@@ -21,7 +21,7 @@ from grounded.diagnosis.validation.own_numbers import SURE
 from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.effects import Library
 from grounded.effects.actuator import delay_again
-from grounded_trials.workspace.adopting import joined
+from grounded_trials.workspace.adoptable import joined
 from small_tasks import pushed_cart
 
 

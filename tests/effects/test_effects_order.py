@@ -18,8 +18,8 @@ from grounded.effects.memory import shifted
 from grounded.models.car import model as car
 from grounded.task import Task
 from grounded.utility import Reward
+from grounded_trials.workspace.adoptable import joined
 from grounded_trials.workspace.adopted import in_order, planner_of
-from grounded_trials.workspace.adopting import joined
 
 DT, STEPS = 0.05, 60
 LIMIT = ("rate_limit:steering", {"r": 2.0})

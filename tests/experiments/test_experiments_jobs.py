@@ -18,7 +18,7 @@ from grounded.errors import GroundedError
 from grounded.experiments.jobs import Job, run_jobs
 from grounded.fit import fit
 from grounded.trial import Trial
-from grounded_trials.workspace.model_file import load_module
+from grounded_trials.workspace.user_files.model_file import load_module
 from shared_data import SUPPORT
 
 joblib = pytest.importorskip("joblib", reason="joblib is not installed")

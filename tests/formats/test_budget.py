@@ -17,7 +17,7 @@ from grounded.errors import GroundedError, nearest
 from grounded.trial import Trial
 from grounded_trials.formats.budget import MEMORY, SECONDS, OverBudget, budget, keep, room, step
 from grounded_trials.formats.mcap_walk import DamagedFile, read_records
-from grounded_trials.logs.inspect_log import inspect_log
+from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.recover import recover_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
 from grounded_trials.store.trial_file import read_trial, trial_bytes

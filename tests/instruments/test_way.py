@@ -16,7 +16,7 @@ from grounded.instruments.predictions.mistaken import mistaken
 from grounded.instruments.preflight import preflight
 from grounded.places import integrals
 from grounded.trial import Trial
-from grounded_trials.workspace.intake.log_faults import way_faults
+from grounded_trials.workspace.intake.remarks.log_faults import way_faults
 
 DT = 0.1
 STATES = {"u": "m/s", "v": "m/s", "r": "rad/s", "x": "m", "y": "m", "psi": "rad"}

@@ -17,15 +17,15 @@ from grounded.errors import GroundedError
 from grounded.models.cart_pole import model as cart_pole
 from grounded.places import integrals
 from grounded_trials import Workspace
-from grounded_trials.logs.inspect_pairs import velocities
-from grounded_trials.logs.joint_names import from_base
+from grounded_trials.logs.inspection.inspect_pairs import velocities
+from grounded_trials.logs.inspection.joint_names import from_base
 from grounded_trials.starting.begin import begin
 from grounded_trials.starting.first_toml import held_first
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, hinges, path_target, swing_up
-from grounded_trials.workspace.exporting import void_exports
+from grounded_trials.workspace.candidates.exporting import void_exports
 from grounded_trials.workspace.off_target import rates_beside
-from grounded_trials.workspace.task_file import equal_weights, read_target, without_range
+from grounded_trials.workspace.user_files.task_file import equal_weights, read_target, without_range
 from ros_bags import arm_bag, boat_bag, car_bag, commanded_arm_bag, rover_bag, thruster_bag
 from shared_data import data
 

@@ -8,7 +8,7 @@ from cli import grounded, plain
 from facts import holds
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
-from grounded_trials.logs.inspect_log import inspect_log
+from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.recover import recover_log
 from workspaces import CONFIG, make
 

@@ -15,7 +15,7 @@ from cli import grounded
 from facts import holds
 from grounded.errors import GroundedError
 from grounded_trials.formats.text_tables import column_units, table_remarks
-from grounded_trials.logs.inspect_log import inspect_log
+from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
 
 N, DT, EPOCH = 300, 0.02, 1_700_000_000_000_000_000

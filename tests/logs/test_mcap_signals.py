@@ -281,7 +281,7 @@ def test_every_number_of_every_ros2_fixture_against_the_other_decoder() -> None:
     from mcap.reader import make_reader
 
     from grounded_trials.formats.message_path import parse_path
-    from grounded_trials.logs.inspect_log import inspect_log
+    from grounded_trials.logs.inspection.inspect_log import inspect_log
     from path_reference import follow
 
     compared = 0

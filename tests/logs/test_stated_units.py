@@ -10,11 +10,11 @@ from facts import holds
 from grounded_trials.logs.stated_units import (
     bare_command,
     factor_between,
+    in_english,
     same_unit,
     unit_in_name,
     without_unit,
 )
-from grounded_trials.logs.words_abroad import in_english
 
 MODEL = """from grounded import Model, Param
 model = Model(states={"x": "m", "v": "m/s", "theta": "rad"}, inputs={"volt": "V"},

@@ -62,7 +62,10 @@ def test_what_is_there_is_imported():
     ("module", "never"),
     [
         ("grounded_trials.report.page.page", ("grounded.diagnosis.likelihood", "grounded.effects")),
-        ("grounded_trials.workspace.proposing", ("grounded.diagnosis", "grounded.search.improve")),
+        (
+            "grounded_trials.workspace.candidates.proposing",
+            ("grounded.diagnosis", "grounded.search.improve"),
+        ),
         (
             "grounded.search.improve",
             ("grounded.search.first_policy", "grounded.search.step.mispred"),

@@ -23,7 +23,7 @@ from grounded_trials.report.page.page import page
 from grounded_trials.report.page.tables import UNKNOWN, parameter_table
 from grounded_trials.report.report_text import report_text
 from grounded_trials.workspace.folder import Folder, Lost
-from grounded_trials.workspace.next_step import Since
+from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.off_target import tracking_error
 from pace import slowness
 from page_browser import unpacked

@@ -42,7 +42,7 @@ from grounded_trials.report.reporting import Report
 from grounded_trials.report.scene import reading_order
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.next_step import Since
+from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.off_target import tracked
 from reported import car, cart, copied, many_flights
 

@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from cli import grounded
 from grounded_trials import Workspace
-from grounded_trials.logs.inspect_log import inspect_log
+from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
 from grounded_trials.report.layouts import write_layouts
 

@@ -17,10 +17,10 @@ from grounded_trials.report.page.tables import candidate_table, parameter_table
 from grounded_trials.report.settled import told
 from grounded_trials.store.documents import write_document
 from grounded_trials.wording import changed, in_digits_apart, legend
-from grounded_trials.workspace.adopted import better_model
-from grounded_trials.workspace.config import set_in_model
+from grounded_trials.workspace.adoptable import better_model
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.next_step import Since
+from grounded_trials.workspace.last_diagnosis import Since
+from grounded_trials.workspace.user_files.config import set_in_model
 from reported import DIAGNOSIS, cart, copied
 
 __all__ = ["cart"]

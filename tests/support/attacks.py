@@ -31,7 +31,7 @@ from bombs import BOMBS, explode
 from cli import COMMAND, grounded
 from grounded.errors import GroundedError
 from grounded_trials.formats.mcap_walk import MAGIC
-from grounded_trials.logs.inspect_log import inspect_log
+from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.recover import recover_log
 from grounded_trials.report.gathering import known_optimum
 from grounded_trials.report.reporting import save_optimum

@@ -28,7 +28,7 @@ def main():
     seed, kills, longest, folder, *command = sys.argv[1:]
     for name in ("main", "learn", "propose", "ingest"):
         import_module(f"grounded_cli.{name}")
-    for name in ("intake.ingest", "running", "proposing"):
+    for name in ("intake.ingest", "candidates.running", "candidates.proposing"):
         import_module(f"grounded_trials.workspace.{name}")
     import_module("grounded.search.improve")
     import_module("llvmlite.binding")

@@ -14,7 +14,7 @@ import sys
 from grounded.plant import Plant
 from grounded_trials.store.candidate_file import read_candidate
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.model_file import load_module, model_in
+from grounded_trials.workspace.user_files.model_file import load_module, model_in
 from dataclasses import replace
 from pathlib import Path
 import numpy as np

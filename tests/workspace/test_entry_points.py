@@ -16,7 +16,7 @@ from facts import holding
 from grounded import Model
 from grounded.effects import Library
 from grounded.errors import GroundedError
-from grounded_trials.workspace.model_file import load_module, model_in
+from grounded_trials.workspace.user_files.model_file import load_module, model_in
 from workspaces import CONFIG, make
 
 ROOT = Path(__file__).resolve().parents[2]

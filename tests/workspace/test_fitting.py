@@ -15,8 +15,7 @@ from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.documents import write_document
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.last_diagnosis import read_diagnosis
-from grounded_trials.workspace.next_step import since_diagnosis, usable_ids
+from grounded_trials.workspace.last_diagnosis import read_diagnosis, since_diagnosis, usable_ids
 from reported import DIAGNOSIS
 from workspaces import make
 

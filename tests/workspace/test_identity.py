@@ -16,9 +16,9 @@ from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from grounded_trials.report.reporting import save_optimum
 from grounded_trials.store.documents import StudyStore, proven
+from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.identity import _decoded, candidate_of
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
-from grounded_trials.workspace.proposing import standing_in
 from reported import cart, copied
 from workspaces import CONFIG, make
 

@@ -10,7 +10,7 @@ from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace import new_target
-from grounded_trials.workspace.heading_of_path import refuse_degrees
+from grounded_trials.workspace.new_target import refuse_degrees
 from small_tasks import rover
 
 LINE = np.linspace(0, 1, 21)

@@ -25,22 +25,21 @@ from grounded_trials import Workspace
 from grounded_trials.report.gathering import gather
 from grounded_trials.store.documents import write_document
 from grounded_trials.wording import ELSEWHERE, folded, placed, rendered
-from grounded_trials.workspace.adopting import diagnosed_again
-from grounded_trials.workspace.config import set_in_model
+from grounded_trials.workspace.adoptable import diagnosed_again
+from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.diagnosing import _deeper, _in_vain
 from grounded_trials.workspace.fitting import apply_fit
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.last_diagnosis import diagnosable, read_diagnosis
+from grounded_trials.workspace.last_diagnosis import diagnosable, read_diagnosis, since_diagnosis
 from grounded_trials.workspace.next_step import (
     DIAGNOSE,
     EXPORT,
     after_diagnosis,
     nothing_to_do,
-    since_diagnosis,
     to_adopt,
     to_look_deeper,
 )
-from grounded_trials.workspace.proposing import standing_in
+from grounded_trials.workspace.user_files.config import set_in_model
 from recorded import LOGGED, record
 from reported import DIAGNOSIS, cart, copied
 from workspaces import CONFIG, make
@@ -830,7 +829,7 @@ def test_an_adoption_in_vain_is_told_how_to_be_undone(tmp_path, monkeypatch):
         found = replace(found, prediction_error=(row,))
         made = [(None, "other", True), *(("a", model, one) for one in accepted)]
         history = [NS(candidate=NS(id=i, model=m), accepted=one) for i, m, one in made]
-        module = "grounded_trials.workspace.proposing.standing_in"
+        module = "grounded_trials.workspace.candidates.search_state.standing_in"
         monkeypatch.setattr(module, lambda _: NS(history=tuple(history)))
         return _in_vain(w, found)
 

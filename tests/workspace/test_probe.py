@@ -12,10 +12,10 @@ from grounded.effects import Library
 from grounded.errors import NextCommand
 from grounded_trials import Workspace
 from grounded_trials.workspace.adopted import planner_of
+from grounded_trials.workspace.candidates.exporting import to_run
+from grounded_trials.workspace.candidates.handover import checked_candidate
 from grounded_trials.workspace.diagnosing import _near, _probe
-from grounded_trials.workspace.handover import checked_candidate
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
-from grounded_trials.workspace.proposing import to_run
 from workspaces import CONFIG, make
 
 NOISY = CONFIG + "[system.noise.measurement]\nx = 0.02\nv = 0.05\n"

@@ -9,8 +9,8 @@ from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.likelihood.intervals import foretold
 from grounded.effects import Library
 from grounded_trials import Workspace
+from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.diagnosing import _candidate_of
-from grounded_trials.workspace.proposing import standing_in
 from workspaces import CONFIG, REAL, make
 
 NOISE = "[system.noise.measurement]\nx = 0.002\nv = 0.005\n[system.noise.process]\nv = 0.02\n"

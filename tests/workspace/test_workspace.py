@@ -10,9 +10,9 @@ from cli import grounded
 from facts import holds
 from grounded.errors import GroundedError
 from grounded_trials.starting.examples import EXAMPLES, write_example
-from grounded_trials.workspace.config import read_config
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.task_file import read_target, target_arrays, write_target
+from grounded_trials.workspace.user_files.config import read_config
+from grounded_trials.workspace.user_files.task_file import read_target, target_arrays, write_target
 from pace import slowness
 from workspaces import CONFIG, MODEL, make
 
@@ -86,7 +86,7 @@ def test_a_model_by_its_import_name(tmp_path):
 
 
 def test_two_workspaces_in_one_process_have_their_own_models(tmp_path):
-    from grounded_trials.workspace.running import simulated_plant
+    from grounded_trials.workspace.candidates.running import simulated_plant
 
     a = make(tmp_path / "a")
     b = make(tmp_path / "b", model=MODEL.replace("Param(0.2", "Param(0.9"))
@@ -129,7 +129,7 @@ def test_a_copied_workspace_is_the_same_workspace(tmp_path):
 
 
 def test_comments_and_layout_of_grounded_toml_survive_fit_apply(tmp_path):
-    from grounded_trials.workspace.config import set_in_model, set_latency
+    from grounded_trials.workspace.user_files.config import set_in_model, set_latency
 
     w = make(tmp_path / "w", config="# mine\n" + CONFIG.replace("dt = 0.05", "dt = 0.05  # 20 Hz"))
     set_in_model(w.config.file, params={"mass": 2.0})

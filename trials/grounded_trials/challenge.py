@@ -26,11 +26,11 @@ from grounded_trials.starting.examples import toml_of
 from grounded_trials.store.documents import read_document
 from grounded_trials.store.store import DIGITS, Store, made_folder, write_atomically
 from grounded_trials.store.trial_file import trial_bytes
-from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.diagnosing import diagnose_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import FILE as DIAGNOSIS
-from grounded_trials.workspace.task_file import write_target
+from grounded_trials.workspace.user_files.config import FILE
+from grounded_trials.workspace.user_files.task_file import write_target
 
 if TYPE_CHECKING:
     from grounded.challenge import Case

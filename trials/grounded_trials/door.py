@@ -31,14 +31,14 @@ if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
     from grounded_trials.report.reporting import Report
     from grounded_trials.workspace.adopting import Adopted, Undone
-    from grounded_trials.workspace.exporting import Exported
+    from grounded_trials.workspace.candidates.exporting import Exported
+    from grounded_trials.workspace.candidates.proposing import Proposed, Status
+    from grounded_trials.workspace.candidates.running import Ran
+    from grounded_trials.workspace.discarding import SetAside
     from grounded_trials.workspace.fitting import Fitted
-    from grounded_trials.workspace.identity import SetAside
     from grounded_trials.workspace.inspecting import Inspected
-    from grounded_trials.workspace.intake.ingested import Ingested
+    from grounded_trials.workspace.intake.ingest import Ingested
     from grounded_trials.workspace.looping import NextRun
-    from grounded_trials.workspace.proposing import Proposed, Status
-    from grounded_trials.workspace.running import Ran
     from grounded_trials.workspace.verifying import Verified
 
 
@@ -104,7 +104,7 @@ class Workspace(Folder):
 
         While a candidate's trial is outstanding, the same candidate is returned.
         """
-        from grounded_trials.workspace.proposing import propose_in
+        from grounded_trials.workspace.candidates.proposing import propose_in
 
         return propose_in(self.forget())
 
@@ -125,7 +125,7 @@ class Workspace(Folder):
             anyway: run it although it is void.
             warn: called with each check that is overridden, before the robot moves.
         """
-        from grounded_trials.workspace.running import run_candidate
+        from grounded_trials.workspace.candidates.running import run_candidate
 
         return run_candidate(self.forget(), candidate, anyway=anyway, warn=warn)
 
@@ -191,7 +191,7 @@ class Workspace(Folder):
 
     def status(self) -> Status:
         """Return the state of the search; writes nothing."""
-        from grounded_trials.workspace.proposing import status_in
+        from grounded_trials.workspace.candidates.proposing import status_in
 
         return status_in(self.forget())
 
@@ -352,7 +352,7 @@ class Workspace(Folder):
             runner: write npz, and beside it the program that runs it on a robot with only numpy.
             anyway: write it although it is void.
         """
-        from grounded_trials.workspace.exporting import export_candidate
+        from grounded_trials.workspace.candidates.exporting import export_candidate
 
         file, here, candidate = Path(path) if path else None, self.forget(), candidate.lower()
         if form == "bag" or candidate.startswith("t"):
@@ -384,7 +384,7 @@ class Workspace(Folder):
 
     def restore(self, *trials: str) -> SetAside:
         """Undo `discard` for some trials."""
-        from grounded_trials.workspace.identity import set_aside
+        from grounded_trials.workspace.discarding import set_aside
 
         return set_aside(self.forget(), "restore", trials, "")
 

@@ -28,7 +28,7 @@ from grounded_trials.wording import count, rendered
 
 if TYPE_CHECKING:
     from grounded_trials import Workspace
-    from grounded_trials.workspace.proposing import Status
+    from grounded_trials.workspace.candidates.proposing import Status
 
 
 MOST = 3  # effects that are looked for if not all trials are used: each more takes 20 s
@@ -50,7 +50,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     from grounded_trials.report.reporting import save_optimum
     from grounded_trials.report.three_lines import three_lines
     from grounded_trials.starting.examples import example
-    from grounded_trials.workspace.running import optimum
+    from grounded_trials.workspace.candidates.running import optimum
 
     example(name)
     target = Path(folder or f"demo-{name}")

@@ -163,6 +163,15 @@ def _lengths(model: Model, trial: Trial, known: Sequence[int]) -> Positions | No
     return None
 
 
+def _by_inputs(model: Model, trial: Trial, known: Sequence[int], i: int) -> bool:
+    """Check whether inputs in another unit explain a velocity as well: commands in percent."""
+    for change in other_input_units(model, [trial]):
+        missed = _missed(model, change.mended(trial), known, [i])
+        if missed is not None and missed[0] < EXPLAINED:
+            return True
+    return False
+
+
 def _missed(model: Model, trial: Trial, known: Sequence[int], some: Sequence[int]) -> Array | None:
     """Return the share of some states' changes that the calibrated model misses; None if unknown.
 

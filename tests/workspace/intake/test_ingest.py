@@ -13,12 +13,13 @@ from facts import holding, holds
 from grounded.errors import GroundedError
 from grounded.trial import Trial
 from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
+from grounded_trials.workspace.candidates.proposing import propose_in
+from grounded_trials.workspace.candidates.running import run_candidate
+from grounded_trials.workspace.candidates.search_state import standing_in
+from grounded_trials.workspace.discarding import set_aside
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import set_aside
-from grounded_trials.workspace.intake import begun
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.proposing import propose_in, standing_in
-from grounded_trials.workspace.running import run_candidate
+from grounded_trials.workspace.intake.remarks import initial_state
 from workspaces import CONFIG, make
 
 
@@ -147,8 +148,8 @@ def test_a_start_that_spoils_a_run_is_told_however_earlier_ones_scatter(
         moved[0, 0] += off * a_step
         write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
         if off == 0.6:  # as if the model were unstable
-            monkeypatch.setattr(begun, "_changes", lambda *_: -part * cost)
-            monkeypatch.setattr(begun, "_lost_by", lambda *_: lost * cost)
+            monkeypatch.setattr(initial_state, "_changes", lambda *_: -part * cost)
+            monkeypatch.setattr(initial_state, "_lost_by", lambda *_: lost * cost)
         warnings = ingest_log(w, tmp_path / "t.mcap", "c0001").warnings
     assert any("the run started with" in one and "`discard t0003`" in one for one in warnings) == (
         told
@@ -162,7 +163,7 @@ def test_a_run_that_began_elsewhere_gets_one_verdict(w, tmp_path, monkeypatch):
     moved = np.array(ran.states)
     moved[0] += np.array([np.sqrt(cost / len(ran.states) / 10), np.ptp(moved[:, 1])])
     write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
-    monkeypatch.setattr(begun, "_changes", lambda *a: -0.5 * cost * bool(a[2][0]))
+    monkeypatch.setattr(initial_state, "_changes", lambda *a: -0.5 * cost * bool(a[2][0]))
     found = ingest_log(w, tmp_path / "t.mcap", "c0001")
     (told,) = [one for one in found.warnings if "the run started with" in one]
     assert holds(told, "x = ", "v = ", "By the model x changes", "`discard t0001`")
@@ -191,8 +192,8 @@ def test_a_start_that_changes_less_than_runs_scatter_is_no_reason_to_repeat_one(
     ran, *_ = read_trial(run(w))
     cost = -w.task.utility(ran)
     a_step = np.sqrt(cost / len(ran.states) / 10)
-    monkeypatch.setattr(begun, "_changes", lambda *_: -0.02 * cost)
-    monkeypatch.setattr(begun, "_lost_by", lambda *_: 0.01 * cost)
+    monkeypatch.setattr(initial_state, "_changes", lambda *_: -0.02 * cost)
+    monkeypatch.setattr(initial_state, "_lost_by", lambda *_: 0.01 * cost)
     for k, off in enumerate((-1.0, 1.0, 1.5)):
         moved = np.array(ran.states)
         moved[0, 0] += 1.5 * a_step * (k == 2)

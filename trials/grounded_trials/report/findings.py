@@ -26,7 +26,7 @@ from grounded.trial import Trial, mean_trial
 from grounded_trials.report.forecast import SECONDS
 from grounded_trials.wording import figure, rendered, shown
 from grounded_trials.workspace.folder import Lost
-from grounded_trials.workspace.next_step import Since
+from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.off_target import (
     WITHIN,
     rates_among,
@@ -38,7 +38,7 @@ from grounded_trials.workspace.off_target import (
 
 if TYPE_CHECKING:
     from grounded_trials.report.settled import Settled
-    from grounded_trials.workspace.adopted import Better
+    from grounded_trials.workspace.adoptable import Better
 
 One = TypeVar("One")
 SHOWN = 4  # largest number of rows of improvements

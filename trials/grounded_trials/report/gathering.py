@@ -24,11 +24,17 @@ from grounded_trials.report.findings import Findings, Log, Run, selection
 from grounded_trials.report.forecast import anchored
 from grounded_trials.report.settled import settled_in
 from grounded_trials.store.documents import read_document
-from grounded_trials.workspace.adopted import Better, better_model
+from grounded_trials.workspace.adoptable import Better, better_model
+from grounded_trials.workspace.candidates.proposing import uncounted
+from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Contents, Folder, Lost
-from grounded_trials.workspace.last_diagnosis import LEAST_STEPS, read_diagnosis
-from grounded_trials.workspace.next_step import Since, next_command, since_diagnosis
-from grounded_trials.workspace.proposing import standing_in, uncounted
+from grounded_trials.workspace.last_diagnosis import (
+    LEAST_STEPS,
+    Since,
+    read_diagnosis,
+    since_diagnosis,
+)
+from grounded_trials.workspace.next_step import next_command
 
 MOST = 200  # number of runs that are read: the latest, and those of compared candidates
 LOGS = 50  # number of logs that are read, the latest

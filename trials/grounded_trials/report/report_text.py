@@ -33,8 +33,8 @@ from grounded_trials.wording import (
     spread,
     wrapped,
 )
+from grounded_trials.workspace.candidates.proposing import not_counted
 from grounded_trials.workspace.next_step import DIAGNOSE
-from grounded_trials.workspace.proposing import not_counted
 
 ROWS, SPARED = 12, 3  # candidates in the table; more than so many others are counted
 ITERATIONS = 5  # of the bias

@@ -27,12 +27,12 @@ from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded_trials.formats.bags import standard_types
-from grounded_trials.logs.inspect_pairs import velocities
+from grounded_trials.logs.inspection.inspect_pairs import velocities
 from grounded_trials.report.scene import Scene, scene_of
 from grounded_trials.store.store import made_folder, write_atomically
-from grounded_trials.workspace.exporting import Exported, format_of
+from grounded_trials.workspace.candidates.exporting import Exported, format_of
+from grounded_trials.workspace.candidates.search_state import candidate_named
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.proposing import candidate_named
 from grounded_trials.workspace.unknown_id import unknown_trial
 
 FRAME, BODY = "map", "robot"

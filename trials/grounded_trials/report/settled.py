@@ -19,11 +19,16 @@ from grounded.task import Task
 from grounded_trials.report.diagnosis_words import made_from
 from grounded_trials.report.three_lines import gained, still_open, three_lines
 from grounded_trials.wording import ALONE, changed
-from grounded_trials.workspace.adopting import as_adopted, joined, left_behind
-from grounded_trials.workspace.config import ModelTable
+from grounded_trials.workspace.adoptable import joined
+from grounded_trials.workspace.adopting import as_adopted, left_behind
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.last_diagnosis import read_diagnosis
-from grounded_trials.workspace.next_step import Since, since_diagnosis, usable_ids
+from grounded_trials.workspace.last_diagnosis import (
+    Since,
+    read_diagnosis,
+    since_diagnosis,
+    usable_ids,
+)
+from grounded_trials.workspace.user_files.config import ModelTable
 
 NOW = "the model now"
 WRITTEN = 1e-6  # relative difference of a value and what `adopt` writes of it

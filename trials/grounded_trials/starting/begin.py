@@ -20,17 +20,25 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Result, listed
 from grounded_trials.formats.text_tables import column_units, states_time_unit
-from grounded_trials.logs.guessed_table import mapping_toml
-from grounded_trials.logs.inspect_evidence import as_stated, weigh
-from grounded_trials.logs.inspect_guess import Guess, clock_of, guess_mapping, is_simulated
-from grounded_trials.logs.inspect_log import LogReport, inspect_log
-from grounded_trials.logs.inspect_pairs import rates_among, velocities
-from grounded_trials.logs.joint_names import joint_names, joint_units, wide_joints
+from grounded_trials.logs.inspection.guessed_table import mapping_toml
+from grounded_trials.logs.inspection.inspect_evidence import (
+    as_stated,
+    from_the_rest,
+    only_commands,
+    weigh,
+)
+from grounded_trials.logs.inspection.inspect_guess import (
+    Guess,
+    clock_of,
+    guess_mapping,
+    is_simulated,
+)
+from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
+from grounded_trials.logs.inspection.inspect_pairs import rates_among, velocities
+from grounded_trials.logs.inspection.joint_names import joint_names, joint_units, wide_joints
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
-from grounded_trials.logs.measured import only_commands
 from grounded_trials.logs.stated_units import Stated, factor_between
-from grounded_trials.logs.unnamed import from_the_rest
 from grounded_trials.starting.examples import fresh_folder
 from grounded_trials.starting.first_toml import held_first, write_first
 from grounded_trials.starting.in_degrees import in_degrees
@@ -39,9 +47,9 @@ from grounded_trials.starting.kinds import KINDS, Joints, called_input, kind_in,
 from grounded_trials.starting.own_model import OwnModel, own_model
 from grounded_trials.store.store import write_atomically
 from grounded_trials.wording import count
-from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.model_file import load_module, model_in
+from grounded_trials.workspace.user_files.config import FILE
+from grounded_trials.workspace.user_files.model_file import load_module, model_in
 
 NONE: Mapping[str, Array] = {}  # no input was read
 SLOWEST = 0.5  # [Hz] smallest plausible row rate; below it, times may be in another unit

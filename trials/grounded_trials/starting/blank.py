@@ -21,9 +21,9 @@ from grounded.utility import Reward
 from grounded_trials.starting.examples import fresh_folder, toml_of
 from grounded_trials.starting.own_model import own_model
 from grounded_trials.store.store import write_atomically
-from grounded_trials.workspace.at_rest import resting
-from grounded_trials.workspace.config import FILE
-from grounded_trials.workspace.task_file import change_weight, write_target
+from grounded_trials.workspace.candidates.at_rest import resting
+from grounded_trials.workspace.user_files.config import FILE
+from grounded_trials.workspace.user_files.task_file import change_weight, write_target
 
 DT, HORIZON = 0.05, 100  # [s], steps
 COMMAND = 'command = "python drive.py {candidate} {trial}"   # or by hand: propose, drive, ingest'

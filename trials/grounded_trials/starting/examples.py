@@ -16,8 +16,8 @@ from grounded.errors import GroundedError, nearest
 from grounded.task import Task
 from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.toml_table import key
-from grounded_trials.workspace.config import FILE
-from grounded_trials.workspace.task_file import target_text
+from grounded_trials.workspace.user_files.config import FILE
+from grounded_trials.workspace.user_files.task_file import target_text
 
 
 @dataclass(frozen=True)

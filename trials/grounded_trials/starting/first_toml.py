@@ -13,10 +13,10 @@ from grounded.model import Model
 from grounded_trials.starting.shapes import has_plane
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import key
-from grounded_trials.workspace.config import FILE, OFFERED
+from grounded_trials.workspace.candidates.at_rest import STEADY, STOOD, drift, steady
 from grounded_trials.workspace.off_target import usual_weights
-from grounded_trials.workspace.rests_at import STILL, STOOD, drift, steady
-from grounded_trials.workspace.task_file import change_weight, write_target
+from grounded_trials.workspace.user_files.config import FILE, OFFERED
+from grounded_trials.workspace.user_files.task_file import change_weight, write_target
 
 BEGAN = 0.1  # [s] at its start in which one may stand still that nothing has to hold
 
@@ -158,10 +158,10 @@ def _stood(
         low, high = spans[name]
         most = max(abs(low), abs(high)) if name in speeds else high - low
         off = first[name].mean() if name in speeds else drift(first[name])
-        if abs(off) > STILL * most:
+        if abs(off) > STEADY * most:
             return {}, {}
         at = float(first[name][steps // 2 :].mean())
-        if name not in speeds and abs(at) > STILL * most:
+        if name not in speeds and abs(at) > STEADY * most:
             found[name] = at
     needed = False
     for name in sent:
@@ -170,7 +170,7 @@ def _stood(
         if not steady(later, high - low):
             return {}, {}
         held[name] = float(later.mean() if np.ptp(later) else later[0])
-        needed |= held[name] != 0 and (not np.ptp(later) or abs(held[name]) > STILL * (high - low))
+        needed |= held[name] != 0 and (not np.ptp(later) or abs(held[name]) > STEADY * (high - low))
     return found, held if needed else {}
 
 

@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from grounded_trials.logs.inspect_guess import Guess
+from grounded_trials.logs.inspection.inspect_guess import Guess
 
 TURN = 2 * math.pi  # a larger command of an angle is doubted
 FOLLOWED = 0.3  # of such a command, that a state in rad reaches if it is a joint of several turns

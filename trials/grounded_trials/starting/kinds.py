@@ -11,10 +11,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from grounded.errors import GroundedError, nearest
-from grounded_trials.logs.inspect_guess import NAMES_BY_UNIT
-from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
-from grounded_trials.logs.inspect_pairs import rates_among
-from grounded_trials.logs.joint_names import from_base, slides
+from grounded_trials.logs.inspection.inspect_guess import NAMES_BY_UNIT
+from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport, TopicReport
+from grounded_trials.logs.inspection.inspect_pairs import rates_among
+from grounded_trials.logs.inspection.joint_names import from_base, slides
 from grounded_trials.logs.stated_units import factor_between, unit_in_name
 from grounded_trials.starting.skeletons import (
     BALANCE,

@@ -17,7 +17,7 @@ from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.result import listed
 from grounded_trials.store.store import made_folder, write_atomically
-from grounded_trials.workspace.model_file import load_module, model_in
+from grounded_trials.workspace.user_files.model_file import load_module, model_in
 
 SIMULATED = (".xml", ".urdf", ".mjcf")  # suffixes of files that MuJoCo loads
 FILE = "model.py"

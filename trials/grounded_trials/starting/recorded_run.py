@@ -9,15 +9,15 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.frozen import Array
-from grounded_trials.logs.inspect_log import inspect_log
+from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
 from grounded_trials.starting.shapes import in_steps
 from grounded_trials.store.own_files import TRIAL
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.task_file import read_target
 from grounded_trials.workspace.unknown_id import refuse_ids, unknown_trial
+from grounded_trials.workspace.user_files.task_file import read_target
 
 
 def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[str, Array]:

@@ -18,7 +18,7 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.task import MAX_HORIZON
-from grounded_trials.logs.inspect_pairs import velocities
+from grounded_trials.logs.inspection.inspect_pairs import velocities
 from grounded_trials.workspace.off_target import position_names
 
 PATHS = ("line", "circle", "figure-8")

@@ -1,12 +1,16 @@
 """A workspace (a folder with a task, its trials and candidates) and what each command does in it.
 
-Read `folder.py` first (how a folder becomes a task, trials and candidates). `config.py`,
-`task_file.py` and `model_file.py` read what the user wrote. One module per verb: `proposing.py`
-(also status), `running.py`, `intake/` (ingesting logs), `looping.py`, `fitting.py`,
-`diagnosing.py`, `adopting.py`, `exporting.py`, `inspecting.py`, `verifying.py`;
-`grounded_trials.door` makes them the methods of one class. `identity.py` resolves the names of
-trials and candidates, `handover.py` checks candidates before they are handed over, `next_step.py`
-chooses the command to suggest next, after what `last_diagnosis.py` reads. `first_plan.py` and
-`at_rest.py` serve the first `propose`, with `wrong_units.py`; `adopted.py` plans with adopted
-effects.
+Read `folder.py` first: how a folder becomes a task, trials and candidates. `identity.py` identifies
+policies by their bytes, `unknown_id.py` explains names that don't exist.
+
+user_files/  what the user wrote: grounded.toml, model.py, target.csv
+candidates/  planning the next candidate, handing it over, running it: propose, export, run
+intake/      logs become stored trials: ingest
+
+One module per further verb: `new_target.py`, `inspecting.py`, `looping.py` (learn and next),
+`fitting.py`, `diagnosing.py`, `adopting.py`, `discarding.py`, `verifying.py`;
+`grounded_trials.door` makes them the methods of one class. `next_step.py` chooses the command to
+suggest next, after what `last_diagnosis.py` reads and `adoptable.py` finds in it. `adopted.py`
+plans with adopted effects, `where_to_mend.py` says where to correct a finding about a sensor, and
+`off_target.py` measures errors of a run in units.
 """

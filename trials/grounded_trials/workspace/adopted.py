@@ -4,15 +4,13 @@
     effects = [ { name = "dead_zone:throttle", c = 0.146 } ]
 
 Families come with grounded and with other packages (`installed_effects`);
-`grounded.search.planner.planner_with` adds them to the model. `better_model` is for reports: the
-model with diagnosed effects that are not adopted yet, or else with the adopted ones.
+`grounded.search.planner.planner_with` adds them to the model.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -32,8 +30,7 @@ from grounded.search.planner import Planner, planner_with
 from grounded.task import Task
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.report import Diagnosis
-    from grounded_trials.workspace.folder import Folder
+    pass
 
 LINEAR = ("c", "k", "A", "B", "a", "b")  # parameters that an added rate is proportional to
 STEEP = 3.0  # largest change of speed by dry friction in one step, in units of its width
@@ -190,45 +187,3 @@ def _bounds(effect: Effect) -> dict[str, tuple[float, float]]:
         for q, p in zip(small.quantities, large.quantities, strict=True)
         if not q.fixed
     }
-
-
-@dataclass(frozen=True, eq=False)
-class Better:
-    """A model to compare the crude one with, and its name in a legend."""
-
-    planner: Planner
-    name: str
-
-
-def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | None:
-    """Return the diagnosed model, else the one with adopted effects, or None if there is neither.
-
-    Raises:
-        GroundedError: if the diagnosis names an unknown effect or parameter.
-    """
-    own, effects = _as_diagnosed(workspace, diagnosis) if diagnosis is not None else ({}, [])
-    if not (own or effects):
-        adopted = workspace.config.model.effects
-        return Better(workspace.planner, "with adopted effects") if adopted else None
-    task = workspace.task
-    estimated = task.with_model(task.model.with_values(own))
-    return Better(planner_of(estimated, effects), "as diagnosed")
-
-
-def _as_diagnosed(
-    workspace: Folder, diagnosis: Diagnosis
-) -> tuple[dict[str, float], list[dict[str, Any]]]:
-    """Return parameters and effects including claims not adopted yet; empty if there are none."""
-    from grounded_trials.workspace.adopting import joined, nominal_values
-
-    table = workspace.config.model
-    new = diagnosis.open(table.effects, table.params)
-    names = [name for name in diagnosis.joining if name in new and diagnosis.ranked(name)]
-    known = {n: e for n, e in diagnosis.known_parameters.items() if math.isfinite(e.value)}
-    nominal = nominal_values(diagnosis, workspace, names)
-    params, both = joined(diagnosis, names, table.effects, nominal, known)
-    own = {name: value for name, value in params.items() if name in workspace.task.model.params}
-    if not (own or names):
-        return {}, []
-    old = len(table.effects)
-    return own, in_order(both[:old], both[old:])

@@ -1,30 +1,38 @@
 """Adopt in a workspace: add diagnosed effects to the model of grounded.toml, with their values.
 
 A diagnosis estimates the model's parameters together with the effects, so both are adopted
-together. reports/adoptions.json records [model] before each adoption, so that it can be undone, and
-how sure the adopted values are.
+together. reports/adoptions.json also records how sure the adopted values are (see `adoptable`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from grounded.diagnosis.cause_words import wider
-from grounded.diagnosis.report import Diagnosis, Estimate, Made
-from grounded.errors import GroundedError, NextCommand, nearest
-from grounded.result import Result, listed, percent
-from grounded_trials.store.documents import read_document, write_document
-from grounded_trials.workspace.config import ModelTable, as_toml, set_in_model
+from grounded.diagnosis.report import Diagnosis, Estimate
+from grounded.errors import GroundedError, NextCommand
+from grounded.result import Result, listed
+from grounded_trials.store.documents import write_document
+from grounded_trials.workspace.adoptable import (
+    KEPT,
+    adoptions,
+    check_adoptable,
+    claims_all,
+    joined,
+    late_open,
+    nominal_values,
+    with_curves,
+)
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.where_to_mend import in_time_now
-from grounded_trials.workspace.last_diagnosis import read_diagnosis
+from grounded_trials.workspace.last_diagnosis import made_from, read_diagnosis
+from grounded_trials.workspace.next_step import to_plan
+from grounded_trials.workspace.off_target import logged_target
+from grounded_trials.workspace.user_files.config import ModelTable, as_toml, set_in_model
 
-Effect = dict[str, Any]  # {"name": "dead_zone:throttle", "c": 0.146}
 AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")
-KEPT = "adoptions.json"  # in reports/
 SLIGHT = 1e-3  # relative change of a parameter that counts as none
 
 
@@ -108,17 +116,15 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     that it does not claim was fitted instead of those, without parameters.
     """
     from grounded_trials.workspace.adopted import in_order
-    from grounded_trials.workspace.next_step import late_open, to_plan
-    from grounded_trials.workspace.off_target import logged_target
 
     found = read_diagnosis(workspace.reports)
     if found is None:
         raise GroundedError("nothing was diagnosed yet: run a diagnosis first", then=AGAIN)
-    names = _corrections(found, list(dict.fromkeys(names)))
+    names = with_curves(found, list(dict.fromkeys(names)))
     before = {} if found.made is None else found.made.effects
-    _check(names, found, workspace, before)
+    check_adoptable(names, found, workspace, before)
     physics = [name for name in names if name not in found.late_sensors]
-    claimed = not physics or _claimed(found, physics)
+    claimed = not physics or claims_all(found, physics)
     if physics and {*found.effects} <= {*physics}:
         names += [name for name in late_open(workspace, found) if name not in names]
     calibrated = found.known_parameters if parameters and physics and claimed else {}
@@ -127,7 +133,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     own, both = joined(found, names, old, nominal, calibrated)
     adopted = in_order(both[: len(old)], both[len(old) :])
     whole = dict(workspace.config.model.params) | own
-    earlier, _ = _kept(workspace)  # raises before anything is written
+    earlier, _ = adoptions(workspace)  # raises before anything is written
     set_in_model(workspace.config.file, params=whole if own else None, effects=adopted or None)
     model = workspace.config.model
     after = {"effects": adopted or model.effects, "params": whole if own else model.params}
@@ -192,7 +198,7 @@ def as_adopted(workspace: Folder) -> dict[str, Estimate]:
     """
     found = dict[str, Estimate]()
     try:
-        for step in _kept(workspace)[0]:
+        for step in adoptions(workspace)[0]:
             known = step.get("known", {}).items()
             found |= {str(name): Estimate(float(v), float(std)) for name, (v, std) in known}
     except (GroundedError, AttributeError, TypeError, ValueError):
@@ -233,7 +239,7 @@ def left_behind(found: Diagnosis) -> dict[str, Left]:
     """
     from grounded.effects import param_name
 
-    made = found.made or Made()
+    made = made_from(found)
     called = {
         param_name(effect, key): f"{key} of {effect}"
         for effect, values in made.effects.items()
@@ -253,9 +259,7 @@ def undo_adoption(workspace: Folder) -> Undone:
     Raises:
         GroundedError: if nothing is left to undo, or [model] was changed since.
     """
-    from grounded_trials.workspace.next_step import to_plan
-
-    kept, undone = _kept(workspace)
+    kept, undone = adoptions(workspace)
     file, model = workspace.config.file, workspace.config.model
     if not kept:
         has = ", ".join(str(effect["name"]) for effect in model.effects) or "none"
@@ -284,204 +288,6 @@ def undo_adoption(workspace: Folder) -> Undone:
     )
 
 
-def declined(workspace: Folder) -> tuple[str, ...]:
-    """Return the effects of the last diagnosis that were adopted and undone since."""
-    return tuple(str(name) for name in _kept(workspace)[1])
-
-
-def _kept(workspace: Folder) -> tuple[list[dict[str, Any]], list[str]]:
-    """Read the adoptions that can be undone, oldest first, and those undone since a diagnosis."""
-    path = workspace.reports / KEPT
-    try:
-        document = read_document(path)
-        return list(document["adoptions"]), list(document["undone"])
-    except FileNotFoundError:
-        return [], []
-    except (ValueError, KeyError, TypeError, RecursionError, GroundedError) as error:
-        raise GroundedError(
-            f"{path} can't be read ({error}): delete it; earlier adoptions can't be undone then"
-        ) from None
-
-
-def diagnosed_again(workspace: Folder) -> None:
-    """Forget which effects were undone: a newer diagnosis may claim them again."""
-    kept, undone = _kept(workspace)
-    if undone:
-        write_document(workspace.reports / KEPT, {"adoptions": kept, "undone": []})
-
-
 def _written(model: ModelTable) -> dict[str, Any]:
     """Return the parts of [model] that an adoption may change, for JSON."""
     return {"effects": [dict(e) for e in model.effects], "params": dict(model.params)}
-
-
-def joined(
-    found: Diagnosis,
-    names: Sequence[str],
-    effects: Sequence[Mapping[str, Any]],
-    nominal: Mapping[str, float],
-    calibrated: Mapping[str, Estimate],
-) -> tuple[dict[str, float], list[Effect]]:
-    """Return the parameters to set and all effects, after adding diagnosed effects to a model.
-
-    Args:
-        found: the diagnosis.
-        names: its effects to add, in any order: they are added in the order of the fit.
-        effects: the effects that the model has already; they stay in front.
-        nominal: the value to which the change of each parameter among `names` is added.
-        calibrated: the parameters that are adopted with the effects.
-    """
-    from grounded_trials.workspace.adopted import settled
-
-    before = {} if found.made is None else found.made.effects
-    adopted, new = [dict(effect) for effect in effects], list[Effect]()
-    params = {key: _rounded(estimate.value) for key, estimate in calibrated.items()}
-    fitted = {name: k for k, name in enumerate(found.joining)}
-    for name in sorted(names, key=lambda name: fitted.get(name, len(fitted))):
-        values = {key: _rounded(value) for key, value in found.values(name).items()}
-        family, _, target = name.partition(":")
-        if family == "parameter":
-            params[target] = _rounded(nominal[target] + values["d"])
-        elif name in before:  # a further delay adds to the adopted one
-            values["d"] = _rounded(float(before[name]["d"]) + values["d"])
-            adopted = [e | values if e["name"] == name else e for e in adopted]
-        else:
-            new.append({"name": name, **values})
-    return settled(params, [*adopted, *new])
-
-
-def _curves(found: Diagnosis) -> list[str]:
-    return [] if found.correction is None else [curve.effect for curve in found.correction.curves]
-
-
-def _corrections(found: Diagnosis, names: list[str]) -> list[str]:
-    """Replace `correction:v` by its curves.
-
-    Raises:
-        GroundedError: if the correction is not adoptable, or claimed effects are not adopted too.
-    """
-    curves, asked = _curves(found), [n for n in names if n.startswith("correction:")]
-    if found.correction is None or asked not in (
-        [f"correction:{found.correction.channel}"],
-        curves,
-    ):
-        return names
-    if not found.correction.adoptable:
-        raise GroundedError(
-            f"'{asked[0]}' is not adoptable: it does not predict trials better that it was not "
-            "fitted to; run more trials and diagnose again"
-        )
-    missing = [name for name in found.effects if name not in names]
-    if missing:
-        raise GroundedError(
-            f"'{asked[0]}' was fitted together with {', '.join(missing)}: adopt them together",
-            then=NextCommand("adopt", (*missing, asked[0])),
-        )
-    return [name for name in names if name not in asked] + curves
-
-
-def nominal_values(found: Diagnosis, workspace: Folder, names: Iterable[str]) -> dict[str, float]:
-    """Return the values that parameters among the effects had when the diagnosis was made.
-
-    Raises:
-        GroundedError: if neither the diagnosis nor the model has a value.
-    """
-    made, base = found.made or Made(), workspace.base_model.params
-    nominal = {}
-    for name in (n.removeprefix("parameter:") for n in names if n.startswith("parameter:")):
-        if name not in made.nominal and name not in base:
-            raise GroundedError(
-                f"the last diagnosis does not state the value of '{name}' that it started from: "
-                "diagnose again",
-                then=AGAIN,
-            )
-        nominal[name] = made.nominal[name] if name in made.nominal else float(base[name].value)
-    return nominal
-
-
-def _check(
-    names: Sequence[str], found: Diagnosis, workspace: Folder, before: Mapping[str, Any]
-) -> None:
-    """Check that each effect is in the diagnosis and was not adopted since.
-
-    Raises:
-        GroundedError: if not, or if [log] already corrects the delay that it describes.
-    """
-    from grounded_trials.workspace.next_step import newer_alone
-
-    if found.changed and not set(names) <= {*found.late_sensors}:
-        raise GroundedError(
-            "the last diagnosis compared two groups of trials between which the robot changed: no "
-            "value of both is right for either",
-            newer_alone(found),
-        )
-    known = [row.effect for row in found.ranking] + _curves(found) + [*found.late_sensors]
-    effects = [str(effect["name"]) for effect in workspace.config.model.effects]
-    adopted = [name for name in effects if name not in before or name not in known]
-    in_log = in_time_now(workspace, found.preflight)
-    for name in names:
-        if name not in known and name not in adopted:
-            _check_alike(name, found)
-            family = [one for one in known if one.startswith(f"{name}:")]
-            there = f"did you mean '{family[0]}'?" if family else nearest(name, known)
-            raise GroundedError(f"'{name}' is not among the effects of the last diagnosis: {there}")
-        if name in in_log:
-            _, _, state = name.partition(":")
-            raise GroundedError(
-                f"'{name}': [log.state.{state}] delay_s = {in_log[name]:g} already removes that "
-                "delay from every log that is read, so the model must not have it as well. Either "
-                "remove delay_s again, as it was for the diagnosed trials, so that plans allow for "
-                "the delay that the robot's program sees; or keep delay_s and let that program "
-                "predict the state ahead by as much"
-            )
-        if name in adopted:
-            raise GroundedError(
-                f"'{name}' is adopted already; see [model] effects in grounded.toml"
-            )
-
-
-def _check_alike(name: str, found: Diagnosis) -> None:
-    """Refuse an effect that the diagnosis only lists as alike a claimed one, without values."""
-    alike = next((one for one in found.lookalikes if one.like == name), None)
-    if alike is None:
-        return
-    family = alike.effect.partition(":")[0]
-    then = NextCommand("diagnose", ("--without", family))
-    what = f"a diagnosis without {family} would fit it"
-    if family == name.partition(":")[0]:
-        then, what = NextCommand("adopt", found.effects), "adopt that one"
-    raise GroundedError(
-        f"'{name}' was not fitted in its own right and has no values: the last diagnosis lists it "
-        f"because it reproduces {percent(alike.share)} of the signal of {alike.effect}, which was "
-        f"fitted; {what} instead",
-        then=then,
-    )
-
-
-def _claimed(found: Diagnosis, names: Sequence[str]) -> bool:
-    """Return whether the verdict claims all the effects.
-
-    Raises:
-        GroundedError: if nothing can be adopted, or several effects are named and some of them were
-            fitted as alternatives to others.
-    """
-    if found.no_cause:
-        raise GroundedError(
-            f"too little is known to adopt anything ({found.sentence}): run another trial, ingest "
-            "it, then diagnose again"
-        )
-    rivals = [name for name in names if name not in (*found.effects, *_curves(found))]
-    if rivals and len(names) > 1:
-        own = f"those that it claims ({', '.join(found.effects)}), or " * bool(found.effects)
-        raise GroundedError(
-            f"the last diagnosis does not claim {', '.join(rivals)}: these effects were fitted one "
-            f"instead of another, not together; adopt {own}one alone",
-            then=NextCommand("adopt", found.effects or (rivals[0],)),
-        )
-    return not rivals
-
-
-def _rounded(value: float) -> float:
-    if not math.isfinite(value):
-        raise GroundedError("the last diagnosis lacks a value: diagnose again", then=AGAIN)
-    return float(f"{float(value):.8g}")

@@ -18,9 +18,9 @@ from grounded.instruments.finding import in_the_log
 from grounded.progress import duration
 from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.identity import ROWS
-from grounded_trials.workspace.intake.where_to_mend import one_message, where_to_mend
 from grounded_trials.workspace.last_diagnosis import diagnosable, write_diagnosis
 from grounded_trials.workspace.unknown_id import named_trials
+from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
@@ -59,7 +59,9 @@ def diagnose_in(
     """
     from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
     from grounded.effects import Library
-    from grounded_trials.workspace.adopting import diagnosed_again
+    from grounded_trials.workspace.adoptable import diagnosed_again
+    from grounded_trials.workspace.candidates.exporting import to_run
+    from grounded_trials.workspace.candidates.search_state import candidate_named
     from grounded_trials.workspace.next_step import (
         DIAGNOSE,
         EXPORT,
@@ -69,7 +71,6 @@ def diagnose_in(
         after_diagnosis,
         nothing_to_do,
     )
-    from grounded_trials.workspace.proposing import candidate_named, to_run
 
     effects = [dict(effect) for effect in workspace.config.model.effects]
     names = [str(effect["name"]) for effect in effects]
@@ -199,7 +200,7 @@ def _in_vain(workspace: Folder, found: Diagnosis) -> str:
     If predictions are better with the adopted effects than before, the losses have another cause.
     """
     from grounded.search.standing import LOST
-    from grounded_trials.workspace.proposing import standing_in
+    from grounded_trials.workspace.candidates.search_state import standing_in
 
     names = [str(effect["name"]) for effect in workspace.config.model.effects]
     paid = gain(found.prediction_error, "outset", "crude") > 0
@@ -272,8 +273,8 @@ def _probe(
         return "", ""  # of one of the two robots, which is to be diagnosed alone
     from grounded.diagnosis.excitation import NOTHING, probe
     from grounded.search.safety import objections, spread
-    from grounded_trials.workspace.handover import outside_limits
-    from grounded_trials.workspace.proposing import standing_in
+    from grounded_trials.workspace.candidates.handover import outside_limits
+    from grounded_trials.workspace.candidates.search_state import standing_in
 
     now = standing_in(workspace)
     best = now.incumbent

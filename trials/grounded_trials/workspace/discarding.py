@@ -9,16 +9,61 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.result import Result
 from grounded.trial import interpolate_gaps
 from grounded_trials.logs.log_files import log_files
 from grounded_trials.store.trial_file import read_trial
+from grounded_trials.workspace.candidates.proposing import status_of
+from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import SetAside, set_aside
-from grounded_trials.workspace.proposing import standing_in, status_of
+from grounded_trials.workspace.unknown_id import unknown_trial
+
+STATUS = NextCommand("status")
+
+
+@dataclass(frozen=True, repr=False)
+class SetAside(Result):
+    """The result of `discard` and `restore`: the named trials, and all that are set aside."""
+
+    trials: tuple[str, ...]
+    discarded: dict[str, str]  # t0004 -> why
+    unchanged: tuple[str, ...] = ()  # those of `trials` that were in this state before
+    then: NextCommand = STATUS
+
+    def summary(self) -> str:
+        """Return all trials that are set aside."""
+        return f"set aside: {', '.join(self.discarded) or 'none'}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of `discard --json` and `restore --json`."""
+        named = {"trials": list(self.trials), "unchanged": list(self.unchanged)}
+        return named | {"discarded": self.discarded}
+
+
+def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> SetAside:
+    """Record that trials were discarded or restored, see `Workspace.discard`."""
+    for name in trials:
+        if not workspace.store.matching(name.lower()):
+            raise unknown_trial(workspace, name)
+    named = dict.fromkeys(name.lower() for name in trials)
+    found = [workspace.store.find(name) for name in named]
+    same = []  # no change: discarded again for no other reason, or restored but never discarded
+    digests = [stored.digest for stored in workspace.store.list()]
+    for one in found:
+        before = workspace.noted.why_aside(one)
+        if before is None if note == "restore" else before is not None and why in ("", before):
+            same.append(one.id)
+            continue
+        copied = digests.count(one.digest) > 1 and one.digest not in workspace.noted.aside
+        trial = one.path.stem if copied else one.digest
+        workspace.notes.add({"note": note, "trial": trial, "why": why})
+    workspace.forget_trials()
+    return SetAside(tuple(one.id for one in found), workspace.discarded(), tuple(same))
 
 
 def discard_in(workspace: Folder, trials: Sequence[str], why: str) -> SetAside:
@@ -32,7 +77,7 @@ def discard_in(workspace: Folder, trials: Sequence[str], why: str) -> SetAside:
 
 def _instead(workspace: Folder, name: str) -> NextCommand | None:
     """Return the command to type after a trial was discarded; None if `status` has to show it."""
-    from grounded_trials.workspace.intake.log_faults import log_faults
+    from grounded_trials.workspace.intake.remarks.log_faults import log_faults
 
     stored = workspace.store.find(name)
     trial, meta, _ = read_trial(workspace.store.read(stored), stored.path.name)
@@ -47,7 +92,7 @@ def _instead(workspace: Folder, name: str) -> NextCommand | None:
 
 def _found(workspace: Folder, meta: Mapping[str, str]) -> str:
     """Return the path of a trial's log if it is in or beside a folder in use, else LOG."""
-    from grounded_trials.workspace.intake.foreign import hashed
+    from grounded_trials.workspace.intake.opening.foreign import hashed
 
     name, home = Path(meta["source"]).name, workspace.folder.resolve()
     for folder in (Path.cwd(), home, home.parent):

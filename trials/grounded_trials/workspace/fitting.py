@@ -17,20 +17,16 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, measured_alike
 from grounded.trial import Trial
-from grounded_trials.store.documents import read_document, write_document
-from grounded_trials.store.store import made_folder
-from grounded_trials.workspace.config import set_in_model, set_latency
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import estimated_in
-from grounded_trials.workspace.unknown_id import named_trials
+from grounded_trials.workspace.last_diagnosis import fittable, ids_of, write_fit
+from grounded_trials.workspace.next_step import after_fit, to_plan
+from grounded_trials.workspace.user_files.config import set_in_model, set_latency
 
 if TYPE_CHECKING:
     from grounded.engine import Engine
     from grounded.fit import Fit
     from grounded.instruments.finding import Finding
-
-
-KEPT = "fit.json"  # in reports/
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -74,19 +70,17 @@ def fit_in(
         GroundedError: if `apply` is set but the fit predicts held-out time worse than before;
             nothing is written then.
     """
-    from grounded_trials.workspace.next_step import after_fit, to_plan
-
-    used = usable_trials(workspace, trials)
+    used = fittable(workspace, trials)
     found, seen = fit_trials(
         workspace, used, names, latency=latency, engine=engine, progress=progress
     )
     kept = () if names or latency else _taken_as_exact(workspace, found)
     if not (names or latency):
-        _keep(workspace, used, found)
+        write_fit(workspace, used, found)
     asked: tuple[str, ...] = ("--params", ",".join(names)) if names else ()
     asked += ("--trials", ",".join(trials)) if trials else ()
     asked += ("--latency",) * latency
-    fitted = partial(Fitted, found, preflight=seen, not_fitted=kept, trials=_ids(used))
+    fitted = partial(Fitted, found, preflight=seen, not_fitted=kept, trials=ids_of(used))
     if apply and not np.isfinite(found.loglik):
         raise GroundedError(f"nothing was written: {found.sentence}", then=after_fit(workspace))
     if apply and found.worse:
@@ -149,51 +143,6 @@ def _worse(found: Fit) -> str:
     )
 
 
-def _keep(workspace: Folder, used: Sequence[Trial], found: Fit) -> None:
-    made = _made_from(workspace, used) | {"helps": found.helps}
-    write_document(made_folder(workspace.reports) / KEPT, made)
-
-
-def _made_from(workspace: Folder, used: Sequence[Trial]) -> dict[str, Any]:
-    """Return the trials and the model of a fit."""
-    return {"trials": list(_ids(used)), "model": workspace.planner.fingerprint}
-
-
-def _ids(trials: Sequence[Trial]) -> tuple[str, ...]:
-    return tuple(trial.id for trial in trials)
-
-
-def fitted_in_vain(workspace: Folder, trials: Sequence[str] = ()) -> bool:
-    """Return whether the current model was already fitted to the same trials without a gain.
-
-    Args:
-        workspace: the workspace.
-        trials: short names; empty: all usable trials.
-    """
-    try:
-        kept = read_document(workspace.reports / KEPT)
-        used = usable_trials(workspace, trials)
-    except (OSError, ValueError, RecursionError, GroundedError):  # then fit again
-        return False
-    return kept.get("helps") is False and _made_from(workspace, used).items() <= kept.items()
-
-
-def usable_trials(workspace: Folder, names: Sequence[str] = ()) -> list[Trial]:
-    """Return stored trials of this model, each up to its first non-finite sample.
-
-    Args:
-        workspace: the workspace.
-        names: short names of the trials to return; empty: all that have at least 3 such steps.
-
-    Raises:
-        GroundedError: if there is none, or one of those named can't be used.
-    """
-    trials = ((trial, trial.finite_steps) for trial in workspace.task_trials())
-    found = [trial.until(T) for trial, T in trials if T >= 3]
-    chosen = named_trials(workspace, names, _ids(found))
-    return [trial for trial in found if not chosen or trial.id in chosen]
-
-
 def fit_trials(
     workspace: Folder,
     used: Sequence[Trial],
@@ -214,7 +163,7 @@ def fit_trials(
     from grounded.estimate import of_states, record_of
     from grounded.fit import fit
     from grounded.instruments.sound_trials import sound_trials
-    from grounded_trials.workspace.intake.where_to_mend import one_message, where_to_mend
+    from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
 
     planner = workspace.planner
     guessed = estimated_in(workspace.trials())

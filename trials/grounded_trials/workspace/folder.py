@@ -27,7 +27,6 @@ from grounded_trials.plain_file import open_file
 from grounded_trials.store.documents import Notes
 from grounded_trials.store.store import Damaged, Store, Stored, made_folder, write_atomically
 from grounded_trials.store.trial_file import read_trial
-from grounded_trials.workspace.config import Config, read_config
 from grounded_trials.workspace.identity import (
     Noted,
     StoredCandidate,
@@ -39,9 +38,10 @@ from grounded_trials.workspace.identity import (
     sha256,
     stored_candidate,
 )
-from grounded_trials.workspace.model_file import check_names, load_module, model_in
-from grounded_trials.workspace.task_file import build_task, read_target
 from grounded_trials.workspace.unknown_id import unknown_candidate
+from grounded_trials.workspace.user_files.config import Config, read_config
+from grounded_trials.workspace.user_files.model_file import check_names, load_module, model_in
+from grounded_trials.workspace.user_files.task_file import build_task, read_target
 
 if TYPE_CHECKING:
     from grounded.search.planner import Planner

@@ -11,25 +11,18 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.result import Result
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.formats.mcap_walk import DamagedFile
 from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
 from grounded_trials.store.store import Damaged, Store, Stored
-from grounded_trials.workspace.unknown_id import unknown_trial
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from grounded_trials.workspace.folder import Folder
 
 # keys of a log's metadata
 ROWS = "rows_s"  # time between rows of a table that repeats commands
@@ -55,7 +48,6 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "sample_age": float,
     "seen": lambda text: tuple(filter(None, text.split(","))),
 }
-STATUS = NextCommand("status")
 T = TypeVar("T")
 MOST_KNOWN = 4  # files of candidates about which something is kept
 _ABSENT = {
@@ -168,46 +160,6 @@ def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
         elif kind == "run":
             found.ran[note["trial"]] = note["sha256"]
     return found
-
-
-@dataclass(frozen=True, repr=False)
-class SetAside(Result):
-    """The result of `discard` and `restore`: the named trials, and all that are set aside."""
-
-    trials: tuple[str, ...]
-    discarded: dict[str, str]  # t0004 -> why
-    unchanged: tuple[str, ...] = ()  # those of `trials` that were in this state before
-    then: NextCommand = STATUS
-
-    def summary(self) -> str:
-        """Return all trials that are set aside."""
-        return f"set aside: {', '.join(self.discarded) or 'none'}"
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of `discard --json` and `restore --json`."""
-        named = {"trials": list(self.trials), "unchanged": list(self.unchanged)}
-        return named | {"discarded": self.discarded}
-
-
-def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> SetAside:
-    """Record that trials were discarded or restored, see `Workspace.discard`."""
-    for name in trials:
-        if not workspace.store.matching(name.lower()):
-            raise unknown_trial(workspace, name)
-    named = dict.fromkeys(name.lower() for name in trials)
-    found = [workspace.store.find(name) for name in named]
-    same = []  # no change: discarded again for no other reason, or restored but never discarded
-    digests = [stored.digest for stored in workspace.store.list()]
-    for one in found:
-        before = workspace.noted.why_aside(one)
-        if before is None if note == "restore" else before is not None and why in ("", before):
-            same.append(one.id)
-            continue
-        copied = digests.count(one.digest) > 1 and one.digest not in workspace.noted.aside
-        trial = one.path.stem if copied else one.digest
-        workspace.notes.add({"note": note, "trial": trial, "why": why})
-    workspace.forget_trials()
-    return SetAside(tuple(one.id for one in found), workspace.discarded(), tuple(same))
 
 
 class _Recent(Generic[T]):

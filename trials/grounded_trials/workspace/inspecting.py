@@ -8,11 +8,11 @@ from typing import Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
-from grounded_trials.logs.inspect_log import LogReport, inspect_log
+from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
-from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.unknown_id import refuse_ids
+from grounded_trials.workspace.user_files.config import FILE
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -83,12 +83,11 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     Raises:
         GroundedError: if the log can't be read at all.
     """
-    from grounded_trials.logs.guessed_table import mapping_toml
-    from grounded_trials.logs.inspect_evidence import weigh
-    from grounded_trials.logs.inspect_guess import guess_mapping, is_simulated
-    from grounded_trials.logs.joint_names import joint_names, joint_units, wide_joints
-    from grounded_trials.logs.unnamed import from_the_rest
-    from grounded_trials.workspace.intake.log_faults import no_angles
+    from grounded_trials.logs.inspection.guessed_table import mapping_toml
+    from grounded_trials.logs.inspection.inspect_evidence import from_the_rest, weigh
+    from grounded_trials.logs.inspection.inspect_guess import guess_mapping, is_simulated
+    from grounded_trials.logs.inspection.joint_names import joint_names, joint_units, wide_joints
+    from grounded_trials.workspace.intake.opening.columns_by_name import no_angles
 
     refuse_ids(workspace, log, "inspect")
     report = inspect_log(log)

@@ -1,27 +1,35 @@
-"""The last diagnosis of a workspace, reports/diagnosis.json, and the trials that the next can use.
+"""The last diagnosis and fit of a workspace, in reports/, and the trials that the next can use.
 
 A diagnosis uses the stored trials up to the first missing input or unbounded number; gaps in single
-states stay gaps. The file may come from another version or an untrusted source, so no text in it is
-trusted.
+states stay gaps. A fit needs complete states. The files may come from another version or an
+untrusted source, so no text in them is trusted.
+
+`Since` describes what changed after a diagnosis: newer trials, adopted effects, other parameters. A
+verdict refers to the model and the trials of its time; effects adopted since are no longer missing.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.store.store import made_folder
+from grounded_trials.workspace.unknown_id import named_trials
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.report import Diagnosis
+    from grounded.diagnosis.report import Diagnosis, Made
+    from grounded.fit import Fit
     from grounded.trial import Trial
     from grounded_trials.workspace.folder import Folder
 
-FILE = "diagnosis.json"
+FILE = "diagnosis.json"  # in reports/, as FIT
+FIT = "fit.json"
 LEAST_STEPS = 2
+SAME = 1e-6  # relative tolerance for values that were written with eight digits
 
 
 def write_diagnosis(folder: Path, found: Diagnosis) -> None:
@@ -49,6 +57,14 @@ def read_diagnosis(folder: Path) -> Diagnosis | None:
         ) from None
 
 
+def readable_diagnosis(folder: Path) -> Diagnosis | None:
+    """Read the diagnosis in a reports folder; a damaged one counts as none."""
+    try:
+        return read_diagnosis(folder)
+    except GroundedError:
+        return None
+
+
 def _with_limit(found: Diagnosis) -> Diagnosis:
     """Add `Verdict.limit` to a diagnosis of an older version, which has it only in the sentence."""
     said = found.verdict
@@ -69,3 +85,150 @@ def diagnosable(workspace: Folder) -> list[Trial]:
     """
     cut = [trial.until(trial.known_steps) for trial in workspace.task_trials(measured=True)]
     return [trial for trial in cut if trial.steps >= LEAST_STEPS]
+
+
+def made_from(diagnosis: Diagnosis) -> Made:
+    """Return what a diagnosis was made from; of an older version it does not say."""
+    from grounded.diagnosis.report import Made  # slow: most commands find no diagnosis
+
+    return diagnosis.made or Made()
+
+
+@dataclass(frozen=True)
+class Since:
+    """What changed since a diagnosis was made."""
+
+    used: int = 0  # usable trials that the diagnosis was made from
+    usable: int = 0  # trials that a diagnosis can use now
+    newer: int = 0  # usable trials that arrived after the diagnosis
+    adopted: tuple[str, ...] = ()  # effects that are part of the model now, claimed ones first
+    missing: tuple[str, ...] = ()  # claimed effects that are not, if others are
+    changed: bool = False  # the diagnosis was made with another model
+    further: bool = False  # it left more to be found than it was allowed to claim
+
+    @property
+    def settled(self) -> bool:
+        """Whether another diagnosis would only repeat this one.
+
+        It is of all trials, and the model is the one that it had, or has all that it claimed and
+        there was nothing more to look for.
+        """
+        adopted = self.used > 0 and bool(self.adopted) and not self.missing and not self.further
+        return not self.newer and (adopted or not self.changed)
+
+    @property
+    def sentence(self) -> str:
+        """Why the diagnosis is outdated; "" if it is not."""
+        parts = []
+        if self.newer:
+            parts.append(f"diagnosed with {self.used} of {self.usable} trials")
+        if self.adopted:
+            but = f", but not {', '.join(self.missing)}" * bool(self.missing)
+            parts.append(f"adopted since: {', '.join(self.adopted)}{but}")
+        elif self.changed:
+            parts.append("the model was changed since")
+        return "; ".join(parts)
+
+
+def usable_ids(workspace: Folder) -> list[str]:
+    """Return the ids of the trials that a diagnosis can use, in order of arrival.
+
+    Raises:
+        GroundedError: if a stored file is damaged.
+    """
+    return [trial.id for trial in diagnosable(workspace)]
+
+
+def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[str]) -> Since:
+    """Return what changed since a diagnosis was made.
+
+    Args:
+        workspace: the workspace with the current model.
+        diagnosis: the diagnosis.
+        usable: the trials that can be used now, in order of arrival.
+    """
+    model, made = workspace.config.model, made_from(diagnosis)
+    seen, params = set(made.trials), made.params
+    last = max((k for k, name in enumerate(usable) if name in seen), default=-1)
+    missing = diagnosis.open(model.effects, model.params)
+    other = [name for name in diagnosis.effects if _other_value(diagnosis, name, model.params)]
+    adopted = tuple(name for name in diagnosis.effects if name not in (*missing, *other))
+    before = {e["name"] for e in made.adopted}
+    named = (str(e["name"]) for e in model.effects)
+    adopted += tuple(n for n in named if n not in before and n not in diagnosis.effects)
+    same = [dict(e) for e in model.effects] == [dict(e) for e in made.adopted]
+    return Since(
+        used=sum(name in seen for name in usable),
+        usable=len(usable),
+        newer=len(usable) - 1 - last if seen else 0,
+        adopted=adopted,
+        missing=missing if adopted else (),
+        changed=not same or params not in (None, dict(model.params)),
+        further=diagnosis.verdict.look_for > 0 or diagnosis.verdict.again,
+    )
+
+
+def _other_value(diagnosis: Diagnosis, name: str, params: Mapping[str, float]) -> bool:
+    """Return whether a claimed parameter differs from the claimed value: it was not adopted."""
+    family, _, own = name.partition(":")
+    row, made = diagnosis.ranked(name), made_from(diagnosis)
+    if family != "parameter" or own not in params or own not in made.nominal or row is None:
+        return False
+    said = row.params["d"].moved(made.nominal[own])
+    low, high = said.interval or (said.value - 2 * said.std, said.value + 2 * said.std)
+    room = SAME * abs(said.value)
+    return not low - room <= params[own] <= high + room
+
+
+def newer_alone(diagnosis: Diagnosis) -> NextCommand:
+    """Return the diagnosis of the newer of the two groups that a diagnosis compared."""
+    made = made_from(diagnosis)
+    newer = max(made.named, made.compared, key=lambda group: max(group, default=""))
+    return NextCommand("diagnose", ("--trials", ",".join(newer)))
+
+
+def write_fit(workspace: Folder, used: Sequence[Trial], found: Fit) -> None:
+    """Write which trials and model a fit was made from, and whether it predicts better."""
+    made = _made_from(workspace, used) | {"helps": found.helps}
+    write_document(made_folder(workspace.reports) / FIT, made)
+
+
+def _made_from(workspace: Folder, used: Sequence[Trial]) -> dict[str, Any]:
+    """Return the trials and the model of a fit."""
+    return {"trials": list(ids_of(used)), "model": workspace.planner.fingerprint}
+
+
+def ids_of(trials: Sequence[Trial]) -> tuple[str, ...]:
+    """Return the short names of trials."""
+    return tuple(trial.id for trial in trials)
+
+
+def fitted_in_vain(workspace: Folder, trials: Sequence[str] = ()) -> bool:
+    """Return whether the current model was already fitted to the same trials without a gain.
+
+    Args:
+        workspace: the workspace.
+        trials: short names; empty: all usable trials.
+    """
+    try:
+        kept = read_document(workspace.reports / FIT)
+        used = fittable(workspace, trials)
+    except (OSError, ValueError, RecursionError, GroundedError):  # then fit again
+        return False
+    return kept.get("helps") is False and _made_from(workspace, used).items() <= kept.items()
+
+
+def fittable(workspace: Folder, names: Sequence[str] = ()) -> list[Trial]:
+    """Return stored trials of this model, each up to its first non-finite sample.
+
+    Args:
+        workspace: the workspace.
+        names: short names of the trials to return; empty: all that have at least 3 such steps.
+
+    Raises:
+        GroundedError: if there is none, or one of those named can't be used.
+    """
+    trials = ((trial, trial.finite_steps) for trial in workspace.task_trials())
+    found = [trial.until(T) for trial, T in trials if T >= 3]
+    chosen = named_trials(workspace, names, ids_of(found))
+    return [trial for trial in found if not chosen or trial.id in chosen]

@@ -11,17 +11,11 @@ from grounded.errors import NextCommand
 from grounded.frozen import whole_number
 from grounded.result import Result
 from grounded.search.candidate import Candidate
-from grounded_trials.workspace.exporting import Exported, export_candidate, void_exports
+from grounded_trials.workspace.candidates.exporting import Exported, export_candidate, void_exports
+from grounded_trials.workspace.candidates.proposing import Proposed, Status, propose_in, status_of
+from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.intake.ingested import Ingested
-from grounded_trials.workspace.proposing import (
-    Proposed,
-    Status,
-    propose_in,
-    standing_in,
-    status_of,
-)
+from grounded_trials.workspace.intake.ingest import Ingested, ingest_log
 
 MOST_TRIALS = 100_000
 STOPS = (
@@ -63,7 +57,7 @@ def learn_in(
     each: Callable[[Candidate, Ingested], None] | None,
 ) -> Status:
     """Propose, run and ingest until the search ends, see `Workspace.learn`."""
-    from grounded_trials.workspace.running import run_candidate
+    from grounded_trials.workspace.candidates.running import run_candidate
 
     if trials is not None:
         whole_number("trials", trials, 0, MOST_TRIALS)
@@ -91,7 +85,7 @@ def learn_in(
 
 def _odd_before(workspace: Folder) -> bool:
     """Return whether the last run's log had faults too, so that the user has chosen to go on."""
-    from grounded_trials.workspace.intake.log_faults import log_faults
+    from grounded_trials.workspace.intake.remarks.log_faults import log_faults
 
     runs = [trial for trial in workspace.task_trials() if trial.candidate]
     return bool(runs) and bool(log_faults(workspace, runs[-1]))

@@ -1,14 +1,9 @@
-"""Choose the command to type next, for every command, the page and the text report.
-
-`Since` describes what changed after a diagnosis: newer trials, adopted effects, other parameters. A
-verdict refers to the model and the trials of its time; effects adopted since are no longer missing.
-"""
+"""Choose the command to type next, for every command, the page and the text report."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,13 +12,24 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.model import all_at_bounds
 from grounded.search.standing import LOST, Standing
 from grounded_trials.wording import count, rendered
+from grounded_trials.workspace.adoptable import declined, late_open
+from grounded_trials.workspace.candidates.exporting import to_run
+from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.last_diagnosis import diagnosable, read_diagnosis
+from grounded_trials.workspace.last_diagnosis import (
+    Since,
+    fitted_in_vain,
+    made_from,
+    newer_alone,
+    read_diagnosis,
+    readable_diagnosis,
+    since_diagnosis,
+    usable_ids,
+)
 from grounded_trials.workspace.off_target import logged_target
-from grounded_trials.workspace.proposing import standing_in, status_of, to_run
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.report import Diagnosis, Made
+    from grounded.diagnosis.report import Diagnosis
 
 PROPOSE = NextCommand("propose")
 DIAGNOSE = NextCommand("diagnose")
@@ -31,9 +37,7 @@ EXPORT = NextCommand("export", ("best", "--runner"))
 REPORT = NextCommand("report", ("--html",))
 TARGET = NextCommand("target", ("SHAPE",))
 AGAIN = 2  # runs of the best candidate after which a search that doubts its model ends
-SHORT = 0.1  # fraction of a control step: shorter filters and delays make no difference
 TRUE = 0.05  # of a utility: a prediction that misses by less came true
-SAME = 1e-6  # relative tolerance for values that were written with eight digits
 
 
 def next_command(
@@ -152,7 +156,10 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
     if _none_stood(now) and (found := read_diagnosis(workspace.reports)) is not None:
         return next_command(workspace, now, found, usable_ids(workspace))
     goes_on = now.phase in ("propose", "await-trial") and not now.doubt
-    return PROPOSE if goes_on else status_of(workspace, now).then
+    if goes_on:
+        return PROPOSE
+    usable = usable_ids(workspace)
+    return next_command(workspace, now, readable_diagnosis(workspace.reports), usable)
 
 
 def _none_stood(now: Standing) -> bool:
@@ -206,11 +213,7 @@ def after_fit(workspace: Folder) -> NextCommand:
 
     It is what else the last diagnosis suggests, or a new diagnosis if model or trials changed.
     """
-    try:
-        found = read_diagnosis(workspace.reports)
-    except GroundedError:
-        found = None
-    if found is None:
+    if (found := readable_diagnosis(workspace.reports)) is None:
         return DIAGNOSE
     now = _standing_ahead(workspace)
     since = since_diagnosis(workspace, found, usable_ids(workspace))
@@ -227,8 +230,6 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     """
     from grounded.diagnosis.cause_words import sign_only
     from grounded.diagnosis.error_report import gain
-    from grounded_trials.workspace.adopting import declined
-    from grounded_trials.workspace.fitting import fitted_in_vain
 
     new = diagnosis.open(workspace.config.model.effects, workspace.config.model.params)
     if diagnosis.changed:  # values of two robots together fit neither
@@ -246,7 +247,7 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
         return DIAGNOSE  # after flipping the sign, as the diagnosis says
     own = {f"parameter:{name}" for name in params}
     if own.issuperset(new):
-        made = _made(diagnosis)
+        made = made_from(diagnosis)
         some = (*made.named, *made.compared)
         alone = not workspace.config.model.effects  # else found beside effects, to be adopted so
         if alone and not fitted_in_vain(workspace, some):  # only parameters: fit all together
@@ -271,20 +272,6 @@ def not_adopted(workspace: Folder, diagnosis: Diagnosis | None) -> str:
     return f"{clauses[0]}{more}; not {done}: `{rendered(then, workspace.address)}` first"
 
 
-def newer_alone(diagnosis: Diagnosis) -> NextCommand:
-    """Return the diagnosis of the newer of the two groups that a diagnosis compared."""
-    made = _made(diagnosis)
-    newer = max(made.named, made.compared, key=lambda group: max(group, default=""))
-    return NextCommand("diagnose", ("--trials", ",".join(newer)))
-
-
-def _made(diagnosis: Diagnosis) -> Made:
-    """Return what a diagnosis was made from; of an older version it does not say."""
-    from grounded.diagnosis.report import Made  # slow: most commands find no diagnosis
-
-    return diagnosis.made or Made()
-
-
 def _like_a_load(workspace: Folder, effects: Sequence[str]) -> bool:
     """Return whether the effects stand in for a load, for which the model lacks a parameter."""
     if len(effects) < 2:  # avoids the import
@@ -294,26 +281,12 @@ def _like_a_load(workspace: Folder, effects: Sequence[str]) -> bool:
     return like_a_load(workspace.planner.plan.model, effects)
 
 
-def late_open(workspace: Folder, diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Return the filters and delays of sensors that a diagnosis found and the model lacks."""
-    from grounded_trials.workspace.intake.where_to_mend import in_time_now
-
-    task = workspace.config.task
-    if not (task.target and task.feedback):
-        return ()
-    known = {effect["name"] for effect in workspace.config.model.effects}
-    known |= set(in_time_now(workspace, diagnosis.preflight))
-    least = SHORT * task.dt
-    found = diagnosis.late_sensors.items()
-    return tuple(n for n, own in found if n not in known and max(own.values()) > least)
-
-
 def to_look_deeper(diagnosis: Diagnosis) -> NextCommand | None:
     """Return the same diagnosis with more effects allowed; None if this one left no more to name.
 
     What it did name can be adopted before.
     """
-    effects, made = diagnosis.verdict.look_for, _made(diagnosis)
+    effects, made = diagnosis.verdict.look_for, made_from(diagnosis)
     if not effects:
         return None
     asked: tuple[str, ...] = ()
@@ -324,89 +297,3 @@ def to_look_deeper(diagnosis: Diagnosis) -> NextCommand | None:
     if made.without:
         asked += ("--without", ",".join(made.without))
     return NextCommand("diagnose", (*asked, "--max-effects", str(effects)))
-
-
-@dataclass(frozen=True)
-class Since:
-    """What changed since a diagnosis was made."""
-
-    used: int = 0  # usable trials that the diagnosis was made from
-    usable: int = 0  # trials that a diagnosis can use now
-    newer: int = 0  # usable trials that arrived after the diagnosis
-    adopted: tuple[str, ...] = ()  # effects that are part of the model now, claimed ones first
-    missing: tuple[str, ...] = ()  # claimed effects that are not, if others are
-    changed: bool = False  # the diagnosis was made with another model
-    further: bool = False  # it left more to be found than it was allowed to claim
-
-    @property
-    def settled(self) -> bool:
-        """Whether another diagnosis would only repeat this one.
-
-        It is of all trials, and the model is the one that it had, or has all that it claimed and
-        there was nothing more to look for.
-        """
-        adopted = self.used > 0 and bool(self.adopted) and not self.missing and not self.further
-        return not self.newer and (adopted or not self.changed)
-
-    @property
-    def sentence(self) -> str:
-        """Why the diagnosis is outdated; "" if it is not."""
-        parts = []
-        if self.newer:
-            parts.append(f"diagnosed with {self.used} of {self.usable} trials")
-        if self.adopted:
-            but = f", but not {', '.join(self.missing)}" * bool(self.missing)
-            parts.append(f"adopted since: {', '.join(self.adopted)}{but}")
-        elif self.changed:
-            parts.append("the model was changed since")
-        return "; ".join(parts)
-
-
-def usable_ids(workspace: Folder) -> list[str]:
-    """Return the ids of the trials that a diagnosis can use, in order of arrival.
-
-    Raises:
-        GroundedError: if a stored file is damaged.
-    """
-    return [trial.id for trial in diagnosable(workspace)]
-
-
-def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[str]) -> Since:
-    """Return what changed since a diagnosis was made.
-
-    Args:
-        workspace: the workspace with the current model.
-        diagnosis: the diagnosis.
-        usable: the trials that can be used now, in order of arrival.
-    """
-    model, made = workspace.config.model, _made(diagnosis)
-    seen, params = set(made.trials), made.params
-    last = max((k for k, name in enumerate(usable) if name in seen), default=-1)
-    missing = diagnosis.open(model.effects, model.params)
-    other = [name for name in diagnosis.effects if _other_value(diagnosis, name, model.params)]
-    adopted = tuple(name for name in diagnosis.effects if name not in (*missing, *other))
-    before = {e["name"] for e in made.adopted}
-    named = (str(e["name"]) for e in model.effects)
-    adopted += tuple(n for n in named if n not in before and n not in diagnosis.effects)
-    same = [dict(e) for e in model.effects] == [dict(e) for e in made.adopted]
-    return Since(
-        used=sum(name in seen for name in usable),
-        usable=len(usable),
-        newer=len(usable) - 1 - last if seen else 0,
-        adopted=adopted,
-        missing=missing if adopted else (),
-        changed=not same or params not in (None, dict(model.params)),
-        further=diagnosis.verdict.look_for > 0 or diagnosis.verdict.again,
-    )
-
-
-def _other_value(diagnosis: Diagnosis, name: str, params: Mapping[str, float]) -> bool:
-    """Return whether a claimed parameter differs from the claimed value: it was not adopted."""
-    family, _, own = name.partition(":")
-    row, made = diagnosis.ranked(name), _made(diagnosis)
-    if family != "parameter" or own not in params or own not in made.nominal or row is None:
-        return False
-    said = row.params["d"].moved(made.nominal[own])
-    low, high = said.interval or (said.value - 2 * said.std, said.value + 2 * said.std)
-    room = SAME * abs(said.value)
-    return not low - room <= params[own] <= high + room

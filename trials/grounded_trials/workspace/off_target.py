@@ -21,7 +21,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import with_unit
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.task_file import equal_weights
+from grounded_trials.workspace.user_files.task_file import equal_weights
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Tried
@@ -168,7 +168,7 @@ def position_names(model: Model) -> list[str]:
 
 def rates_beside(model: Model, names: Collection[str]) -> set[str]:
     """Return which of some states are the velocities of others, or of a position among them."""
-    from grounded_trials.logs.inspect_pairs import velocities
+    from grounded_trials.logs.inspection.inspect_pairs import velocities
 
     known = {model.state_names[i] for role in RATES for i in roles_of(model).get(role, ())}
     moved = {rate for place, rate in velocities(model).items() if place in names}

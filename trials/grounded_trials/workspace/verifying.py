@@ -13,8 +13,8 @@ from grounded.result import Result
 from grounded_trials.plain_file import read_file
 from grounded_trials.store.documents import read_document
 from grounded_trials.store.own_files import FILE_LIMIT
+from grounded_trials.workspace.candidates.handover import intact
 from grounded_trials.workspace.folder import Folder, Lost
-from grounded_trials.workspace.handover import intact
 from grounded_trials.workspace.identity import Noted, noted, sha256
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
 

@@ -29,7 +29,8 @@ from grounded_trials.report.page.tables import (
 )
 from grounded_trials.report.settled import so_far
 from grounded_trials.wording import percent, rendered
-from grounded_trials.workspace.next_step import DIAGNOSE, Since
+from grounded_trials.workspace.last_diagnosis import Since
+from grounded_trials.workspace.next_step import DIAGNOSE
 
 MOST = 6  # states whose error without each effect is drawn
 WHITE = 0.01  # p-value below which what is left is no longer taken for white noise

@@ -48,8 +48,8 @@ from grounded_trials.report.page.tables import (
 from grounded_trials.report.settled import told
 from grounded_trials.report.three_lines import gained_most
 from grounded_trials.wording import count, figure, glued, placed, rendered
+from grounded_trials.workspace.candidates.proposing import not_counted
 from grounded_trials.workspace.next_step import DIAGNOSE
-from grounded_trials.workspace.proposing import not_counted
 
 OPEN = 12  # largest number of candidates whose table is shown unfolded
 

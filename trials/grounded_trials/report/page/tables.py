@@ -33,7 +33,7 @@ from grounded_trials.wording import (
     spread,
     with_unit,
 )
-from grounded_trials.workspace.next_step import Since
+from grounded_trials.workspace.last_diagnosis import Since
 
 FEW = 4  # columns of errors from which the table of forecasts has a row for each trial instead
 UNKNOWN = "–, not determined by these trials"

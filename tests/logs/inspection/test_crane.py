@@ -1,0 +1,111 @@
+"""A crane's log: a trolley and a load that swings, each a position with its rate."""
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from grounded_trials import Workspace
+from grounded_trials.logs.inspection.joint_names import joint_units, slides
+from grounded_trials.starting.begin import begin
+from grounded_trials.workspace.next_step import to_plan
+from grounded_trials.workspace.off_target import logged_target
+from ros_bags import crane_bag
+
+CRANE = """import numpy as np
+from grounded import Model, Param
+
+def dynamics(s, a, p):
+    sn, cs = np.sin(s.{th}), np.cos(s.{th})
+    force = p.kF * a.voltage - p.c * s.v
+    acc = (force + p.m * p.L * s.w**2 * sn + p.m * 9.81 * sn * cs) / (p.M + p.m * sn**2)
+    return {{"x": s.v, "v": acc, "{th}": s.w, "w": -(acc * cs + 9.81 * sn) / p.L}}
+
+model = Model(
+    states={{"x": "m", "v": "m/s", "{th}": "rad", "w": "rad/s"}}, inputs={{"voltage": "V"}},
+    params={{"M": Param(6.0, "kg"), "m": Param(2.0, "kg"), "kF": Param(5.0, "N/V", 3.0, 8.0),
+            "c": Param(3.0, "N s/m", 0.0, 10.0), "L": Param(1.0, "m", 0.5, 1.6)}},
+    roles={{"rail": "x", "hanging": ("{th}",)}}, angles=("{th}",), derivative=dynamics)
+"""
+RIGHT = {
+    "x": "/joint_states.position[0]",
+    "v": "/joint_states.velocity[0]",
+    "w": "/sway/state.rate",
+    "voltage": "/motor/command.voltage",
+}
+
+
+@pytest.mark.parametrize("joint, th", [("trolley", "th"), ("trolley", "beta"), ("axis_1", "beta")])
+def test_a_trolley_and_its_load_are_told_apart(tmp_path, joint, th):
+    """By names and units where they say it, by the model's steps where they don't."""
+    (tmp_path / "mine.py").write_text(CRANE.format(th=th))
+    log = crane_bag(tmp_path / "bag", joint)
+    found = begin(tmp_path / "w", log, model=tmp_path / "mine.py")
+    paths = {guess.name: guess.path for guess in (*found.states, *found.inputs)}
+    assert paths == RIGHT | {th: "/sway/state.angle"}
+    assert found.dt == 0.04
+    if joint == "trolley":
+        assert not {"x", "v"} & {guess.name for guess in found.unsure}
+
+
+@pytest.mark.parametrize("joint, kind", [("trolley", "crane"), ("hinge", "pendulum")])
+def test_a_trolley_with_a_load_is_a_crane(tmp_path, joint, kind):
+    """It was a pendulum, on the grid of its sensor."""
+    found = begin(tmp_path / "w", crane_bag(tmp_path / "bag", joint))
+    assert found.kind == kind and found.dt == 0.04
+    if kind == "crane":
+        paths = {guess.name: guess.path for guess in (*found.states, *found.inputs)}
+        assert paths == {
+            **{name: RIGHT[name] for name in ("x", "v", "voltage")},
+            **{"theta": "/sway/state.angle", "omega": RIGHT["w"]},
+        }
+        model = Workspace(tmp_path / "w").base_model
+        s = np.array([[0.0, 0.0, 0.1, 0.0], [0.0, 0.0, 0.0, 0.0]])
+        moved = model.system.step(s, np.array([[0.0], [5.0]]), model.values, 0.01)
+        assert moved[0, 3] < 0 < moved[1, 1] and moved[1, 3] < 0  # it falls back, and lags behind
+
+
+def test_what_steps_do_not_tell_is_unsure_as_a_group_and_the_rivals_are_named(tmp_path):
+    """Two integrators in one unit: either may be either."""
+    text = CRANE.format(th="th").split("def dynamics")[0] + (
+        "def f(s, a, p):\n"
+        '    return {"a": s.da, "da": 0 * s.a, "b": s.db, "db": 0 * s.b}\n'
+        'model = Model(states={"a": "1", "da": "1/s", "b": "1", "db": "1/s"},\n'
+        '    inputs={"voltage": "V"}, params={}, derivative=f)\n'
+    )
+    (tmp_path / "mine.py").write_text(text)
+    found = begin(tmp_path / "w", crane_bag(tmp_path / "bag", "axis_1"), model=tmp_path / "mine.py")
+    assert {guess.name for guess in found.unsure} == {"a", "da", "b", "db"}
+    assert all(guess.path and guess.others for guess in found.states)
+
+
+@pytest.mark.parametrize(
+    "joint, slide",
+    [
+        *(
+            (name, True)
+            for name in ("trolley", "slider_to_cart", "joint_lift", "X_Rail", "railJoint")
+        ),
+        *((name, False) for name in ("shoulder_lift_joint", "cart_to_pole", "cart_wheel")),
+    ],
+)
+def test_joints_that_slide_by_their_names(joint, slide):
+    assert slides(joint) is slide
+    units = joint_units({"/j": (joint,)})
+    assert units["/j.velocity[0]"] == ("m/s" if slide else "rad/s")
+
+
+def test_a_crane_from_its_log_to_its_target(tmp_path):
+    """Ranges had no units, and nothing said how a load is brought to rest, or to draw it at all."""
+    (tmp_path / "mine.py").write_text(CRANE.format(th="th"))
+    w, log = tmp_path / "w", crane_bag(tmp_path / "bag")
+    begin(w, log, model=tmp_path / "mine.py")
+    taken = grounded("-C", w, "ingest", "--data", log).out
+    assert all(unit in taken for unit in (" m/s\n", " rad\n", " V\n", "header stamps"))
+    assert logged_target(Workspace(w)) == "t0001"
+    grounded("-C", w, "discard", "t0001")  # to read it in another unit: the target is the old run
+    assert logged_target(Workspace(w)) == "t0001" and to_plan(Workspace(w)).verb == "target"
+    drawn = grounded("-C", w, "target", "line", "--to", "x=1", "--seconds", "3").out
+    assert "--to th=0" in drawn
+    assert logged_target(Workspace(w)) == ""
+    rest = ("--to", "x=1", "--to", "th=0")
+    assert "free" not in grounded("-C", w, "target", "line", *rest, "--seconds", "3").out

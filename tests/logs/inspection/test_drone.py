@@ -1,0 +1,114 @@
+"""A drone's log as mavros writes it: body velocities in the odometry, an attitude as command."""
+
+import re
+
+import numpy as np
+import pytest
+
+import ros_bags
+from grounded.errors import GroundedError
+from grounded_trials import Workspace
+from grounded_trials.logs.signals import SignalSpec, read_signals
+from grounded_trials.starting.begin import begin
+from grounded_trials.starting.shapes import Drive, path_target
+from grounded_trials.workspace.user_files.model_file import load_module, model_in
+
+ODOMETRY, COMMAND = "/mavros/local_position/odom", "/mavros/setpoint_raw/attitude"
+
+
+def by_name(found):
+    return {guess.name: guess for guess in (*found.states, *found.inputs)}
+
+
+def test_everything_of_a_drone_is_found(tmp_path):
+    """Velocities are turned into the frame of the position; a steady yaw becomes a constant."""
+    found = begin(tmp_path / "w", ros_bags.drone_bag(tmp_path / "bag"))
+    by = by_name(found)
+    assert found.kind == "drone" and all(guess.sure for guess in by.values())
+    assert [by[f"v{axis}"].path for axis in "xyz"] == [
+        f"{ODOMETRY}.@world_velocity.{axis}" for axis in "xyz"
+    ]
+    assert by["pitch_command"].path == f"{COMMAND}.orientation.@rpy.pitch"
+    assert by["thrust"].path == f"{COMMAND}.thrust"
+    model = model_in(load_module(tmp_path / "w", "model.py"))
+    assert model.params["yaw"].value == pytest.approx(1.4, abs=0.01)
+    assert "yaw" not in model.states
+
+
+def test_a_drone_that_turns_has_its_yaw_as_a_state(tmp_path):
+    found = begin(tmp_path / "w", ros_bags.drone_bag(tmp_path / "bag", turning=0.8))
+    by = by_name(found)
+    assert by["yaw"].path == f"{ODOMETRY}.pose.pose.orientation.@rpy.yaw" and by["yaw"].sure
+    assert by["yaw_command"].path == f"{COMMAND}.orientation.@rpy.yaw"
+    model = model_in(load_module(tmp_path / "w", "model.py"))
+    assert model.angles == ("yaw",)
+
+
+def test_an_attitude_that_nothing_follows_is_asked_for(tmp_path):
+    found = begin(tmp_path / "w", ros_bags.drone_bag(tmp_path / "bag", followed=False))
+    by = by_name(found)
+    for name in ("roll_command", "pitch_command"):
+        assert not by[name].sure and not by[name].path
+        assert f"{COMMAND}.orientation.@rpy.{name[:-8]}" in by[name].others
+
+
+def test_the_skeleton_predicts_its_own_drone(tmp_path):
+    """The skeleton's equations are those of the bag: right signs, at a yaw of 80 degrees."""
+    bag = ros_bags.drone_bag(tmp_path / "bag")
+    begin(tmp_path / "w", bag)
+    model = model_in(load_module(tmp_path / "w", "model.py"))
+    names = [f"{ODOMETRY}.pose.pose.position.{a}" for a in "xyz"]
+    names += [f"{ODOMETRY}.@world_velocity.{a}" for a in "xyz"]
+    names += [f"{ODOMETRY}.pose.pose.orientation.@rpy.{a}" for a in ("roll", "pitch")]
+    names += [f"{COMMAND}.orientation.@rpy.{a}" for a in ("roll", "pitch")]
+    names += [f"{COMMAND}.thrust"]
+    read = read_signals((next(bag.glob("*.db3")),), {n: SignalSpec(n) for n in names})
+    columns = np.column_stack([read[n].values for n in names])
+    states, inputs = columns[:, :8], columns[:, 8:]
+    after = model.system.step(states[:-1], inputs[:-1], model.values, 0.02)
+    assert np.abs(after - states[1:]).max(axis=0) == pytest.approx(np.zeros(8), abs=0.02)
+
+
+def test_the_velocity_in_the_world_needs_an_odometry(tmp_path):
+    bag = ros_bags.drone_bag(tmp_path / "bag")
+    path = f"{COMMAND}.@world_velocity.x"
+    with pytest.raises(GroundedError, match=r"needs a message with pose\.pose\.orientation"):
+        read_signals((next(bag.glob("*.db3")),), {"v": SignalSpec(path)})
+
+
+def test_a_robot_that_only_rolls_forwards_is_offered_no_velocity_in_the_world(tmp_path):
+    from grounded_trials.logs.inspection.inspect_log import inspect_log
+
+    report = inspect_log(ros_bags.car_bag(tmp_path / "bag"))
+    assert not [f for t in report.topics for f in t.fields if "@world_velocity" in f.path]
+
+
+def test_a_path_of_a_drone_keeps_its_height(tmp_path):
+    """Left free, the height would be what costs least: the drone would sink."""
+    begin(tmp_path / "w", ros_bags.drone_bag(tmp_path / "bag"))
+    model = model_in(load_module(tmp_path / "w", "model.py"))
+    with pytest.raises(GroundedError, match="needs a value of z"):
+        path_target("circle", Drive(), model, 0.02)
+    columns = path_target("circle", Drive(), model, 0.02, {"z": 1.5}, {"x": 0.4, "z": 3.0})
+    assert set(columns) == {"x", "y", "z"} and columns["x"][0] == pytest.approx(0.4)
+    assert (columns["z"] == 1.5).all()
+    assert (path_target("line", Drive(), model, 0.02, {}, {"z": 3.0})["z"] == 3.0).all()
+    with pytest.raises(GroundedError, match="itself sets 'x'"):
+        path_target("circle", Drive(), model, 0.02, {"x": 1.0, "z": 1.0})
+
+
+def test_a_hover_in_wind_is_found_though_its_limits_leave_out_zero(tmp_path):
+    """The tilt against the wind is a state that the target leaves free; its thrust is known."""
+    grounded_file = tmp_path / "w" / "grounded.toml"
+    begin(tmp_path / "w", ros_bags.drone_bag(tmp_path / "bag"))
+    source = tmp_path / "w" / "model.py"
+    windy = source.read_text().replace("- p.drag * s.vx,", "- p.drag * s.vx + 0.3,")
+    source.write_text(windy)
+    workspace = Workspace(tmp_path / "w")
+    workspace.target(path_target("circle", Drive(), workspace.base_model, 0.02, {"z": 2.0}))
+    text = re.sub(r"(?m)^thrust = .*$", "thrust = [0.4, 0.9]", grounded_file.read_text())
+    grounded_file.write_text(re.sub(r"(?m)^start = .*$", "start = { }", text))
+    workspace.forget()
+    (note,) = [n for n in workspace.propose().proposal.notes if "the plan assumes" in n]
+    thrust = float(re.search(r"start = .*thrust = ([\d.]+)", note)[1])
+    assert thrust == pytest.approx(0.5 / np.cos(np.arctan(0.3 / 9.81)), abs=2e-3)

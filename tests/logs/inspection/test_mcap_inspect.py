@@ -1,0 +1,227 @@
+"""Unknown logs: what is found in them, said about them, and proposed for them."""
+
+from __future__ import annotations
+
+import io
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from facts import holding
+from grounded.errors import GroundedError
+from grounded_trials.formats.messages import Dynamic
+from grounded_trials.formats.path_walk import FIELD_LIMIT, number_paths
+from grounded_trials.formats.schemas import parse_ros
+from grounded_trials.logs.inspection.guessed_table import mapping_toml
+from grounded_trials.logs.inspection.inspect_guess import Guess, guess_mapping, is_simulated
+from grounded_trials.logs.inspection.inspect_log import find_twins, inspect_log
+from grounded_trials.logs.log_table import LogMapping, read_log
+from grounded_trials.logs.signals import SignalSpec
+from shared_data import data, files, needs_data
+
+
+@pytest.mark.slow
+@needs_data
+def test_every_shared_log_can_be_inspected() -> None:
+    paths = files("*/*.mcap") + files("mcap_format_fixtures/*/*.mcap")
+    assert len(paths) > 30
+    for path in paths:
+        if path.name in ("zero_bytes.mcap", "magic_only.mcap"):
+            with pytest.raises(GroundedError):
+                inspect_log(path)
+            continue
+        report = inspect_log(path)
+        assert bool(report.damage) == ("derived_corrupt" in str(path)), path.name
+        for topic in report.topics:
+            assert topic.problem == "" or topic.encoding == "wrong_format", (path.name, topic)
+
+
+@needs_data
+def test_service_events_are_read() -> None:
+    (path,) = files("mcap_format_fixtures/rosbag2/*bags__topics_and_services.mcap")
+    report = inspect_log(path)
+    (events,) = [t for t in report.topics if t.topic == "/add_two_ints/_service_event"]
+    values = {f.path: (f.low, f.high) for f in events.fields}
+    assert values["/add_two_ints/_service_event.info.event_type"] == (1, 2)
+    assert values["/add_two_ints/_service_event.request[0].a"] == (1, 3)
+    assert values["/add_two_ints/_service_event.response[0].sum"] == (4, 6)
+
+
+@needs_data
+@pytest.mark.parametrize(
+    ("bag", "says"),
+    [
+        ("pitch-45bag", "@rpy.pitch show the same motion with OPPOSITE SIGN (correlation -1.000)"),
+        ("flybag", "@rpy.pitch show the same motion with OPPOSITE SIGN"),
+        ("yx3bag", "/vicon/Group466CF/Group466CF/pose has a gap of 0.930 s"),
+        ("yx4bag", "/cf_logpos has values that are not numbers, first in /cf_logpos.position.x"),
+        ("flybag", "/cf_command has a single message"),
+    ],
+)
+def test_the_crazyflie_bags_defects_are_found_and_said(bag: str, says: str) -> None:
+    report = inspect_log(data("crazyflie_p4_ros2_mcap", f"{bag}.mcap"))
+    assert any(says in remark for remark in report.remarks), report.remarks
+
+
+@needs_data
+def test_a_gap_in_a_genuine_bag_is_refused_where_it_is() -> None:
+    pose = "/vicon/Group466CF/Group466CF/pose.pose.position."
+    mapping = LogMapping(
+        {name: SignalSpec(pose + name) for name in "xyz"},
+        {"thrust": SignalSpec("/cf_controll.position.z", "log")},
+    )
+    bag = data("crazyflie_p4_ros2_mcap", "yx3bag.mcap")
+    with pytest.raises(GroundedError, match=r"\bgap\b.* 0.\d\d\d s\b.* \d"):
+        read_log(bag, mapping, 0.02)
+    states = {name: SignalSpec(pose + name, max_age_s=1.0) for name in "xyz"}
+    found = read_log(bag, LogMapping(states, mapping.inputs), 0.02)
+    assert found.reports[0].bridged >= 46 and len(found.states) > 150
+    nan = LogMapping({"x": SignalSpec("/cf_logpos.position.x", "log")}, mapping.inputs)
+    with pytest.raises(GroundedError, match=holding(236, "finite")):
+        read_log(data("crazyflie_p4_ros2_mcap", "yx4bag.mcap"), nan, 0.02)
+
+
+@needs_data
+def test_simulation_time_is_said() -> None:
+    report = inspect_log(data("mcap_format_fixtures", "evo", "nav2_turtlebot_SIM.mcap"))
+    assert is_simulated(report)
+    states, inputs = guess_mapping(report, ["v", "x", "y", "psi"], ["throttle"])
+    assert [g.path for g in states] == [
+        "/odom.twist.twist.linear.x",
+        "/odom.pose.pose.position.x",
+        "/odom.pose.pose.position.y",
+        "/odom.pose.pose.orientation.@rpy.yaw",
+    ]
+    table = tomllib.loads(mapping_toml(states, inputs, simulated=True))
+    assert table["log"]["clock"] == "log" and "input" not in table["log"]
+
+
+@needs_data
+def test_dart_from_an_unknown_bag_to_arrays() -> None:
+    path = data("dart_small_car", "dart_4_sept_random_driving_slow_ros2.mcap")
+    report = inspect_log(path)
+    states, inputs = guess_mapping(report, ["v", "x", "y", "psi"], ["steering", "throttle"])
+    assert [g.path for g in inputs] == ["/steering_1.data", "/throttle_1.data"]
+    assert [g.sure for g in states] == [False, True, True, True] and states[0].path == ""
+    text = mapping_toml(states, inputs)
+    assert "\n# [log.state.v]" in text
+    log = tomllib.loads(text)["log"]
+    assert log["clock"] == "header" and log["state"]["psi"]["unwrap"] is True
+    measured = tomllib.loads(text)["estimate"]["measured"]
+    assert set(measured) == {"x", "y", "psi"} and 1e-4 < measured["x"] < 5e-3
+    specs = {
+        kind: {n: SignalSpec(**{"clock": log["clock"], **s}) for n, s in log[kind].items()}
+        for kind in ("state", "input")
+    }
+    found = read_log(path, LogMapping(specs["state"], specs["input"]), 0.05)
+    assert found.states.shape == (1260, 3) and found.inputs.shape == (1259, 2)
+    assert found.warnings == () and np.abs(np.diff(found.states[:, 2])).max() < 0.3
+
+
+def test_number_paths() -> None:
+    text = (
+        "std_msgs/Header header\nfloat64[36] covariance\nfloat64[2] pair\nQ q\nQ[] many\nstring s\n"
+        + "=" * 80
+        + "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+        + "=" * 80
+        + "\nMSG: x/Q\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n"
+    )
+    angles = [".@rpy.roll", ".@rpy.pitch", ".@rpy.yaw", ".x", ".y", ".z", ".w"]
+    assert number_paths(parse_ros(text, "x/msg/M", ros1=False)) == [
+        ".pair[0]",
+        ".pair[1]",
+        *(".q" + a for a in angles),
+        *(".many[0]" + a for a in angles),
+    ]
+    sample = {"a": 1, "b b": [True, {"c": 2.5}], "t": "text", "n": None}
+    assert number_paths(Dynamic(), sample) == [".a", '."b b"[0]', '."b b"[1].c']
+    deep: dict[str, object] = {}
+    for _ in range(50):
+        deep = {"d": deep, "v": 1}
+    assert len(number_paths(Dynamic(), deep)) < 20
+
+
+def test_a_json_log_with_odd_names(tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    channel = writer.register_channel("odd topic.name", "json", 0)
+    for i in range(10):
+        body = b'{"timestamp": {"sec": %d, "nsec": 0}, "my value": %d}' % (i, i)
+        writer.add_message(channel, i * 10**9, body, i * 10**9)
+    writer.finish()
+    path = tmp_path / "log.mcap"
+    path.write_bytes(stream.getvalue())
+    (topic,) = inspect_log(path).topics
+    paths = [f.path for f in topic.fields]
+    assert paths[-1] == '"odd topic.name"."my value"' and topic.stamped and topic.skew_s == 0
+    guess = Guess("v", paths[-1], "header", True, ())
+    table = tomllib.loads(mapping_toml([guess], []))
+    assert table["log"]["state"]["v"]["path"] == paths[-1]
+
+
+def test_twins() -> None:
+    t = np.arange(0, 10, 0.01)
+    ns = (t * 1e9).astype(np.int64)
+    slow = ns[::9]
+    samples = {
+        "/a.q.@rpy.pitch": (ns, np.sin(t)),
+        "/b.q.@rpy.pitch": (slow, -np.sin(t[::9])),
+        "/b.q.@rpy.roll": (slow, np.sin(t[::9])),
+        "/c.q.@rpy.pitch": (slow, np.cos(t[::9])),
+        "/d.q.@rpy.pitch": (slow, np.full(len(slow), np.nan)),
+    }
+    (twins,) = find_twins(samples)
+    assert (twins.first, twins.second) == ("/a.q.@rpy.pitch", "/b.q.@rpy.pitch")
+    assert twins.opposite and twins.correlation < -0.999
+
+
+def test_a_table_wider_than_the_list_says_so(tmp_path):
+    for columns, said in ((150, False), (206, True)):
+        path = tmp_path / f"{columns}.csv"
+        rows = [",".join(["t", *(f"u{i}" for i in range(columns))])]
+        rows += [",".join(f"{k * 0.01 + i:.3f}" for i in range(columns + 1)) for k in range(40)]
+        path.write_text("\n".join(rows) + "\n")
+        found = inspect_log(path)
+        assert len(found.topics[0].fields) == min(columns, FIELD_LIMIT)
+        assert any(str(FIELD_LIMIT) in remark for remark in found.remarks) == said
+
+
+def test_an_input_in_volts_is_sought_by_its_unit_too(tmp_path):
+    """A part of a quaternion was offered for `volts` before `/motor/voltage`."""
+    log, t = tmp_path / "log.csv", np.arange(0, 5, 0.01)
+    columns = np.column_stack([t, np.sin(t), 3 * np.sin(2 * t), np.sin(3 * t)])
+    np.savetxt(log, columns, "%.5f", ",", header="t,tilt,motor_voltage,orientation_x", comments="")
+    units = {"theta": "rad", "volts": "V"}
+    (theta,), (volts,) = guess_mapping(inspect_log(log), ["theta"], ["volts"], units)
+    assert (theta.path, volts.path) == ("/csv.tilt", "/csv.motor_voltage")
+
+
+@pytest.mark.parametrize(
+    ("others", "found"),
+    [
+        ([], "motor_voltage"),
+        (["motor_voltage_rate"], "motor_voltage"),
+        (["pump_voltage"], ""),
+        (["voltage"], "voltage"),
+    ],
+)
+def test_a_command_that_has_an_input_s_word_in_its_name_is_that_input(tmp_path, others, found):
+    """The only other number of a cart's only command topic was "UNSURE no name in the log fits"."""
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    channel = writer.register_channel("/cart/command", "json", 0)
+    for i in range(50):
+        known = {"steering_angle": np.sin(i), "motor_voltage": i % 7}
+        body = json.dumps(known | dict.fromkeys(others, i % 5)).encode()
+        writer.add_message(channel, i * 10**8, body, i * 10**8)
+    writer.finish()
+    path = tmp_path / "log.mcap"
+    path.write_bytes(stream.getvalue())
+    _, (_, voltage) = guess_mapping(inspect_log(path), [], ["steering", "voltage"])
+    assert voltage.path.rpartition(".")[2] == found and voltage.sure == bool(found)

@@ -1,0 +1,64 @@
+"""A run that the search asked for is taken, also if another run settled what it was to settle."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from facts import holds
+from grounded.errors import GroundedError
+from grounded_trials.store.trial_file import read_trial, write_trial
+from grounded_trials.workspace.candidates.proposing import propose_in
+from grounded_trials.workspace.candidates.running import run_candidate
+from grounded_trials.workspace.candidates.search_state import standing_in
+from grounded_trials.workspace.intake.ingest import ingest_log
+from workspaces import make
+
+
+@pytest.fixture
+def doubtful(tmp_path):
+    """A workspace whose c0002 lost by what may be bad luck: c0001 was handed out to run again."""
+    w = make(tmp_path / "w")
+    best, *_ = read_trial(run_candidate(w, propose_in(w).candidate.id).trial_file)
+    ingest_log(w, w.folder / "runs" / "c0001-1.mcap")
+    second = propose_in(w).candidate.id
+    lost, *_ = read_trial(run_candidate(w, second).trial_file)
+    cost = -w.task.utility(best)
+
+    def worse(by):
+        """Write a run of c0002 that lost by this share of the best cost; return its file."""
+        low, high = 0.0, 1.0
+        for _ in range(50):
+            off = np.zeros_like(lost.states)
+            off[1:, 0] = 0.5 * (low + high)
+            run = replace(lost, states=lost.states + off)
+            too_much = -w.task.utility(run) > (1 + by) * cost
+            low, high = (low, off[1, 0]) if too_much else (off[1, 0], high)
+        path = tmp_path / f"lost-{by}.mcap"
+        write_trial(path, run, {"kind": "trial"})
+        return path
+
+    w.worse, w.best, w.unnamed = worse, best, tmp_path / "unnamed.mcap"
+    ingest_log(w, worse(0.8), second)
+    again = propose_in(w)
+    assert again.candidate.id == "c0001" and not again.proposal.is_new
+    return w
+
+
+def test_a_doubt_that_is_settled_without_the_run_asked_for_says_so(doubtful):
+    found = ingest_log(doubtful, doubtful.worse(0.81), "c0002")
+    assert standing_in(doubtful).outstanding is None
+    (told,) = [one for one in found.notes if "once more" in one]
+    assert holds(told, "c0001 need not", "c0002", "still counts")
+
+
+def test_the_run_that_was_asked_for_is_taken_without_its_name(doubtful):
+    """An arm's search asked for it, a run of the loser came first: `none is waiting`."""
+    ingest_log(doubtful, doubtful.worse(0.81), "c0002")
+    moved = doubtful.best.states + 1e-6
+    write_trial(doubtful.unnamed, replace(doubtful.best, states=moved, candidate=""), {})
+    found = ingest_log(doubtful, doubtful.unnamed)
+    assert (found.candidate, found.verdict) == ("c0001", "run again")
+    write_trial(doubtful.unnamed, replace(doubtful.best, states=moved + 1e-6, candidate=""), {})
+    with pytest.raises(GroundedError, match="none is waiting"):  # one run was asked for
+        ingest_log(doubtful, doubtful.unnamed)

@@ -1,0 +1,115 @@
+"""Where a run begins whose first commands were not the policy's: two steps late it looked as good.
+
+An arm's loop swung its torques from step to step. Its program missed step 0, and made the next few
+of what it had: the mean of all differences put the start 20 ms late, and its utility was another's.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded.errors import GroundedError
+from grounded_trials import Workspace
+from grounded_trials.workspace.intake.locating import run_start
+from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
+from recorded import RATE, record, waiting
+
+SWING = 10.0  # [N], to and fro from step to step
+STRANGE = (0.0, 4.9, -4.8)  # [N]
+
+
+@pytest.fixture
+def w(tmp_path):
+    return waiting(tmp_path)
+
+
+def swinging(policy, share):
+    """The policy with a share of its gains, and a plan that swings more and more, to its limits."""
+    k = np.arange(policy.horizon)
+    swung = 0.5 * SWING * (-1.0) ** k * (1 + k / policy.horizon)
+    plan = np.clip(policy.feedforward + swung[:, None], policy.low, policy.high)
+    return replace(policy, feedforward=plan, gain=share * policy.gain)
+
+
+def run(w, path, policy, strange, before=1.0):
+    """The log of a run, its first commands `strange`, not the policy's; each with its own stamp."""
+    record(w, path, policy, before)
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    every, first = round(policy.dt * RATE), round(before * RATE)
+    for k, force in enumerate(strange):
+        table[first + k * every : first + (k + 1) * every, 3] = force
+    table[(np.arange(len(table)) - first) % every != 0, 3] = np.nan
+    np.savetxt(path, table, "%.5f", ",", header="t,x,v,force", comments="")
+    return path
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0])
+@pytest.mark.parametrize("strange", [0, 1, 2, 3])
+def test_a_run_begins_where_most_of_its_commands_are_the_policy_s(w, tmp_path, strange, share):
+    policy = swinging(w.candidate("c0002")[0].policy, share)
+    log = run(w, tmp_path / "a.csv", policy, STRANGE[:strange])
+    found = read_foreign(w, log, mapping_of(w, log)).recording.start_of(policy)
+    assert found.opens_alike and found.alike == (strange < 3)
+    assert found.seconds == pytest.approx(1.0, abs=0.2 / RATE)
+
+
+def unsent(w, path, policy, missed):
+    """The log of a run of which the first steps were never sent, nor anything before."""
+    run(w, path, policy, ())
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    table[: round((1.0 + missed * policy.dt) * RATE), 3] = np.nan
+    np.savetxt(path, table, "%.5f", ",", header="t,x,v,force", comments="")
+    return path
+
+
+@pytest.mark.parametrize("missed", [0, 1, 2])
+def test_a_run_whose_first_steps_were_not_sent_begins_before_its_first_command(w, tmp_path, missed):
+    """A car's driver skipped step 0: all of it was booked a step late, its utility was halved."""
+    policy = w.candidate("c0002")[0].policy
+    found = w.ingest(unsent(w, tmp_path / "a.csv", policy, missed))
+    told = [one for one in found.warnings if "first command in the log is that of step" in one]
+    assert found.candidate == "c0002" and len(told) == bool(missed)
+    assert all(f"step {missed} of c0002" in one for one in told)
+    assert not any("bridged" in one or "seem to be" in one for one in found.warnings)
+    stored = w.trials()[-1]
+    assert int(stored.meta["start_ns"]) * 1e-9 == pytest.approx(1001.0, abs=0.2 / RATE)
+    np.testing.assert_array_equal(stored.trial.inputs[:missed, 0], w.task.past[0])
+    np.testing.assert_array_equal(stored.trial.inputs[missed:, 0] != 0, True)
+
+
+def test_a_log_that_was_stored_a_step_late_is_another_trial_once_that_is_discarded(
+    w, tmp_path, monkeypatch
+):
+    log = unsent(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 1)
+    with monkeypatch.context() as before:
+        before.setattr(run_start, "missed_steps", lambda *_: 0)
+        late = w.ingest(log, candidate="c0002")
+    w.discard(late.trial)
+    found = w.ingest(log)
+    assert found.candidate == "c0002" and found.trial != late.trial and not found.known
+
+
+@pytest.mark.parametrize("said", [False, True])
+def test_a_run_whose_first_commands_were_not_sent_is_its_candidate_s(w, tmp_path, said):
+    """With [log.span], too: `somebody, or another controller, drove`, for two commands of 40."""
+    log = run(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, (-5.0, -4.9))
+    if said:
+        toml = w.folder / "grounded.toml"
+        toml.write_text(toml.read_text() + "[log.span]\nstart = 1.0\n")
+    w = Workspace(w.folder)
+    found = w.ingest(log)
+    assert found.candidate == "c0002" and not any("drove" in one for one in found.warnings)
+    begun = int(w.trials()[-1].meta["start_ns"]) * 1e-9
+    assert begun == pytest.approx(1001.0, abs=0.2 / RATE)
+
+
+def test_a_run_that_somebody_took_over_is_not_its_candidate_s_where_its_start_is_said(w, tmp_path):
+    log = run(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, ())
+    table = np.loadtxt(log, delimiter=",", skiprows=1)
+    table[200:, 3] *= -1
+    np.savetxt(log, table, "%.5f", ",", header="t,x,v,force", comments="")
+    toml = w.folder / "grounded.toml"
+    toml.write_text(toml.read_text() + "[log.span]\nstart = 1.0\n")
+    with pytest.raises(GroundedError, match="took over"):
+        Workspace(w.folder).ingest(log)

@@ -1,0 +1,661 @@
+"""Where a run begins in a recording: a second arm was refused, or stored a second out of step.
+
+A cart with feedback and noisy sensors is recorded at 100 Hz; whoever records begins before the run.
+Sought by the feed-forward alone, and only for what fitted nobody, starts were missed.
+"""
+
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from facts import holding, holds
+from grounded.errors import GroundedError, NextCommand
+from grounded.policy import Policy
+from grounded_trials import Workspace
+from grounded_trials.logs.signals import Series, SignalSpec
+from grounded_trials.store.trial_file import read_trial, write_trial
+from grounded_trials.workspace.intake.locating.run_start import recording
+from grounded_trials.workspace.intake.opening import foreign, reading
+from recorded import LOGGED, RATE, record, waiting
+from workspaces import make
+
+
+@pytest.fixture
+def w(tmp_path):
+    """It waits for c0002; c0001 was run."""
+    return waiting(tmp_path)
+
+
+@pytest.mark.parametrize("forced", [False, True])
+@pytest.mark.parametrize("before", [0.01, 0.02, 0.04, 1.0])
+def test_a_run_with_feedback_is_found_to_the_log_s_sample(w, tmp_path, before, forced):
+    policy = w.candidate("c0002")[0].policy
+    exact = w.ingest(record(w, tmp_path / "a.csv", policy, 0.0), data=True)
+    found = w.ingest(
+        record(w, tmp_path / "b.csv", policy, before, after=1.0),
+        candidate="c0002" if forced else None,
+    )
+    assert found.candidate == "c0002" and not found.warnings[:-1] and found.notes
+    assert not any("left out" in note for note in exact.notes)
+    stored = w.trials()[-1].trial
+    table = np.loadtxt(tmp_path / "b.csv", delimiter=",", skiprows=1)
+    k = round(before * RATE) + 5 * np.arange(policy.horizon)
+    np.testing.assert_allclose(stored.inputs[:, 0], table[k, 3], atol=1e-4)
+    np.testing.assert_allclose(stored.states[:-1], table[k, 1:3], atol=1e-3)
+
+
+@pytest.mark.parametrize("before", [0.0, 1.0])
+def test_a_run_on_late_states_is_found_though_the_log_is_corrected_for_them(tmp_path, before):
+    """Its feedback saw the states as they were logged, not as [log] delay_s moves them."""
+    late = LOGGED.replace('path = "/csv.x"\n', 'path = "/csv.x"\ndelay_s = 0.12\n')
+    w = Workspace(make(tmp_path / "w", config=late).folder)
+    w.propose()
+    w.ingest(record(w, tmp_path / "a.csv", w.candidate("c0001")[0].policy, 0.0, late=12))
+    policy = w.propose().candidate.policy
+    assert policy.gain is not None
+    log = record(w, tmp_path / "b.csv", policy, before, late=12)
+    found = w.ingest(log)
+    assert found.candidate == "c0002"
+    stored, table = w.trials()[-1].trial, np.loadtxt(log, delimiter=",", skiprows=1)
+    k = round(before * RATE) + 5 * np.arange(policy.horizon)
+    np.testing.assert_allclose(stored.inputs[:, 0], table[k, 3], atol=1e-4)
+    assert not any("known to" in warning for warning in found.warnings)
+    np.testing.assert_allclose(stored.states[:-1, 0], table[k + 12, 1], atol=1e-3)
+    np.testing.assert_allclose(stored.states[:-1, 1], table[k, 2], atol=1e-3)
+    assert not before or any("begins 1.000 s before" in note for note in found.notes)  # as logged
+
+
+def test_a_span_begins_at_the_same_command_whatever_delay_s_says(tmp_path):
+    """Put in for a late sensor, it moved the start by as much."""
+    begun = []
+    for delay in ("", "delay_s = 0.12\n"):
+        config = LOGGED.replace('path = "/csv.x"\n', f'path = "/csv.x"\n{delay}')
+        config += "[log.span]\nstart = 1.0\n"
+        w = Workspace(make(tmp_path / f"w{len(begun)}", config=config).folder)
+        policy = w.propose().candidate.policy
+        w.ingest(record(w, tmp_path / "a.csv", policy, 1.0, late=12), candidate="c0001")
+        begun.append(w.trials()[-1].meta["start_ns"])
+    assert begun[0] == begun[1]
+
+
+def test_a_start_where_lively_gains_throw_noise_from_limit_to_limit_is_where_it_is_exact():
+    """Commands at their limits, whatever the noise: the mean was less some rows off."""
+    T, dt, rng, waits = 60, 0.01, np.random.default_rng(4), 100
+    feedforward, gain = rng.normal(0, 0.05, (T, 1)), np.zeros((T, 1, 3))
+    feedforward[:2] = -3
+    gain[2:, 0, :2] = 20, 60
+    names, limit, none = (("x", "v"), ("force",)), np.array([3.0]), np.zeros(1)
+    policy = Policy(
+        feedforward, -limit, limit, dt, *names, (1,), (False,) * 2, none, gain, np.zeros((T, 3))
+    )
+    felt = rng.normal(0, (0.002, 0.06), (waits + T + 50, 2))
+    k = np.clip(np.arange(len(felt)) - waits, 0, T - 1)
+    sent = np.clip(feedforward[k, 0] + (gain[k, 0, :2] * felt).sum(axis=1), -3, 3)
+    sent[:waits], sent[waits + T :] = felt[:waits] @ [20, 1], 0
+    found = start_in(policy, felt, sent)
+    assert found.exact and found.seconds == pytest.approx(waits * dt + 0.001, abs=1e-6)
+
+
+def test_the_start_of_a_run_that_fell_is_found_where_gains_are_high():
+    """A millisecond between a state and its command was another command: somebody drove, it said.
+
+    And of a log that ends before the run would have, no instant has the run whole.
+    """
+    T, dt, rng, waits, fell = 200, 0.01, np.random.default_rng(5), 100, 120
+    t = dt * np.arange(waits + T - 20)
+    way = 0.03 * np.sin(9 * t) + 0.02 * np.sin(31 * t + 1)
+    felt = np.stack([way, np.gradient(way, dt)], axis=1) + rng.normal(0, (5e-4, 0.02), (len(t), 2))
+    gain, names = np.zeros((T, 1, 3)), (("x", "v"), ("force",))
+    gain[:, 0, :2] = 900, 60
+    limit, none, own = np.array([12.0]), np.zeros(1), 4 * np.sin(0.07 * np.arange(T))[:, None]
+    policy = Policy(
+        own, -limit, limit, dt, *names, (1,), (False,) * 2, none, gain, np.zeros((T, 3))
+    )
+    k = np.clip(np.arange(len(t)) - waits, 0, T - 1)
+    sent = np.clip(own[k, 0] + felt @ [900, 60], -12, 12)
+    sent[:waits], sent[waits + fell :] = -5 * np.cos(40 * t[:waits]), 0
+    found = start_in(policy, felt, sent)
+    assert found.opens_alike and found.seconds == pytest.approx(waits * dt + 0.001, abs=1e-6)
+
+
+def start_in(policy, felt, sent):
+    """Where a policy's run is found in a log of states, and of commands a millisecond later."""
+
+    def logged(values, late=0):
+        t = late + 10_000_000 * np.arange(len(values))
+        return Series(SignalSpec("/a.b"), t, values, t, len(t), "", True)
+
+    series = {"x": logged(felt[:, 0]), "v": logged(felt[:, 1]), "force": logged(sent, 1_000_000)}
+    names = {"state_names": policy.state_names, "input_names": policy.input_names}
+    model = SimpleNamespace(**names, angles=())
+    task = SimpleNamespace(model=model, dt=policy.dt, horizon=policy.horizon, past=policy.past)
+    return recording(series, task, lambda one: one).start_of(policy)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("named", [False, True])
+@pytest.mark.parametrize("fell", [0.0, 1.0, 1.65])
+def test_a_run_that_fell_in_a_log_that_goes_on_has_failed_there(tmp_path, fell, named):
+    """Its motors were cut: somebody had taken over, it said, or the floor was scored.
+
+    So it was near the end of a run, the more so: it was the first to be improved on.
+    """
+    w = waiting(tmp_path, LOGGED + "[safety]\nx = [-5.0, 5.0]\n")
+    policy = w.candidate("c0002")[0].policy
+
+    def cut(table):
+        at = 100 + round(100 * (fell or 1.0))
+        table[at:, 1] += 20.0 * bool(fell)
+        table[at:, 3] = 0.0 if fell else -2.0
+
+    log = edited(record(w, tmp_path / "a.csv", policy, 1.0), cut)
+    wanted = "c0002" if named else None
+    if not fell and not named:
+        with pytest.raises(GroundedError, match="did not run"):
+            w.ingest(log)
+        return
+    found = w.ingest(log, candidate=wanted)
+    assert found.candidate == "c0002" and (found.verdict == "crashed") == bool(fell)
+    about = [one for one in found.warnings if "left [safety]" in one or "run ended" in one]
+    assert len(about) == bool(fell) or not fell
+    assert any("not judged" in one for one in about) == bool(fell)
+    steps = w.trials()[-1].trial.steps
+    assert abs(steps - fell / policy.dt) <= 1 if fell else steps == policy.horizon
+    again = w.ingest(log, candidate=wanted)
+    assert again.known and again.trial == found.trial
+
+
+def test_a_log_that_begins_with_the_run_is_taken_as_it_is(w, tmp_path):
+    found = w.ingest(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0))
+    assert found.candidate == "c0002" and found.notes == ()
+
+
+@pytest.mark.parametrize("until", [1.0, 1.5, 1.9])
+def test_an_aborted_run_crashed_with_a_lead_in_too(w, tmp_path, until):
+    policy = w.candidate("c0002")[0].policy
+    found = w.ingest(record(w, tmp_path / "a.csv", policy, 1.0, until=until))
+    assert (found.candidate, found.verdict) == ("c0002", "crashed")
+    assert abs(w.trials()[-1].trial.steps - until / policy.dt) <= 1
+
+
+@pytest.mark.parametrize("until", [1.0, 1.5])
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_run_that_was_cut_is_found_behind_a_hold_controller_too(w, tmp_path, until, stopped):
+    """A robot that is held upright before its run moves: somebody took over at 0.4 s, it said."""
+    policy = w.candidate("c0002")[0].policy
+    path = record(w, tmp_path / "a.csv", policy, 1.0, until=until)
+    head, rows = path.read_text().splitlines()[0], np.loadtxt(path, delimiter=",", skiprows=1)
+    t = np.arange(RATE) / RATE
+    rows[:RATE, 1:3] += 0.02 * np.stack([np.sin(30 * t), np.cos(30 * t)], axis=1)
+    rows[:RATE, 3] = -0.5 * rows[:RATE, 1] - 0.3 * rows[:RATE, 2]
+    if stopped:  # by a switch, and the log goes on
+        still = np.repeat(rows[-1:], 2 * RATE, axis=0)
+        still[:, 0] += (1 + np.arange(2 * RATE)) / RATE
+        still[:, 3] = 0.0
+        rows = np.concatenate([rows, still])
+    np.savetxt(path, rows, delimiter=",", header=head, comments="", fmt="%.6f")
+    found = w.ingest(path, candidate="c0002" if stopped else None)
+    (note,) = [one for one in found.notes if "begins" in one]
+    assert found.candidate == "c0002"
+    assert abs(float(re.search(r"begins ([0-9.]+) s", note)[1]) - 1.0) < 1.5 / RATE
+    assert stopped or found.verdict == "crashed"
+    taken = [one for one in found.warnings if "took over" in one]
+    assert bool(taken) == (stopped and until == 1.0)  # later, the policy rests as well
+    assert all("up to 1." in one for one in taken)
+
+
+def test_a_log_that_ends_a_row_early_says_by_how_much_and_what_that_costs(w, tmp_path):
+    policy, states = w.candidate("c0002")[0].policy, "its last state 10 ms before"
+    path = record(w, tmp_path / "a.csv", policy, 0.0, after=0.01)
+    rows = path.read_text().splitlines()
+    whole = w.ingest(path)
+    assert whole.candidate == "c0002" and not any("steps" in one for one in whole.warnings)
+    w.discard(whole.trial)  # which is the same recording
+    (tmp_path / "b.csv").write_text("\n".join(rows[:-1]))
+    short = w.ingest(tmp_path / "b.csv", candidate="c0002")
+    (said,) = [one for one in short.warnings if "after 39 of 40 steps" in one]
+    assert states in said and "one more row" in said and np.isfinite(short.utility)
+    w.discard(short.trial)
+    (tmp_path / "c.csv").write_text("\n".join(rows[:-4]))
+    (said,) = [
+        one
+        for one in w.ingest(tmp_path / "c.csv", candidate="c0002").warnings
+        if "after 39 of 40 steps" in one
+    ]
+    assert "its last state 40 ms before" in said
+
+
+def test_a_log_whose_start_is_sought_is_read_once(w, tmp_path, monkeypatch):
+    reads = []
+    counted = lambda *a: reads.append(a) or read(*a)  # noqa: E731
+    read = foreign.mapped_signals
+    monkeypatch.setattr(foreign, "mapped_signals", counted)
+    found = w.ingest(record(w, tmp_path / "b.csv", w.candidate("c0002")[0].policy, 1.0))
+    assert found.notes and len(reads) == 1
+
+
+@pytest.mark.parametrize("before", [0.0, 1.0])
+@pytest.mark.parametrize("late", [0, 1, 2, 3])
+def test_commands_that_are_logged_steps_late_are_told(w, tmp_path, before, late):
+    """One step was told, two were taken without a word."""
+    policy = w.candidate("c0002")[0].policy
+    table = np.loadtxt(record(w, tmp_path / "a.csv", policy, before), delimiter=",", skiprows=1)
+    rows = late * round(policy.dt * RATE)
+    table[rows:, 3] = table[: len(table) - rows, 3]
+    np.savetxt(tmp_path / "b.csv", table, "%.5f", ",", header="t,x,v,force", comments="")
+    told = [one for one in w.ingest(tmp_path / "b.csv").warnings if "seem to be" in one]
+    assert len(told) == bool(late) and all(f"logged {late} step" in one for one in told)
+
+
+def test_a_start_is_no_surer_than_its_states_are_the_controller_s(w, tmp_path):
+    """Velocities that were made of positions afterwards moved the start by 6 ms, unsaid."""
+    policy = w.candidate("c0002")[0].policy
+    path = record(w, tmp_path / "a.csv", policy, 1.0)
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    table[1:, 2] = np.diff(table[:, 1]) * RATE
+    np.savetxt(tmp_path / "b.csv", table, "%.5f", ",", header="t,x,v,force", comments="")
+    told = [one for one in w.ingest(tmp_path / "b.csv").warnings if "known to 10 ms" in one]
+    assert len(told) == 1 and "c0002" in told[0]
+    w.propose()
+    own = record(w, tmp_path / "c.csv", w.candidate("c0003")[0].policy, 1.0)
+    assert not any("known to" in one for one in w.ingest(own).warnings)
+
+
+def test_a_log_with_two_runs_says_which_is_taken(w, tmp_path):
+    """One of them was taken, and no word said."""
+    path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 1.0)
+    once = np.loadtxt(path, delimiter=",", skiprows=1)
+    length = once[-1, 0] - once[0, 0] + 1 / RATE
+    twice = np.vstack([once, once + np.array([length, 0, 0, 0])])
+    np.savetxt(path, twice, "%.5f", ",", header="t,x,v,force", comments="")
+    told = [one for one in w.ingest(path).warnings if "in doubt" in one]
+    assert len(told) == 1 and holds(told[0], "1.000 s", f"{1 + length:.3f}", "[log.span] start")
+
+
+def test_the_operator_jogged_the_cart_first(w, tmp_path):
+    policy = w.candidate("c0002")[0].policy
+    found = w.ingest(record(w, tmp_path / "a.csv", policy, 7.0, jog=1.5))
+    assert found.candidate == "c0002" and "7.00" in found.notes[0]
+
+
+@pytest.mark.parametrize("before", [0.0, 0.02, 1.0])
+def test_the_log_of_another_candidate_is_not_credited_wherever_it_begins(w, tmp_path, before):
+    path = record(w, tmp_path / "a.csv", w.candidate("c0001")[0].policy, before)
+    with pytest.raises(GroundedError, match="those of c0001") as refused:
+        w.ingest(path)
+    assert refused.value.then == NextCommand("ingest", (str(path), "--candidate", "c0001"))
+    assert w.ingest(path, candidate="c0001").candidate == "c0001"
+
+
+@pytest.mark.parametrize("before", [0.0, 1.0])
+def test_a_log_that_was_stored_before_is_no_run_of_the_candidate_that_waits_now(
+    w, tmp_path, before, monkeypatch
+):
+    path = record(w, tmp_path / "b.csv", w.candidate("c0002")[0].policy, before)
+    first, waiting = w.ingest(path), w.propose().candidate.id
+    assert first.candidate == "c0002" and not first.known and waiting != "c0002"
+    again = w.ingest(path)
+    assert again.known and (again.trial, again.candidate) == (first.trial, "c0002")
+    copy = tmp_path / "copy.csv"
+    copy.write_bytes(path.read_bytes())
+    renamed = w.ingest(copy, candidate="c0002")
+    assert renamed.known and renamed.trial == first.trial and len(w.trials()) == 2
+    with monkeypatch.context() as nothing:  # the search has ended
+        nothing.setattr(reading, "_outstanding", lambda *_: pytest.fail("asked for"))
+        assert w.ingest(copy).trial == first.trial
+
+
+def test_a_log_whose_trial_was_discarded_is_of_the_candidate_that_it_was_of(w, tmp_path):
+    """It was booked on the one that waited; and one that did not count was `run again`."""
+    first, log = tmp_path / "first.csv", tmp_path / "b.csv"
+    ran = w.ingest(record(w, log, w.candidate("c0002")[0].policy, 0.0))
+    assert w.propose().candidate.id == "c0003"
+    w.discard("t0001", ran.trial)
+    for path, trial, candidate in ((first, "t0001", "c0001"), (log, ran.trial, "c0002")):
+        again = w.ingest(path)
+        assert (again.trial, again.candidate, again.verdict) == (trial, candidate, "set aside")
+        (note,) = [one for one in again.notes if "stored before" in one]
+        assert holds(note, trial, candidate, "--candidate")
+        assert any(f"restore {trial}" in one for one in again.warnings)
+    w.restore("t0001")
+    assert w.ingest(first).verdict == "first"
+    other = w.ingest(log, candidate="c0003")
+    assert other.candidate == "c0003" and any("those of c0002" in one for one in other.warnings)
+
+
+def test_a_damaged_trial_is_replaced_by_its_log_beside_others(w, tmp_path):
+    policy = w.candidate("c0002")[0].policy
+    logs = [record(w, tmp_path / f"{k}.csv", policy, 0.0, seed=k) for k in range(2)]
+    first, _ = (w.ingest(log, data=True) for log in logs)
+    (path,) = (w.folder / "trials").glob(f"{first.trial}-*")
+    path.chmod(0o644)
+    path.write_bytes(path.read_bytes()[:-200])
+    again = Workspace(w.folder).ingest(logs[0], data=True)
+    assert again.trial == first.trial and len(Workspace(w.folder).trials()) == 3
+
+
+def test_the_log_of_a_probe_is_not_credited_and_its_export_says_how_it_is_taken_in(w, tmp_path):
+    made, _ = w.candidate("c0002")
+    turned = replace(made.policy, feedforward=np.array(made.policy.feedforward[::-1]))
+    sent = turned.commands(made.predicted_states[None, :-1], turned.past)[0]
+    probe = w.save_candidate(
+        replace(made, id="c0003", policy=turned, predicted_inputs=sent), kind="probe"
+    )
+    w.forget()
+    with pytest.raises(GroundedError, match=f"those of {probe.id}") as refused:
+        w.ingest(record(w, tmp_path / "a.csv", turned, 1.0))
+    assert refused.value.then.arguments[1:] == ("--candidate", probe.id)
+    out = str(tmp_path / "p.npz")
+    done = grounded("-C", w.folder, "export", probe.id, "--runner", "-o", out)
+    assert done.out.replace("\\", "").split()[-3:] == ["LOG", "--candidate", probe.id]
+    waiting = grounded("-C", w.folder, "export", "c0002", "--runner", "-o", out)
+    assert waiting.out.split()[-1] == "LOG"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("by", "told"), [(1e3, "1000 times too large"), (-1.0, "other sign")])
+def test_a_log_that_begins_before_a_run_with_commands_of_another_unit_is_told_so(
+    w, tmp_path, by, told
+):
+    """In millivolts a log was "a recording played at another rate"; no start is found as it is."""
+    path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.7)
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    table[:, 3] *= by
+    head = path.read_text().splitlines()[0]
+    np.savetxt(path, table, delimiter=",", header=head, comments="")
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(path)
+    assert holds(str(refused.value), "ran c0002", "force", told, "scale")
+    named = w.ingest(path, candidate="c0002")
+    assert any("force" in warning and f"{1 / by:g}" in warning for warning in named.warnings)
+
+
+@pytest.mark.slow
+def test_a_strange_log_has_no_start_and_is_taken_with_a_warning_where_it_is_named(w, tmp_path):
+    """A named one was refused too, and told to name the candidate."""
+    policy = w.candidate("c0002")[0].policy
+    driven = 3 * np.sin(np.arange(policy.horizon) / 3)[:, None]
+    strange = replace(policy, feedforward=driven, gain=0 * policy.gain)
+    path = record(w, tmp_path / "a.csv", strange, 1.0)
+    with pytest.raises(GroundedError, match=holding("c0002", "--candidate c0002 anyway")):
+        w.ingest(path)
+    assert len(w.trials()) == 1
+    found = w.ingest(path, candidate="c0002")
+    assert found.candidate == "c0002" and len(w.trials()) == 2
+    why, begins = found.warnings[:2]
+    assert holds(why, "c0002", "force") and holds(begins, "[log.span] start = SECONDS", "0.000 s")
+
+
+@pytest.mark.parametrize(
+    "wrong, said",
+    [
+        ((57.29578, 57.29578, 1), ("theta and omega", "large", "degrees", "0.0174533")),
+        ((1 / 57.29578, 1, 1), ("theta 57.3", "small", "57.2958")),
+        ((1 / 57.29578, 1 / 57.29578, 1), ("passed to `runner.action` in degrees", "pass rad")),
+        ((1, 1, 1e-3), ("torque 1000", "small", "by 1000")),
+    ],
+)
+def test_a_run_in_other_units_says_so_and_a_name_that_is_none_is_answered(tmp_path, wrong, said):
+    """The last two were somebody who took over, to be taken in as data."""
+    folder = make(tmp_path / "w", "pendulum").folder
+    with (folder / "grounded.toml").open("a") as file:
+        for kind, name in (("state", "theta"), ("state", "omega"), ("input", "torque")):
+            file.write(f'\n[log.{kind}.{name}]\npath = "/csv.{name}"\n')
+    w = Workspace(folder)
+    w.propose()
+    w.run()
+    log = next((folder / "runs").iterdir())
+    trial = read_trial(log.read_bytes(), str(log))[0]
+    t = trial.dt * np.arange(trial.steps)
+    table = np.column_stack([t, np.column_stack([trial.states[:-1], trial.inputs]) * wrong])
+    path = tmp_path / "run.csv"
+    np.savetxt(path, table, "%.9f", ",", header="t,theta,omega,torque", comments="")
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(path)
+    assert holds(str(refused.value), *said)
+    with pytest.raises(GroundedError, match="no candidate 'c0009'"):
+        w.ingest(path, candidate="c0009")
+
+
+BOAT = """import numpy as np
+
+from grounded import Model, Param
+
+model = Model(
+    states={"x": "m", "y": "m", "psi": "rad", "u": "m/s", "r": "rad/s"},
+    inputs={"thrust": "N", "rudder": "rad"},
+    params={"drag": Param(4.0, "N s/m", 1.0, 12.0)},
+    angles=("psi",),
+    derivative=lambda s, a, p: {
+        "x": s.u * np.cos(s.psi),
+        "y": s.u * np.sin(s.psi),
+        "psi": s.r,
+        "u": (a.thrust - p.drag * s.u) / 6,
+        "r": (1.5 * s.u * a.rudder - s.r) / 0.4,
+    },
+)
+"""
+BOAT_CONFIG = """[model]
+file = "model.py"
+[task]
+dt = 0.05
+horizon = 240
+target = "target.csv"
+start = { u = 1.0 }
+[reward]
+state = { x = 4.0, y = 4.0, psi = 0.5, u = 0.5 }
+input = { thrust = 0.001, rudder = 0.05 }
+input_change = { thrust = 0.01, rudder = 0.01 }
+[limits]
+thrust = [-10.0, 15.0]
+rudder = [-0.7, 0.7]
+[system]
+model = "model.py"
+noise.measurement = { x = 0.01, y = 0.01, psi = 0.004, u = 0.01, r = 0.01 }
+"""
+
+
+def test_a_log_so_noisy_that_any_commands_follow_from_it_is_one_in_degrees(tmp_path):
+    """A boat's compass: 0.23 of noise, taken for radians, made any rudder the candidate's."""
+    t = np.arange(241) * 0.05
+    path = np.column_stack([t, 3 * np.sin(t / 3), 3 - 3 * np.cos(t / 3), t / 3, 1 + 0 * t])
+    rows = "\n".join(",".join(f"{v:.6f}" for v in row) for row in path)
+    target = f"t,x,y,psi,u\n{rows}\n"
+    w = Workspace(make(tmp_path / "w", config=BOAT_CONFIG, model=BOAT, target=target).folder)
+    w.propose()
+    w.run()
+    trial, meta, _ = read_trial(next((w.folder / "runs").iterdir()))
+    odd = replace(trial, states=trial.states * [1, 1, 180 / np.pi, 1, 1])
+    write_trial(tmp_path / "odd.mcap", odd, {k: meta[k] for k in ("kind", "task")})
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(tmp_path / "odd.mcap")
+    assert holds(str(refused.value), "psi 57.3", "large", "degrees", "0.0174533")
+    named = w.ingest(tmp_path / "odd.mcap", candidate=trial.candidate)
+    assert any("psi" in warning and "0.0174533" in warning for warning in named.warnings)
+
+
+@pytest.mark.parametrize("pace", [2.0, 0.5])
+def test_stamps_of_a_recording_played_at_another_rate_are_told(w, tmp_path, pace):
+    path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.2)
+    rows = np.loadtxt(path, delimiter=",", skiprows=1)
+    rows[:, 0] = rows[0, 0] + (rows[:, 0] - rows[0, 0]) / pace
+    np.savetxt(path, rows, "%.5f", ",", header="t,x,v,force", comments="")
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(path)
+    assert holds(str(refused.value), "c0002", "stamps", f"by {pace:g}")
+    assert len(w.trials()) == 1
+    named = w.ingest(path, candidate="c0002")
+    assert holds(named.warnings[0], "stamps", f"by {pace:g}")
+
+
+def test_one_log_is_one_trial(w, tmp_path):
+    """A stranger's log was stored three times: as runs of two candidates, and as data."""
+    path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0)
+    first = w.ingest(path)
+    for other in ({"candidate": "c0001"}, {"data": True}):
+        with pytest.raises(GroundedError, match=f"stored already, as {first.trial}") as refused:
+            w.ingest(path, **other)
+        assert refused.value.then == NextCommand("discard", (first.trial,))
+    assert w.ingest(path, candidate="c0002").known and len(w.trials()) == 2
+    w.discard(first.trial)
+    kept = w.ingest(path, data=True)
+    assert kept.candidate == ""
+    with pytest.raises(GroundedError, match=f"stored already, as {kept.trial}, data") as refused:
+        w.ingest(path)  # "ran c0001, which was made for an earlier task"
+    assert refused.value.then is None  # `next` with the log of a drive: it advised to discard it
+
+
+def recorded_in_motion(path, change=0.3, begun=0.13):
+    """A joystick's commands on a 50 ms grid, begun between two of them; the rows of 100 Hz."""
+    rng = np.random.default_rng(3)
+    t = np.arange(0, 12, 0.01)
+    steps = np.floor((t + begun) / change + 1e-6).astype(int)
+    force = rng.uniform(0.5, 2.0, steps.max() + 1)[steps]
+    rows = np.column_stack([t, np.sin(t), np.cos(t), force])
+    np.savetxt(path, rows, "%.6f", ",", header="t,x,v,force", comments="")
+    return rows
+
+
+def test_data_that_begin_in_motion_begin_where_it_is_known_what_was_sent(w, tmp_path):
+    """Held at rest before the first row, a delay made of the first step a limit that nobody has."""
+    rows = recorded_in_motion(tmp_path / "a.csv")
+    found = w.ingest(tmp_path / "a.csv", data=True)
+    assert any("before the first command" in note for note in found.notes)
+    (kept,) = (t for t in w.trials() if t.stored.id == found.trial)
+    first = round((0.17 + 0.25) / 0.01)  # nothing has changed for 0.25 s
+    np.testing.assert_allclose(kept.trial.states[0], rows[first, 1:3], atol=1e-3)
+    np.testing.assert_allclose(kept.trial.start_inputs, rows[first - 1, 3:], atol=1e-5)
+    assert float(kept.meta["rows_s"]) == pytest.approx(0.01)
+
+
+def test_what_was_sent_first_holds_before_where_commands_never_rest(w, tmp_path):
+    rows = recorded_in_motion(tmp_path / "a.csv", change=0.1, begun=0.0)
+    w.ingest(tmp_path / "a.csv", data=True)
+    np.testing.assert_allclose(w.trials()[-1].trial.start_inputs, rows[0, 3:], atol=1e-5)
+
+
+def test_a_delay_is_no_surer_than_the_rows_of_a_table(w, tmp_path):
+    from grounded.diagnosis.report import Estimate, Ranked
+    from grounded_trials.workspace.diagnosing import _as_known, _row_interval
+    from grounded_trials.workspace.folder import Folder
+
+    recorded_in_motion(tmp_path / "a.csv")
+    trial = w.ingest(tmp_path / "a.csv", data=True).trial
+    d = {"d": Estimate(0.07, 0.0002, (0.0696, 0.0704), "s")}
+    rows = (Ranked("delay:force", d), Ranked("first_order_lag:force", d))
+    late, lag = _as_known(rows, _row_interval(Folder(w.folder), {trial}))
+    assert late.params["d"].interval == pytest.approx((0.0596, 0.0804))
+    assert late.params["d"].std == pytest.approx(0.005, rel=0.01)
+    assert lag.params["d"] is d["d"]
+
+
+def test_a_log_while_nothing_waits_is_offered_as_what_its_commands_are(tmp_path):
+    """A drive by hand was offered as the best candidate's run: it cost -3,943."""
+    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
+    policy = w.propose().candidate.policy
+    w.ingest(record(w, tmp_path / "first.csv", policy, 0.0))
+    again = record(w, tmp_path / "again.csv", policy, 0.0, seed=1)
+    table = np.loadtxt(again, delimiter=",", skiprows=1)
+    table[:, 3] = 2 * np.sin(np.arange(len(table)) // 10)
+    hand = tmp_path / "hand.csv"
+    np.savetxt(hand, table, "%.5f", ",", header="t,x,v,force", comments="")
+    for log, then in ((again, ("--candidate", "c0001")), (hand, ("--data",))):
+        with pytest.raises(GroundedError) as refused:
+            w.ingest(log)
+        assert refused.value.then == NextCommand("ingest", (str(log), *then))
+
+
+def test_logs_are_data_without_a_target_whatever_errors_would_weigh(tmp_path):
+    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
+    log = record(w, tmp_path / "drive.csv", w.propose().candidate.policy, 0.0)
+    config = w.folder / "grounded.toml"
+    config.write_text(config.read_text().replace('target = "target.csv"', 'target = ""'))
+    other = Workspace(w.folder)
+    taken = other.ingest(log, data=True)
+    assert other.trials()[0].stored.id == taken.trial and not other.task.reward.state.any()
+
+
+def test_a_hole_in_a_log_is_told_where_it_is_not_taken_for_the_run(tmp_path):
+    """Of a run that lacked a second somebody else was said to have driven, and no more."""
+    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
+    policy = w.propose().candidate.policy
+    log = record(w, tmp_path / "run.csv", policy, 0.5)
+    table = np.loadtxt(log, delimiter=",", skiprows=1)
+    table[:, 3] *= -0.4  # nobody's
+    table = np.delete(table, slice(120, 160), axis=0)
+    np.savetxt(log, table, "%.5f", ",", header="t,x,v,force", comments="")
+    config = w.folder / "grounded.toml"
+    text = config.read_text().replace('path = "/csv.x"', 'path = "/csv.x"\nmax_age_s = 2')
+    text = text.replace('path = "/csv.v"', 'path = "/csv.v"\nmax_age_s = 2')
+    config.write_text(text)
+    with pytest.raises(GroundedError, match=holding("did not run", "no sample of", "0.41")):
+        Workspace(w.folder).ingest(log)
+
+
+def edited(path, change):
+    """The log with its rows changed: t, x, v, force."""
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    change(table)
+    np.savetxt(path, table, "%.5f", ",", header="t,x,v,force", comments="")
+    return path
+
+
+def test_a_gap_within_the_run_is_the_reason_that_is_given(w, tmp_path):
+    """Behind a lead-in no start was found for it: `somebody, or another controller, drove`."""
+
+    def hole(table):
+        table[450:470, 1:3] = np.nan
+
+    log = edited(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 4.0), hole)
+    with pytest.raises(GroundedError, match=r"has a gap of 0\.2.* s .*max_age_s"):
+        w.ingest(log)
+
+
+def test_commands_that_were_logged_before_the_states_are_a_lead_in(w, tmp_path):
+    """A robot that sends zeros all the time: `start recording before the run`, which it did."""
+
+    def blind(table):
+        table[:8, 1:3] = np.nan
+
+    log = edited(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 1.0), blind)
+    found = w.ingest(log)
+    assert found.candidate == "c0002" and any("begins 1.0" in one for one in found.notes)
+    late = edited(record(w, tmp_path / "b.csv", w.candidate("c0002")[0].policy, 0.0), blind)
+    w.discard(found.trial)
+    with pytest.raises(GroundedError, match="before every state is known"):
+        w.ingest(late)
+
+
+def test_a_delay_that_puts_states_off_is_named_where_a_run_seems_to_begin_too_early(tmp_path):
+    """What to take out where the clocks were said to differ, and did not."""
+    w = waiting(tmp_path)
+    log = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0)
+    toml = w.folder / "grounded.toml"
+    written = toml.read_text()
+    toml.write_text(written.replace('path = "/csv.x"\n', 'path = "/csv.x"\ndelay_s = -0.24\n'))
+    assert toml.read_text() != written
+    with pytest.raises(GroundedError, match=r"\[log\.state\.x\] delay_s = -0\.24 .*remove that"):
+        Workspace(w.folder).ingest(log, candidate="c0002")
+    toml.write_text(written)
+    assert Workspace(w.folder).ingest(log, candidate="c0002").candidate == "c0002"
+
+
+@pytest.mark.parametrize("before", [0.91, 0.92, 0.93, 0.94])
+def test_a_run_whose_commands_are_logged_as_they_are_sent_begins_with_its_own(w, tmp_path, before):
+    """A step too early, and the log was blamed for it."""
+    step = round(w.task.dt * RATE)
+
+    def sent(table):
+        kept = (np.arange(len(table)) - round(before * RATE)) % step == 0
+        kept[0] = True  # a zero, while it waits
+        table[~kept, 3] = np.nan
+
+    log = edited(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, before), sent)
+    found = w.ingest(log)
+    (note,) = [one for one in found.notes if "begins" in one]
+    assert abs(float(re.search(r"begins ([0-9.]+) s", note)[1]) - before) < 1.5 / RATE
+    assert not any("seem to be" in one for one in found.warnings)

@@ -1,0 +1,115 @@
+"""Signals that [log] reads from each other's column, by what those are called."""
+
+import pytest
+
+from facts import holding, holds
+from grounded import Model
+from grounded.errors import GroundedError
+from grounded_trials import Workspace
+from grounded_trials.logs.log_table import LogMapping
+from grounded_trials.logs.signals import SignalSpec
+from grounded_trials.workspace.intake.opening.columns_by_name import crossed
+from recorded import LOGGED, record
+from workspaces import make
+
+ARM = Model(
+    states={"shoulder": "rad", "elbow": "rad", "shoulder_vel": "rad/s", "elbow_vel": "rad/s"},
+    inputs={"torque": "N m"},
+    derivative=lambda s, a, p: {
+        "shoulder": s.shoulder_vel,
+        "elbow": s.elbow_vel,
+        "shoulder_vel": a.torque,
+        "elbow_vel": -a.torque,
+    },
+)
+PLANE = Model(
+    states={"x": "m", "y": "m"},
+    inputs={"u": "m/s"},
+    roles={"position": ("x", "y")},
+    derivative=lambda s, a, p: {"x": a.u, "y": s.x},
+)
+
+
+ROVER = Model(
+    states={"v": "m/s", "psi": "rad"},
+    inputs={"linear": "m/s", "angular": "rad/s"},
+    derivative=lambda s, a, p: {"v": a.linear - s.v, "psi": a.angular},
+)
+
+
+def reading(model, *columns, form="/csv.{}"):
+    paths = {
+        name: SignalSpec(form.format(column))
+        for name, column in zip((*model.states, *model.inputs), columns, strict=True)
+    }
+    states = {name: paths[name] for name in model.states}
+    return LogMapping(states, {name: paths[name] for name in model.inputs})
+
+
+@pytest.mark.parametrize(
+    "model, columns, pairs",
+    [
+        (ARM, ("shoulder", "elbow", "shoulder_vel", "elbow_vel", "torque"), []),
+        (ARM, ("shoulder_pos", "elbow_pos", "elbow_vel", "shoulder_vel", "torque"), ["elbow_vel"]),
+        (ARM, ("shoulder_vel", "elbow", "shoulder", "elbow_vel", "torque"), ["shoulder_vel"]),
+        (ARM, ("shoulder", "torque_Nm", "shoulder_vel", "elbow_vel", "elbow_deg"), ["torque"]),
+        (ARM, ("a", "b", "c", "d", "e"), []),
+        (ARM, ("elbow", "b", "c", "d", "shoulder_cmd"), []),  # of another thing
+        (PLANE, ("y", "x", "u"), []),  # the log's axes are its own
+    ],
+)
+def test_what_the_names_of_columns_say(model, columns, pairs):
+    found = crossed(model, reading(model, *columns))
+    assert len(found) == len(pairs)
+    assert all(holds(text, part) for text, part in zip(found, pairs, strict=True))
+
+
+@pytest.mark.parametrize("form", ["/cmd/{}.data", "/{}/value.data", '"/cmd-{}".data'])
+def test_a_message_of_a_number_alone_is_named_by_its_topic(form):
+    boat = Model(
+        states={"v": "m/s"},
+        inputs={"port": "1", "starboard": "1"},
+        derivative=lambda s, a, p: {"v": a.port + a.starboard},
+    )
+    assert crossed(boat, reading(boat, "v", "port", "starboard", form=form)) == ()
+    (told,) = crossed(boat, reading(boat, "v", "starboard", "port", form=form))
+    assert holds(told, "port", "starboard", "exchanged")
+
+
+@pytest.mark.parametrize(
+    ("columns", "odd"),
+    [
+        (("odom.twist.twist.linear.x", "@rpy.yaw", "cmd.linear.x", "cmd.angular.z"), False),
+        (("odom.twist.twist.linear.x", "@rpy.yaw", "cmd.angular.z", "cmd.linear.x"), True),
+        (("odom.twist.twist.linear.x", "@rpy.yaw", "cmd.linear.x", "cmd.linear.y"), False),
+        (("odom.speed", "odom.yaw", "cmd.angular.z", "cmd.data[0]"), False),
+    ],
+)
+def test_two_numbers_of_a_twist_in_each_others_unit_are_exchanged(columns, odd):
+    """That somebody took over was said of a run, and of data that the robot moved by 0 m/s^2."""
+    found = crossed(ROVER, reading(ROVER, *columns, form="/{}"))
+    assert len(found) == odd
+    assert all(holds(text, "linear", "angular", "exchanged", "units") for text in found)
+
+
+@pytest.mark.parametrize(("path", "scale"), [("/sway.angle", 1), ("/sway.angle", 0.2), ("/t.x", 1)])
+def test_a_length_that_is_read_from_an_angle_is_told(path, scale):
+    boat = Model(states={"p": "m"}, inputs={"u": "1"}, derivative=lambda s, a, p: {"p": a.u})
+    mapping = LogMapping({"p": SignalSpec(path, scale=scale)}, {"u": SignalSpec("/c.u")})
+    found = crossed(boat, mapping)
+    assert len(found) == (path == "/sway.angle" and scale == 1)
+    assert all(holds(text, "p", path) for text in found)
+
+
+def test_an_input_in_the_column_of_a_state_is_told_at_ingest(tmp_path):
+    """The program was said to be another controller, or the data were taken without a word."""
+    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
+    log = record(w, tmp_path / "run.csv", w.propose().candidate.policy, 0.0)
+    config = w.folder / "grounded.toml"
+    text = config.read_text().replace("/csv.v", "/csv.V").replace("/csv.force", "/csv.v")
+    config.write_text(text.replace("/csv.V", "/csv.force"))
+    other = Workspace(w.folder)
+    with pytest.raises(GroundedError, match=holding("/csv.force", "/csv.v", "exchanged")):
+        other.ingest(log)
+    (warning,) = (one for one in other.ingest(log, data=True).warnings if "/csv.force" in one)
+    assert holds(warning, "v", "force", "exchanged")

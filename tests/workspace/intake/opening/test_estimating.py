@@ -1,0 +1,286 @@
+"""Speeds that no sensor gives, along a whole log: gaps, slow sensors, units, the noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from facts import holds
+from grounded.errors import GroundedError
+from grounded.model import Model
+from grounded_trials import Workspace
+from grounded_trials.logs.signals import Series, SignalSpec
+from grounded_trials.workspace.adopted import planner_of
+from grounded_trials.workspace.intake.opening.estimating import EstimateTable, with_estimates
+from grounded_trials.workspace.user_files.config import set_in_model
+from workspaces import CONFIG, MODEL, make
+
+TABLE = EstimateTable({"x": 0.002}, {})
+
+
+def series(t, values, path="/csv.x"):
+    stamps = np.round(1e9 * (1000 + t)).astype(np.int64)
+    return Series(SignalSpec(path, "log"), stamps, values, stamps, len(t), "table", False)
+
+
+def driven(every=0.01, until=6.0, size=1.0, noise=0.002, seed=0):
+    """A cart heavier than the model's, pushed to and fro at 20 Hz: samples, and the true speed."""
+    fine = 1e-3
+    t = np.arange(0, until, fine)
+    force = np.where(t < 1, 0.0, 2 * np.sin(2 * np.floor(t / 0.05) * 0.05))
+    x = v = 0.0
+    path = []
+    for u in force:
+        path.append((x, v))
+        x, v = x + fine * v, v + fine * (u - 0.4 * v) / 1.3
+    x, v = size * np.transpose(path)
+    at = np.arange(0, len(t), round(every / fine))
+    rng = np.random.default_rng(seed)
+    found = {
+        "x": series(t[at], x[at] + size * noise * rng.standard_normal(len(at))),
+        "force": series(t[::10], force[::10], "/csv.force"),
+    }
+    return found, t, v
+
+
+@pytest.fixture
+def task(tmp_path):
+    return make(tmp_path / "w").task
+
+
+def off(found, t, v):
+    """The error of the estimated speed, and when [s]."""
+    at = (found["v"].t - 1000 * 10**9) * 1e-9
+    inside = (at >= 0) & (at <= t[-1])
+    return found["v"].values[inside] - np.interp(at[inside], t, v), at[inside]
+
+
+@pytest.mark.parametrize("every", [0.001, 0.01, 0.03, 0.05])
+def test_a_speed_is_estimated_whatever_the_sensor_s_rate(task, every):
+    logged, t, v = driven(every)
+    error, at = off(with_estimates(logged, TABLE, task), t, v)
+    assert np.sqrt(np.mean(error**2)) < 0.06 and np.abs(error[at < 0.8]).max() < 0.05
+
+
+def test_a_speed_is_estimated_in_steps_that_a_simulator_can_make(task):
+    """One of 25 ms was asked for steps of 10 ms, as the sensor had them."""
+
+    class Simulator:
+        timestep = 0.025
+
+        def __call__(self, s, a, p, dt):
+            if abs(dt / self.timestep - round(dt / self.timestep)) > 1e-6:
+                raise GroundedError(f"{dt:g} s is no multiple")
+            return {"x": s.x + dt * s.v, "v": s.v + dt * (a.force - 0.4 * s.v) / 1.3}
+
+    model = Model(states=task.model.states, inputs=task.model.inputs, step=Simulator())
+    logged, t, v = driven(0.01)
+    error, _ = off(with_estimates(logged, TABLE, replace(task, model=model)), t, v)
+    assert np.sqrt(np.mean(error**2)) < 0.06
+
+
+def test_samples_that_were_lost_part_a_log(task):
+    logged, t, v = driven()
+    x = logged["x"]
+    kept = (x.t < 1002 * 10**9) | (x.t > 1004 * 10**9)
+    log = {**logged, "x": series(t[::10][kept], x.values[kept])}
+    found = with_estimates(log, TABLE, task)
+    error, at = off(found, t, v)
+    assert not ((at > 2.01) & (at < 3.99)).any()
+    assert np.sqrt(np.mean(error**2)) < 0.06
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_log_that_begins_at_speed_is_estimated_alike_in_any_unit(tmp_path, seed):
+    """A speed was taken to begin at 0, give or take 1: 635 mm/s were off by 135 all along."""
+    in_mm = MODEL.replace("(a.force - p.drag * s.v)", "(1000 * a.force - p.drag * s.v)")
+    errors = []
+    for size, model in ((1.0, MODEL), (1000.0, in_mm)):
+        task = make(tmp_path / f"{size}", model=model, config=CONFIG).task
+        logged, t, v = driven(size=size, seed=seed)
+        first = int(np.argmax(v)) // 10
+        log = {
+            name: series(t[10 * first :: 10], one.values[first:], one.spec.path)
+            for name, one in logged.items()
+        }
+        table = EstimateTable({"x": 0.002 * size}, {})
+        errors.append(off(with_estimates(log, table, task), t, v)[0] / size)
+    np.testing.assert_allclose(errors[1], errors[0], atol=1e-6)
+    assert v[10 * first] > 400 and np.abs(errors[0][:5]).max() < 0.05
+
+
+@pytest.mark.parametrize("process", [{}, {"v": 0.05}])
+def test_a_speed_is_the_slope_of_its_position_where_the_model_is_off_for_long(tmp_path, process):
+    """It answers in 0.03 s, its gain is too large: the speed was 0.025 m/s too low on average."""
+    quick = MODEL.replace("(a.force - p.drag * s.v) / p.mass", "(a.force - s.v) / 0.03")
+    task = make(tmp_path / "w", model=quick).task
+    t = np.arange(0, 4, 1e-3)
+    force = np.where((t > 0.5) & (t < 3.5), 1.0 + 0.5 * np.sin(2 * np.floor(t / 0.05) * 0.05), 0.0)
+    v = np.zeros(len(t))
+    for k in range(len(t) - 1):
+        v[k + 1] = v[k] + 1e-3 * (0.8 * force[k] - v[k]) / 0.06
+    x = 1e-3 * np.cumsum(v)
+    noise = 0.001 * np.random.default_rng(0).standard_normal(len(t) // 10)
+    log = {
+        "x": series(t[::10], x[::10] + noise),
+        "force": series(t[::10], force[::10], "/csv.force"),
+    }
+    error, _ = off(with_estimates(log, EstimateTable({"x": 0.001}, process), task), t, v)
+    assert abs(np.mean(error)) < 0.003
+    assert np.sqrt(np.mean(error**2)) < (0.03 if process else 0.045)
+
+
+def test_a_process_noise_that_is_given_is_that_of_a_control_step(task):
+    """With hardly any, the speed is the model's; with much, it follows the samples."""
+    logged, t, v = driven()
+    errors = {}
+    for std in (1e-5, 5.0):
+        given = EstimateTable({"x": 0.002}, {"x": 1e-6, "v": std})
+        errors[std] = off(with_estimates(logged, given, task), t, v)[0]
+    rough = {k: np.std(np.diff(e)) for k, e in errors.items()}
+    assert rough[5.0] > 10 * rough[1e-5]
+
+
+def test_nothing_is_estimated_where_everything_is_measured(task):
+    logged, t, v = driven()
+    logged["v"] = series(t[::10], v[::10], "/csv.v")
+    table = EstimateTable({"x": 0.002, "v": 0.01}, {})
+    assert with_estimates(logged, table, task) == logged
+
+
+@pytest.mark.parametrize(
+    ("effect", "lag", "friction"),
+    [
+        ({"name": "first_order_lag:force", "tau": 0.15}, 0.15, 0.0),  # has a memory state
+        ({"name": "coulomb_friction:v", "c": 0.8}, 0.0, 0.8),
+    ],
+)
+def test_adopted_effects_make_estimates_better(task, effect, lag, friction):
+    logged, t, v = disturbed(lag, friction)
+    crude, _ = off(with_estimates(logged, TABLE, task), t, v)
+    plan = planner_of(task, [effect]).plan
+    found = with_estimates(logged, TABLE, plan, task.model.state_names)
+    better, _ = off(found, t, v)
+    assert set(found) == {"x", "v", "force"}
+    assert np.sqrt(np.mean(better**2)) < 0.5 * np.sqrt(np.mean(crude**2))
+
+
+def disturbed(lag, friction, until=6.0, fine=1e-3):
+    """The crude model's cart with a lag or a friction."""
+    t = np.arange(0, until, fine)
+    held = np.floor(t / 0.05) * 0.05
+    force = np.where(t < 1, 0.0, 3 * np.sin(2 * held) + 1.5 * np.sign(np.sin(5 * held)))
+    x = v = u = 0.0
+    path = []
+    for k in force:
+        path.append((x, v))
+        u += fine / max(lag, fine) * (k - u)
+        x, v = x + fine * v, v + fine * (u - 0.2 * v - friction * np.tanh(v / 0.02))
+    x, v = np.transpose(path)
+    noisy = x[::10] + 0.002 * np.random.default_rng(0).standard_normal(len(x[::10]))
+    return {"x": series(t[::10], noisy), "force": series(t[::10], force[::10], "/u")}, t, v
+
+
+def test_trials_that_another_model_estimated_stay_and_are_told(tmp_path):
+    lines = [f'[log.{k}.{n}]\npath = "/csv.{n}"' for k, n in (("state", "x"), ("input", "force"))]
+    config = CONFIG + "\n".join([*lines, "[estimate]", "measured = { x = 0.002 }"])
+    folder = make(tmp_path / "w", config=config).folder
+    for k in range(3):
+        logged, _, _ = disturbed(0.0, 0.8, until=4.0 + k)
+        t = logged["x"].t * 1e-9 + 100 * k
+        table = np.column_stack([t, logged["x"].values, logged["force"].values])
+        np.savetxt(tmp_path / f"{k}.csv", table, "%.5f", ",", header="t,x,force", comments="")
+    first = Workspace(folder).ingest(tmp_path / "0.csv", data=True)
+    before = Workspace(folder).trials()[0].measured.states
+    set_in_model(folder / "grounded.toml", effects=[{"name": "coulomb_friction:v", "c": 0.8}])
+    w = Workspace(folder)
+    again = w.ingest(tmp_path / "0.csv", data=True)
+    assert again.known and again.trial == first.trial
+    np.testing.assert_array_equal(w.trials()[0].measured.states, before)
+    told = w.ingest(tmp_path / "1.csv", data=True)
+    for one in (again, told):
+        assert any("coulomb_friction:v" in note and "t0001" in note for note in one.notes)
+    third = w.ingest(tmp_path / "2.csv", data=True)
+    assert not any("t0001" in note for note in third.notes)
+    w.discard("t0001")
+    anew = w.ingest(tmp_path / "0.csv", data=True)
+    assert not anew.known and anew.trial != first.trial
+
+
+def test_a_late_sensor_that_was_adopted_leaves_estimates_as_they_are(tmp_path):
+    """The speed of a position that is told 40 ms late is as late; it was 20 times worse."""
+    lines = [f'[log.{k}.{n}]\npath = "/csv.{n}"' for k, n in (("state", "x"), ("input", "force"))]
+    config = CONFIG + "\n".join([*lines, "[estimate]", "measured = { x = 0.002 }"])
+    logged, *_ = disturbed(0.0, 0.8)
+    late = np.interp(logged["x"].t * 1e-9 - 0.04, logged["x"].t * 1e-9, logged["x"].values)
+    table = np.column_stack([logged["x"].t * 1e-9, late, logged["force"].values])
+    np.savetxt(tmp_path / "late.csv", table, "%.5f", ",", header="t,x,force", comments="")
+    friction = {"name": "coulomb_friction:v", "c": 0.8}
+    speeds = []
+    for name, effects in (
+        ("a", [friction]),
+        ("b", [friction, {"name": "sensor_delay:x", "d": 0.04}]),
+    ):
+        folder = make(tmp_path / name, config=config).folder
+        set_in_model(folder / "grounded.toml", effects=effects)
+        w = Workspace(folder)
+        w.ingest(tmp_path / "late.csv", data=True)
+        stored = w.trials()[0]
+        assert stored.meta["estimated_with"] == "coulomb_friction:v"
+        speeds.append(stored.measured.states[:, 1])
+    np.testing.assert_array_equal(*speeds)
+    assert np.sqrt(np.mean(speeds[0] ** 2)) > 0.1
+
+
+def test_a_mapped_state_that_estimate_leaves_out_is_told(tmp_path):
+    """Its signal was not read, and nothing said so."""
+    names = (("state", "x"), ("state", "v"), ("input", "force"))
+    lines = [f'[log.{k}.{n}]\npath = "/csv.{n}"' for k, n in names]
+    config = CONFIG + "\n".join([*lines, "[estimate]", "measured = { x = 0.002 }"])
+    logged, _, v = disturbed(0.0, 0.0)
+    table = [logged["x"].t * 1e-9, logged["x"].values, v[::10], logged["force"].values]
+    head = {"header": "t,x,v,force", "comments": ""}
+    np.savetxt(tmp_path / "all.csv", np.column_stack(table), "%.5f", ",", **head)
+    w = Workspace(make(tmp_path / "w", config=config).folder)
+    warned = w.ingest(tmp_path / "all.csv", data=True).warnings
+    told = ("v is in [log]", "an estimate in its place", "measured")
+    assert any(holds(one, *told) for one in warned)
+
+
+def late(before, until=3.0, delay=0.06, held=0.0, v=0.0, seed=0):
+    """A log of a cart that receives its commands late; `before` of it, they were those held."""
+    t = np.arange(-1.0, until, fine := 1e-3)
+    sent = np.where(t < 0, held, 3.0 * np.cos(np.floor(t / 0.05) * 0.05))
+    x, path = 0.0, []
+    for u in np.interp(t - delay, t, sent):
+        path.append((x, v))
+        x, v = x + fine * v, v + fine * (u - 0.4 * v)
+    x, v = np.transpose(path)
+    at = np.arange(round((1.0 - before) / fine), len(t), 10)
+    noise = np.random.default_rng(seed).normal(0, 0.002, len(at))
+    log = {"x": series(t[at] + 1, x[at] + noise), "force": series(t[at] + 1, sent[at], "/csv.f")}
+    return log, t + 1, v
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_log_that_begins_with_a_run_knows_what_was_held_before(task, seed):
+    """Its first command was taken to have been held before, so it seemed to start in motion."""
+    task = replace(task, latency=np.array([0.06]))
+    logged, t, v = late(0.0, seed=seed)
+    error, at = off(with_estimates(logged, TABLE, task), t, v)
+    assert np.abs(error[at < 1.2]).max() < 0.02
+
+
+def test_a_log_that_begins_amid_driving_had_its_first_command_before(task):
+    task = replace(task, latency=np.array([0.06]))
+    logged, t, v = late(0.3, held=2.0, v=0.5)
+    error, at = off(with_estimates(logged, TABLE, task), t, v)
+    assert np.abs(error[(at > 0.75) & (at < 1.2)]).max() < 0.1
+
+
+def test_seconds_under_a_column_of_milliseconds_are_told(task):
+    """The smoother's noise was NaN, with warnings of numpy."""
+    logged, _, _ = driven()
+    log = {n: replace(one, t=one.t[0] + (one.t - one.t[0]) // 1000) for n, one in logged.items()}
+    with pytest.raises(GroundedError, match=r"times 1000 they would be 0\.01 s"):
+        with_estimates(log, TABLE, task)

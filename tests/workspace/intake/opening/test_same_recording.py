@@ -1,0 +1,113 @@
+"""A file that holds a recording which is stored already, whole or in part, is no second trial."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from facts import holding
+from grounded.errors import GroundedError
+from grounded.trial import Trial
+from grounded_trials.store.trial_file import write_trial
+from grounded_trials.workspace.candidates.proposing import propose_in
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.intake.ingest import ingest_log
+from recorded import record, waiting
+from workspaces import make
+
+TABLE = """
+[log.state]
+x = { path = "/csv.x" }
+v = { path = "/csv.v" }
+
+[log.input]
+force = { path = "/csv.force" }
+"""
+STAMP = 1_700_000_000.0
+
+
+@pytest.fixture
+def w(tmp_path):
+    return make(tmp_path / "w")
+
+
+def log(path, rows=slice(None), start=0.0, seed=0, scale=1.0):
+    """A log of the cart as a table: some rows of it, with the noise of one run."""
+    t = np.arange(0, 4, 0.02)
+    noise = 0.001 * np.random.default_rng(seed).normal(size=(2, len(t)))
+    force = np.sin(3 * np.floor(t / 0.06))
+    table = np.column_stack(
+        [t + start, scale * (np.sin(t) + noise[0]), np.cos(t) + noise[1], force]
+    )
+    np.savetxt(path, table[rows], "%.6f", ",", header="t,x,v,force", comments="")
+    return path
+
+
+def mapped(w, text=TABLE):
+    file = w.folder / "grounded.toml"
+    file.write_text(file.read_text() + text)
+    return w
+
+
+@pytest.mark.parametrize("start", [0.0, STAMP])
+def test_what_is_left_of_a_stored_log_is_that_trial(w, tmp_path, start):
+    """Seen: a recovered file was taken for a repeat, and its data counted twice."""
+    mapped(w)
+    first = ingest_log(w, log(tmp_path / "a.csv", start=start), data=True)
+    for rows in (slice(0, 120), slice(0, 60)):
+        again = ingest_log(w, log(tmp_path / "b.csv", rows, start), data=True)
+        assert (again.trial, again.known) == (first.trial, True) and len(w.trials()) == 1
+        assert any(first.trial in note for note in again.notes)
+    other = ingest_log(w, log(tmp_path / "c.csv", slice(0, 120), start, seed=1), data=True)
+    assert other.trial != first.trial and not other.known
+
+
+def test_the_rest_of_a_part_that_is_stored_asks_to_discard_that(w, tmp_path):
+    mapped(w)
+    first = ingest_log(w, log(tmp_path / "a.csv", slice(0, 120)), data=True).trial
+    with pytest.raises(GroundedError, match=holding(first, "discard")) as refused:
+        ingest_log(w, log(tmp_path / "b.csv"), data=True)
+    assert refused.value.then.arguments == (first,) and len(w.trials()) == 1
+
+
+def test_the_same_stamps_through_another_table_are_refused(w, tmp_path):
+    mapped(w)
+    first = ingest_log(w, log(tmp_path / "a.csv", start=STAMP), data=True).trial
+    part = log(tmp_path / "b.csv", slice(0, 120), STAMP, scale=2.0)
+    with pytest.raises(GroundedError, match=holding(first, "another way")):
+        ingest_log(w, part, data=True)
+    assert grounded("-C", w.folder, "discard", first).code == 0
+    assert not ingest_log(Folder(w.folder), part, data=True).known
+
+
+def test_what_is_left_of_a_trial_of_ours_is_that_trial(w, tmp_path):
+    made = propose_in(w).proposal.candidate
+    t = np.linspace(0, 1, 41)
+    states = np.column_stack([t, np.sin(t)])
+    fields = {"dt": 0.05, "state_names": ("x", "v"), "input_names": ("force",)}
+    whole = Trial(states=states, inputs=np.cos(t)[:-1, None], candidate=made.id, **fields)
+    write_trial(tmp_path / "t.mcap", whole, {"kind": "trial"})
+    first = ingest_log(w, tmp_path / "t.mcap", made.id)
+    part = replace(whole, states=states[:30], inputs=whole.inputs[:29])
+    write_trial(tmp_path / "p.mcap", part, {"kind": "trial"})
+    again = ingest_log(w, tmp_path / "p.mcap", made.id)
+    assert (again.trial, again.known) == (first.trial, True) and again.utility == first.utility
+    with pytest.raises(GroundedError, match=holding(first.trial, "discard")):
+        ingest_log(w, tmp_path / "p.mcap", data=True)
+
+
+@pytest.mark.parametrize("rows", [-40, -110])
+def test_a_shorter_copy_of_a_run_is_no_second_run(tmp_path, rows):
+    """Behind a lead-in it counted as one, whose scatter was 5e-8: "an improvement, 1.00"."""
+    w = waiting(tmp_path)
+    whole = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 1.0, after=1.0)
+    first = w.ingest(whole)
+    assert first.candidate == "c0002" and not first.known
+    part = "\n".join(whole.read_text().splitlines()[:rows])  # of 401: 0.4 and 1.1 s
+    (tmp_path / "b.csv").write_text(part)
+    again = w.ingest(tmp_path / "b.csv", candidate="c0002")
+    assert (again.trial, again.known) == (first.trial, True)
+    assert any(first.trial in note for note in again.notes)
+    with pytest.raises(GroundedError, match=holding(first.trial, "discard")):
+        w.ingest(tmp_path / "b.csv", candidate="c0001")

@@ -1,0 +1,196 @@
+"""Logs with two commands exchanged, or in percent: told at ingest, and before a diagnosis."""
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from facts import holds
+from grounded.errors import GroundedError, NextCommand
+from grounded_trials import Workspace
+from grounded_trials.store.trial_file import read_trial
+from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
+from grounded_trials.workspace.intake.recognising.read_otherwise import exchanged_in
+from workspaces import make
+
+MODEL = """import numpy as np
+from grounded import Model, Param
+model = Model(
+    states={"v": "m/s", "r": "rad/s", "psi": "rad"},
+    inputs={"port": "1", "starboard": "1"},
+    params={"gain": Param(1.0, "m/s^2", 0.2, 3.0), "arm": Param(0.6, "1/m", 0.1, 2.0)},
+    angles=("psi",),
+    derivative=lambda s, a, p: {
+        "v": p.gain * (a.port + a.starboard) - 0.8 * s.v,
+        "r": p.gain * p.arm * (a.starboard - a.port) - 1.2 * s.r,
+        "psi": s.r,
+    },
+)
+"""
+CONFIG = """[model]
+file = "model.py"
+[task]
+dt = 0.05
+horizon = 100
+target = "target.csv"
+[reward]
+state = { v = 1.0, psi = 1.0 }
+input = { port = 0.01, starboard = 0.01 }
+input_change = { port = 0.01, starboard = 0.01 }
+[limits]
+port = [-1.0, 1.0]
+starboard = [-1.0, 1.0]
+[system]
+model = "model.py"
+[log]
+state = { v = { path = "/csv.v" }, r = { path = "/csv.r" }, psi = { path = "/csv.psi" } }
+input = { port = { path = "/csv.port" }, starboard = { path = "/csv.starboard" } }
+"""
+T = np.arange(101) * 0.05
+TARGET = "t,v,psi\n" + "\n".join(f"{t:.2f},{0.3 * t:.4f},{0.2 * t:.4f}" for t in T) + "\n"
+
+
+@pytest.fixture
+def w(tmp_path):
+    return Workspace(make(tmp_path / "w", config=CONFIG, model=MODEL, target=TARGET).folder)
+
+
+def log(w, path, scale=1.0, columns=("port", "starboard"), seed=0):
+    """300 steps of the robot, whose parameters are a little off, as a table."""
+    model, rng = w.base_model, np.random.default_rng(seed)
+    sent = np.repeat(rng.uniform(-0.6, 1.0, (30, 2)), 10, axis=0)
+    x, rows = np.zeros(3), []
+    for k, u in enumerate(sent):
+        rows.append([0.05 * k, *(x + rng.normal(0, 2e-3, 3)), *(scale * u)])
+        x = model.system.step(x[None], u[None] * [0.9, 1.1], model.values, 0.05)[0]
+    np.savetxt(path, rows, "%.6f", ",", header=f"t,v,r,psi,{','.join(columns)}", comments="")
+    return path
+
+
+def test_a_sound_log_is_taken_in_without_a_word(w, tmp_path):
+    found = w.ingest(log(w, tmp_path / "a.csv"), data=True)
+    assert not found.warnings and w.preflight() == ()
+
+
+def test_exchanged_commands_are_told_at_once_and_stop_a_diagnosis(w, tmp_path):
+    for k in range(2):
+        path = log(w, tmp_path / f"{k}.csv", columns=("starboard", "port"), seed=k)
+        (warning,) = w.ingest(path, data=True).warnings
+        assert holds(
+            warning,
+            "port and starboard",
+            "exchanged",
+            "paths in [log]",
+            f"then discard t000{k + 1}",
+        )
+    done = grounded("-C", w.folder, "diagnose")
+    said = " ".join(done.err.replace("\\\n", " ").split())  # wherever the command was wrapped
+    assert done.code == 1 and holds(said, "port and starboard", "discard t0001 t0002")
+    with pytest.raises(GroundedError, match="exchanged"):
+        Workspace(w.folder).preflight()
+
+
+def test_a_yaw_in_degrees_beside_its_rate_is_told_at_once(w, tmp_path):
+    """Only the diagnosis told it, when the next logs were read so, too."""
+    path = log(w, tmp_path / "a.csv")
+    rows = np.loadtxt(path, delimiter=",", skiprows=1)
+    rows[:, 3] = np.rad2deg(rows[:, 3])
+    np.savetxt(path, rows, "%.6f", ",", header="t,v,r,psi,port,starboard", comments="")
+    (warning,) = w.ingest(path, data=True).warnings
+    assert holds(warning, "psi", "degrees", "[log.state.psi]", "0.017453293")
+
+
+@pytest.mark.parametrize(("most", "wrong"), [(100.0, True), (1.0, False)])
+def test_limits_in_the_wrong_unit_of_a_log_are_told_with_the_right_ones(tmp_path, most, wrong):
+    """Once the scale was corrected, limits from the log in degrees allowed a steer of 22.9 rad."""
+    config = CONFIG.replace("[-1.0, 1.0]", f"[-{most}, {most}]")
+    w = Workspace(make(tmp_path / "w", config=config, model=MODEL, target=TARGET).folder)
+    (warning,) = w.ingest(log(w, tmp_path / "a.csv", scale=100.0), data=True).warnings
+    assert ("write port = [-1, 1], starboard = [-1, 1] there, then discard" in warning) is wrong
+
+
+@pytest.mark.parametrize("here", [True, False])
+def test_a_log_in_a_wrong_unit_is_to_be_ingested_again_once_it_is_discarded(
+    w, tmp_path, monkeypatch, here
+):
+    """`next: status`, it said, after a warning to ingest the log again."""
+    path = log(w, tmp_path / "a.csv", scale=100.0)
+    w.ingest(path, data=True)
+    (tmp_path / "b").mkdir()
+    monkeypatch.chdir(tmp_path / "b")
+    if not here:
+        path = path.rename(tmp_path / "b" / "elsewhere.csv")
+    done = w.discard("t0001")
+    assert done.then == NextCommand("ingest", ("../a.csv" if here else "LOG", "--data"))
+    said = grounded("-C", w.folder, "discard", "t0001").out.replace("\\\n", "").split()
+    assert said[-3:] == ["ingest", *done.then.arguments]
+    toml = w.folder / "grounded.toml"
+    toml.write_text(toml.read_text().replace('port" }', 'port", scale = 0.01 }'))
+    toml.write_text(toml.read_text().replace('starboard" }', 'starboard", scale = 0.01 }'))
+    again = Workspace(w.folder).ingest(path, data=True)
+    assert (again.trial, again.warnings) == ("t0002", ())
+    assert Workspace(w.folder).discard("t0002").then == NextCommand("status")
+
+
+def test_percent_is_told_with_the_scale_and_a_scale_mends_it(w, tmp_path):
+    path = log(w, tmp_path / "a.csv", scale=100.0)
+    (warning,) = w.ingest(path, data=True).warnings
+    assert holds(warning, "100 times", "percent", "[log.input.port]", "by 0.01", "[limits]")
+    with pytest.raises(GroundedError) as stopped:
+        w.diagnose()
+    assert stopped.value.then is not None and stopped.value.then.verb == "discard"
+    w.discard("t0001")
+    toml = w.folder / "grounded.toml"
+    text = toml.read_text()
+    for name in ("port", "starboard"):
+        text = text.replace(f'"/csv.{name}" }}', f'"/csv.{name}", scale = 0.01 }}')
+    toml.write_text(text)
+    again = Workspace(w.folder)
+    assert not again.ingest(path, data=True).warnings and again.preflight() == ()
+
+
+def test_percent_far_beyond_limits_is_told_where_the_model_tells_nothing(w, tmp_path):
+    path = log(w, tmp_path / "a.csv", scale=100.0)
+    rows = np.loadtxt(path, delimiter=",", skiprows=1)
+    rows[:, 1:4] = 0.0  # its motors are off
+    np.savetxt(path, rows, "%.6f", ",", header="t,v,r,psi,port,starboard", comments="")
+    still, *told = w.ingest(path, data=True).warnings
+    assert holds(still, "no state changes")
+    assert len(told) == 2 and all(holds(one, "-1 to 1", "percent", "0.01") for one in told)
+
+
+def test_a_run_whose_commands_are_in_percent_is_its_candidate_s(w, tmp_path):
+    plan = w.propose().candidate
+    w.run()
+    trial = read_trial(next((w.folder / "runs").iterdir()))[0]
+    t = trial.dt * np.arange(trial.steps)
+    table = np.column_stack([t, trial.states[:-1], 100 * trial.inputs])
+    path = tmp_path / "run.csv"
+    np.savetxt(path, table, "%.9f", ",", header="t,v,r,psi,port,starboard", comments="")
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(path)
+    assert holds(str(refused.value), plan.id, "port and starboard 100", "in percent", "by 0.01")
+
+
+def test_a_run_with_exchanged_commands_names_them(w, tmp_path):
+    """It was told as `somebody, or another controller, drove`."""
+    plan = w.propose().candidate
+    w.run()
+    trial = read_trial(next((w.folder / "runs").iterdir()))[0]
+    t = trial.dt * np.arange(trial.steps)
+    table = np.column_stack([t, trial.states[:-1], trial.inputs])
+    path = tmp_path / "run.csv"
+    np.savetxt(path, table, "%.9f", ",", header="t,v,r,psi,starboard,port", comments="")
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(path)
+    said = str(refused.value)
+    assert holds(said, plan.id, "port", "starboard") and "somebody" not in said
+    recording = read_foreign(w, path, mapping_of(w, path)).recording
+    assert exchanged_in(recording, w.task, plan) == ("port", "starboard")
+    toml = w.folder / "grounded.toml"
+    toml.write_text(
+        toml.read_text()
+        .replace('port = { path = "/csv.port" }', 'port = { path = "/csv.A" }')
+        .replace('starboard = { path = "/csv.starboard" }', 'starboard = { path = "/csv.port" }')
+        .replace("/csv.A", "/csv.starboard")
+    )
+    assert Workspace(w.folder).ingest(path).candidate == plan.id

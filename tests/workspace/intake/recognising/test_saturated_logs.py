@@ -1,0 +1,167 @@
+"""Logs of a balancing robot that fell: its motor was at its limits nearly all the time.
+
+Commands at the limits follow from most policies, so few samples tell where a run begins and what a
+program passed to its candidate.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from facts import holds
+from grounded import Model, Reward, Task
+from grounded.policy import Policy
+from grounded.search.returned.who_drove import evidence, follows
+from grounded.trial import Trial
+from grounded_trials.logs.signals import Series, SignalSpec
+from grounded_trials.workspace.intake.locating.run_start import recording
+from grounded_trials.workspace.intake.recognising.misused_run import exactly_misused, misused_in
+
+DT, STEPS, WAITS, LIMIT, NAMES = 0.01, 300, 150, 7.4, (("tilt", "rate"), ("voltage",))
+HAND = np.array([38.0, 4.0])
+
+
+def candidate(gain, seed=1, name="c0003"):
+    """A policy whose plan and gains change from step to step."""
+    rng, k = np.random.default_rng(seed), np.arange(STEPS)
+    plan = 0.8 * np.sin(0.05 * k + rng.uniform(0, 6))[:, None]
+    gains = np.zeros((STEPS, 1, 3))
+    gains[:, 0, :2] = np.asarray(gain) * (1 + 0.2 * np.sin(0.03 * k))[:, None]
+    limit, none = np.array([LIMIT]), np.zeros(1)
+    reference = np.zeros((STEPS, 3))
+    reference[:, 0] = 0.03 * np.sin(0.07 * k)
+    policy = Policy(plan, -limit, limit, DT, *NAMES, (1,), (False,) * 2, none, gains, reference)
+    predicted = np.stack([reference[:, 0], np.gradient(reference[:, 0], DT)], axis=1)
+    return SimpleNamespace(
+        id=name, policy=policy, predicted_states=np.vstack([predicted, predicted[-1:]])
+    )
+
+
+def balanced(ran, seed=0, factor=1.0, after=100):
+    """Balance by hand for 1.5 s, then by a policy with late commands and a loop that jitters."""
+    rng, queue, u = np.random.default_rng(seed), [], 0.0
+    x, now, rows = np.array([0.0, 0.0]), 0.0, []
+    for k in range(WAITS + STEPS + after):
+        t = k * DT + abs(rng.normal(0, 0.0008))
+        while now < t:
+            while queue and queue[0][0] <= now:
+                u = queue.pop(0)[1]
+            fell = abs(x[0]) > 0.9
+            x = np.array([np.sign(x[0]) * 0.95, 0.0]) if fell else x + 5e-4 * acceleration(x, u)
+            now += 5e-4
+        felt = x + rng.normal(0, (0.0015, 0.01))
+        step = k - WAITS
+        if 0 <= step < STEPS:
+            one = ran.policy
+            sent = one.feedforward[step, 0]
+            sent += one.gain[step, 0, :2] @ (factor * felt - one.reference[step, :2])
+        else:
+            sent = HAND @ felt
+        sent = float(np.clip(sent, -LIMIT, LIMIT))
+        queue.append((t + 0.025, sent))
+        rows.append((t, *felt, sent))
+    return np.array(rows)
+
+
+def acceleration(x, u):
+    return np.array([x[1], 45 * np.sin(x[0]) - 9 * u])
+
+
+def log_of(rows):
+    """Return a task and the recording of rows whose commands have stamps of their own."""
+
+    def logged(values, late):
+        t = np.round(1e9 * (1000 + rows[:, 0] + late)).astype(np.int64)
+        return Series(SignalSpec("/a.b"), t, values, t, len(t), "", True)
+
+    series = {
+        "tilt": logged(rows[:, 1], 0.0),
+        "rate": logged(rows[:, 2], 0.0),
+        "voltage": logged(rows[:, 3], 0.0006),
+    }
+    model = Model(
+        states={"tilt": "rad", "rate": "rad/s"},
+        inputs={"voltage": "V"},
+        params={},
+        derivative=lambda s, a, p: {"tilt": s.rate, "rate": 45 * np.sin(s.tilt) - 9 * a.voltage},
+    )
+    task = Task(
+        model=model,
+        dt=DT,
+        target=np.zeros((STEPS + 1, 2)),
+        reward=Reward(np.array([1.0, 0.1]), np.zeros(2), np.array([0.01]), np.zeros(1)),
+        start=np.zeros(2),
+        past=np.zeros(1),
+        low=np.array([-LIMIT]),
+        high=np.array([LIMIT]),
+        latency=np.array([0.025]),
+    )
+    return task, recording(series, task, lambda one: one)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_run_at_its_limits_begins_where_its_few_other_commands_are_exact(seed):
+    """It began 0.25 s late, when the robot was falling already: its commands fitted there too."""
+    ran = candidate(30 * HAND)
+    rows = balanced(ran, seed)
+    assert np.mean(np.abs(rows[WAITS : WAITS + STEPS, 3]) < LIMIT) < 0.05
+    _, log = log_of(rows)
+    found = log.start_of(ran.policy)
+    assert found.alike and found.exact
+    assert found.seconds == pytest.approx(WAITS * DT, abs=0.004)
+    assert found.loose_s == 0.0 and found.rival_s is None  # each command has its own stamp
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_degrees_are_named_though_somebody_else_drove_first(seed):
+    """`Up to 2.0 s they are alike: then somebody took over`, it was said of hand and candidate."""
+    own = candidate(HAND)
+    task, log = log_of(balanced(own, seed, 180 / np.pi))
+    told = exactly_misused(log, task, own)
+    assert holds(told, "tilt and rate", "degrees", "pass rad")
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_another_policy_at_its_limits_is_no_misuse(seed):
+    """It was what the candidate sends `if the time stays at 0`: 90 % of the commands were."""
+    ran, own = candidate(6 * HAND, 2), candidate((2 + 0.5 * seed) * HAND, 3)
+    task, log = log_of(balanced(ran, seed))
+    assert exactly_misused(log, task, own) == "" == misused_in(log, task, own)
+
+
+def test_commands_at_the_same_limit_make_neither_of_two_policies_likelier():
+    rng, own, other = np.random.default_rng(0), candidate(HAND), candidate(1.05 * HAND, 1)
+    states = rng.normal(0, (0.01, 0.1), (STEPS + 1, 2))
+    states[100:] = 0.95, 0.0
+    sent = own.policy.commands(states[None, :STEPS], np.zeros(1))[0]
+    sent[:100] += rng.normal(0, 0.3, (100, 1))
+    trial = Trial(states, np.clip(sent, -LIMIT, LIMIT), DT, *NAMES)
+    whole, part = (
+        evidence(*(follows(one.policy, some) for one in (own, other)))
+        for some in (trial, trial.until(100))
+    )
+    assert whole == pytest.approx(part, rel=0.05)
+
+
+def test_a_hand_that_balanced_before_a_fall_is_not_said_to_be_the_candidate():
+    """`Up to 2.0 s they are alike`, it said of commands without any correlation."""
+    own, rng = candidate(4 * HAND), np.random.default_rng(0)
+    states = rng.normal(0, (0.0015, 0.01), (STEPS + 1, 2))
+    sent = states[:STEPS] @ [0, 10.0]
+    states[100:] += rng.normal(0, (0.01, 0.1), (STEPS - 99, 2))
+    sent[100:] = LIMIT * np.sign(rng.normal(size=STEPS - 100))
+    found = follows(own.policy, Trial(states, sent[:, None], DT, *NAMES))
+    assert not found.alike and found.until_s >= 1.0 and not found.opens
+
+
+@pytest.mark.parametrize("tilt", [0.5, 0.01])
+def test_an_opening_at_the_limit_is_no_opening(tilt):
+    own, t = candidate(8 * HAND), np.arange(STEPS + 1)
+    states = np.stack([0.02 * np.sin(0.09 * t), 0.18 * np.cos(0.09 * t)], axis=1)
+    if tilt == 0.5:
+        states[:100] = tilt, 0.0
+    sent = own.policy.commands(states[None, :STEPS], np.zeros(1))[0]
+    sent[100:] *= -1
+    found = follows(own.policy, Trial(states, sent, DT, *NAMES))
+    assert not found.alike and found.until_s >= 1.0 and found.opens == (tilt < 0.5)

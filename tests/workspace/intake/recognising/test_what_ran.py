@@ -1,0 +1,456 @@
+"""Is this log that run? What FACTS of 0.1 found: a manual-driving log was taken for a candidate's.
+
+Every test here fails on 0.1, which compared nothing and knew no `discard`.
+"""
+
+import json
+import re
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from facts import holding, holds
+from grounded.errors import GroundedError, NextCommand
+from grounded.plant import Plant
+from grounded.search.returned.who_drove import suspicion
+from grounded.trial import Trial
+from grounded_trials import Workspace
+from grounded_trials.store.trial_file import read_trial, write_trial
+from grounded_trials.workspace.candidates.proposing import propose_in
+from grounded_trials.workspace.candidates.running import run_candidate
+from grounded_trials.workspace.candidates.search_state import standing_in
+from grounded_trials.workspace.intake.ingest import ingest_log
+from recorded import LOGGED as AS_TABLE
+from recorded import record
+from workspaces import CONFIG, make
+
+NOISY = CONFIG + "[system.noise.measurement]\nx = 0.002\nv = 0.01\n"
+
+
+@pytest.fixture(scope="module")
+def learnt(tmp_path_factory):
+    """Three candidates of a cart with noisy sensors, each with its trial."""
+    w = make(tmp_path_factory.mktemp("w") / "w", config=NOISY)
+    for _ in range(3):
+        ingest_log(w, run_candidate(w, propose_in(w).candidate.id).trial_file)
+    return w
+
+
+def runs(w):
+    contents = w.read()
+    by_id = {c.id: c for c in contents.candidates}
+    return [(by_id[t.trial.candidate], t.trial, contents.candidates) for t in contents.trials]
+
+
+def late(x):
+    return np.vstack([x[:1], x[:-1]])
+
+
+HONEST = {
+    "as it was": lambda x, u: (x, u),
+    "inputs a step late": lambda x, u: (x, late(u)),
+    "states a step late": lambda x, u: (late(x), u),
+    "noisy log": lambda x, u: (x + np.random.default_rng(1).normal(0, 0.01, x.shape), u),
+    "coarse commands": lambda x, u: (x, np.round(u, 1)),
+    "before clipping": lambda x, u: (x, np.where(np.abs(u) >= 5, 1.5 * u, u)),
+}
+OTHERS = {
+    "somebody": lambda u: 3 * np.sin(np.arange(len(u)) / 3)[:, None],
+    "the same half a second late": lambda u: np.vstack([u[:1]] * 10 + [u[:-10]]),
+    "nobody": lambda u: 0 * u,
+    "backwards": lambda u: u[::-1],
+}
+
+
+@pytest.mark.parametrize("kind", HONEST)
+def test_a_run_is_recognised_though_the_log_is_not_perfect(learnt, kind):
+    for own, trial, candidates in runs(learnt):
+        states, inputs = HONEST[kind](np.array(trial.states), np.array(trial.inputs))
+        logged = replace(trial, states=states, inputs=inputs)
+        assert suspicion(learnt.task, logged, own, candidates).why == ""
+
+
+@pytest.mark.parametrize("share", [0.01, 0.03])
+def test_a_run_on_states_of_varying_age_with_noise_of_its_own_is_recognised(learnt, share):
+    """The robot acted on other samples than the log has: up to 2 steps older, another noise."""
+    rng = np.random.default_rng(2)
+    for own, trial, _ in runs(learnt):
+        clean, T = np.array(trial.states), trial.steps
+        noise = share * np.ptp(clean, axis=0)
+        for _ in range(5):
+            age = np.maximum(np.arange(T) - rng.integers(0, 3, T), 0)
+            acted = clean[age] + noise * rng.normal(size=(T, clean.shape[1]))
+            logged = replace(
+                trial,
+                states=clean + noise * rng.normal(size=clean.shape),
+                inputs=own.policy.commands(acted[None], own.policy.past)[0],
+            )
+            assert suspicion(learnt.task, logged, own, [own]).why == ""
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_other_commands_are_not_the_candidate_s(learnt, kind):
+    for own, trial, candidates in runs(learnt):
+        logged = replace(trial, inputs=OTHERS[kind](np.array(trial.inputs)))
+        assert "force" in suspicion(learnt.task, logged, own, candidates).why
+
+
+def test_every_pair_of_candidates_is_told_apart(learnt):
+    for own, trial, candidates in runs(learnt):
+        for other in candidates:
+            why = suspicion(learnt.task, replace(trial, candidate=other.id), other, candidates).why
+            assert why.endswith(f"those of {own.id}") if other.id != own.id else why == ""
+
+
+def test_a_takeover_is_dated(learnt):
+    own, trial, candidates = runs(learnt)[0]
+    inputs = np.array(trial.inputs)
+    inputs[25:] = -inputs[25:] + 2
+    why = suspicion(learnt.task, replace(trial, inputs=inputs), own, candidates).why
+    assert re.search(r"up to 1\.[0-3] s", why)
+
+
+@pytest.fixture
+def waiting(tmp_path):
+    """A workspace that waits for c0002, and a log of manual driving."""
+    w = Workspace(make(tmp_path / "w").folder)
+    ran = w.run(w.propose().candidate.id).trial_file
+    w.ingest(ran)
+    w.propose()
+    t = 0.05 * np.arange(41)
+    driven = Trial(
+        states=np.column_stack([1 - np.cos(t), np.sin(t)]),
+        inputs=(1.4 * np.cos(t) + 0.5 * np.sin(t))[:40, None],
+        dt=0.05,
+        state_names=("x", "v"),
+        input_names=("force",),
+    )
+    write_trial(tmp_path / "driven.mcap", driven, {"kind": "trial"})
+    return w, ran, tmp_path / "driven.mcap"
+
+
+def test_manual_driving_is_refused_and_taken_as_data(waiting):
+    w, _, driven = waiting
+    refused = grounded("-C", w.folder, "ingest", driven)
+    assert refused.code == 1 and holds(refused.err, driven.name, "c0002", "--data")
+    assert len(w.store.list()) == 1
+    taken = grounded("-C", w.folder, "ingest", driven, "--data", "--json")
+    assert taken.code == 0 and taken.json["trials"][0]["candidate"] is None
+    w.forget()
+    assert standing_in(w).outstanding.id == "c0002"
+
+
+def test_a_named_candidate_overrides_with_a_warning(waiting):
+    w, _, driven = waiting
+    found = w.ingest(driven, candidate="c0002")
+    assert found.candidate == "c0002" and "force" in found.warnings[0]
+
+
+def said_to_have_run(candidate, run, to, steps=sys.maxsize, nudge=0.0):
+    """The file `to`, with a run's trial, or its first steps, as one that names this candidate."""
+    trial, _, _ = read_trial(run)
+    trial = replace(trial, states=trial.states + nudge)  # no two runs are the same recording
+    write_trial(to, replace(trial.until(steps), candidate=candidate), {"kind": "trial"})
+    return to
+
+
+def test_the_log_of_another_candidate_says_so(waiting, tmp_path):
+    w, ran, _ = waiting
+    again = said_to_have_run("", ran, tmp_path / "again.mcap")
+    with pytest.raises(GroundedError, match="those of c0001") as refused:
+        w.ingest(again)
+    arguments = (str(again), "--candidate", "c0001")
+    assert refused.value.then == NextCommand("ingest", arguments)
+    done = grounded("-C", w.folder, "next", again, "--candidate", "c0001")
+    assert done.code == 0, done.err
+    assert w.ingest(again, candidate="c0001").candidate == "c0001"
+
+
+def test_a_trial_that_names_its_candidate_is_not_given_to_another(waiting, tmp_path):
+    """A run of another workspace's c0002 was said to be one of c0001, and refused as that."""
+    w, ran, _ = waiting
+    other = said_to_have_run("c0002", ran, tmp_path / "x.mcap")
+    with pytest.raises(GroundedError, match="another workspace") as refused:
+        w.ingest(other)
+    assert "says that it ran c0002" in str(refused.value)
+    assert "--candidate c0001" not in str(refused.value)  # which would be refused in turn
+    assert refused.value.then == NextCommand("ingest", (str(other), "--data"))
+    assert w.ingest(other, candidate="c0002").candidate == "c0002"
+
+
+def test_a_run_that_ended_early_says_how_to_take_it_back(waiting, tmp_path):
+    w, ran, _ = waiting
+    for candidate in ("c0001", "c0002"):
+        short = said_to_have_run("", ran, tmp_path / f"{candidate}.mcap", 20, nudge=1e-9)
+        found = w.ingest(short, candidate=candidate)
+        (said,) = [one for one in found.warnings if "after 20 of 40 steps" in one]
+        assert f"`discard {found.trial}`" in said
+        assert ("ran to the end before" in said) == (candidate == "c0001")
+        assert found.verdict == "crashed" or candidate == "c0001"
+
+
+def test_a_candidate_that_crashed_before_names_the_run_that_did(tmp_path):
+    """Of a run that came to its end: `c0010 utility -83.04, crashed: it did not run to the end`."""
+    w = Workspace(make(tmp_path / "w").folder)
+    ran = w.run(w.propose().candidate.id).trial_file
+    short = w.ingest(said_to_have_run("c0001", ran, tmp_path / "short.mcap", 20))
+    assert short.crashed == (short.trial,)
+    run = said_to_have_run("c0001", ran, tmp_path / "run.mcap", nudge=1e-9)
+    done = grounded("-C", w.folder, "ingest", run)
+    told = " ".join(done.out.split())
+    assert holds(told, "t0002", f"{short.trial} did not") and "it did not run" not in told
+    again = w.ingest(run)
+    assert (again.verdict, again.crashed) == ("crashed", ("t0001",))
+    assert np.isfinite(again.utility) and again.to_json()["crashed"] == ["t0001"]
+    w.discard(short.trial)
+    assert (w.ingest(run).verdict, w.ingest(run).crashed) == ("first", ())
+
+
+def test_a_discarded_trial_counts_nowhere_until_it_is_restored(waiting):
+    w, _, driven = waiting
+    w.ingest(w.run().trial_file)
+    before = w.status()
+    w.ingest(driven, data=True)
+    done = grounded("-C", w.folder, "discard", "T0002", "--why", "a wheel was loose", "--json")
+    assert done.code == 0 and done.json == {
+        "trials": ["t0002"],
+        "unchanged": [],
+        "discarded": {"t0002": "a wheel was loose"},
+    }
+    now = w.status()
+    assert now.standing.outstanding.id == "c0002" and now.standing.trials == 1
+    assert [t.stored.id for t in w.trials()] == ["t0001", "t0003"]
+    assert now.discarded["t0002"] in grounded("-C", w.folder, "status").out
+    assert grounded("-C", w.folder, "status", "--json").json["discarded"] == now.discarded
+    assert "aside: t0002" in grounded("-C", w.folder, "report").out
+    assert len(w.store.list()) == 3 and w.verify().damaged == ()  # nothing is deleted
+    assert w.restore("t0002").discarded == {}
+    assert w.status().standing.utilities == before.standing.utilities
+    assert w.discard("t0002").discarded == {"t0002": ""}  # and again
+
+
+def test_a_discarded_trial_that_is_ingested_again_stays_aside(waiting):
+    w, ran, _ = waiting
+    w.discard("t0001")
+    found = w.ingest(ran)
+    assert found.known and any("set aside" in text for text in found.warnings)
+    assert w.status().standing.trials == 0
+
+
+def test_a_name_that_no_trial_has(waiting):
+    w, _, _ = waiting
+    with pytest.raises(GroundedError, match="no trial 'T0009': the only one is t0001"):
+        w.discard("t0001", "T0009")
+    assert w.discarded() == {}
+
+
+def test_a_damaged_note_is_named_and_the_trial_does_not_come_back_silently(waiting):
+    w, _, _ = waiting
+    w.discard("t0001")
+    (note,) = (w.folder / "trials").glob("n0001-*.json")
+    note.chmod(0o644)
+    note.write_text(json.dumps({"note": "restore", "trial": "0" * 16, "why": ""}))
+    assert [one.file for one in w.verify().damaged] == [str(note)]
+    with pytest.raises(GroundedError, match="is damaged"):
+        w.status()
+
+
+FOREIGN = CONFIG.replace("[system]", "[unused]").split("[unused]")[0] + (
+    '[log]\nclock = "publish"\n[log.state.x]\npath = "/state.x"\n[log.state.v]\n'
+    'path = "/state.v"\n[log.input.force]\npath = "/input.force"\nresample = "hold"\n'
+)
+
+
+def test_several_foreign_logs_are_taken_in_one_after_another(tmp_path):
+    """`ingest A B C`: on 0.1 the first emptied the [log] table, and the second was refused."""
+    w = make(tmp_path / "w", config=FOREIGN)
+    paths = [tmp_path / f"{k}.mcap" for k in range(3)]
+    for k, path in enumerate(paths):
+        foreign_log(path, k)
+    for path in paths:
+        assert not ingest_log(w, path, data=True).known
+    assert grounded("-C", w.folder, "ingest", "--data", *paths).code == 0
+    assert len(w.store.list()) == 3
+
+
+def foreign_log(path, seed):
+    """A log that is no trial of ours: the same channels, without the table `grounded`."""
+    from grounded_trials.formats.mcap_writer import LogWriter, encode_doubles
+
+    values = np.random.default_rng(seed).normal(size=(81, 3))
+    with path.open("wb") as stream:
+        log = LogWriter(stream)
+        state = log.channel("/state", "State", ["x", "v"])
+        force = log.channel("/input", "Input", ["force"])
+        rows = zip(encode_doubles(values[:, :2]), encode_doubles(values[:, 2:]), strict=True)
+        for k, (x, u) in enumerate(rows):
+            log.message(state, k * 25_000_000, x)
+            log.message(force, k * 25_000_000, u)
+        log.finish()
+
+
+def test_the_candidate_after_a_false_crash_is_not_handed_out_once_that_is_discarded(tmp_path):
+    w = Workspace(make(tmp_path / "w").folder)
+    ran, _, _ = read_trial(w.run(w.propose().candidate.id).trial_file)
+    write_trial(tmp_path / "short.mcap", ran.until(20), {"kind": "trial", "task": w.task.hash})
+    assert w.ingest(tmp_path / "short.mcap", candidate="c0001").verdict == "crashed"
+    assert w.propose().candidate.caution == 1
+    w.discard("t0001")
+    again = w.propose()
+    assert again.candidate.id == "c0001" and "crash" not in again.proposal.standing.sentence
+    w.ingest(w.run("c0001").trial_file)
+    new = w.propose()
+    assert (new.candidate.id, new.candidate.base, new.candidate.caution) == ("c0003", "c0001", 0)
+    for proposed, told in ((again, True), (new, False)):  # once
+        notes = proposed.proposal.notes
+        assert any("c0002" in note and "set aside" in note for note in notes) == told
+
+
+def test_the_candidate_after_a_run_that_was_stopped_gives_way_once_that_is_discarded(tmp_path):
+    """Only deleting candidates/c0007.mcap brought back the candidate that had been stopped."""
+    w = Workspace(make(tmp_path / "w").folder)
+    w.ingest(w.run(w.propose().candidate.id).trial_file)
+    ran, _, _ = read_trial(w.run(w.propose().candidate.id).trial_file)
+    write_trial(tmp_path / "short.mcap", ran.until(20), {"kind": "trial", "task": w.task.hash})
+    short = w.ingest(tmp_path / "short.mcap", candidate="c0002").trial
+    after = w.propose().candidate
+    assert (after.id, after.seen) == ("c0003", ("t0001", short))
+    w.discard(short)
+    again = w.propose()
+    assert (again.candidate.id, again.proposal.is_new) == ("c0002", False)
+    for notes in (again.proposal.notes, w.status().notes):
+        assert any(holds(note, "c0003", short, "void", "--candidate c0003") for note in notes)
+    assert w.propose().candidate.id == "c0002"
+    assert any(short in note for note in w.export("c0003", tmp_path / "c.npz").notes)
+    w.restore(short)
+    assert w.propose().candidate.id == "c0003"
+
+
+def test_it_is_said_whose_commands_they_are_only_where_they_match(learnt):
+    """A third policy's run, nearer to one candidate than to the other, is neither's."""
+    (own, _, candidates), _, (_, theirs, _) = runs(learnt)
+    inputs = theirs.inputs + 0.25 * np.sin(np.arange(theirs.steps) / 8)[:, None]
+    seen = suspicion(learnt.task, replace(theirs, inputs=inputs), own, candidates)
+    why, name = seen.why, seen.other
+    assert "nearer" in why and name == ""
+    seen = suspicion(learnt.task, theirs, own, candidates)
+    why, name = seen.why, seen.other
+    assert why and name == theirs.candidate != own.id
+
+
+LOGGED = (
+    CONFIG
+    + """
+[log.state.x]
+path = "/csv.x"
+[log.state.v]
+path = "/csv.v"
+[log.input.force]
+path = "/csv.force"
+"""
+)
+
+
+def recorded(path, trial, before, rng):
+    """A run as a table at 100 Hz that begins earlier: the robot rests and is sent zeros."""
+    t = np.arange(round((before + 2.5) * 100)) / 100
+    run = np.clip(t - before, 0, 2)
+    x = [np.interp(run, 0.05 * np.arange(41), column) for column in trial.states.T]
+    step = np.clip(np.floor((t - before) / 0.05 + 1e-6).astype(int), -1, 40)
+    force = np.concatenate([[0.0], trial.inputs[:, 0], [0.0]])[step + 1]
+    noisy = np.column_stack(x) + rng.normal(0, 0.001, (len(t), 2))
+    rows = np.column_stack([1000 + t, noisy, force])
+    np.savetxt(path, rows, "%.5f", ",", header="t,x,v,force", comments="")
+
+
+@pytest.mark.parametrize("before", [0.0, 1.0, 3.23])
+def test_a_recording_may_begin_before_the_run(tmp_path, before):
+    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
+    trial, _, _ = read_trial(w.run(w.propose().candidate.id).trial_file)
+    recorded(tmp_path / "run.csv", trial, before, np.random.default_rng(0))
+    taken = w.ingest(tmp_path / "run.csv")
+    assert taken.candidate == "c0001" and taken.utility == pytest.approx(
+        w.task.utility(trial), rel=0.02
+    )
+    (stored,) = w.trials()
+    np.testing.assert_allclose(stored.trial.inputs, trial.inputs, atol=1e-4)
+    assert [f"{before:.2f}" in one for one in taken.notes] == [True] * (before > 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("given", ["start = 0.0", 'start = "first-input"'])
+def test_a_span_that_was_given_is_kept_to_and_a_strange_run_has_no_start(tmp_path, given):
+    config = LOGGED + f"[log.span]\n{given}\n"
+    w = Workspace(make(tmp_path / "w", config=config).folder)
+    trial, _, _ = read_trial(w.run(w.propose().candidate.id).trial_file)
+    recorded(tmp_path / "run.csv", trial, 1.0, np.random.default_rng(0))
+    with pytest.raises(GroundedError, match=holding("log.span")):
+        w.ingest(tmp_path / "run.csv")
+    (w.folder / "grounded.toml").write_text(LOGGED)
+    w.forget()
+    strange = replace(trial, inputs=OTHERS["somebody"](np.array(trial.inputs)))
+    recorded(tmp_path / "strange.csv", strange, 1.0, np.random.default_rng(0))
+    with pytest.raises(GroundedError, match="c0001"):
+        w.ingest(tmp_path / "strange.csv")
+    assert not w.trials()
+
+
+def test_a_copy_is_discarded_without_its_original(waiting):
+    """Both have one hash; a stranger lost the run that he had, with the copy of it."""
+    w, _, _ = waiting
+    w.ingest(w.run().trial_file)
+    original = w.trials()[0].stored
+    w.store.add(original.path.read_bytes(), again=True)
+    w.forget()
+    copy = w.trials()[-1].stored
+    assert copy.digest == original.digest
+    assert list(w.discard(copy.id).discarded) == [copy.id]
+    assert [one.stored.id for one in w.trials()].count(original.id) == 1
+    assert list(w.discard(original.id).discarded) == [original.id, copy.id]
+    assert list(w.restore(original.id).discarded) == [copy.id]
+    assert w.restore(copy.id).discarded == {}
+
+
+def test_a_run_of_another_workspace_s_candidate_is_told(tmp_path):
+    """Two copies of a task with other weights: their first candidates send nearly the same."""
+    here, there = (
+        Workspace(make(tmp_path / name, config=CONFIG.replace("x = 10.0", weight)).folder)
+        for name, weight in (("here", "x = 10.0"), ("there", "x = 300.0"))
+    )
+    for w in (here, there):
+        w.propose()
+    log = there.run()
+    trial = read_trial(log.trial_file)[0]
+    stored = here.ingest(log.trial_file, data=True)
+    assert any("another workspace" in note for note in stored.notes)
+    write_trial(tmp_path / "bare.mcap", trial, {"kind": "trial"})
+    told = here.ingest(tmp_path / "bare.mcap")
+    assert any("another workspace" in warning for warning in told.warnings)
+    assert not there.ingest(tmp_path / "bare.mcap").warnings
+    assert not there.ingest(log.trial_file, data=True).notes
+
+
+@pytest.mark.parametrize("before", [0.0, 0.7])
+def test_a_run_without_its_feedback_is_named(tmp_path, before):
+    """`Somebody, or another controller, drove, or no new states reached the policy`, it was."""
+    w = Workspace(make(tmp_path / "w", config=AS_TABLE).folder)
+    alone = replace(w.propose().candidate.policy, gain=None, reference=None)
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(record(w, tmp_path / "a.csv", alone, before))
+    assert holds(str(refused.value), "feed-forward of c0001 alone", "without its feedback")
+
+
+@pytest.mark.parametrize(("mass", "told"), [(1.0, False), (1.02, True)])
+def test_a_run_without_feedback_that_changes_little_counts_with_a_warning(tmp_path, mass, told):
+    w = Workspace(make(tmp_path / "w").folder)
+    alone = replace(w.propose().candidate.policy, gain=None, reference=None)
+    robot = Plant(w.base_model.with_values({"mass": mass}))
+    trial = robot.run(alone, dict.fromkeys(("x", "v"), 0.0), np.random.default_rng(0))
+    file = tmp_path / "t.mcap"
+    write_trial(file, replace(trial, candidate="c0001"), {"kind": "trial", "task": w.task.hash})
+    found = w.ingest(file)
+    assert found.verdict == "first"
+    assert any("feed-forward" in one for one in found.warnings) is told

@@ -1,0 +1,212 @@
+"""[limits] that were read off one log: later logs go beyond them, and a plan stays at them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from facts import holds
+from grounded.instruments.inputs import beyond_limits
+from grounded.instruments.preflight import preflight
+from grounded.trial import Trial
+from grounded_trials import Workspace
+from grounded_trials.store.trial_file import write_trial
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.intake.remarks.after_run import _to_stay
+from grounded_trials.workspace.where_to_mend import where_to_mend
+from recorded import LOGGED, record, waiting
+from workspaces import CONFIG, MODEL, make
+
+NARROW = CONFIG.replace("force = [-5.0, 5.0]", "force = [0.0, 1.17]")
+T = np.arange(200) * 0.05
+
+
+def driven(most, low=0.0):
+    force = low + (most - low) * (0.5 - 0.5 * np.cos(2 * T))[:, None]
+    states = np.column_stack([np.zeros(201), np.zeros(201)])
+    return Trial(states, force, 0.05, ("x", "v"), ("force",))
+
+
+@pytest.fixture
+def w(tmp_path):
+    assert NARROW != CONFIG
+    return Workspace(make(tmp_path / "w", config=NARROW).folder)
+
+
+@pytest.mark.parametrize("most, said", [(2.15, True), (1.17, False), (1.175, False)])
+def test_data_beyond_the_limits_are_told_how_far(w, tmp_path, most, said):
+    write_trial(tmp_path / "d.mcap", driven(most), {"kind": "data"})
+    found = w.ingest(tmp_path / "d.mcap", data=True).warnings
+    told = [one for one in found if "[limits]" in one]
+    assert len(told) == said
+    assert all(holds(one, "force", f"{most:.4g}", "0 to 1.17 N", "widen") for one in told)
+
+
+def test_commands_beyond_their_limits_are_not_said_to_be_at_them(w):
+    """It said `at its limits 43 % of the time` of commands that went to twice the limit."""
+    (found,) = preflight(w.task, [driven(2.15)]).findings
+    share = float((driven(2.15).inputs > 1.17 + 0.0215).mean())
+    assert (found.signal, found.kind) == ("force", "beyond")
+    assert found.share == pytest.approx(share)
+    assert holds(found.finding, "0 to 1.17 N", "0 to 2.15", f"{100 * share:.0f} %")
+    clipped = driven(2.15)
+    clipped = replace(clipped, inputs=np.minimum(clipped.inputs, 1.17))
+    assert [one.kind for one in preflight(w.task, [clipped]).findings] == ["saturated"]
+
+
+LOG = """
+[log]
+state = { x = { path = "/csv.x" }, v = { path = "/csv.v" } }
+input = { force = { path = "/csv.force" } }
+"""
+
+
+def test_logs_are_not_said_to_be_at_limits_that_were_read_off_one(tmp_path):
+    """It said `at its limits 24 % of the time` of the log whose range [limits] are."""
+    seen = NARROW.replace("force = [0.0, 1.17]", 'force = [0.0, 1.17]\nseen_in = "a.csv"')
+    w = Workspace(make(tmp_path / "w", config=seen + LOG).folder)
+
+    def at_limits():
+        found = Workspace(w.folder).preflight()
+        return {one.signal: one.share for one in found if one.kind == "saturated"}
+
+    run = driven(2.15)
+    force = np.minimum(run.inputs, 1.17)
+    rows = np.column_stack([T, run.states[:-1], force])
+    np.savetxt(tmp_path / "a.csv", rows, "%.9f", ",", header="t,x,v,force", comments="")
+    w.ingest(tmp_path / "a.csv", data=True)
+    assert at_limits() == {}
+    plan = w.propose().proposal.candidate.id
+    write_trial(tmp_path / "b.mcap", replace(run, inputs=np.full((200, 1), 1.17)), {"kind": "data"})
+    b = w.ingest(tmp_path / "b.mcap", data=True)
+    assert at_limits() == {}
+    trial = next(one.trial for one in w.trials() if one.stored.id == b.trial)
+    ran = [replace(trial, candidate=plan)]
+    (finding,) = (f for f in preflight(w.task, ran).findings if f.kind == "saturated")
+    assert where_to_mend(Folder(w.folder), ran, [finding]) == (finding,)  # the plan is held by them
+    toml = w.folder / "grounded.toml"
+    toml.write_text(toml.read_text().replace('seen_in = "a.csv"', ""))
+    assert at_limits()["force"] > 0.5
+
+
+@pytest.mark.parametrize(("most", "far"), [(0.0204, True), (0.9, False)])
+def test_limits_far_beyond_all_that_was_sent_are_not_the_range_of_a_log(tmp_path, most, far):
+    """Limits in degrees were `only the range used in drive.mcap`, which was corrected to rad."""
+    seen = NARROW.replace("force = [0.0, 1.17]", 'force = [0.0, 1.17]\nseen_in = "a.csv"')
+    w = Workspace(make(tmp_path / "w", config=seen).folder)
+    write_trial(tmp_path / "d.mcap", driven(most), {"kind": "data"})
+    w.ingest(tmp_path / "d.mcap", data=True)
+    (note,) = (one for one in w.propose().proposal.notes if "seen_in" in one)
+    assert holds(note, "57.4 times", "(0.0204 N)", "unit") is far
+    assert ("only the range used in a.csv" in note) is not far
+
+
+def test_a_side_without_a_limit_has_no_beyond(w):
+    free = replace(w.task, low=np.array([-np.inf]), high=np.array([np.inf]))
+    assert not beyond_limits(free, driven(1e6).inputs).any()
+    one = replace(w.task, low=np.array([-np.inf]))
+    assert beyond_limits(one, driven(2.15).inputs).max() == pytest.approx(0.98, abs=1e-3)
+    assert not beyond_limits(w.task, np.full((5, 1), np.nan)).any()
+
+
+@pytest.mark.parametrize("limit, said", [(0.3, True), (5.0, False)])
+def test_a_first_plan_that_its_limits_keep_from_the_target_says_so(tmp_path, limit, said):
+    """It sent 1.17 m/s for 8 s, reached 2.2 of 3 m, and had no note."""
+    config = CONFIG.replace("force = [-5.0, 5.0]", f"force = [-5.0, {limit}]")
+    notes = Workspace(make(tmp_path / "w", config=config).folder).propose().proposal.notes
+    told = [one for one in notes if "at its limit" in one]
+    assert len(told) == said
+    assert all(holds(one, "force", "0.3 N", "x", "[limits]") for one in told)
+
+
+@pytest.mark.parametrize(("most", "said"), [(40.0, True), (0.9, False), (400.0, False)])
+def test_an_angle_far_beyond_safety_that_degrees_would_explain_is_told(tmp_path, most, said):
+    """An encoder in degrees without a rate sensor: nothing else in the log contradicts it."""
+    w = make(tmp_path / "w", "pendulum")
+    config = w.folder / "grounded.toml"
+    config.write_text(config.read_text() + "\n[safety]\ntheta = [-1.0, 1.0]\n")
+    w = Workspace(w.folder)
+    names = w.task.model.state_names, w.task.model.input_names
+    theta = most * np.sin(2 * T)
+    states = np.column_stack([theta, np.full(len(T), np.nan)])
+    trial = Trial(states, np.sin(T[:-1])[:, None], w.task.dt, *names)
+    write_trial(tmp_path / "d.mcap", trial, {"kind": "data"})
+    found = [one for one in w.ingest(tmp_path / "d.mcap", data=True).warnings if "degrees" in one]
+    assert len(found) == said
+    assert all(
+        holds(one, "program that writes the trials", "write rad", "`discard ") for one in found
+    )
+
+
+def driven_on(w, folder):
+    """A run of c0002 that is logged for 1.5 s longer: file, table, seconds after its end."""
+    policy, file = w.candidate("c0002")[0].policy, folder / "t.csv"
+    record(w, file, policy, 1.0, after=1.5)
+    table = np.loadtxt(file, delimiter=",", skiprows=1)
+    return file, table, table[:, 0] - table[0, 0] - 1.0 - policy.horizon * policy.dt
+
+
+@pytest.mark.parametrize("rolls", [0.0, 0.4])
+def test_a_robot_that_moves_on_after_its_run_did_not_come_to_rest(tmp_path, rolls):
+    """An arm was 0.02 mrad off at the end of its run, and 93 mrad a second later."""
+    w = waiting(tmp_path)
+    file, table, beyond = driven_on(w, tmp_path)
+    end = table[beyond <= 0, 1][-1]
+    table[beyond > 0, 1] = end + rolls * beyond[beyond > 0]
+    np.savetxt(file, table, "%.5f", ",", header="t,x,v,force", comments="")
+    told = [one for one in Workspace(w.folder).ingest(file).warnings if "after the run" in one]
+    assert len(told) == (rolls > 0)
+    assert not told or holds(told[0], " mm from its target", "--hold")
+
+
+@pytest.mark.parametrize("knows", [True, False])
+def test_a_robot_that_its_held_input_lets_go_is_told_so(tmp_path, knows):
+    """A helicopter fell under 0 V after every run: terminal weights and --hold were advised."""
+    model = MODEL.replace("a.force - p", "a.force - 1.5 * s.x - p") if knows else MODEL
+    made = Workspace(make(tmp_path / "w", config=LOGGED, model=model).folder)
+    record(made, tmp_path / "first.csv", made.propose().candidate.policy, 0.0, seed=9)
+    made.ingest(tmp_path / "first.csv")
+    made.propose()
+    file, table, beyond = driven_on(made, tmp_path)
+    if not knows:  # what pulls is not in the model, but in the log
+        late = beyond > 0
+        table[late, 1] = table[beyond <= 0, 1][-1] - 0.3 * beyond[late] ** 2
+        np.savetxt(file, table, "%.5f", ",", header="t,x,v,force", comments="")
+    (told,) = (
+        one for one in Workspace(made.folder).ingest(file).warnings if "after the run" in one
+    )
+    assert holds(told, "force = 0 N", "runner.done(t)", "[task] start")
+    assert ("force = 1.5 N would" in told) is knows
+    assert "terminal" not in told and "--hold" not in told
+
+
+@pytest.mark.parametrize("rolls", [0.0, 0.4])
+def test_a_robot_that_leaves_safety_after_its_run_is_seen_to(tmp_path, rolls):
+    """A car stood in the wall a second after its run, and the log of it was "first"."""
+    w = waiting(tmp_path)
+    file, table, beyond = driven_on(w, tmp_path)
+    most = table[beyond <= 0.1, 1].max()
+    table[beyond > 0, 1] = np.minimum(table[beyond > 0, 1], most)
+    table[:, 1] += rolls * np.clip(beyond - 0.1, 0.0, None)
+    np.savetxt(file, table, "%.5f", ",", header="t,x,v,force", comments="")
+    config = w.folder / "grounded.toml"
+    config.write_text(f"{config.read_text()}\n[safety]\nx = [-9.0, {most + 0.1:.3f}]\n")
+    told = [one for one in Workspace(w.folder).ingest(file).warnings if "after its end" in one]
+    assert len(told) == (rolls > 0)
+    assert not told or holds(told[0], "[safety] x = [-9,", "m.")
+
+
+@pytest.mark.parametrize("rests", [False, True])
+@pytest.mark.parametrize("weighed", [False, True])
+def test_what_a_task_has_already_is_not_advised(tmp_path, rests, weighed):
+    """`--hold` and terminal weights were advised to a task with both."""
+    task = make(tmp_path / "w").task
+    target = np.zeros_like(task.target)  # both states are given
+    target[:, 0] = np.linspace(0, 1, len(target))
+    if rests:
+        target[-len(target) // 4 :, 0] = 1.0
+    reward = replace(task.reward, terminal=np.array([1.0, float(weighed)]))
+    said = _to_stay(replace(task, target=target, reward=reward), [0])
+    assert ("let the target rest at its end" in said) == (not rests)
+    assert ("[reward] terminal" in said) == (not weighed)
+    assert ("for longer" in said) == (rests and weighed)

@@ -1,0 +1,80 @@
+"""Angles that [log] reads from one number of a quaternion, and commands in degrees."""
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from facts import holds
+from grounded import Model, Trial
+from grounded_trials import Workspace
+from grounded_trials.logs.log_table import LogMapping
+from grounded_trials.logs.signals import SignalSpec
+from grounded_trials.workspace.intake.opening.columns_by_name import no_angles
+from grounded_trials.workspace.intake.remarks.log_faults import _degrees
+from ros_bags import rover_bag
+
+CAR = Model(
+    states={"psi": "rad", "qz": "1", "z": "m"},
+    inputs={"u": "1"},
+    derivative=lambda s, a, p: {"psi": a.u, "qz": a.u, "z": a.u},
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "path", "scale", "instead"),
+    [
+        ("psi", "/odom.pose.pose.orientation.z", 1.0, "/odom.pose.pose.orientation.@rpy.yaw"),
+        ("psi", "/tf.transforms[0].transform.rotation.x", 1.0, "rotation.@rpy.roll"),
+        ("psi", "/odom.pose.pose.orientation.@rpy.yaw", 1.0, ""),
+        ("psi", "/odom.pose.pose.orientation.z", 2.0, ""),  # of a small yaw
+        ("psi", "/odom.pose.pose.orientation.z.@asin.@mul(2)", 1.0, ""),
+        ("qz", "/odom.pose.pose.orientation.z", 1.0, ""),
+        ("z", "/odom.pose.pose.position.z", 1.0, ""),
+    ],
+)
+def test_which_paths_are_no_angles(name, path, scale, instead):
+    found = no_angles(CAR, LogMapping({name: SignalSpec(path, scale=scale)}, {}))
+    assert [holds(text, path, instead) for text in found.values()] == [True] * bool(instead)
+
+
+def test_a_part_of_a_quaternion_is_told_wherever_it_is_read(tmp_path):
+    """Nothing was said, and the diagnosis found a gap that no known effect explains."""
+    log, w = rover_bag(tmp_path / "bag"), tmp_path / "w"
+    grounded("init", w, "--from", log, "--json")
+    toml, angle, part = w / "grounded.toml", "orientation.@rpy.yaw", "orientation.z"
+
+    def told():
+        said = grounded("-C", w, "inspect", log, "--json").json["remarks"]
+        found = grounded("-C", w, "diagnose", "--instruments", "--json").json["preflight"]
+        return [any(holds(one, part, angle) for one in some) for some in (said, texts(found))]
+
+    def texts(findings):
+        return [one["finding"] for one in findings]
+
+    assert not any(part in one for one in Workspace(w).ingest(log, data=True).warnings)
+    assert told() == [False, False]
+    toml.write_text(toml.read_text().replace(angle, part))
+    grounded("-C", w, "discard", "t0001")
+    (warning,) = (s for s in Workspace(w).ingest(log, data=True).warnings if part in s)
+    assert holds(warning, "psi", "quaternion", angle)
+    assert told() == [True, True]
+
+
+def test_a_command_in_degrees_is_named_with_its_own_table():
+    """The fault was looked up among the states, which ended ingest with a KeyError."""
+    boat = Model(
+        states={"psi": "rad", "r": "rad/s"},
+        inputs={"rudder": "rad"},
+        derivative=lambda s, a, p: {"psi": s.r, "r": (0.6 * a.rudder - s.r) / 0.8},
+        angles=("psi",),
+    )
+    rudder = 0.3 * np.sign(np.sin(0.9 * np.arange(400) * 0.1))[:, None]
+    x = [np.zeros(2)]
+    for u in rudder:
+        x.append(boat.system.step(x[-1][None], u[None], boat.values, 0.1)[0])
+    y = np.array(x) + 1e-3 * np.random.default_rng(1).standard_normal((401, 2))
+    trial = Trial(y, np.degrees(rudder), 0.1, ("psi", "r"), ("rudder",))
+    (fault,) = _degrees(boat, trial)
+    assert (fault.inputs, fault.factor) == (("rudder",), pytest.approx(57.29578))
+    assert fault.said.startswith("rudder ")
+    assert holds(fault.mend, "[log.input.rudder]", "0.017453293") and "rad" in fault.program

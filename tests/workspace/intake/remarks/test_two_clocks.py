@@ -1,0 +1,97 @@
+"""A motion capture and a robot's program, each with its own clock, in one log."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facts import holding, holds
+from grounded.errors import GroundedError
+from grounded_trials import Workspace
+from recorded import LOGGED, record
+from workspaces import make
+
+SPLIT = LOGGED.replace("/csv.force", "/cmd.force").replace("/csv.", "/mocap.")
+APART = 8134.22  # [s] by which the cameras' clock is ahead
+
+
+def two_tables(w, path, policy, apart):
+    """A run as an NPZ of two tables: what the cameras saw, and what the program sent."""
+    rows = np.loadtxt(record(w, path.with_suffix(".csv"), policy, 0.0), delimiter=",", skiprows=1)
+    t, states, force = rows[:, 0] - rows[0, 0], rows[:, 1:3], rows[:, 3]
+    sent = slice(None, None, round(policy.dt / (t[1] - t[0])))
+    np.savez(
+        path,
+        mocap=states,
+        mocap_t=t + apart,
+        mocap_names=np.array(["x", "v"]),
+        cmd=force[sent, None],
+        cmd_t=t[sent],
+        cmd_names=np.array(["force"]),
+    )
+    return path
+
+
+@pytest.mark.parametrize("apart", [APART, -APART])
+def test_two_clocks_are_told_with_the_lines_that_bridge_them(tmp_path, apart):
+    """It was said that the trial had 0 steps, and [log.span] was named."""
+    config = SPLIT
+    w = Workspace(make(tmp_path / "w", config=config).folder)
+    ran = w.propose().candidate
+    log = two_tables(w, tmp_path / "run.npz", ran.policy, apart)
+    for how in ({"data": True}, {}):
+        with pytest.raises(GroundedError, match="clocks that differ") as refused:
+            w.ingest(log, **how)
+    lines = dict(re.findall(r"\[log\.state\.(\w)\] (delay_s = -?\d+\.\d+)", str(refused.value)))
+    assert list(lines) == ["x", "v"]
+    for name, line in lines.items():
+        assert float(line.split()[-1]) == pytest.approx(apart, abs=0.02)
+        config = config.replace(f'"/mocap.{name}"', f'"/mocap.{name}"\n{line}')
+    (w.folder / "grounded.toml").write_text(config)
+    found = Workspace(w.folder).ingest(log)  # the program was no 8134 s late
+    assert found.candidate == ran.id
+
+
+def test_tables_of_one_clock_are_read_as_they_are(tmp_path):
+    w = Workspace(make(tmp_path / "w", config=SPLIT).folder)
+    ran = w.propose().candidate
+    assert w.ingest(two_tables(w, tmp_path / "run.npz", ran.policy, 0.0)).candidate == ran.id
+
+
+@pytest.mark.parametrize("early", [0.0, 0.5])
+def test_a_log_that_was_put_together_too_early_is_told_with_its_delay(tmp_path, early):
+    """Nothing was said, and a diagnosis claimed four effects."""
+    config = SPLIT.replace('"/mocap.x"', f'"/mocap.x"\ndelay_s = {0.1 + early}')
+    config = config.replace('"/mocap.v"', f'"/mocap.v"\ndelay_s = {0.1 + early}')
+    w = Workspace(make(tmp_path / "w", config=config).folder)
+    rng, t, x, rows = np.random.default_rng(0), 0.0, np.zeros(2), []
+    for force in np.repeat(rng.uniform(-3, 3, 40), 20):
+        rows.append([t, *(x + rng.normal(0, 0.002, 2)), force])
+        x, t = x + 0.02 * np.array([x[1], 0.7 * force - 0.4 * x[1]]), t + 0.02
+    rows = np.array(rows)
+    names = {"mocap_names": np.array(["x", "v"]), "cmd_names": np.array(["force"])}
+    tables = {"mocap": rows[:, 1:3], "cmd": rows[:, 3:]}
+    log = tmp_path / "run.npz"
+    np.savez(log, mocap_t=rows[:, 0] + 0.1, cmd_t=rows[:, 0], **tables, **names)
+    said = [one for one in w.ingest(log, data=True).warnings if "clocks" in one]
+    assert len(said) == (early > 0)
+    for one in said:
+        assert holds(one, "before force", "[log.state.x]", "[log.state.v]", "t0001")
+        assert float(re.search(r"Subtract (\S+) s", one)[1]) == pytest.approx(early, abs=0.06)
+
+
+def test_the_lines_of_the_docs_make_one_log_of_two_tables(tmp_path, monkeypatch):
+    w = Workspace(make(tmp_path / "w", config=SPLIT).folder)
+    ran = w.propose().candidate
+    rows = np.loadtxt(record(w, tmp_path / "a.csv", ran.policy, 0.0), delimiter=",", skiprows=1)
+    (tmp_path / "run").mkdir()
+    monkeypatch.chdir(tmp_path / "run")
+    for name, columns, head in (("mocap", (0, 1, 2), "time,x,v"), ("cmd", (0, 3), "t,force")):
+        np.savetxt(f"{name}.csv", rows[:, columns], "%.5f", ",", header=head, comments="")
+    with pytest.raises(GroundedError, match=holding("cmd.csv and mocap.csv", ".npz", "NAME_t")):
+        w.ingest(tmp_path / "run")
+    docs = Path(__file__).parents[4] / "docs/log-reference.md"
+    (lines,) = re.findall(r"```python\n(.*?np\.savez.*?)```", docs.read_text(), re.DOTALL)
+    exec(compile(lines, str(docs), "exec"), {})
+    assert w.ingest(tmp_path / "run/run.npz").candidate == ran.id

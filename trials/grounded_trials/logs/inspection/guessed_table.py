@@ -1,0 +1,92 @@
+"""Write guessed assignments as the [log] and [estimate] tables of a grounded.toml."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from grounded_trials.logs.inspection.inspect_guess import FEW, Guess
+from grounded_trials.toml_table import key
+
+DRIFT = 2e-4  # of a signal's range: the smallest standard deviation proposed for it
+
+
+def mapping_toml(
+    states: Sequence[Guess], inputs: Sequence[Guess], *, simulated: bool = False
+) -> str:
+    """Format guesses as a [log] table, with comments where a person should check."""
+    clock = "log" if simulated else "header"
+    lines = ["[log]", f'clock = "{clock}"']
+    if simulated:
+        lines[-1] += "  # header stamps are on another clock than the log (simulation time?)"
+    for kind, guesses in (("state", states), ("input", inputs)):
+        for guess in guesses:
+            lines += ["", *_table(kind, guess, clock)]
+    lines += _estimate(states)
+    return "\n".join(lines) + "\n"
+
+
+def _table(kind: str, guess: Guess, clock: str) -> list[str]:
+    head = f"[log.{kind}.{key(guess.name)}]"
+    others = f"; or {', '.join(guess.others[:FEW])}" if guess.others else ""
+    if not guess.path and not guess.others:
+        return [f"# {head}  # nothing in the log fits"]
+    if not guess.path:
+        rest = f"  # or {', '.join(guess.others[1:FEW])}" * (len(guess.others) > 1)
+        keys = (_scale(guess), _clock(guess, clock), _unwrap(guess.others[0]))
+        more = [f"# {line}" for line in keys if line]
+        what = f"no name in the log fits; to use one of these, remove all {len(more) + 2} #"
+        what = what if more else what.replace("all 2", "both")
+        return [f"# {head}  # {what}", f"# path = {_quote(guess.others[0])}{rest}", *more]
+    lines = [head if guess.sure else f"{head}  # unsure{others}"]
+    lines.append(f"path = {_quote(guess.path)}")
+    if guess.field is not None and guess.field.low is not None:
+        lines[-1] += f"  # {guess.field.low:.4g} to {guess.field.high:.4g} in this log"
+    if guess.reasons:
+        lines.insert(1, f"# {'; '.join(guess.reasons)}")
+    if scale := _scale(guess):
+        lines.append(scale)
+    return lines + [line for line in (_clock(guess, clock), _unwrap(guess.path)) if line]
+
+
+def _clock(guess: Guess, usual: str) -> str:
+    return f'clock = "{guess.clock}"' * (guess.clock != usual)
+
+
+def _scale(guess: Guess) -> str:
+    return f"scale = {guess.scale:.10g}" * (guess.scale != 1.0)
+
+
+def _unwrap(path: str) -> str:
+    return "unwrap = true" * path.endswith("@rpy.yaw")
+
+
+def _estimate(states: Sequence[Guess]) -> list[str]:
+    """Return an [estimate] table for the states that the log does not contain."""
+    missing, known = [guess.name for guess in states if not guess.path], estimating(states)
+    if not missing or not known:
+        return []
+    deviations = ", ".join(
+        f"{guess.name} = {abs(guess.scale) * _deviation(guess):.1g}" for guess in known
+    )
+    return [
+        "",
+        f"[estimate]  # the smoother estimates {', '.join(missing)}",
+        f"measured = {{ {deviations} }}  # standard deviations, in the model's units; check them",
+        f"# add {' or '.join(missing)} if the log contains it after all",
+    ]
+
+
+def estimating(states: Sequence[Guess]) -> list[Guess]:
+    """Return the states of the log from which [estimate] gets those that it does not contain."""
+    return [guess for guess in states if guess.path and guess.field is not None]
+
+
+def _deviation(guess: Guess) -> float:
+    """Return its noise in this log, at least a small part of its range, since sensors drift."""
+    assert guess.field is not None
+    low, high = guess.field.low or 0.0, guess.field.high or 0.0
+    return max(guess.field.noise, DRIFT * (high - low), 1e-6)
+
+
+def _quote(path: str) -> str:
+    return f"'{path}'" if '"' in path and "'" not in path else '"' + path.replace('"', '\\"') + '"'

@@ -1,0 +1,415 @@
+"""Summarise an unknown log: topics, types, rates, and every number with its range.
+
+The files are read once; for topics with very many messages, ranges come from every k-th message.
+Signals of different topics that show the same motion are compared, such as the pitch of a motion
+capture and of the on-board estimate. If their signs are opposite, their conventions differ, and the
+two must not be mixed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded_trials.formats.budget import OverBudget, keep
+from grounded_trials.formats.mcap_records import Channel, Header, Messages, Metadata, Schema
+from grounded_trials.formats.mcap_walk import DamagedFile
+from grounded_trials.formats.message_path import WORLD, is_topic, parse_path
+from grounded_trials.formats.messages import (
+    BadMessage,
+    BadPath,
+    BadSchema,
+    Dynamic,
+    Floats,
+    Ints,
+)
+from grounded_trials.formats.path_walk import (
+    FIELD_LIMIT,
+    Bound,
+    bind,
+    evaluate,
+    number_paths,
+)
+from grounded_trials.formats.text_tables import table_remarks
+from grounded_trials.logs.log_files import log_records, reading
+from grounded_trials.logs.signals import Decoder, decoder_of
+
+NOISE_SAMPLES = 10  # samples of a batch needed to estimate the noise
+DECODED = 20_000  # decoded messages of a topic beyond which messages are skipped
+TIME_BYTES = 40  # memory for the times of a message
+GAP = 10.0  # intervals; longer gaps are reported
+SKEW_S = 0.1  # larger differences between header stamps and the log's clock are reported
+SAME = 0.95  # correlation above which two signals show the same motion
+LEAST = 30  # fewest samples
+KINDS = (
+    *(f"@rpy.{angle}" for angle in ("roll", "pitch", "yaw")),
+    *(f"{place}.{axis}" for place in ("position", "translation") for axis in "xyz"),
+    *(f"{rate}.{axis}" for rate in ("linear", "angular") for axis in "xyz"),
+)
+
+
+@dataclass(frozen=True)
+class FieldReport:
+    """A number in a topic's messages."""
+
+    path: str
+    low: float | None  # smallest and largest finite value; None if there is none
+    high: float | None
+    not_finite: int
+    noise: float = 0.0  # standard deviation of the white noise
+    held: float = 0.0  # share of nonzero samples that repeat the one before
+
+
+@dataclass(frozen=True)
+class TopicReport:
+    """A topic: timing and contents of its messages."""
+
+    topic: str
+    type: str
+    encoding: str
+    messages: int
+    rate_hz: float  # 1 / median interval of the log times; 0 for fewer than two messages
+    jitter_s: float  # half the width that holds 90 % of the intervals
+    largest_gap_s: float
+    first_s: float | None  # after the log's first message; None without messages
+    last_s: float | None
+    stamped: bool  # messages have a header stamp
+    skew_s: float | None  # median of header stamp minus log time
+    fields: tuple[FieldReport, ...]
+    problem: str = ""  # why its numbers can't be read
+
+
+@dataclass(frozen=True)
+class LogReport:
+    """A log: its files, its length, its topics, and whether it is damaged."""
+
+    files: tuple[Path, ...]
+    library: str  # that wrote it
+    start_ns: int
+    duration_s: float
+    messages: int
+    topics: tuple[TopicReport, ...]
+    twins: tuple[Twins, ...]  # signals of different topics with one motion
+    damage: str = ""  # where reading it ended early, and why
+    meta: Mapping[str, str] = field(default_factory=dict)  # metadata, if grounded wrote the file
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Warnings about the log, as sentences for a person."""
+        return _remarks(self)
+
+
+def _remarks(log: LogReport) -> tuple[str, ...]:
+    found = [log.damage] if log.damage else []
+    found += [f"{file}: {odd}" for file in log.files for odd in table_remarks(file)]
+    for topic in log.topics:
+        if topic.problem:
+            found.append(f"{topic.topic} ({topic.type}) can't be read: {topic.problem}")
+        if topic.messages == 0:
+            found.append(f"{topic.topic} has no messages")
+        elif topic.messages == 1:
+            found.append(f"{topic.topic} has a single message, {topic.first_s:.3f} s into the log")
+        elif topic.rate_hz and topic.largest_gap_s > GAP / topic.rate_hz:
+            found.append(f"{topic.topic} has a gap of {topic.largest_gap_s:.3f} s")
+        if topic.skew_s is not None and abs(topic.skew_s) > SKEW_S:
+            found.append(
+                f"the stamps of {topic.topic} differ from the log's clock by {topic.skew_s:.3f} s "
+                "(simulation time, or an unset clock?)"
+            )
+        if len(topic.fields) >= FIELD_LIMIT:
+            found.append(
+                f"{topic.topic} is listed with its first {FIELD_LIMIT} numbers; "
+                "[log] can use any other by its path"
+            )
+        bad = [f.path for f in topic.fields if f.not_finite]
+        if bad:
+            found.append(f"{topic.topic} has values that are not numbers, first in {bad[0]}")
+    for twins in log.twins:
+        if twins.opposite:
+            found.append(
+                f"{twins.first} and {twins.second} show the same motion with OPPOSITE SIGN "
+                f"(correlation {twins.correlation:.3f})"
+            )
+    return tuple(found)
+
+
+def inspect_log(paths: str | Path | Sequence[str | Path]) -> LogReport:
+    """Summarise a log; at damage the reading ends, and the damage is reported.
+
+    Args:
+        paths: a log file, several in order, or the folder of a bag.
+
+    Raises:
+        GroundedError: if a file can't be read, or is not a log.
+    """
+    look = _Look()
+    with reading(paths) as files:
+        for path in files:
+            look.new_file()
+            try:
+                for record in log_records(path):
+                    look.add(record)
+            except DamagedFile as error:
+                if not look.headers:
+                    raise
+                look.damage = str(error)
+                break
+        return look.report(files)
+
+
+class _Look:
+    """The summary while it is built; topics continue from file to file, channels do not."""
+
+    def __init__(self) -> None:
+        self.headers: list[Header] = []
+        self.topics: dict[str, _Topic] = {}
+        self.damage = ""
+        self.meta: dict[str, str] = {}
+        self.new_file()
+
+    def new_file(self) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, _Topic] = {}
+
+    def add(self, record: object) -> None:
+        if isinstance(record, Header):
+            self.headers.append(record)
+        elif isinstance(record, Schema):
+            self.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            known = self.topics.get(record.topic)
+            if known is None:
+                known = _Topic(record, self.schemas.get(record.schema_id))
+                self.topics[record.topic] = known
+            self.channels[record.id] = known
+        elif isinstance(record, Metadata) and record.name == "grounded":
+            self.meta = record.data
+        elif isinstance(record, Messages):
+            for identity in record.channel_ids():
+                if identity in self.channels:
+                    self.channels[identity].add(record.of(identity))
+
+    def report(self, files: tuple[Path, ...]) -> LogReport:
+        times = [t for topic in self.topics.values() for t in topic.log_times]
+        joined = np.concatenate(times) if times else np.zeros(1, dtype=np.int64)
+        start, end = int(joined.min()), int(joined.max())
+        return LogReport(
+            files=files,
+            library=self.headers[0].library if self.headers else "",
+            start_ns=start,
+            duration_s=(end - start) * 1e-9,
+            messages=sum(topic.count for topic in self.topics.values()),
+            topics=tuple(topic.report(start) for topic in self.topics.values()),
+            twins=find_twins(self._samples()),
+            damage=self.damage,
+            meta=self.meta if len(files) == 1 else {},
+        )
+
+    def _samples(self) -> dict[str, tuple[Ints, Floats]]:
+        found = {}
+        for topic in self.topics.values():
+            for path, r in topic.ranges.items():
+                if r.samples:
+                    t, y = (np.concatenate(part) for part in zip(*r.samples, strict=True))
+                    found[path] = (t, y)
+        return found
+
+
+@dataclass
+class _Range:
+    """The values of one path so far."""
+
+    bound: Bound
+    low: float = np.inf
+    high: float = -np.inf
+    count: int = 0
+    not_finite: int = 0
+    samples: list[tuple[Ints, Floats]] | None = None  # kept if it may have a twin
+    noises: list[float] = field(default_factory=list)
+    repeated: int = 0
+
+    def add(self, values: Floats, log_times: Ints) -> None:
+        if self.samples is not None:
+            keep(16 * len(values))
+            self.samples.append((log_times, values))
+        finite = values[np.isfinite(values)]
+        self.count += len(values)
+        self.not_finite += len(values) - len(finite)
+        self.repeated += int(((np.diff(values) == 0) & (values[1:] != 0)).sum())
+        if len(finite) >= NOISE_SAMPLES:
+            self.noises.append(_noise(finite))
+        if len(finite):
+            self.low = min(self.low, float(finite.min()))
+            self.high = max(self.high, float(finite.max()))
+
+
+@dataclass
+class _Topic:
+    """One topic so far."""
+
+    channel: Channel
+    schema: Schema | None
+    count: int = 0
+    looked: int = 0
+    problem: str = ""
+    log_times: list[Ints] = field(default_factory=list)
+    skews: list[Ints] = field(default_factory=list)
+    decoder: Decoder | None = None
+    ranges: dict[str, _Range] = field(default_factory=dict)
+
+    def add(self, batch: Messages) -> None:
+        self.count += len(batch)
+        keep(TIME_BYTES * len(batch))
+        self.log_times.append(batch.log_times)
+        if self.problem or not len(batch):
+            return
+        stride = 1 + self.looked // DECODED
+        chosen = np.zeros(len(batch), dtype=np.bool_)
+        chosen[::stride] = True
+        self.looked += int(chosen.sum())
+        try:
+            if self.decoder is None:
+                self.decoder = decoder_of(self.channel, self.schema)
+                self._find_paths(batch)
+            for part in self.decoder.parts(batch.take(chosen)):
+                self._look(self.decoder, part)
+        except (BadSchema, BadMessage, BadPath) as error:
+            self.problem = str(error)
+
+    def _look(self, decoder: Decoder, batch: Messages) -> None:
+        root = decoder.root(batch.buffer, batch.starts, batch.ends)
+        for i, found in enumerate(self.ranges.values()):
+            try:
+                values = evaluate(root, found.bound, stamps=i == 0)
+            except BadPath:  # behind a wstring, or a text in one JSON message
+                continue
+            found.add(values.values, batch.log_times[values.rows])
+            if values.stamps is not None:
+                self.skews.append(values.stamps - batch.log_times[values.rows])
+
+    def _find_paths(self, batch: Messages) -> None:
+        assert self.decoder is not None
+        sample = None
+        if isinstance(self.decoder.type, Dynamic):
+            sample = self.decoder.root(batch.buffer, batch.starts[:1], batch.ends[:1]).sample()
+        topic = self.channel.topic if is_topic(self.channel.topic) else f'"{self.channel.topic}"'
+        for rest in number_paths(self.decoder.type, sample):
+            try:
+                path = parse_path(topic + rest)
+                found = _Range(bind(path, self.decoder.type))
+                found.samples = [] if measured_kind(path.text) else None
+                self.ranges[path.text] = found
+            except BadPath:
+                continue
+            except GroundedError as error:
+                if isinstance(error, OverBudget):
+                    raise
+
+    def report(self, start: int) -> TopicReport:
+        t = np.concatenate(self.log_times) if self.log_times else np.zeros(0, dtype=np.int64)
+        gaps = np.diff(np.sort(t)) * 1e-9
+        low, high = np.percentile(gaps, [5, 95]) if len(gaps) else (0.0, 0.0)
+        median = float(np.median(gaps)) if len(gaps) else 0.0
+        skews = np.concatenate(self.skews) if self.skews else None
+        stamped = any(found.bound.stamp is not None for found in self.ranges.values())
+        return TopicReport(
+            topic=self.channel.topic,
+            type=self.schema.name if self.schema else "",
+            encoding=self.channel.encoding,
+            messages=self.count,
+            rate_hz=1 / median if median > 0 else 0.0,
+            jitter_s=float(high - low) / 2,
+            largest_gap_s=float(gaps.max(initial=0.0)),
+            first_s=float(t.min() - start) * 1e-9 if len(t) else None,
+            last_s=float(t.max() - start) * 1e-9 if len(t) else None,
+            stamped=stamped or bool(skews is not None and len(skews)),
+            skew_s=float(np.median(skews)) * 1e-9 if skews is not None and len(skews) else None,
+            fields=tuple(_field(p, r) for p, r in _telling(self.ranges).items() if r.count),
+            problem=self.problem,
+        )
+
+
+def _telling(ranges: Mapping[str, _Range]) -> dict[str, _Range]:
+    """Leave out velocities in the pose's axes if the robot only moves forwards: v says it all."""
+    ways = [r for p, r in ranges.items() if p.endswith(("linear.y", "linear.z"))]
+    if all(r.low == r.high for r in ways):
+        return {path: r for path, r in ranges.items() if f"@{WORLD}" not in path}
+    return dict(ranges)
+
+
+def _field(path: str, found: _Range) -> FieldReport:
+    none = found.low > found.high
+    return FieldReport(
+        path=path,
+        low=None if none else found.low,
+        high=None if none else found.high,
+        not_finite=found.not_finite,
+        noise=float(np.median(found.noises)) if found.noises else 0.0,
+        held=found.repeated / max(found.count - 1, 1),
+    )
+
+
+def _noise(values: Floats) -> float:
+    """Return a robust standard deviation of a signal's white noise, from second differences."""
+    return float(np.median(np.abs(np.diff(values, 2))) / (0.6745 * np.sqrt(6)))
+
+
+@dataclass(frozen=True)
+class Twins:
+    """Two signals with the same motion; the correlation is negative if their signs differ."""
+
+    first: str  # message paths
+    second: str
+    correlation: float
+
+    @property
+    def opposite(self) -> bool:
+        """Whether the two have opposite signs."""
+        return self.correlation < 0
+
+
+def measured_kind(path: str) -> str:
+    """Return what a path measures, such as position.x; "" if its name does not show it."""
+    return next((kind for kind in KINDS if path.endswith("." + kind)), "")
+
+
+def find_twins(samples: Mapping[str, tuple[Ints, Floats]]) -> tuple[Twins, ...]:
+    """Find signals of the same kind that show the same motion.
+
+    Args:
+        samples: stamps [ns] and values by message path.
+    """
+    found = []
+    for first, second in combinations(samples, 2):
+        if measured_kind(first) == measured_kind(second) != "":
+            correlation = _correlation(samples[first], samples[second])
+            if abs(correlation) >= SAME:
+                found.append(Twins(first, second, correlation))
+    return tuple(found)
+
+
+def _correlation(a: tuple[Ints, Floats], b: tuple[Ints, Floats]) -> float:
+    """Return the correlation of the slower signal with the other one at its stamps."""
+    (ta, ya), (tb, yb) = sorted((_clean(*a), _clean(*b)), key=lambda s: len(s[0]))
+    inside = (ta >= tb[0]) & (ta <= tb[-1]) if len(tb) else np.zeros(len(ta), dtype=np.bool_)
+    if inside.sum() < LEAST:
+        return 0.0
+    other = np.interp((ta[inside] - ta[0]) * 1e-9, (tb - ta[0]) * 1e-9, yb)
+    one = ya[inside]
+    if min(one.std(), other.std()) < 1e-3 * max(one.std(), other.std(), 1e-9):
+        return 0.0
+    return float(np.corrcoef(one, other)[0, 1])
+
+
+def _clean(t: Ints, y: Floats) -> tuple[Ints, Floats]:
+    finite = np.isfinite(y)
+    t, y = t[finite], y[finite]
+    order = np.argsort(t, kind="stable")
+    t, y = t[order], y[order]
+    keep = np.append(True, np.diff(t) > 0) if len(t) else finite[:0]
+    return t[keep], y[keep]

@@ -1,0 +1,265 @@
+"""Find where the robot rests: the input that holds it at its start, and its start by its logs.
+
+If the task begins with an input under which the robot is not at rest, another one may hold it.
+
+Without a start, a step or a path would begin at zero: a plate at 0 degC in a room of 23 degC. Only
+states whose value the physics depends on are read off a log (a temperature, an angle under
+gravity). A position that may be anywhere is for the user to choose.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.model import Model, is_clock
+from grounded.places import integrals, true_values
+from grounded.task import Task
+from grounded.trial import Trial
+from grounded_trials.wording import with_unit
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.user_files.config import FILE
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+FARTHEST = 1e4  # largest distance, in its unit, of a free state from where it starts
+UNGIVEN = 3  # largest number of states without a start value that are solved for
+STILL = 1e-3  # the robot is at rest if it moves less than this share of the motion as configured
+NOTHING = 1e-6  # fraction of an input's range (of 1 unit without limits) treated as zero
+MOVED = 0.01  # fraction of the same by which a given input must differ to be reported
+SETTLED = 10  # least steps over which a rest is tried
+SLOW = 0.05  # fraction of its range in the target that a state may move in that time
+BEGUN = (0.0, 1.0, -1.0)  # offsets tried: a thrust that is squared has zero slope at 0
+STOOD = 0.5  # [s] at the start of a log in which the robot may stand still
+LEAST = 3  # steps of it
+STEADY = 0.05  # fraction of a signal's range (or a rate's maximum) that counts as standing still
+DEPENDS = 1e-9  # change of a step per unit of a state, above which the physics depends on it
+
+
+def held_before(workspace: Folder, again: bool = False) -> list[str]:
+    """Return a note if the robot is not at rest at its start, but would be under another input.
+
+    Values of states that the user did not give (a fan's speed, say) may be changed too. There is no
+    note if the user gave the inputs, or if they make no difference: without weights on changes and
+    without latency the first command does not depend on the input held before.
+
+    Args:
+        workspace: the workspace of the first plan.
+        again: whether another model was used for an earlier plan: inputs that the user gave are
+            checked too, since they may have held that one.
+    """
+    base, planner, config = workspace.task, workspace.planner, workspace.config.task
+    task, loose = planner.plan, planner.loose
+    assert base.latency is not None
+    names, states, n = task.model.input_names, task.model.state_names, base.model.n
+    memory = np.arange(task.model.n) >= n  # the memory states of adopted effects: they settle
+    free = memory.copy()
+    biased = {str(e["name"]).removeprefix("sensor_bias:") for e in workspace.config.model.effects}
+    # a start taken from the target is off by the bias of a sensor: such a state is free too
+    begun = dict(zip(states, base.target[0], strict=False))
+    free[:n] = [s not in config.start and (np.isnan(x) or s in biased) for s, x in begun.items()]
+    free[[one.j for one in integrals(base.model) if one.exact]] = False  # at rest, a rate is 0
+    chosen = any(name in config.start for name in names)
+    priced = bool(base.reward.input_change.any() or base.latency.any())
+    stands = None if (chosen and not again) or not priced else resting(task, memory, loose)
+    if stands is None and 0 < free[:n].sum() <= UNGIVEN:
+        stands = resting(task, free, loose)
+    if stands is None:
+        return []
+    units = {**base.model.states, **task.model.inputs}
+    given = np.concatenate([task.start[:n], task.past])
+    stands = _as_given(task, stands, base.target)
+    stands = np.concatenate([stands[:n], stands[len(states) :]])
+    span = np.append(np.ones(n), task.high - task.low)
+    span = np.where(np.isfinite(span), span, np.maximum(1.0, np.abs(given)))
+    stands[np.abs(stands) < NOTHING * span] = 0.0
+    if not (np.abs(stands - given) > (MOVED if chosen else NOTHING) * span).any():
+        return []
+    moved = moved_at_start(task, task.past) / task.dt
+    rate = moved[:n].copy()  # of a state that is logged through a filter, the true rate
+    for memory_state, own in true_values(states, states[n:]).items():
+        rate[own] = max(rate[own], moved[memory_state], key=abs)
+    k = int(np.argmax(np.abs(rate)))
+    other = {
+        name: to
+        for name, at, to in zip(units, given, stands, strict=True)
+        if name in names or abs(to - at) > STILL * (1 + abs(to))
+    }
+    before = dict(zip(units, given, strict=True))
+    held = ", ".join(with_unit(f"{name} = {before[name]:.4g}", units[name]) for name in other)
+    whole = {name: f"{value:.10g}" for name, value in config.start.items() if name in units}
+    whole |= {name: f"{to:.4g}" for name, to in other.items()}
+    told = ", ".join(f"{name} = {whole[name]}" for name in units if name in whole)
+    return [
+        f"the plan assumes {held} before the start, under which {states[k]} changes at once, by "
+        f"{with_unit(f'{rate[k]:.3g}', units[states[k]])} per second; after its end the runner "
+        "holds that input again. If the robot is at rest before the run, put what holds it into "
+        f"[task] of {FILE} and propose again (if not, just propose again): start = {{ {told} }}"
+    ]
+
+
+def _as_given(task: Task, stands: Array, target: Array) -> Array:
+    """Return states and inputs at rest with each input as given if the robot rests under that too.
+
+    In SETTLED steps, or a second, no state but the rates may then move, except for SLOW of its
+    range in the target. Within a dead zone, for example, it rests anywhere, not only at the edge.
+
+    Args:
+        task: the task.
+        stands: states and inputs at rest (n + m,).
+        target: of the states that are not the memory of effects, which may settle.
+    """
+    n, stands, own = task.model.n, stands.copy(), target.shape[1]
+    ranges = np.nan_to_num(np.ptp(target, axis=0))
+    units = [*task.model.states.values()][:own]
+    rates = np.array([unit.endswith("/s") for unit in units])
+    by = np.where(ranges > 0, SLOW * ranges, np.where(rates & ranges.any(), np.inf, NOTHING))
+    most = _drift(task, stands, own) + by
+    for j, given in enumerate(task.past):
+        other = stands.copy()
+        other[n + j] = given
+        if (_drift(task, other, own) <= most).all():
+            stands = other
+    return stands
+
+
+def _drift(task: Task, stands: Array, own: int) -> Array:
+    """Return how far each of the first `own` states goes from a rest while its inputs are held."""
+    problem, n = task.problem(exact=True), task.model.n
+    x, u = stands[None, :n], stands[None, n:]
+    with np.errstate(all="ignore"):
+        for _ in range(max(SETTLED, math.ceil(1 / task.dt))):
+            x = problem.system.step(x, u, problem.p, problem.dt)
+    return np.abs(np.asarray(task.model.difference(x[0], stands[:n])))[:own]
+
+
+def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> Array | None:
+    """Find states and inputs inside the limits under which the robot rests at its start.
+
+    The clock states of effects that grow with time are ignored: they always move.
+
+    Args:
+        task: the task with the start.
+        free: (n,), states that may differ from the start.
+        loose: the task with softened dry friction, used for the search: with sticking friction the
+            robot would rest under almost any input.
+
+    Returns:
+        States and inputs (n + m,); None if the robot rests under the input held before already, or
+        if no input holds it because the start is in motion.
+    """
+    from grounded.search.first_guess import trim
+
+    clocks = free & [is_clock(name) for name in task.model.state_names]
+    free = free & ~clocks
+    away = np.abs(moved_at_start(task, task.past))[~clocks].max()
+    if not away > 1e-9 or _out_of_reach(task, free, clocks):
+        return None
+    still = np.tile(task.start, (2, 1))
+    still[1, clocks] += task.dt
+    middle, inside = task.past.copy(), np.isfinite(task.high - task.low)
+    middle[inside] = 0.5 * (task.low[inside] + task.high[inside])
+    for first in [*(task.past + move for move in BEGUN), middle]:
+        x, u = still[0], np.clip(first, task.low, task.high)
+        for one in (loose or task, replace(task, smoothing=0.0)):  # a kink at 0, once near the rest
+            one = replace(one, target=still, input_target=None, past=u)
+            x, u = (found[0] for found in trim(one, np.stack([x, still[1]]), ~free))
+            moved = np.abs(moved_at_start(replace(task, start=x), u))[~clocks]
+            if (moved <= STILL * away).all():
+                return np.append(x, u)
+    return None
+
+
+def _out_of_reach(task: Task, free: NDArray[np.bool_], clocks: NDArray[np.bool_]) -> bool:
+    """Return whether no input inside the limits can stop the motion at the start, linearised."""
+    if not np.isfinite(task.high - task.low).all():
+        return False
+    problem = task.problem(exact=True)
+    u = np.array([task.past, task.low, 0.5 * (task.low + task.high), task.high])
+    with np.errstate(all="ignore"):
+        f_x, f_u = problem.system.linearise(np.tile(task.start, (4, 1)), u, problem.p, problem.dt)
+    others = np.abs(f_x - np.eye(len(free))).max(axis=0)[:, free]
+    reach = 2 * np.abs(f_u).max(axis=0) @ (task.high - task.low) + FARTHEST * others.sum(axis=1)
+    inside = np.clip(task.past, task.low, task.high)  # a hover's thrust need not reach down to 0
+    return bool((np.abs(moved_at_start(task, inside)) > reach)[~clocks].any())
+
+
+def moved_at_start(task: Task, inputs: Array) -> Array:
+    """Return by how much the state changes in the first step under an input, (n,)."""
+    problem = task.problem(exact=True)
+    with np.errstate(all="ignore"):
+        after = problem.system.step(task.start[None], inputs[None], problem.p, problem.dt)[0]
+    return task.model.difference(after, task.start)
+
+
+def rest_of_trials(workspace: Folder) -> tuple[dict[str, float], str]:
+    """Return where the robot rests at the start of the first stored trial that begins at rest.
+
+    Returns:
+        The values for [task] start that are not zero, inputs that hold it included, and the trial;
+        ({}, "") if [task] start has values, or no trial tells.
+    """
+    if workspace.config.task.start:
+        return {}, ""
+    try:
+        trials = workspace.task_trials()
+    except GroundedError:  # a damaged file, which other commands report
+        return {}, ""
+    for trial in trials:
+        if found := _rest_of(workspace.base_model, trial):
+            return found, trial.id
+    return {}, ""
+
+
+def _rest_of(model: Model, trial: Trial) -> dict[str, float]:
+    """Return the states in which a robot rests at the start of a trial, and the inputs holding it.
+
+    Empty if it moves there, or rests where all of these are zero.
+    """
+    steps = max(LEAST, round(STOOD / trial.dt))
+    x, u = trial.states[: steps + 1], trial.inputs[:steps]
+    if trial.steps <= steps or not (np.isfinite(x).all() and np.isfinite(u).all()):
+        return {}
+    whole, sent = np.nan_to_num(np.ptp(trial.states, axis=0)), np.ptp(trial.inputs, axis=0)
+    rates = np.array([unit.endswith("/s") for unit in model.states.values()])
+    fastest = np.abs(trial.states).max(axis=0)
+    off = np.where(rates, np.abs(x.mean(axis=0)), np.abs(drift(x)))
+    most = np.where(rates, fastest, whole)
+    if (off > STEADY * most).any() or not steady(u, sent).all():
+        return {}
+    at, held = np.median(x, axis=0), np.median(u, axis=0)
+    a = model.system.linearise(at[None], held[None], model.values, trial.dt)[0][0]
+    needed = np.abs(np.nan_to_num(a) - np.eye(model.n)).max(axis=0) > DEPENDS
+    told = needed & ~rates & (np.abs(at) > STEADY * whole)
+    found = {n: float(f"{at[i]:.4g}") for i, n in enumerate(model.state_names) if told[i]}
+    inputs = {n: float(f"{held[j]:.4g}") for j, n in enumerate(model.input_names)}
+    return found | {n: v for n, v in inputs.items() if found and v}
+
+
+def steady(sent: Array, span: Array | float) -> Array:
+    """Return whether inputs (T,) or (T, m) neither drift nor scatter by more than `STEADY`.
+
+    The scatter is judged by its rms: a controller that holds a robot answers the noise of its
+    sensors, so that commands tremble by several times that around what holds it.
+
+    Args:
+        sent: the inputs.
+        span: their range in the whole log.
+    """
+    most = STEADY * np.asarray(span)
+    return np.asarray((np.abs(drift(sent)) <= most) & (sent.std(axis=0) <= most))
+
+
+def drift(values: Array) -> Array:
+    """Return the change from first to last of the straight line through values (T,) or (T, n)."""
+    steps = len(values)
+    if steps < 2:
+        return np.zeros(values.shape[1:])
+    t = np.arange(steps) - (steps - 1) / 2
+    return np.asarray(np.tensordot(t, values, axes=1) / (t**2).sum() * (steps - 1))

@@ -1,0 +1,341 @@
+"""propose and status in a workspace: ask the search, and write the candidate's file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from grounded.errors import GroundedError, NextCommand
+from grounded.result import Result
+from grounded.search.scatter import noise_cost, sensor_noise
+from grounded_trials.wording import ranges, rendered
+from grounded_trials.workspace.candidates.exporting import to_run
+from grounded_trials.workspace.candidates.handover import Void, checked_candidate, outside_limits
+from grounded_trials.workspace.candidates.search_state import answered, planned, standing_in
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.last_diagnosis import (
+    Since,
+    readable_diagnosis,
+    since_diagnosis,
+    usable_ids,
+)
+from grounded_trials.workspace.next_step import doubted, next_command, not_adopted
+from grounded_trials.workspace.off_target import OffTarget, off_target_of
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
+    from grounded.diagnosis.report import Diagnosis
+    from grounded.figures.figure import Figure
+    from grounded.search.candidate import Candidate
+    from grounded.search.standing import Proposal, Standing
+    from grounded_trials.workspace.identity import StoredTrial
+
+PROPOSE = NextCommand("propose")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Proposed(Result):
+    """The result of `propose`."""
+
+    proposal: Proposal
+    file: Path | None  # the candidate's file; None if the search has ended
+    then: NextCommand
+    noise_cost: float = 0.0  # expected cost of sensor noise in its log, beyond what is predicted
+    off_target: tuple[OffTarget, ...] = ()  # errors of the predicted run, in units
+    lacks: str = ""  # what the last diagnosis found and the model lacks
+
+    @property
+    def candidate(self) -> Candidate | None:
+        """The candidate to run next; None if the search has ended."""
+        return self.proposal.candidate
+
+    @property
+    def standing(self) -> Standing:
+        """The standing of the search."""
+        return self.proposal.standing
+
+    def summary(self) -> str:
+        """Return the candidate, or the end of the search."""
+        return self.proposal.summary()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of `propose --json`; candidate is null if the search has ended."""
+        found = self.proposal.to_json() | {"file": str(self.file) if self.file else None}
+        errors = [one.to_json() for one in self.off_target]
+        age = self.candidate.sample_age if self.candidate else None
+        return found | {"noise_cost": self.noise_cost, "off_target": errors, "sample_age_s": age}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Status(Result):
+    """The result of `status`: where the search stands, and what to do next."""
+
+    standing: Standing
+    then: NextCommand
+    again: NextCommand  # runs or exports the best candidate once more; `next` once it is exported
+    outdated: str = ""  # why the last diagnosis is outdated
+    notes: tuple[str, ...] = ()  # notes on the end of the search, and on trials that don't count
+    discarded: dict[str, str] = field(default_factory=dict)  # t0004 -> why it is set aside
+    off_target: tuple[OffTarget, ...] = ()  # errors of the best candidate's runs, in units
+    diagnosis: Diagnosis | None = None  # the last one; None if there is none or it is damaged
+    since: Since | None = None  # what changed since the diagnosis
+
+    def summary(self) -> str:
+        """Return the phase and the best candidate."""
+        return self.standing.summary()
+
+    def _repr_html_(self) -> str:
+        """Return the candidates, the outcome and the next command as HTML."""
+        from html import escape
+
+        then = escape(rendered(self.then))
+        return f"{self.standing._repr_html_()}<p>next: <code>{then}</code></p>"
+
+    def figures(self) -> Sequence[Figure]:
+        """Return the figure of the utility by candidate."""
+        return self.standing.figures()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of `status --json`, with the whole history."""
+        found = self.standing.to_json() | {"discarded": self.discarded}
+        if found["best"] is not None:
+            found["best"] |= {"off_target": [one.to_json() for one in self.off_target]}
+        return found
+
+
+def propose_in(workspace: Folder) -> Proposed:
+    """Propose the next candidate, or the outstanding one again while its trial is missing.
+
+    An outstanding candidate that has become void, and was not run, is replaced.
+
+    Raises:
+        GroundedError: if the candidate must not be handed over (see `handover`), a stored file is
+            damaged, or the task can't be planned.
+    """
+    if not workspace.config.task.target:
+        raise GroundedError(
+            "there is no manoeuvre to learn: [task] names no target. Draw one with `grounded "
+            "target`; `fit` and `diagnose` need none",
+            NextCommand("target", ("SHAPE",)),
+        )
+    before, told = workspace.candidate_ids(), bool(workspace.noted.since)
+    proposal, void = _handed_over(workspace)
+    proposal = replace(proposal, standing=answered(workspace, proposal.standing))
+    candidate = proposal.candidate
+    notes = [f"{name} was not run and is void: {why}" for name, why in void.items()]
+    left = _disowned(proposal.standing)
+    if candidate is not None and proposal.is_new:
+        notes = notes or left or _void(workspace, before)
+    elif candidate is not None:
+        notes += left
+    if told:  # when the candidate that replaced them was handed out
+        notes = [note for note in notes if note not in left]
+    instead = f"; run {candidate.id} instead" if candidate is not None else ""
+    notes = [f"{note}{instead}" for note in notes]
+    held: list[str] = []
+    if not proposal.standing.trials and (candidate is None or proposal.is_new):
+        from grounded_trials.workspace.candidates.at_rest import held_before
+        from grounded_trials.workspace.candidates.first_plan import left_open
+
+        held = held_before(workspace, _other_model(workspace, before))
+        notes += left_open(workspace, proposal, held)
+    from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
+
+    status = status_of(workspace, proposal.standing)
+    if lacks := not_adopted(workspace, status.diagnosis) if candidate else "":
+        notes.append(f"the last diagnosis found that {lacks}")
+    if doubt := proposal.standing.doubt:
+        since = status.since
+        if doubted(proposal.standing, since, usable_ids(workspace)):
+            notes.append(f"{doubt}: `{rendered(NextCommand('diagnose'), workspace.address)}`")
+    proposal = replace(proposal, notes=(*proposal.notes, *notes))
+    if candidate is None:
+        asked, then = unanswered(workspace)
+        then = PROPOSE if held else then or status.then  # after [task] start is changed, as noted
+        return Proposed(replace(proposal, notes=(*proposal.notes, *asked)), None, then)
+    path = workspace.candidate_path(candidate.id)
+    # the user should first correct the held input; a second `propose` hands the candidate out
+    then = PROPOSE if held else to_run(workspace, candidate.id)
+    cost = 0.0
+    if not candidate.grounded:  # else the model replays a log, and its noise is included
+        noise = sensor_noise(workspace.task_trials(), workspace.base_model.n)
+        cost = noise_cost(workspace.task, candidate.policy, noise)
+    off_target = off_target_of(workspace.task, [candidate.predicted_run])
+    return Proposed(proposal, path, then, cost, off_target, lacks)
+
+
+def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
+    """Write and check the next candidate; also return outstanding ones that are void: id -> why."""
+    void: dict[str, str] = {}
+    while True:
+        seen = workspace.names()
+        proposal = _proposal(workspace, void)
+        candidate = proposal.candidate
+        if candidate is None:
+            return proposal, void
+        if proposal.is_new:
+            candidate = workspace.save_candidate(candidate, seen)
+            if candidate is None:  # another process stored something meanwhile
+                workspace.forget_trials()
+                continue
+            proposal = replace(proposal, candidate=candidate)
+        else:
+            workspace.bring_back(candidate.id)
+        try:
+            handed = checked_candidate(workspace, candidate.id, now=proposal.standing)
+        except Void as error:
+            if proposal.is_new:
+                raise
+            if any(t.trial.candidate == candidate.id for t in workspace.trials()):
+                raise GroundedError(
+                    f"{proposal.standing.sentence}, but {'; '.join(error.reasons)}. Undo what was "
+                    f"changed, or run {candidate.id} regardless with --anyway"
+                ) from None
+            void[candidate.id] = "; ".join(error.reasons)
+        else:
+            return replace(proposal, notes=(*proposal.notes, *handed.notes)), void
+
+
+def _proposal(workspace: Folder, without: Collection[str]) -> Proposal:
+    """Ask the search for a proposal as if some (void) candidates had never been proposed."""
+    contents = workspace.read()
+    candidates = tuple(c for c in contents.candidates if c.id not in without)
+    return planned(workspace, replace(contents, candidates=candidates))
+
+
+def _not_run(workspace: Folder, before: Sequence[str]) -> tuple[Candidate, dict[str, str]] | None:
+    """Return the last candidate of the search with its metadata if no trial ran it, else None."""
+    for name in reversed(before):
+        made, meta = workspace.candidate(name)
+        if meta.get("kind") == "search":
+            return (
+                None if any(t.trial.candidate == name for t in workspace.trials()) else (made, meta)
+            )
+    return None
+
+
+def _disowned(now: Standing) -> list[str]:
+    """Explain which latest candidates, never run, are void since a trial was discarded."""
+    found = []
+    for tried in reversed(now.history):
+        if not tried.gone or tried.accepted:
+            break
+        if tried.void:
+            name = tried.candidate.id
+            found.append(
+                f"{name} was not run and is void: {ranges(tried.gone)}, which it was made from, "
+                f"{'is' if len(tried.gone) == 1 else 'are'} set aside. If the robot has run it "
+                f"meanwhile, ingest that log with --candidate {name}: it counts"
+            )
+    return found
+
+
+def _other_model(workspace: Folder, before: Sequence[str]) -> bool:
+    """Return whether the search's last candidate was planned with another model, and never run."""
+    last = _not_run(workspace, before)
+    if last is None or last[1].get("task") != workspace.task.hash:
+        return False
+    return last[0].model != workspace.planner.fingerprint
+
+
+def _void(workspace: Folder, before: Sequence[str]) -> list[str]:
+    """Explain why the search's last candidate, never run, is replaced; [] if it is not."""
+    if (last := _not_run(workspace, before)) is None:
+        return []
+    made, meta = last
+    if meta.get("task") == workspace.task.hash:
+        same = made.model == workspace.planner.fingerprint
+        why = "the trial that it followed was set aside" if same else "the model was changed"
+        why += " since it was made"
+    elif (made.policy.state_names, made.policy.input_names) != (
+        workspace.base_model.state_names,
+        workspace.base_model.input_names,
+    ):
+        why = "it is for another robot"
+    else:
+        wider = list(outside_limits(workspace.task, made.policy))
+        why = "; ".join(wider) or "the task was changed since it was made"
+    return [f"{made.id} was not run and is void: {why}"]
+
+
+def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()) -> Status:
+    """Return a standing with the command to type next and the state of the last diagnosis.
+
+    Raises:
+        GroundedError: if a stored file is damaged.
+    """
+    usable = usable_ids(workspace)
+    found = readable_diagnosis(workspace.reports)
+    since = since_diagnosis(workspace, found, usable) if found else None
+    return Status(
+        standing,
+        next_command(workspace, standing, found, usable),
+        again_best(workspace, standing),
+        since.sentence if since else "",
+        (
+            *notes,
+            *(_disowned(standing) if standing.phase != "propose" else ()),
+            *_namesakes(workspace),
+            *not_counted(uncounted(workspace, workspace.trials(), standing)),
+        ),
+        workspace.discarded(),
+        off_target_of(workspace.task, standing.incumbent.trials if standing.incumbent else ()),
+        found,
+        since,
+    )
+
+
+def status_in(workspace: Folder) -> Status:
+    """Return where the search stands; if its last trial should be discarded, say that first."""
+    from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
+
+    asked, then = unanswered(workspace)
+    if then is None:
+        return status_of(workspace, standing_in(workspace, ahead=True))
+    return replace(status_of(workspace, standing_in(workspace), asked), then=then)
+
+
+def again_best(workspace: Folder, now: Standing) -> NextCommand:
+    """Return the command for one more trial of the best candidate, see `to_run`."""
+    if now.incumbent is None or workspace.config.system.reachable:
+        return NextCommand("run", ("best",))
+    best = now.incumbent.candidate.id  # "best" may be another one when the log comes in
+    return to_run(workspace, best, best)
+
+
+def uncounted(workspace: Folder, trials: Sequence[StoredTrial], now: Standing) -> list[str]:
+    """Return trials of this model that ran no candidate of the search: of another task, or probes.
+
+    Trials of another policy with the name of a candidate (see `_namesakes`) are left out.
+    """
+    own = {tried.candidate.id for tried in now.history}
+    ran = [t for t in trials if t.trial.candidate and workspace.fits(t.trial)]
+    return [
+        t.stored.id for t in ran if "~" not in t.trial.candidate and t.trial.candidate not in own
+    ]
+
+
+def not_counted(names: Sequence[str]) -> list[str]:
+    """Return a sentence saying that these trials only serve fit and diagnose; [] for none."""
+    if not names:
+        return []
+    one, ran = len(names) < 2, "candidates of another task, or probes"
+    return [
+        f"{ranges(names)} {'counts' if one else 'count'} only as data, for fit and diagnose: "
+        f"{'it' if one else 'they'} ran {ran}"
+    ]
+
+
+def _namesakes(workspace: Folder) -> list[str]:
+    """Report trials that ran another policy of a candidate's name (after merging two folders)."""
+    names: dict[str, list[str]] = {}
+    for one in workspace.trials():
+        if "~" in one.trial.candidate:
+            names.setdefault(one.trial.candidate, []).append(one.stored.id)
+    return [
+        f"{', '.join(ids)} ran another policy that is also called {name.split('~')[0]}: only data, "
+        "for fit and diagnose"
+        for name, ids in names.items()
+    ]

@@ -1,0 +1,202 @@
+"""run: hand a candidate to the real system and get a trial file back.
+
+The real system is a command of the user (for a robot, another simulator), which gets the paths of
+the candidate and of the trial that it must write; or it is simulated by a model in the workspace.
+For a simulated system `optimum` finds how good a candidate could get, by the same search in the
+true model; it is for studies and demos, and the search of the workspace never uses it.
+"""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.plant import Noise, Plant
+from grounded.result import Result
+from grounded.search.ask_tell import learn
+from grounded.search.candidate import Candidate
+from grounded.search.step.step_size import SearchOptions
+from grounded.trial import Trial
+from grounded.trusted import check_own
+from grounded_trials.store.store import made_folder
+from grounded_trials.store.trial_file import write_trial
+from grounded_trials.workspace.candidates.exporting import to_run
+from grounded_trials.workspace.candidates.handover import Handed, checked_candidate
+from grounded_trials.workspace.candidates.search_state import candidate_named
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.user_files.config import FILE
+from grounded_trials.workspace.user_files.model_file import load_module, model_in
+
+TRIALS = 30  # limit of the search for the optimum
+
+
+@dataclass(frozen=True, repr=False)
+class Ran(Result):
+    """A candidate that was run, and the file of its trial, to be ingested."""
+
+    candidate: str
+    trial_file: Path
+    notes: tuple[str, ...] = ()  # remarks on the candidate
+    overridden: tuple[str, ...] = ()  # reasons against it, overridden by `anyway`
+
+    @property
+    def then(self) -> NextCommand:
+        """The command that ingests the trial."""
+        return NextCommand("ingest", (str(self.trial_file),))
+
+    def summary(self) -> str:
+        """Return what was run, and where its trial is."""
+        return f"{self.candidate}: {self.trial_file}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of `run --json`."""
+        return {"trial_file": str(self.trial_file), "candidate": self.candidate}
+
+
+def run_candidate(
+    workspace: Folder,
+    candidate: str | None,
+    *,
+    anyway: bool = False,
+    warn: Callable[[str], None] | None = None,
+) -> Ran:
+    """Run a candidate once and write its trial to runs/cNNNN-K.mcap, see `Workspace.run`."""
+    system, identity = workspace.config.system, candidate_named(workspace, candidate)
+    handed = checked_candidate(workspace, identity, anyway=anyway)
+    if warn is not None:
+        for reason in handed.overridden:
+            warn(f"{identity} is run anyway: {reason}")
+    path = _next_run(workspace.folder / "runs", identity)
+    if system.command:
+        _call(workspace, system.command, handed, path)
+    elif system.model:
+        _simulate(workspace, handed, path)
+    else:
+        raise GroundedError(
+            "grounded.toml has no [system]: run the candidate "
+            f"{workspace.candidate_path(identity)} on your robot by hand and ingest its log, or "
+            'give [system] command = "python drive.py {candidate} {trial}"',
+            to_run(workspace, identity, *(() if candidate is None else (candidate,))),
+        )
+    return Ran(identity, path, handed.notes, handed.overridden)
+
+
+def simulated_plant(workspace: Folder) -> Plant:
+    """Return the simulated system of [system] model.
+
+    Raises:
+        GroundedError: if its file defines no model, or [system.noise] names an unknown state.
+    """
+    system = workspace.config.system
+    module = load_module(workspace.folder, file=system.model, key="[system] model")
+    model = model_in(module)
+    for kind, values in system.noise.items():
+        for name in values:
+            if name not in model.states:
+                raise GroundedError(
+                    f"grounded.toml: [system.noise.{kind}] {name}: {system.model} has no such "
+                    "state: " + nearest(name, model.states)
+                )
+    noise = Noise(**{kind: dict(values) for kind, values in system.noise.items()})
+    latency = getattr(module, "latency", {})
+    return Plant(
+        model=model,
+        latency=dict(latency),
+        noise=noise,
+        substeps=int(getattr(module, "substeps", 5)),
+    )
+
+
+def _next_run(folder: Path, identity: str) -> Path:
+    taken = [p.stem.rsplit("-", 1)[-1] for p in made_folder(folder).glob(f"{identity}-*.mcap")]
+    number = max((int(t) for t in taken if t.isdigit()), default=0) + 1
+    return folder / f"{identity}-{number}.mcap"
+
+
+def _call(workspace: Folder, command: str, handed: Handed, path: Path) -> None:
+    """Call the user's command; its stdout goes to stderr."""
+    check_own(workspace.folder, [workspace.folder / FILE])
+    file = workspace.bring_back(handed.candidate.id)
+    words = {
+        "candidate": str(file.resolve()),
+        "trial": str(path.resolve()),
+    }
+    for name in words:
+        if "{" + name + "}" not in command:
+            raise GroundedError(f"[system] command must contain {{{name}}}, found: {command}")
+    try:
+        parts = shlex.split(command)
+    except ValueError as error:
+        raise GroundedError(
+            f"[system] command can't be split into words ({error}): {command}"
+        ) from None
+    for name, text in words.items():
+        parts = [part.replace("{" + name + "}", text) for part in parts]
+    try:
+        done = subprocess.run(parts, cwd=workspace.folder, stdout=2, check=False)
+    except OSError as error:
+        raise GroundedError(
+            f"[system] command '{parts[0]}' can't be run: {error.strerror}; expected a program on "
+            f"the PATH, or a path from the workspace: {command}"
+        ) from None
+    if done.returncode != 0:
+        hint = f"; what it wrote is kept in {path}" if path.exists() else ""
+        raise GroundedError(
+            f"[system] command ended with exit code {done.returncode}: {shlex.join(parts)}{hint}"
+        )
+    if not path.exists():
+        raise GroundedError(f"[system] command succeeded but wrote no trial to {{trial}} = {path}")
+
+
+def _simulate(workspace: Folder, handed: Handed, path: Path) -> None:
+    candidate, meta = handed.candidate, handed.meta
+    task, plant = workspace.task, simulated_plant(workspace)
+    start = dict(zip(task.model.state_names, map(float, task.start), strict=True))
+    number = len(workspace.store.list()) + 1
+    rng = np.random.default_rng([workspace.config.system.seed, number])
+    trial = plant.run(candidate.policy, start, rng)
+    write_trial(
+        path,
+        replace(trial, candidate=candidate.id),
+        {
+            "kind": "trial",
+            "iteration": meta["iteration"],
+            "alpha": meta["alpha"],
+            "task": meta["task"],
+            "system": f"simulated: {workspace.config.system.model}",
+            "number": str(number),
+        },
+        policy=handed.data,
+        state_units=dict(task.model.states),
+        input_units=dict(task.model.inputs),
+    )
+
+
+def optimum(workspace: Folder) -> float | None:
+    """Return the best utility found with the true model.
+
+    Returns None if the system is not simulated, or if the true model has other states or inputs
+    than the crude one, so that the task does not fit it.
+    """
+    if not workspace.config.system.model:
+        return None
+    task, plant = workspace.task, replace(simulated_plant(workspace), noise=Noise())
+    model = plant.model
+    if (model.state_names, model.input_names) != (task.model.state_names, task.model.input_names):
+        return None
+    delays = np.array([plant.latency.get(name, 0.0) for name in model.input_names])
+    truth = replace(task.with_model(model), latency=delays)
+    start = dict(zip(model.state_names, map(float, task.start), strict=True))
+
+    def run(candidate: Candidate) -> Trial:
+        return plant.run(candidate.policy, start, np.random.default_rng(0))
+
+    best = learn(truth, run, SearchOptions(max_trials=TRIALS, tolerance=1e-4), check=False).best
+    return best.utility if best else None

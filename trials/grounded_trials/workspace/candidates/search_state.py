@@ -1,0 +1,190 @@
+"""Where the search of a workspace stands, by its stored trials and candidates.
+
+How a search ended is remembered, so that the end is not planned again by every command: whether a
+step is worth a trial takes as long to find as a candidate does, up to half a minute of CPU. The end
+follows from the files alone, so it is kept in the cache of compiled models, one file a workspace,
+with a digest of all that it was made from. The workspace stores no end.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from contextlib import suppress
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import grounded
+from grounded.compile.run.jit import store, stored
+from grounded.errors import GroundedError, NextCommand
+from grounded.search.planner import model_fingerprint
+from grounded.search.standing import Standing
+from grounded_trials.workspace.folder import Contents, Folder
+from grounded_trials.workspace.last_diagnosis import (
+    readable_diagnosis,
+    since_diagnosis,
+    usable_ids,
+)
+
+if TYPE_CHECKING:
+    from grounded.search.candidate import Candidate
+    from grounded.search.standing import Proposal
+
+KIND = ".ended"
+SAID = ("phase", "sentence", "ending", "doubt", "missed")
+
+
+def standing_in(
+    workspace: Folder, *, ahead: bool = False, contents: Contents | None = None
+) -> Standing:
+    """Return the standing of the search in a workspace.
+
+    Args:
+        workspace: the workspace with the trials and candidates.
+        ahead: also plan the next candidate, without writing it, which shows whether the search has
+            anything left to gain.
+        contents: the contents of the folder, if they were read already.
+
+    Raises:
+        GroundedError: if a stored file is damaged, or the task can't be planned.
+    """
+    from grounded.search.standing import standing
+
+    contents = contents or workspace.read()
+    trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
+    task, options, planner = workspace.task, workspace.config.search, workspace.planner
+    now = standing(task, contents.candidates, trials, options, planner.fingerprint)
+    workspace.save_index()
+    if ahead and now.phase == "propose" and now.incumbent is not None:
+        now = planned(workspace, contents).standing
+    return answered(workspace, now)
+
+
+def answered(workspace: Folder, now: Standing) -> Standing:
+    """Return the standing, which asks for no diagnosis if there is one of all that it knows."""
+    if not now.missed:
+        return now
+    if (found := readable_diagnosis(workspace.reports)) is None:
+        return now
+    since = since_diagnosis(workspace, found, usable_ids(workspace))
+    return now.answered() if since.settled else now
+
+
+def planned(workspace: Folder, contents: Contents) -> Proposal:
+    """Ask the search for a proposal, unless it is known to have ended with these contents."""
+    from grounded.search.improve import propose
+    from grounded.search.standing import Proposal, standing
+
+    task, options, planner = workspace.task, workspace.config.search, workspace.planner
+    trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
+    now = standing(task, contents.candidates, trials, options, planner.fingerprint)
+    planning = now.phase == "propose" and now.incumbent is not None
+    if planning and (ended := known_end(workspace, contents, now)) is not None:
+        return Proposal(ended, None, is_new=False)
+    name = workspace.next_id()
+    made = propose(task, contents.candidates, trials, options, identity=name, planner=planner)
+    if planning and made.candidate is None:
+        remember_end(workspace, contents, made.standing)
+    return made
+
+
+def known_end(workspace: Folder, contents: Contents, now: Standing) -> Standing | None:
+    """Return the end of a search that was planned before; None if it goes on or is not known.
+
+    Args:
+        workspace: the workspace.
+        contents: its contents.
+        now: the standing, which asks for a candidate.
+    """
+    found = stored(_place(workspace), KIND)
+    if found is None:
+        return None
+    said = json.loads(found)
+    if said["of"] != _digest(workspace, contents):
+        return None
+    verb, *arguments = said["then"] or [""]
+    then = NextCommand(verb, tuple(arguments)) if verb else None
+    return replace(now, step=None, then=then, **{name: said[name] for name in SAID})
+
+
+def remember_end(workspace: Folder, contents: Contents, ended: Standing) -> None:
+    """Keep the end of a search, unless it goes on or a candidate was refused, with its reasons."""
+    if ended.phase not in ("converged", "stopped") or ended.ending == "not allowed":
+        return
+    then = ended.then and [ended.then.verb, *ended.then.arguments]
+    said = {name: getattr(ended, name) for name in SAID}
+    document = {"of": _digest(workspace, contents), "then": then, **said}
+    store(_place(workspace), json.dumps(document).encode(), KIND)
+
+
+def _place(workspace: Folder) -> str:
+    return hashlib.sha256(str(workspace.folder.resolve()).encode()).hexdigest()
+
+
+def _digest(workspace: Folder, contents: Contents) -> str:
+    """Return a digest of all that the end of a search follows from, with the version of the code.
+
+    A stored trial's name has a hash of its contents.
+    """
+    trials = [(one.stored.path.name, one.trial.candidate) for one in contents.trials]
+    models = [model_fingerprint(task) for task in (workspace.planner.task, workspace.planner.plan)]
+    digest = hashlib.sha256(repr((_version(), workspace.task.hash, models, trials)).encode())
+    files = [workspace.config.file, *_model_file(workspace)]
+    files += [workspace.candidate_path(one.id) for one in contents.candidates]
+    for path in files:
+        data = path.read_bytes() if path.is_file() else b""
+        digest.update(repr((path.name, len(data))).encode() + data)
+    return digest.hexdigest()
+
+
+def _model_file(workspace: Folder) -> list[Path]:
+    file = workspace.config.model.file
+    return [workspace.folder / file] if file else []
+
+
+@cache
+def _version() -> tuple[str, int]:
+    """Return the version, and when the method's code last changed [ns]."""
+    code = Path(grounded.__file__).parent.rglob("*.py")
+    return grounded.__version__, max((path.stat().st_mtime_ns for path in code), default=0)
+
+
+def candidate_named(workspace: Folder, name: str | None, now: Standing | None = None) -> str:
+    """Return the id of the named candidate, of the best for `best`, of the outstanding for None.
+
+    Args:
+        workspace: the workspace.
+        name: an id, "best" or None.
+        now: the standing of the search, if known.
+
+    Raises:
+        GroundedError: if there is none of that name, no best one yet, or none is outstanding.
+    """
+    if name is None:
+        waiting = standing_in(workspace).outstanding
+        if waiting is None:
+            raise GroundedError(
+                "no candidate is waiting to be run: make the next one with `propose`, or name a "
+                "candidate to run it again",
+                NextCommand("propose"),
+            )
+        return waiting.id
+    if (name := name.lower()) != "best":
+        workspace.candidate_bytes(name)  # raises if there is none
+        return name
+    best = (now or standing_in(workspace)).incumbent
+    if best is None:
+        raise GroundedError("there is no best candidate yet: no trial was ingested")
+    return best.candidate.id
+
+
+def latest_candidates(workspace: Folder, most: int) -> list[Candidate]:
+    """Return the latest candidates of the task, including probes and void ones."""
+    found = []
+    for identity in workspace.candidate_ids()[-most:]:
+        with suppress(GroundedError):  # a damaged file can't have been run
+            candidate, meta = workspace.candidate(identity)
+            found += [candidate] * (meta.get("task") == workspace.task.hash)
+    return found

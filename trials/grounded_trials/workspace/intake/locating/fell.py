@@ -1,0 +1,126 @@
+"""Detect runs that failed although their log goes on: the robot fell, or its motors were cut.
+
+After a fall a robot's program sends other commands than the policy, mostly zeros, and the log
+contains them too. If the run had left [safety] by then, it counts as a failed run of the candidate,
+cut there. This also covers falls near the end, where the commands as a whole still resemble the
+candidate's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.search.candidate import Candidate
+from grounded.search.returned.who_drove import FINE, LEAST, SAME, Following
+from grounded.task import Task
+from grounded.trial import LAST, Trial, interpolate_gaps
+from grounded_trials.wording import with_unit
+from grounded_trials.workspace.intake.locating.acted_on import acted_on
+from grounded_trials.workspace.intake.locating.run_start import Recording, Start
+
+
+@dataclass(frozen=True)
+class Fall:
+    """Where a run failed, and the warning for the user."""
+
+    steps: int  # steps of the run before it failed
+    told: str
+
+
+def fall_in(task: Task, own: Candidate, trial: Trial, ran: Following | None) -> Fall | None:
+    """Find where a run left [safety], if its commands ceased to be the candidate's about then.
+
+    Args:
+        task: the task with [safety] and the horizon.
+        own: the candidate.
+        trial: the run and what follows it, with the task's states and inputs.
+        ran: the comparison of its commands with the candidate's.
+
+    Returns:
+        None if the commands are the candidate's to the end, or never were; if the run was inside
+        [safety] for `LEAST` steps before and after they ceased to be; or if it was almost complete.
+    """
+    ceased = None if ran is None else _ceased(task, trial, ran)
+    if ceased is None or ceased < LEAST:
+        return None
+    assert task.safety_low is not None and task.safety_high is not None
+    whole = interpolate_gaps(trial).trial
+    states = whole.states[: whole.finite_steps + 1]
+    beyond = np.maximum(task.safety_low - states, states - task.safety_high)
+    out = beyond.max(axis=1) > 0
+    begin = max(0, ceased - LEAST)
+    about = out[begin : ceased + LEAST + 1]
+    if not about.any():
+        return None
+    first = begin + int(np.argmax(about))
+    inside = np.flatnonzero(~out[:first])
+    first = int(inside[-1]) + 1 if len(inside) else 0
+    steps = min(first, ceased)
+    if steps < LEAST or steps + LAST >= task.horizon:
+        return None
+    i, name = int(np.argmax(beyond[first])), own.id
+    state, unit = list(task.model.states.items())[i]
+    was, predicted = (with_unit(f"{x[first, i]:.3g}", unit) for x in (states, own.predicted_states))
+    low, high = task.safety_low[i], task.safety_high[i]
+    return Fall(
+        steps,
+        f"{state} left [safety] = [{low:g}, {high:g}] at {first * task.dt:.2f} s (it was {was}, "
+        f"where {predicted} was predicted), and the commands are those of {name} only up to "
+        f"{ceased * task.dt:.2f} s: this counts as a failed run of {name}, cut at "
+        f"{steps * task.dt:.2f} s; the part before is kept for fit and diagnose, the rest is "
+        "not judged. If something disturbed it, `discard` it",
+    )
+
+
+def _ceased(task: Task, trial: Trial, ran: Following) -> int | None:
+    """Return the step at which the commands of a run cease to be its candidate's, or None.
+
+    From there they are constant although the policy would have changed them, or they are unlike the
+    policy's.
+    """
+    T = len(ran.off)
+    sent, off = trial.inputs[:T], np.nan_to_num(ran.off) / (ran.fine / FINE)
+    moves = np.flatnonzero((np.abs(np.diff(sent, axis=0)) > ran.fine).any(axis=1))
+    held = int(moves[-1]) + 1 if len(moves) else 0
+    before, after = (float((part**2).mean()) for part in (off[: max(held, 1)], off[held:]))
+    if T - held >= FEW and after > max(STOPPED**2, 4 * before):
+        return held
+    return None if ran.alike else round(ran.until_s / task.dt)
+
+
+FEW = 5  # smallest number of steps with constant inputs that counts as motors cut
+STOPPED = 0.1  # rms difference from the policy during these steps, relative to an input's size
+
+
+def who_fell(
+    log: Recording,
+    own: Candidate,
+    candidates: Sequence[Candidate],
+    start_of: Callable[[Candidate], Start | None],
+    end: float,
+) -> str:
+    """Return another candidate whose commands were sent until a fall; "" if the own fits as well.
+
+    Args:
+        log: the log with the failed run.
+        own: the candidate that it is said to have run.
+        candidates: candidates that may have been run instead.
+        start_of: returns where a candidate's run seems to begin in the log.
+        end: when the run had failed, seconds after the log's first sample.
+    """
+
+    def left(one: Candidate) -> float:
+        start = start_of(one)
+        fit = acted_on(log, one.policy, start.seconds) if start and start.opens_alike else None
+        if start is None or fit is None:
+            return np.inf
+        off = fit.off[: max(0, round((end - start.seconds) / log.dt))]
+        off = off[np.isfinite(off)]
+        return float(np.median(off)) if len(off) >= LEAST else np.inf
+
+    others = {one.id: left(one) for one in candidates if one.id != own.id}
+    nearest = min(others, key=others.__getitem__, default="")
+    return nearest if nearest and others[nearest] < SAME * max(left(own), FINE) else ""

@@ -1,0 +1,118 @@
+"""Detect runs whose first steps were never sent, so that they begin before the first command.
+
+A program whose timer fires late skips step 0, as the runner does for missed calls, and the first
+command in the log is that of step 1. If it is taken as step 0, every command is compared with the
+gains and reference of its neighbour, and may still look alike if those change little from step to
+step. So starts some steps earlier are tried as well, with the input held before the run in place of
+the missing commands, and the commands that were sent are compared with the policy's.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.policy import Policy
+from grounded.result import listed
+from grounded.search.returned.who_drove import LEAST, follows
+from grounded.task import Task
+from grounded.trial import Trial
+from grounded_trials.wording import count, with_unit
+from grounded_trials.workspace.intake.locating.acted_on import acted_on
+
+if TYPE_CHECKING:
+    from grounded_trials.workspace.intake.locating.run_start import Recording
+
+MOST = 5  # largest number of missed steps that is tried
+COARSE = 100  # steps of a run at which a log may begin, first tried
+ALIKE = 0.05  # median difference of commands, relative to their size, below which they are alike
+BY_FAR = 0.25  # the difference of the commands must fall below this share of that elsewhere
+
+
+def missed_steps(log: Recording, policy: Policy, first: float, found: float) -> int:
+    """Return how many steps of a policy's run lie before the log's first command; 0 if unclear.
+
+    Args:
+        log: the log with the run.
+        policy: the policy, for the states and inputs of the log.
+        first: the time of the first command, moved to where a step begins [s].
+        found: where the run seems to begin otherwise [s].
+    """
+    usual = acted_on(log, policy, found)
+    if usual is not None and usual.exact:
+        return 0
+    k = min(range(1, MOST + 1), key=lambda k: _left(log, policy, first, k))
+    if not np.isfinite(_left(log, policy, first, k)):
+        return 0
+    begins = first - k * log.dt
+    there, trial = acted_on(log, policy, begins), log.trial_from(begins)
+    if there is None or trial is None or there.told.sum() < LEAST:
+        return 0
+    if there.exact:
+        return k
+    ran = follows(policy, trial.until(policy.horizon), 0)
+    alike = ran is not None and ran.alike and not ran.late
+    return k if alike and usual is not None and there.left < BY_FAR * usual.left else 0
+
+
+def _left(log: Recording, policy: Policy, first: float, missed: int) -> float:
+    """Return the median difference of the sent commands from the policy's, in units of size."""
+    trial = log.trial_from(first - missed * log.dt)
+    T = 0 if trial is None else min(trial.finite_steps, policy.horizon)
+    if trial is None or T - missed < LEAST:
+        return np.inf
+    return float(np.median(_apart(policy, trial.until(T), log.past)[missed:]))
+
+
+def _apart(policy: Policy, trial: Trial, past: Array) -> Array:
+    """Return the rms difference of each step's commands from the policy's, in units of size."""
+    sent = np.clip(trial.inputs, policy.low, policy.high)
+    asked = policy.commands(trial.states[None, : len(sent)], past, sent[None])[0]
+    size = np.maximum(np.abs(policy.feedforward).max(axis=0), np.abs(sent).max(axis=0)) + 1e-12
+    return np.asarray(np.sqrt((((asked - sent) / size) ** 2).mean(axis=1)))
+
+
+def begins_late(log: Recording, policy: Policy) -> float:
+    """Return by how much a log begins after a policy's run did [s]; 0 if it does not.
+
+    Its commands are then those of later steps, each with the gains of its own step.
+
+    Args:
+        log: the log in which no run of the policy was found.
+        policy: the policy, for the states and inputs of the log.
+    """
+    trial = log.trial_from(log.first)
+    if trial is None:
+        return 0.0
+    past = policy.past if trial.start_inputs is None else trial.start_inputs
+    most = min(trial.finite_steps, policy.horizon)
+
+    def left(k: int) -> float:
+        """Return the median difference of commands if the log begins at step k."""
+        T = min(most, policy.horizon - k)
+        if T < LEAST:
+            return np.inf
+        return float(np.median(_apart(policy.after(k), trial.until(T), past)))
+
+    stride = max(1, policy.horizon // COARSE)
+    best = min(range(0, policy.horizon, stride), key=left)
+    best = min(range(max(0, best - stride), best + stride + 1), key=left)
+    sure = best > 0 and left(best) < min(ALIKE, BY_FAR * left(0))
+    return best * policy.dt if sure else 0.0
+
+
+def not_sent(task: Task, ran: str, missed: int) -> str:
+    """Return the warning about missed steps."""
+    held = listed(
+        f"{name} = {with_unit(f'{value:g}', unit)}"
+        for (name, unit), value in zip(task.model.inputs.items(), task.past, strict=True)
+    )
+    gone = "step 0 was" if missed == 1 else f"steps 0 to {missed - 1} were"
+    return (
+        f"the first command in the log is that of step {missed} of {ran}: {gone} not sent, or not "
+        f"logged. The run begins {count(missed, 'step')} ({missed * task.dt:.3g} s) before it, "
+        f"with {held} held until then. Make the program send from step 0 on (a timer that fires "
+        "late skips it), and start recording before that"
+    )

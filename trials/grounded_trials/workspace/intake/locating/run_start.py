@@ -1,0 +1,442 @@
+"""Find where in a recording the run of a candidate begins; recordings start before the run.
+
+Without a [log.span] the run is assumed to begin with the first command in the log. That is wrong if
+the robot sends zeros while it waits. So at every instant of the log, as finely as it was sampled,
+the logged commands are compared with what the policy would send (including feedback) on the states
+logged from there on. The result is refined to the instants at which commands change. If the log
+ends before the run would have, it is compared as far as it goes, provided that the commands were
+constant before.
+
+A table shows a new command only with the first row after its change, up to one row late: at 2 m/s
+and 100 Hz that is 2 cm. Feedback determines when within that row the run began, since the commands
+respond to where the robot was then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.policy import Policy
+from grounded.search.returned.who_drove import (
+    FINE,
+    LEAST,
+    SAME,
+    UNLIKE,
+    follows,
+)
+from grounded.task import Task
+from grounded.trial import LAST, Trial, interpolate_gaps
+from grounded_trials.logs.command_steps import changes_of, phase_of
+from grounded_trials.logs.resample import Gridded, Span, to_grid
+from grounded_trials.logs.signals import Series
+from grounded_trials.workspace.intake.locating.acted_on import acted_on
+from grounded_trials.workspace.intake.locating.missed_steps import missed_steps
+
+TRIED = 5  # number of best-fitting instants that are examined
+BESIDE = 4  # steps before the best of them that are checked for an exact fit
+HELD = 3.5  # steps without a change of commands before an instant that may begin a run
+FINEST = 8  # largest number of instants per step at which a start is tried
+KNOWN = 0.25  # largest std, in rows, with which feedback determines the start within a row
+EXACT = 0.1  # share of the effect of a late row below which the logged states were the policy's
+SOUGHT = 24  # number of instants at which samples of different ages are tried
+MOVES = 0.05  # smallest change of commands, relative to an input's size, that identifies a run
+EXACT_TO = 1e-3  # largest median difference of the first commands, relative to an input's size
+QUIET_S = 1.0  # time without a change of commands before a run that is cut short in the log
+SHORT = 4  # at least 1 / SHORT of a run must be in the log
+EXACTLY = 0.02  # mean difference, relative to an input's size, below which commands are alike
+BATCH = 256  # instants compared at once
+
+# adds the estimated states to the samples of a log
+Complete = Callable[[Mapping[str, Series]], Mapping[str, Series]]
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a policy's run seems to begin."""
+
+    seconds: float  # after the log's first sample
+    apart: float  # mean difference of the commands there, in units of each input's size
+    alike: bool  # the commands are the policy's from there on
+    opens_alike: bool  # at least the first commands are; somebody may have taken over later
+    between_rows: bool = False  # determined by feedback, finer than the time between rows
+    loose_s: float = 0.0  # uncertainty of the start [s]
+    missed: int = 0  # steps of the run before the first command, which were not sent
+    exact: bool = False  # most commands are the policy's to the last digits, and no part is not
+    rival_s: float | None = None  # another start, far from it, that fits about as well
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A foreign log in which a run may begin anywhere, on a grid of `parts` instants per step."""
+
+    series: Mapping[str, Series]  # of every state and input
+    logged: Mapping[str, Series]  # those that were logged, not estimated
+    complete: Complete
+    names: tuple[tuple[str, ...], tuple[str, ...]]
+    angles: tuple[str, ...]
+    dt: float
+    steps: int
+    past: Array  # (m,) inputs held before a run
+    parts: int
+    whole: Gridded
+    changes: Array  # when a command changed in the log, seconds after the log's first sample
+    late: Array  # by how much each change may appear late [s]; 0 if commands have own stamps
+    interval: float  # between samples [s]
+    _cut: dict[float, Trial | None] = field(init=False, default_factory=dict)  # by start
+
+    @property
+    def first(self) -> float:
+        """The time of the first command, the default start of a run [s]."""
+        return (self.whole.start_ns - self.whole.origin_ns) * 1e-9
+
+    def trial_from(self, start: float) -> Trial | None:
+        """Return the log as a trial from `start` [s] on, or None if a state is not known there."""
+        if start not in self._cut:
+            self._cut[start] = self._trial_from(start)
+        return self._cut[start]
+
+    def _trial_from(self, start: float) -> Trial | None:
+        span = Span(start=start)
+        try:
+            cut = to_grid(
+                self.series,
+                self.dt,
+                *self.names,
+                span,
+                angles=self.angles,
+                steps=self.steps,
+                past=self.past,
+            )
+        except GroundedError:
+            return None
+        run = Trial(cut.states, cut.inputs, self.dt, *self.names, start_inputs=cut.start_inputs)
+        return interpolate_gaps(run).trial if cut.late_s == 0 else None
+
+    @property
+    def openings(self) -> list[float]:
+        """Instants at which commands change after being constant for some steps [s]."""
+        held = np.diff(self.changes, prepend=-np.inf)
+        return [float(at) for at in self.changes[held > HELD * self.dt]]
+
+    def start_of(self, policy: Policy) -> Start | None:
+        """Find where a policy's run begins; return None if the log is too short.
+
+        Args:
+            policy: the policy, for the states and inputs of this log.
+        """
+        if (policy.state_names, policy.input_names) != self.names or policy.dt != self.dt:
+            return None
+        apart, until, strays = instants_apart(self.whole, self.parts, policy)
+        whole = self._starts(policy, apart)
+        if (found := self._surest(policy, whole)) is None:
+            begun = [one for one in self._starts(policy, until) if one.opens_alike]
+            found = min(begun or whole, key=lambda one: (not one.alike, one.apart), default=None)
+        if found is None or not found.alike:
+            found = self._by_its_samples(policy, strays) or found
+        found = found and self._exactly(policy, found)
+        first, _ = self._on_step(policy, self.first)
+        missed = missed_steps(self, policy, first, found.seconds if found else first)
+        if not missed:
+            return found
+        apart_s = found.apart if found else np.inf
+        return Start(first - missed * self.dt, apart_s, True, True, missed=missed)
+
+    def _surest(self, policy: Policy, starts: Sequence[Start]) -> Start | None:
+        """Choose among likely starts where most commands are the policy's; None if there is none.
+
+        The mean difference is affected by other commands sent in place of the first steps, and by
+        commands at their limits, which contain no timing. The median on the samples that the
+        program acted on is not.
+        """
+        alike = [one for one in starts if one.alike]
+        likeliest = min(alike or starts, key=lambda one: one.apart, default=None)
+        if likeliest is None:
+            return None
+        near = [one for one in starts if SAME * one.apart <= likeliest.apart] if alike else []
+        if len(near) == 1:
+            return likeliest
+        fits = [(acted_on(self, policy, one.seconds), one) for one in near or [likeliest]]
+        told = [(fit, one) for fit, one in fits if fit is not None and fit.enough]
+        fit, best = min(told, key=lambda pair: pair[0].left, default=(None, likeliest))
+        if fit is not None and fit.throughout:
+            rival = self._rival(best, [one for fit, one in told if fit.throughout])
+            return replace(best, alike=True, opens_alike=True, exact=True, rival_s=rival)
+        usual = next((other.left for other, one in told if one is likeliest), 0.0)
+        if fit is not None and alike and fit.left < SAME * usual:
+            return replace(best, opens_alike=True)
+        return replace(likeliest, rival_s=self._rival(likeliest, near)) if alike else None
+
+    def _rival(self, found: Start, others: Sequence[Start]) -> float | None:
+        """Return the likeliest of the other starts far from the one found [s], or None."""
+        apart = [one for one in others if abs(one.seconds - found.seconds) > LEAST * self.dt]
+        return min(apart, key=lambda one: one.apart).seconds if apart else None
+
+    def _by_its_samples(self, policy: Policy, strays: Array) -> Start | None:
+        """Find where the first commands are the policy's to the last digits, on samples of any age.
+
+        This finds runs with high gains, whose commands change completely if a state is a
+        millisecond older, and runs that failed early.
+        """
+        first = least_of(policy.horizon)
+
+        def off(at: float) -> float:
+            """Return the median difference of the first commands; infinite if they don't move."""
+            fit = acted_on(self, policy, at)
+            told = np.zeros(0, int) if fit is None else np.flatnonzero(fit.told[:first])
+            if fit is None or len(told) < LEAST:
+                return np.inf
+            moves = bool((np.ptp(fit.asked[told], axis=0) > MOVES * fit.size).any())
+            return float(np.median(fit.off[told])) if moves else np.inf
+
+        tried, left = dict[float, float](), strays.copy()
+        while len(tried) < SOUGHT and np.isfinite(left).any() and policy.gain is not None:
+            k = int(np.argmin(left))
+            left[max(0, k - self.parts + 1) : k + self.parts] = np.inf
+            at, _ = self._on_step(policy, self.first + k * self.dt / self.parts)
+            tried[at] = off(at)
+        best = min(tried, key=tried.__getitem__, default=0.0)
+        if not tried or tried[best] > EXACT_TO:
+            return None
+        return Start(best, self.apart_at(policy, best), alike=False, opens_alike=True)
+
+    def _exactly(self, policy: Policy, found: Start) -> Start:
+        """Move a start some steps earlier if the commands are exactly the policy's there.
+
+        With high gains that amplify noise, the mean difference may be smaller some rows off.
+        """
+        here = acted_on(self, policy, found.seconds) if found.opens_alike else None
+        if policy.gain is None or here is None or here.exact:
+            return found
+        for steps in range(1, BESIDE + 1):  # not later: a log with late commands fits there too
+            at = found.seconds - steps * self.dt
+            fit = acted_on(self, policy, at)
+            if fit is not None and fit.throughout:
+                apart = self.apart_at(policy, at)
+                return replace(found, seconds=at, apart=apart, alike=True, exact=True)
+        return found
+
+    def _starts(self, policy: Policy, apart: Array) -> list[Start]:
+        """Return the likeliest starts, by the difference of the commands from each instant on."""
+        found, left = list[Start](), apart.copy()
+        while len(found) < TRIED and np.isfinite(left).any():
+            k = int(np.argmin(left))
+            left[max(0, k - self.parts) : k + self.parts + 1] = np.inf
+            on_step, room = self._on_step(policy, self.first + k * self.dt / self.parts)
+            seconds, loose = self._between_rows(policy, on_step, room)
+            trial = self.trial_from(seconds)
+            fit = None if trial is None else follows(policy, trial.until(policy.horizon), 0)
+            if trial is not None and fit is not None:
+                alike = fit.alike and not fit.late and _close(policy, trial)
+                opens = alike or fit.opens
+                between = seconds < on_step
+                found.append(Start(seconds, float(apart[k]), alike, opens, between, loose))
+        return found
+
+    def apart_at(self, policy: Policy, start: float) -> float:
+        """Return the mean difference of the commands from an instant on, as `Start.apart`."""
+        k = round((start - self.first) * self.parts / self.dt)
+        if not 0 <= k < len(self.whole.inputs):
+            return np.inf
+        return float(instants_apart(self.whole, self.parts, policy, range(k, k + 1))[0][k])
+
+    def on_step(self, policy: Policy, start: float) -> float:
+        """Move a start by less than a step to where commands change [s]."""
+        return self._on_step(policy, start)[0]
+
+    def _on_step(self, policy: Policy, start: float) -> tuple[float, float]:
+        """Move a start by less than a step to where commands change; return its uncertainty too."""
+        dt, length = self.dt, self.dt * policy.horizon
+        inside = (self.changes > start - dt / 2) & (self.changes < start + length)
+        late = self.late[inside]
+        if (found := phase_of(self.changes[inside] - start, dt, late)) is None:
+            return start, float(np.median(late)) if len(late) else 0.0
+        phase, room = found
+        if abs(phase) < dt / 4:
+            return start + phase, room
+        tried = [start + phase + move * dt for move in (-1, 0, 1)]
+        return min(tried, key=lambda one: self._misfit(policy, one)), room
+
+    def _misfit(self, policy: Policy, start: float) -> float:
+        """Return the mean difference of the commands from a start on, in units of their size."""
+        trial = self.trial_from(start)
+        T = 0 if trial is None else min(trial.finite_steps, policy.horizon)
+        if trial is None or T < LEAST:
+            return np.inf
+        sent = np.clip(trial.inputs[:T], policy.low, policy.high)
+        asked = policy.commands(trial.states[None, :T], policy.past)[0]
+        return float((np.abs(asked - sent) / (np.abs(sent).max(axis=0) + 1e-12)).mean())
+
+    def _between_rows(self, policy: Policy, start: float, row: float) -> tuple[float, float]:
+        """Move a start back by less than a row, to where the feedback commands fit best.
+
+        Args:
+            policy: the policy.
+            start: the start [s].
+            row: the remaining uncertainty from the changes of the commands [s].
+
+        Returns:
+            The start [s], and its uncertainty [s]: `row` if the commands do not follow from the
+            logged states at any time within the row, else 0.
+        """
+        if policy.gain is None or not row:
+            return start, 0.0
+        late, early = self.trial_from(start), self.trial_from(start - row)
+        if late is None or early is None:
+            return start, 0.0
+        T = min(late.finite_steps, early.finite_steps, policy.horizon)
+        if T < LEAST:
+            return start, 0.0
+        states = np.stack([late.states[:T], early.states[:T]])
+        asked, before = policy.commands(states, policy.past)
+        sent = np.clip(late.inputs[:T], policy.low, policy.high)
+        unit = np.abs(policy.feedforward).max(axis=0) + 1e-12
+        free = (asked > policy.low) & (asked < policy.high)
+        slope, off = (((v - asked) / unit)[free] for v in (before, sent))
+        power = float(slope @ slope)
+        if not power:
+            return start, 0.0
+        share = float(slope @ off) / power
+        left = float(((off - share * slope) ** 2).mean())
+        loose = row if left * len(off) > EXACT**2 * power else 0.0
+        if left > KNOWN**2 * power or not -KNOWN < share < 1 + KNOWN:
+            return start, loose
+        return start - float(np.clip(share, 0.0, 1.0)) * row, loose
+
+
+def _close(policy: Policy, trial: Trial) -> bool:
+    """Return whether commands differ by a small share of what unrelated ones differ by.
+
+    A search over a whole log finds coincidental fits, so the test is stricter than `follows`, which
+    allows states of any age within two steps.
+    """
+    T = min(trial.finite_steps, policy.horizon)
+    sent = np.clip(trial.inputs[:T], policy.low, policy.high)
+    asked = policy.commands(trial.states[None, :T], policy.past)[0]
+    usual = sum(np.abs(u - u.mean(axis=0)).mean(axis=0) for u in (sent, asked))
+    finest = FINE * np.abs(policy.feedforward).max(axis=0)
+    return bool((np.abs(sent - asked).mean(axis=0) <= UNLIKE * usual + finest).all())
+
+
+def recording(
+    logged: Mapping[str, Series],
+    task: Task,
+    complete: Complete,
+    series: Mapping[str, Series] | None = None,
+) -> Recording | None:
+    """Return a log in which a run may begin anywhere, or None if it can't be sampled.
+
+    Args:
+        logged: its samples.
+        task: the task with the control step and the horizon.
+        complete: adds the estimated states to the samples.
+        series: the completed samples, if they are known already.
+    """
+    series = complete(logged) if series is None else series
+    model, dt = task.model, task.dt
+    names = (model.state_names, model.input_names)
+    every = [float(np.median(np.diff(np.sort(s.t)))) for s in series.values() if len(s.t) > 1]
+    interval = max(every, default=dt * 1e9) * 1e-9
+    parts = 2 * int(np.clip(np.ceil(dt / max(interval, 1e-9) / 2 - 0.01), 1, FINEST / 2))
+    try:
+        whole = to_grid(series, dt / parts, *names, angles=model.angles)
+    except GroundedError:
+        series = {n: _bridged(one) if n in names[0] else one for n, one in series.items()}
+        try:
+            whole = to_grid(series, dt / parts, *names, angles=model.angles)
+        except GroundedError:
+            return None
+    sent = [series[name] for name in model.input_names]
+    seen = [changes_of(s.t, s.values) for s in sent]
+    at, late = (np.concatenate(x) for x in zip(*seen, strict=True))
+    changes, late = (at - whole.origin_ns) * 1e-9, late * 1e-9
+    return Recording(
+        series,
+        logged,
+        complete,
+        names,
+        model.angles,
+        dt,
+        task.horizon,
+        task.past,
+        parts,
+        whole,
+        changes,
+        late,
+        interval,
+    )
+
+
+def _bridged(series: Series) -> Series:
+    """Allow gaps of any length in samples; the trial cut from the log has the gaps again."""
+    longest = float(np.ptp(series.t)) * 1e-9 if len(series.t) else 0.0
+    return replace(series, spec=replace(series.spec, max_age_s=longest))
+
+
+def instants_apart(
+    log: Gridded, parts: int, policy: Policy, instants: Sequence[int] | None = None
+) -> tuple[Array, Array, Array]:
+    """Return three measures for every instant, infinite where no run can begin, (N,) each.
+
+    Args:
+        log: states and inputs at N instants.
+        parts: instants per step of the policy.
+        policy: the policy for these states and inputs.
+        instants: the indices to compute; None: all.
+
+    Returns:
+        The mean difference of the commands, if the log has the complete run or commands are
+        constant before it; the share of the run after which commands are no longer the policy's,
+        for runs that were cut or stopped; and the share of the first commands that are not the
+        policy's.
+    """
+    sent, H = np.clip(log.inputs, policy.low, policy.high), policy.horizon
+    changed = np.any(np.diff(sent, axis=0, prepend=sent[:1]) != 0, axis=1)
+    count, quiet = np.cumsum(changed), round(QUIET_S / policy.dt * parts)
+    apart, until, strays = np.full((3, len(sent)), np.inf)
+    least, steps = least_of(H), np.arange(1, H + 1)
+    asked = range(len(sent)) if instants is None else instants
+    lasting = [(len(sent) - k - parts // 2 - 1) // parts + 1 for k in asked]
+    enough = min(least, H - LAST)
+    wanted = [k for k, some in zip(asked, lasting, strict=True) if some >= enough]
+    for ks, off, known in _off(log, parts, policy, wanted):
+        left = known.sum(axis=1)
+        before = np.maximum(ks - 1, 0)
+        begun = count[before] == count[np.maximum(ks - 1 - quiet, 0)]
+        whole = (left >= H - LAST) | (begun & (left >= least))
+        apart[ks[whole]] = ((off * known).sum(axis=1) / left)[whole]
+        mean = np.where(known, np.cumsum(off, axis=1) / steps, np.inf)
+        alike = np.where(mean < EXACTLY, steps, 0).max(axis=1)
+        at = mean[np.arange(len(ks)), np.maximum(alike - 1, 0)]
+        lost = 1 - alike / H + 0.1 * at / EXACTLY  # one more step must not cost a worse fit
+        until[ks] = np.where(alike >= least, lost, np.inf)
+        strays[ks] = (off[:, :least] > EXACTLY).mean(axis=1)
+    return apart, until, strays
+
+
+def least_of(horizon: int) -> int:
+    """Return the number of steps at the beginning that identify a run."""
+    return max(LEAST, horizon // SHORT)
+
+
+def _off(
+    log: Gridded, parts: int, policy: Policy, wanted: Sequence[int]
+) -> Iterator[tuple[Any, Any, Any]]:
+    """Yield instants (K,), differences of the commands from there (K, H), and which are known."""
+    states, H = log.states, policy.horizon
+    sent, width = np.clip(log.inputs, policy.low, policy.high), policy.high - policy.low
+    size = np.maximum(np.abs(sent).max(axis=0), np.abs(policy.feedforward).max(axis=0))
+    size = size + np.where(np.isfinite(width), 0.1 * width, 1e-12)
+    steps = parts * np.arange(H)
+    for at in range(0, len(wanted), BATCH):
+        ks = np.array(wanted[at : at + BATCH])
+        x = states[np.minimum(ks[:, None] + steps, len(states) - 1)]
+        here = ks[:, None] + steps + parts // 2
+        u = sent[np.minimum(here, len(sent) - 1)]
+        off = (np.abs(policy.commands(x, policy.past) - u) / size).mean(axis=2)
+        yield ks, off, here < len(sent)

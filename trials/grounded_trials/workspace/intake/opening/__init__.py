@@ -1,0 +1,7 @@
+"""Open a file that is to be ingested, before it is checked what it ran.
+
+Read `reading.py` first: a trial written by grounded must belong to this workspace. Any other log is
+read by `foreign.py` through [log]; `estimating.py` finds its unmeasured states, and
+`columns_by_name.py` columns whose names say something else. `stored_before.py` finds whether a log
+is stored already.
+"""

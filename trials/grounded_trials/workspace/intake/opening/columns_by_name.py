@@ -1,0 +1,103 @@
+"""Find signals that [log] reads from wrong columns, by the names of the columns alone.
+
+The data may not show it: a beam's angle read from the servo's column is as smooth as its own. Two
+signals count as exchanged if each column's name fits the other signal better, or if the unit of
+each path by ROS conventions is that of the other signal. An angle read from a part of a quaternion
+is none, and a length read from a column of angles is none either.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from itertools import combinations
+
+from grounded.model import Model
+from grounded_trials.logs.log_table import LogMapping
+from grounded_trials.logs.stated_units import LENGTHS, bare_command, is_angle, unit_of
+from grounded_trials.workspace.user_files.config import FILE
+
+UNNAMED = ("data", "value")  # field names without meaning: the topic is the name
+PART = re.compile(r"((?:^|[._])(?:orientation|rotation|quaternion))\.([xyzw])$")
+ABOUT = {"x": "roll", "y": "pitch", "z": "yaw", "w": "yaw"}  # the angle closest to each component
+SMALL = 2.0  # a scale of 2 is intended: 2 sin(a / 2) is a for small angles
+
+
+def crossed(model: Model, mapping: LogMapping) -> tuple[str, ...]:
+    """Return warnings on signals that are read from each other's columns, or lengths from angles.
+
+    Axes of a position are exempt, since their names vary.
+
+    Args:
+        model: the model with the states and inputs.
+        mapping: the column of each signal.
+    """
+    paths = {name: one.path for name, one in {**mapping.states, **mapping.inputs}.items()}
+    units = {**model.states, **model.inputs}
+    angles = [n for n, s in mapping.states.items() if is_angle(s.path) and s.scale == 1]
+    lengths = [name for name in angles if units[name] in LENGTHS]
+    axes = model.roles.get("position", ())  # north may be the x of one and the y of another
+    by = {
+        (a, b): "units" if _of_the_other(a, b, paths, units) else "names"
+        for a, b in combinations(paths, 2)
+        if _of_the_other(a, b, paths, units) or _crossed(a, b, paths)
+    }
+    no_lengths = tuple(
+        f"{n} [{units[n]}] is read from {paths[n]}, an angle by its name: check {FILE}'s [log]"
+        for n in lengths
+    )
+    return no_lengths + tuple(
+        f"{a} is read from {paths[a]} and {b} from {paths[b]}: by their {what} they are exchanged "
+        f"in {FILE}'s [log]"
+        for (a, b), what in by.items()
+        if not {a, b} <= set(axes)
+    )
+
+
+def _of_the_other(a: str, b: str, paths: Mapping[str, str], units: Mapping[str, str]) -> bool:
+    """Return whether each path's number is in the other signal's unit, and not in its own."""
+    found = unit_of(paths[a]), unit_of(paths[b])
+    return found == (units[b], units[a]) != (units[a], units[b])
+
+
+def _crossed(a: str, b: str, paths: Mapping[str, str]) -> bool:
+    """Return whether each name fits the other's column better than its own."""
+    return all(
+        _alike(one, paths[other]) > _alike(one, paths[one])
+        and _alike(one, paths[other]) >= _alike(other, paths[other])
+        for one, other in ((a, b), (b, a))
+    )
+
+
+def _alike(name: str, path: str) -> float:
+    """Return the share of words that a name and the end of a path have in common, without units.
+
+    For a message with a single number, such as `/cmd/port.data`, the topic is the name.
+    """
+    words = re.split(r"[./]", bare_command(path).strip('"'))
+    last = next((one for one in reversed(words) if one and one not in UNNAMED), "")
+    own, found = (set(re.findall(r"[a-z]+|\d+", one.lower())) for one in (name, last))
+    return len(own & found) / max(len(own | found), 1)
+
+
+def no_angles(model: Model, mapping: LogMapping | None) -> Mapping[str, str]:
+    """Return states in rad or deg that are read from a component of a quaternion, with a message.
+
+    The z of an orientation is sin(yaw / 2): as smooth as a yaw, about half as large, but different
+    beyond a quarter turn. The data can't distinguish it from a gain, but the path can.
+
+    Args:
+        model: the model with the states.
+        mapping: the column of each signal; None if there is no [log].
+    """
+    found = {}
+    for name, one in (mapping.states if mapping else {}).items():
+        part = PART.search(one.path)
+        angle = name in model.angles or model.states.get(name) in ("rad", "deg")
+        if part and angle and abs(one.scale) != SMALL:
+            instead = f"{one.path[: part.end(1)]}.@rpy.{ABOUT[part[2]]}"
+            found[name] = (
+                f"is read from {one.path}, a part of a quaternion, which is not an angle: "
+                f"use {instead} in {FILE}'s [log.state.{name}]"
+            )
+    return found

@@ -1,0 +1,347 @@
+"""Foreign logs (not written by grounded): read once, mapped by [log], cut to their trial.
+
+States that are not measured are estimated along the whole log, see `estimating`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from grounded.errors import GroundedError, NextCommand
+from grounded.model import Model
+from grounded.result import listed
+from grounded.task import Task
+from grounded.trial import Trial
+from grounded_trials.logs.inspection.inspect_log import inspect_log
+from grounded_trials.logs.log_files import kind_of, log_files, log_records
+from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signals
+from grounded_trials.logs.resample import Gridded, Span, to_grid
+from grounded_trials.logs.samples import MIXED_S
+from grounded_trials.logs.signals import Series, read_signals
+from grounded_trials.store.store import hash_file
+from grounded_trials.wording import count
+from grounded_trials.workspace.adopted import but_late_sensors, planner_of
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, StoredTrial, sha256
+from grounded_trials.workspace.intake.locating.run_start import Recording, recording
+from grounded_trials.workspace.intake.opening.estimating import (
+    EstimateTable,
+    read_estimate,
+    with_estimates,
+)
+from grounded_trials.workspace.user_files.config import FILE
+from grounded_trials.workspace.where_to_mend import read_by
+
+SLOWER = 1.5  # commands with intervals above this multiple of dt were sent on another grid
+FEW = 12  # largest number of a log's signals that a message lists
+
+
+@dataclass(frozen=True, eq=False)
+class ForeignLog:
+    """The samples of a foreign log, to be cut where its run begins."""
+
+    workspace: Folder
+    path: Path
+    mapping: LogMapping
+    estimate: EstimateTable | None
+    series: dict[str, Series]  # the mapped signals
+    source: dict[str, str]  # its name, hash and estimated states, for the trial's metadata
+    own: Mapping[str, Series] = field(default_factory=dict)  # states its program estimated itself
+
+    def cut(self, candidate: str, start: float | None = None) -> tuple[Trial, Gridded]:
+        """Cut the trial from the log; also return how it was sampled.
+
+        Args:
+            candidate: the candidate that it ran; "" for data, which may be longer than the task.
+            start: where it begins, seconds after the log's first sample; None: as in [log.span].
+
+        Raises:
+            GroundedError: if the log contains no complete trial.
+        """
+        model, task = self.workspace.base_model, self.workspace.config.task
+        rest = np.array([task.start.get(name, 0.0) for name in model.input_names])
+        found = to_grid(
+            self.whole,
+            task.dt,
+            model.state_names,
+            model.input_names,
+            self.mapping.span if start is None else Span(start=start),
+            angles=model.angles,
+            steps=task.horizon if candidate else None,
+            rest=None if candidate else rest,
+            rates=() if candidate else _rates(model),
+            past=self.workspace.task.past if candidate and start is not None else None,
+        )
+        logged = tuple(one for one in found.reports if one.name in self.series), found.warnings
+        found = replace(found, told=lambda: logged)
+        trial = Trial(
+            states=found.states,
+            inputs=found.inputs,
+            dt=task.dt,
+            state_names=model.state_names,
+            input_names=model.input_names,
+            candidate=candidate,
+            start_inputs=found.start_inputs,
+        )
+        return trial, found
+
+    def refuse_late(self, found: Gridded) -> None:
+        """Refuse a candidate's run if its beginning was not recorded.
+
+        Raises:
+            GroundedError: if a state is not known when the run begins.
+        """
+        dt = self.workspace.config.task.dt
+        if found.late_s > dt / 2:
+            put_off = [
+                f"[log.state.{name}] delay_s = {one.spec.delay_s:g}"
+                for name, one in self.series.items()
+                if name in self.mapping.states and one.spec.delay_s < dt - found.late_s
+            ]
+            mend = "Start recording before the run"
+            if put_off:
+                mend = (
+                    f"{listed(put_off)} shift{'s' * (len(put_off) == 1)} states later by about as "
+                    "much: remove that, unless the clocks really differ; otherwise start recording "
+                    "before the run"
+                )
+            raise GroundedError(
+                f"{self.path}: the run starts {found.late_s:.2f} s before every state is known: "
+                f"the trial's time would not be the candidate's. {mend}, or ingest it with --data"
+            )
+
+    @property
+    def unlike_units(self) -> tuple[str, ...]:
+        """Warnings on columns in a multiple of the model's unit without a scale in [log]."""
+        from grounded_trials.logs.stated_units import Stated
+
+        model, found = self.workspace.base_model, []
+        said = Stated.by(log_files(self.path))
+        units = {**model.states, **model.inputs}
+        for name, one in self.series.items():  # including that of [log.span]
+            path, wanted = one.spec.path, units.get(name, "")
+            factor = said.factor(path, wanted)
+            if one.spec.scale == 1 and abs(factor - 1) > 1e-9:
+                named = f"whose name says {said.unit(path)}"
+                column = f"in {said.unit(path)}" if path in said.heads else named
+                found.append(
+                    f"{name} is read without a scale from a column {column}, but the model has "
+                    f"{wanted}: [log] scale = {factor:.6g} would convert it"
+                )
+        return tuple(found)
+
+    @cached_property
+    def stored(self) -> tuple[StoredTrial, ...]:
+        """The trials that were made from a file with the same bytes, whatever its name."""
+        key = "source_sha256"
+        trials = self.workspace.whole_trials()
+        return tuple(one for one in trials if one.meta.get(key) == self.source[key])
+
+    def complete(self, series: Mapping[str, Series]) -> Mapping[str, Series]:
+        """Add the estimated states to the signals of this log."""
+        if not self.estimate:
+            return series
+        names = self.workspace.base_model.state_names
+        return {**with_estimates(series, self.estimate, self._estimating, names), **self.own}
+
+    @cached_property
+    def _estimating(self) -> Task:
+        """The task with the model that is used to estimate states."""
+        effects = self.workspace.config.model.effects
+        kept = but_late_sensors(effects)
+        if len(kept) == len(effects):
+            return self.workspace.planner.plan
+        return planner_of(self.workspace.task, kept).plan
+
+    @property
+    def _beside(self) -> tuple[str, ...]:
+        """States that are mapped in [log] but not listed in [estimate] measured."""
+        if not self.estimate:
+            return ()
+        names, measured = self.workspace.base_model.state_names, self.estimate.measured
+        return tuple(n for n in names if n in self.mapping.states and n not in measured)
+
+    @property
+    def unread(self) -> tuple[str, ...]:
+        """Warnings that such states only identify a run, while its trial has estimates."""
+        return tuple(
+            f"{name} is in [log], but not in [estimate] measured: it is used to identify a run, "
+            f"but the trial has an estimate in its place. To use the logged one add {name} = its "
+            "scatter at standstill there"
+            for name in self._beside
+        )
+
+    @cached_property
+    def whole(self) -> Mapping[str, Series]:
+        """The samples of every state and input."""
+        return self.complete(self.series)
+
+    @cached_property
+    def as_seen(self) -> ForeignLog | None:
+        """The log as the robot's program saw it; None if it is the same.
+
+        Late states are as late as they arrived, and speeds that the program computed itself (by
+        differences, a filter, an observer) replace those of the smoother. A delay_s above MIXED_S
+        or below zero corrects another clock and is kept.
+        """
+        states = self.workspace.base_model.state_names
+        late = {
+            name: one
+            for name, one in self.series.items()
+            if name in states and 0 < one.spec.delay_s <= MIXED_S
+        }
+        seen = {n: replace(s, spec=replace(s.spec, delay_s=0.0)) for n, s in late.items()}
+        own = dict[str, Series]()
+        if specs := {n: self.mapping.states[n] for n in self._beside}:
+            with suppress(GroundedError):  # a log may lack them
+                own = read_signals(log_files(self.path), specs)
+        if not seen and not own:
+            return None
+        return replace(self, series={**self.series, **seen, **own}, own=own)
+
+    @cached_property
+    def recording(self) -> Recording | None:
+        """The log in which a run may begin anywhere; None if [log.span] is set."""
+        return None if self.spanned else self.anywhere
+
+    @cached_property
+    def anywhere(self) -> Recording | None:
+        """The log in which a run may begin anywhere, ignoring [log.span]; None if unusable."""
+        return recording(self.series, self.workspace.task, self.complete, self.whole)
+
+    @property
+    def spanned(self) -> bool:
+        """Whether [log.span] sets where its run begins."""
+        return bool(self.workspace.config.log.sub("span").names())
+
+
+def mapping_of(workspace: Folder, path: Path) -> LogMapping:
+    """Return the [log] table, for this log.
+
+    Raises:
+        GroundedError: if there is no [log] table, or the file is not a log.
+    """
+    model, files = workspace.base_model, log_files(path)
+    mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
+    if mapping is not None:
+        return mapping
+    if (path / FILE).is_file():
+        raise GroundedError(f"{path} is a workspace: name the log in it, or the log's folder")
+    own = [file for file in files if kind_of(file)] if path.is_dir() else []
+    if own:
+        raise GroundedError(
+            f"{path} is a folder with {count(len(own), 'file')} that grounded wrote: ingest the "
+            "file of a run",
+            NextCommand("ingest", (str(max(own, key=lambda file: file.stat().st_mtime)),)),
+        )
+    for file in files:
+        next(iter(log_records(file)), None)
+    raise GroundedError(
+        f"{path} is not a trial written by grounded, and grounded.toml has no [log] table to map "
+        "it: `inspect` prints one",
+        NextCommand("inspect", (str(path),)),
+    )
+
+
+def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignLog:
+    """Read a log through the [log] table.
+
+    Raises:
+        GroundedError: if a state or an input is not mapped, or the log can't be read.
+    """
+    model, config, files = workspace.base_model, workspace.config, log_files(path)
+    estimate = read_estimate(config.estimate, model) if config.estimate.names() else None
+    states = tuple(estimate.measured) if estimate else model.state_names
+    missing = [s for s in states if s not in mapping.states]
+    missing += [i for i in model.input_names if i not in mapping.inputs]
+    if missing:
+        raise _unmapped(model, mapping, missing[0], path, estimated=estimate is not None)
+    source = {"source": path.name, "source_sha256": hashed(files)}
+    source |= read_by(mapping)
+    if guessed := [name for name in model.state_names if name not in states]:
+        source["estimated"] = ",".join(guessed)
+        kept = but_late_sensors(config.model.effects)
+        source[ESTIMATED_WITH] = ",".join(str(effect["name"]) for effect in kept)
+    series = mapped_signals(files, mapping, states, model.input_names)
+    ends = [(int(one.t.min()), int(one.t.max())) for one in series.values()]
+    source[LASTED] = f"{1e-9 * (max(e for _, e in ends) - min(b for b, _ in ends)):.6f}"
+    return ForeignLog(workspace, path, mapping, estimate, series, source)
+
+
+def _unmapped(
+    model: Model, mapping: LogMapping, name: str, path: Path, *, estimated: bool
+) -> GroundedError:
+    """Return the error for a state or an input that [log] does not map."""
+    if name in model.input_names:
+        return GroundedError(
+            f"[log] maps no '{name}': every input must be logged, map it{_numbers(path)}"
+        )
+    if estimated:
+        return GroundedError(
+            f"[log] maps no '{name}', but [estimate] lists it in measured: map it, or remove it "
+            "there"
+        )
+    known = [f"{one} = 0.01" for one in model.state_names if one in mapping.states]
+    if not known:
+        return GroundedError(
+            f"[log] maps no '{name}', nor any other state: map what is measured{_numbers(path)}"
+        )
+    return GroundedError(
+        f"[log] maps no '{name}': map it. If no sensor measures it, a smoother can estimate it "
+        "from the others: add to grounded.toml, each with its own noise (standard deviation, in "
+        f"the state's unit),\n[estimate]\nmeasured = {{ {', '.join(known)} }}"
+    )
+
+
+def _numbers(path: Path) -> str:
+    """List the numbers in a log that change, if they are few; else ""."""
+    found = [f.path for t in inspect_log(path).topics for f in t.fields if f.low != f.high]
+    return f". {path.name} has {', '.join(found)}" if 0 < len(found) <= FEW else ""
+
+
+def hashed(files: Sequence[Path]) -> str:
+    """Return the SHA-256 of a log's file, or of the hashes if it has several files."""
+    hashes = [hash_file(file) for file in files]
+    return hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode())
+
+
+def _rates(model: Model) -> tuple[str, ...]:
+    """Return the states that are velocities, which are zero while the robot is at rest."""
+    from grounded.places import integrals
+
+    said = (model.roles.get("speed"), model.roles.get("heading_rate"))
+    found = {model.state_names[one.j] for one in integrals(model)} | {*said}
+    return tuple(name for name in model.state_names if name in found)
+
+
+def begun(found: Gridded, dt: float, inputs: Sequence[str]) -> Iterator[str]:
+    """Yield notes on where data begin, the timing of their commands, and a dt that does not fit."""
+    at = f"it is used from {(found.start_ns - found.origin_ns) * 1e-9:.3f} s on"
+    if found.moved_s > dt:
+        yield (
+            f"{at}: what was sent before the first command is not in the log, and the robot was "
+            "not at rest"
+        )
+    elif found.moved_s > 0:
+        yield f"{at}, where a step of the commands begins"
+    slow = [
+        one for one in found.reports if one.name in inputs and 0 < one.rate_hz * dt < 1 / SLOWER
+    ]
+    if slow:
+        every = 1 / max(one.rate_hz for one in slow)
+        yield (
+            f"the commands of {listed(one.name for one in slow)} come every {every:.3g} s, but "
+            f"[task] dt is {dt:g} s: did you mean dt = {every:.3g}?"
+        )
+    if found.row_s > dt / 20:
+        yield (
+            f"its rows come every {found.row_s:.3g} s and repeat the commands: a row does not say "
+            f"if its command was sent just then or up to {found.row_s:.3g} s before, so a delay is "
+            f"known to +- {found.row_s / 2:.3g} s only"
+        )

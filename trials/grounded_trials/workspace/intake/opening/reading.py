@@ -1,0 +1,294 @@
+"""Read a file, a trial written by grounded or a log, before it is checked what it ran.
+
+A trial written by grounded must have this workspace's model, time grid and task. If it contains the
+policy that it ran, that must equal this workspace's candidate to the last bit.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from grounded.errors import GroundedError, NextCommand
+from grounded.trial import Trial
+from grounded_trials.formats.text_tables import table_remarks
+from grounded_trials.logs.log_files import log_files
+from grounded_trials.logs.resample import Gridded
+from grounded_trials.logs.signal_report import SignalReport
+from grounded_trials.logs.stated_units import same_unit
+from grounded_trials.plain_file import read_file
+from grounded_trials.store.own_files import FILE_LIMIT
+from grounded_trials.store.store import DIGITS
+from grounded_trials.store.trial_file import read_trial, trial_bytes
+from grounded_trials.workspace.candidates.search_state import standing_in
+from grounded_trials.workspace.candidates.standing_without import asked_again
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, ROWS, sha256
+from grounded_trials.workspace.intake.opening.columns_by_name import crossed, no_angles
+from grounded_trials.workspace.intake.opening.stored_before import (
+    refuse_as_another,
+    refuse_known_data,
+    same_recording,
+    set_aside_of,
+)
+
+if TYPE_CHECKING:
+    from grounded_trials.workspace.intake.opening.foreign import ForeignLog
+
+HOLE = 10.0  # length of a gap, in usual intervals between samples, that is reported
+
+
+@dataclass(frozen=True, eq=False)
+class Read:
+    """A trial that may be stored, with its warnings and notes."""
+
+    trial: Trial
+    data: bytes
+    warnings: tuple[str, ...] = ()
+    signals: tuple[SignalReport, ...] = ()
+    notes: tuple[str, ...] = ()
+    copy: bool = False  # a copy of a stored trial, or of a part of one
+    bare: bool = False  # it ran a candidate but contains no copy of it
+    doubted: bool = False  # ingested as a candidate's run although its commands differ
+    log: ForeignLog | None = None
+    cut: Gridded | None = None  # how a foreign log was sampled
+    fell: bool = False  # it failed before the log ends, as a warning says
+    last_s: float = math.nan  # when all states of a foreign log were last known [s from the start]
+
+    @property
+    def own(self) -> bool:
+        """Whether it was written by grounded, in the model's units, and not read through [log]."""
+        return self.log is None and not self.copy
+
+    @property
+    def hole(self) -> str:
+        """A sentence on the longest gap in a log; "" if there is no long one."""
+        longest = max(self.signals, key=lambda one: one.largest_gap_s, default=None)
+        if longest is None or not longest.largest_gap_s * longest.rate_hz > HOLE:
+            return ""
+        return (
+            f" It has no sample of {longest.name} for {longest.largest_gap_s:.2g} s, from "
+            f"{longest.largest_gap_at_s:.2f} s on: that may be why."
+        )
+
+
+def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: bool) -> Read:
+    """Read a trial written by grounded; its names, time grid and task must be this workspace's.
+
+    Raises:
+        GroundedError: if they are not, or its candidate is not of this workspace.
+    """
+    content = read_file(path, FILE_LIMIT)
+    trial, meta, policy = read_trial(content, str(path))
+    model, dt = workspace.base_model, workspace.config.task.dt
+    for what, found, own in (
+        ("states", trial.state_names, model.state_names),
+        ("inputs", trial.input_names, model.input_names),
+    ):
+        if found != own:
+            raise GroundedError(
+                f"{path} has the {what} {', '.join(found)}, but this workspace's model has "
+                f"{', '.join(own)}: it is a trial of another robot"
+            )
+    if other := list(_other_units(workspace, meta)):
+        raise GroundedError(
+            f"{path}: {'; '.join(other)}. A trial is stored unchanged: write its signals in the "
+            "model's units and name those, or ingest them as a CSV with a scale in [log]"
+        )
+    if abs(trial.dt - dt) > 1e-9:
+        raise GroundedError(
+            f"{path} was recorded every {trial.dt:g} s, but this workspace's [task] dt is {dt:g} "
+            "s: it belongs to another task"
+        )
+    if data:
+        if not trial.candidate:
+            return Read(trial, content)
+        kept = ("system", "source", "source_sha256", "estimated", ESTIMATED_WITH, LASTED, READ_BY)
+        about = {k: v for k, v in meta.items() if k in kept}
+        about |= {"kind": "data", "ran": trial.candidate}
+        notes = _elsewhere(workspace, trial.candidate, policy)
+        trial = replace(trial, candidate="")
+        return Read(trial, _encode(workspace, trial, about), notes=notes)
+    if candidate is not None and trial.candidate not in ("", candidate):
+        raise GroundedError(f"{path} says that it ran {trial.candidate}, not {candidate}")
+    if trial.candidate:
+        _check_candidate(workspace, path, trial.candidate, meta.get("task", ""), policy)
+        return Read(trial, content, bare=policy is None)
+    trial = replace(trial, candidate=candidate or _outstanding(workspace, path))
+    _check_candidate(workspace, path, trial.candidate)
+    return Read(trial, _encode(workspace, trial, _about(workspace, trial.candidate)))
+
+
+def _other_units(workspace: Folder, meta: dict[str, str]) -> Iterator[str]:
+    """Yield the signals of a trial with stated units that differ from the model's."""
+    model = workspace.base_model
+    for kind, own in (("states", model.states), ("inputs", model.inputs)):
+        for name, unit in json.loads(meta[kind]).items():
+            if unit and "1" not in (unit.strip(), own[name]) and not same_unit(unit, own[name]):
+                yield f"{name} is in {unit}, but the model has it in {own[name]}"
+
+
+def _elsewhere(workspace: Folder, candidate: str, policy: bytes | None) -> tuple[str, ...]:
+    """Return a note if the policy in a trial is not this workspace's candidate."""
+    known = candidate in workspace.candidate_ids()
+    if policy is None or (known and policy == workspace.candidate_bytes(candidate)):
+        return ()
+    return (f"the {candidate} that it ran is from another workspace, or was made again since",)
+
+
+def _check_candidate(
+    workspace: Folder, path: Path, candidate: str, task: str = "", policy: bytes | None = None
+) -> None:
+    """Check that a candidate is of this workspace and task, and the policy equals its file.
+
+    Raises:
+        GroundedError: if not.
+    """
+    if candidate not in workspace.candidate_ids():
+        raise GroundedError(
+            f"{path} ran {candidate}, which this workspace never proposed; ingest it with --data "
+            "to use it for fitting and diagnosis"
+        )
+    own = workspace.task.hash
+    _, meta = workspace.candidate(candidate)
+    if meta.get("task") != own or task not in ("", own):
+        raise GroundedError(
+            f"{path} ran {candidate} for another task (other target, reward, limits, start or "
+            "horizon); its utility can't be compared. Ingest it with --data to use it for fitting "
+            "and diagnosis"
+        )
+    if policy is not None and policy != workspace.candidate_bytes(candidate):
+        raise GroundedError(
+            f"{path} contains a policy that is not the {candidate} of this workspace: it comes "
+            "from another one, or the candidate was made again since. Ingest it with --data"
+        )
+
+
+def read_log_file(workspace: Folder, path: Path, candidate: str | None, data: bool) -> Read:
+    """Read a foreign log through [log].
+
+    Raises:
+        GroundedError: if it can't be mapped or sampled, or no candidate is outstanding.
+    """
+    from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
+
+    log = read_foreign(workspace, path, mapping_of(workspace, path))
+    ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
+    refuse_as_another(path, log.stored, "" if data else candidate)
+    if not (data or ran):
+        refuse_known_data(path, log.stored)
+    before = None if data or ran else set_aside_of(workspace, log.source["source_sha256"])
+    if before and before.candidate in workspace.candidate_ids():
+        ran = before.candidate
+    chosen = "" if data else ran or _outstanding(workspace, path)
+    if chosen:
+        refuse_as_another(path, log.stored, chosen)
+        _check_candidate(workspace, path, chosen)
+    read = cut_log(log, chosen)
+    return replace(read, notes=(before.told(),)) if before and chosen == ran else read
+
+
+def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read:
+    """Cut the trial from a log, from `start` [s] on; None: from [log.span] or the first command."""
+    from grounded_trials.workspace.intake.opening.foreign import begun
+
+    trial, found = log.cut(candidate, start)
+    about = _about(log.workspace, candidate) | log.source
+    about |= {ROWS: f"{found.row_s:.6g}"} if found.row_s and not candidate else {}
+    encoded = _encode(log.workspace, trial, about, found.start_ns)
+    return Read(
+        trial,
+        encoded,
+        (
+            *(text for file in log_files(log.path) for text in table_remarks(file)),
+            *misread(log),
+            *log.unlike_units,
+            *log.unread,
+            *found.warnings,
+        ),
+        found.reports,
+        notes=() if candidate else tuple(begun(found, trial.dt, trial.input_names)),
+        log=log,
+        cut=found,
+        last_s=(found.last_ns - found.start_ns) * 1e-9,
+    )
+
+
+def cut_short(read: Read, steps: int, told: str) -> Read:
+    """Cut a run in a foreign log after `steps`, with the warning `told`, if it is longer."""
+    if read.log is None or read.cut is None or read.trial.steps <= steps:
+        return read
+    trial, workspace = read.trial.until(steps), read.log.workspace
+    about = _about(workspace, trial.candidate) | read.log.source
+    data = _encode(workspace, trial, about, read.cut.start_ns)
+    warnings = (*read.warnings, told) if told else read.warnings
+    return replace(read, trial=trial, data=data, warnings=warnings, fell=bool(told))
+
+
+def misread(log: ForeignLog) -> tuple[str, ...]:
+    """Return warnings on signals read from each other's column, or angles from something else."""
+    model = log.workspace.base_model
+    odd = no_angles(model, log.mapping)
+    return (*crossed(model, log.mapping), *(f"{name} {said}" for name, said in odd.items()))
+
+
+class NoneWaits(GroundedError):
+    """Raised if no candidate is waiting for a trial; `best` may have been run again."""
+
+    def __init__(self, path: Path, best: str) -> None:
+        super().__init__(
+            f"{path} doesn't say which candidate it ran, and none is waiting for a trial: name it "
+            "with --candidate ID, or use --data for a log that ran none",
+            NextCommand("ingest", (str(path), "--candidate", best)) if best else None,
+        )
+        self.best = best
+
+
+def _outstanding(workspace: Folder, path: Path) -> str:
+    now = standing_in(workspace)
+    if now.outstanding is None and (asked := asked_again(workspace)):
+        return asked
+    if now.outstanding is None:
+        raise NoneWaits(path, now.incumbent.candidate.id if now.incumbent else "")
+    return now.outstanding.id
+
+
+def _about(workspace: Folder, candidate: str) -> dict[str, str]:
+    """Return the metadata of a trial that is written here."""
+    if not candidate:
+        return {"kind": "data"}
+    _, meta = workspace.candidate(candidate)
+    return {"kind": "trial", "task": workspace.task.hash} | {
+        key: meta[key] for key in ("iteration", "alpha")
+    }
+
+
+def _encode(workspace: Folder, trial: Trial, about: dict[str, str], start_ns: int = 0) -> bytes:
+    return trial_bytes(
+        trial,
+        about,
+        workspace.candidate_bytes(trial.candidate) if trial.candidate else None,
+        state_units=dict(workspace.base_model.states),
+        input_units=dict(workspace.base_model.inputs),
+        start_ns=start_ns,
+    )
+
+
+def copied(workspace: Folder, path: Path, read: Read, wanted: str | None) -> Read:
+    """Replace a file that is a copy or a part of a stored trial by that trial."""
+    if is_stored(workspace, read.data) or (read.log and read.log.stored):
+        return read
+    if (one := same_recording(workspace, path, read.data, read.log)) is None:
+        return read
+    refuse_as_another(path, (one,), wanted)
+    note = f"its rows are those of {one.stored.id}: it is the same recording, or a part of it"
+    return Read(one.trial, workspace.store.read(one.stored), notes=(note,), copy=True)
+
+
+def is_stored(workspace: Folder, data: bytes) -> bool:
+    """Return whether a file is in the store, even if its trial is set aside."""
+    return sha256(data)[:DIGITS] in workspace.store.digests()

@@ -1,0 +1,268 @@
+"""Detect recordings that are stored already: the same trial, a repeat, or another reading of it.
+
+One log, or one part of it, is one trial. Read through another [log] it would become a second trial
+that repeats the first with other numbers, which would invalidate any diagnosis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from grounded.errors import GroundedError, NextCommand
+from grounded.result import listed
+from grounded.trial import Trial, scattered
+from grounded_trials.logs.log_files import log_files
+from grounded_trials.logs.resample import ABSOLUTE_S
+from grounded_trials.store.trial_file import read_trial
+from grounded_trials.workspace.candidates.search_state import standing_in
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, StoredTrial, sha256
+from grounded_trials.workspace.intake.opening.foreign import ForeignLog
+
+EDGE = 2  # last rows of a cut log that are ignored, since its end affects them
+LEAST = 10  # rows that two recordings must share to count as the same
+
+
+def refuse_as_another(path: Path, stored: Sequence[StoredTrial], wanted: str | None) -> None:
+    """Refuse a log that is stored as a run of another candidate, or as data.
+
+    Args:
+        path: the log.
+        stored: the trials that were made from it.
+        wanted: the requested candidate, "" for data, None for no preference.
+
+    Raises:
+        GroundedError: if it is stored as something else, with the trial to discard.
+    """
+    if not stored or wanted in (None, *(one.trial.candidate for one in stored)):
+        return
+    identity, as_run = stored[-1].stored.id, stored[-1].trial.candidate
+    raise GroundedError(
+        f"{path} is stored already, as {identity}, {_what(as_run)}: one log is one trial. To "
+        f"use it as {_what(wanted)} instead, discard {identity} first",
+        NextCommand("discard", (identity,)),
+    )
+
+
+def refuse_known_data(path: Path, stored: Sequence[StoredTrial]) -> None:
+    """Refuse a log that is stored as data and was passed as the log of a run, probably by mistake.
+
+    Raises:
+        GroundedError: if it is stored as data.
+    """
+    if stored and not stored[-1].trial.candidate:
+        identity = stored[-1].stored.id
+        raise GroundedError(
+            f"{path} is stored already, as {identity}, data: pass the log of the candidate's run. "
+            f"If this is one, discard {identity} and name the candidate with --candidate ID"
+        )
+
+
+def _what(candidate: str | None) -> str:
+    return f"a run of {candidate}" if candidate else "data"
+
+
+@dataclass(frozen=True)
+class Aside:
+    """A trial that was made from a log and is set aside."""
+
+    id: str
+    candidate: str  # "" for data
+
+    def told(self) -> str:
+        """Return the note that the log is used as before, and how to change that."""
+        return (
+            f"it was stored before, as {self.id}, {_what(self.candidate)}, which is set aside: it "
+            f"is used as {_what(self.candidate)} again. To change that, use --candidate ID"
+        )
+
+
+def set_aside_of(workspace: Folder, digest: str) -> Aside | None:
+    """Return the last trial, among those set aside, that was made from a log with this hash."""
+    aside = workspace.discarded()
+    for stored in reversed([one for one in workspace.store.list() if one.id in aside]):
+        with suppress(GroundedError):  # skip damaged files
+            trial, meta, _ = read_trial(workspace.store.read(stored))
+            if meta.get("source_sha256") == digest:
+                return Aside(stored.id, trial.candidate or "")
+    return None
+
+
+def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> bytes:
+    """Return the stored file of a log's trial if it is stored, else the new one.
+
+    Args:
+        workspace: the workspace.
+        log: the log, with its `stored` trials.
+        trial: the trial as it was read now.
+        data: the file of that trial.
+
+    Raises:
+        GroundedError: if the same part of the log is stored with other numbers.
+    """
+    digest, now = sha256(data), log.source.get(ESTIMATED_WITH, "")
+    for one in log.stored:
+        same = one.trial.candidate == trial.candidate
+        guessed = one.meta.get("estimated", "") if one.meta.get(ESTIMATED_WITH, "") != now else ""
+        kept = [name not in guessed.split(",") for name in trial.state_names]
+        pairs = (
+            (one.measured.states[:, kept], trial.states[:, kept]),
+            (one.measured.inputs, trial.inputs),
+        )
+        if digest.startswith(one.stored.digest):
+            return data
+        if same and all(np.array_equal(a, b, equal_nan=True) for a, b in pairs):
+            return workspace.store.read(one.stored)
+    start, end = _span(read_trial(data)[1], trial)
+    spans = {one.stored.id: _span(one.meta, one.trial) for one in log.stored}
+    names = tuple(name for name, (a, b) in spans.items() if a < end and start < b)
+    if not names:
+        return data  # another part of a long recording
+    raise _read_otherwise(log.path, names)
+
+
+def estimated_otherwise(workspace: Folder, log: ForeignLog) -> tuple[str, ...]:
+    """Return a note if the latest estimated trials were estimated with another model."""
+    if (now := log.source.get(ESTIMATED_WITH)) is None:
+        return ()
+    known = [one for one in workspace.whole_trials() if one.meta.get("estimated")]
+    other = [one for one in known if one.meta.get(ESTIMATED_WITH, "") != now]
+    if not other or known[-1] is not other[-1]:
+        return ()
+    before = other[-1].meta.get(ESTIMATED_WITH, "")
+    names, states = listed(t.stored.id for t in other), log.source["estimated"].split(",")
+    now, before = (listed(s.split(",")) if s else "no effect" for s in (now, before))
+    return (
+        f"the model that estimates {listed(states)} has {now}; for {names} it had {before}. To "
+        f"have all estimates from one model, discard {names} and ingest "
+        f"{'that log' if len(other) == 1 else 'those logs'} again",
+    )
+
+
+def _read_otherwise(path: Path, names: tuple[str, ...]) -> GroundedError:
+    which = names[0] if len(names) == 1 else "them"
+    return GroundedError(
+        f"{path}: the same recording is stored as {', '.join(names)}, read in another way "
+        f"(another [log], [estimate] or [task] dt): discard {which}, then ingest it again",
+        NextCommand("discard", names),
+    )
+
+
+def same_recording(
+    workspace: Folder, path: Path, data: bytes, log: ForeignLog | None
+) -> StoredTrial | None:
+    """Return the stored trial that a file is a copy or a part of (recovered from damage, say).
+
+    Trials are the same recording if all rows are equal at the same times of the log's clock.
+    Complete runs of a deterministic simulator whose clock starts at zero are not: they may be equal
+    in logs of equal length.
+
+    Args:
+        workspace: the workspace.
+        path: the file.
+        data: the trial in it, as it would be stored.
+        log: the log from which the trial was read; None if the file was written by grounded.
+
+    Raises:
+        GroundedError: if it has more of the recording than the stored trial, or other numbers.
+    """
+    trial, meta, _ = read_trial(data)
+    begin, end = _span(meta, trial)
+    for one in workspace.whole_trials():
+        first, last = _span(one.meta, one.measured)
+        foreign = "source" in one.meta
+        if foreign != (log is not None) or not (first < end and begin < last):
+            continue
+        here = trial
+        if one.meta["start_ns"] != meta["start_ns"]:
+            if log is None or (there := _from(log, one)) is None:
+                continue
+            here = there
+        alike = _alike(one, here)
+        stamped = first > ABSOLUTE_S  # absolute time; else the clock of each log may start at zero
+        if alike == "none" or (alike == "some" and not stamped):
+            continue
+        if alike == "some":
+            raise _read_otherwise(path, (one.stored.id,))
+        if here.finite_steps > one.measured.finite_steps:
+            raise GroundedError(
+                f"{path}: {one.stored.id} is a part of the same recording, which is longer here: "
+                f"discard {one.stored.id}, then ingest it again",
+                NextCommand("discard", (one.stored.id,)),
+            )
+        lasted = one.meta.get(LASTED)
+        cut = lasted is not None and log is not None and lasted != log.source[LASTED]
+        if stamped or cut or here.finite_steps < one.measured.finite_steps:
+            return one
+    return None
+
+
+def _from(log: ForeignLog, one: StoredTrial) -> Trial | None:
+    """Return a log as a trial that begins when a stored one does, or None if it can't be cut."""
+    with suppress(GroundedError):
+        _, found = log.cut("")
+        after = 1e-9 * (int(one.meta["start_ns"]) - found.origin_ns)
+        return log.cut(one.trial.candidate or "", after)[0]
+    return None
+
+
+def _alike(one: StoredTrial, here: Trial) -> Literal["all", "some", "none"]:
+    """Return which signals are equal row by row: all, some (the inputs and some states), or none.
+
+    "some" means that the recording was read in another way. Constant and estimated signals are
+    ignored.
+    """
+    before = one.measured
+    names = (before.state_names, before.input_names)
+    rows = min(before.finite_steps, here.finite_steps) - EDGE
+    if rows < LEAST or names != (here.state_names, here.input_names):
+        return "none"
+    guessed = one.meta.get("estimated", "").split(",")
+    known = [i for i, name in enumerate(here.state_names) if name not in guessed]
+    states, inputs = before.states[:rows, known], before.inputs[:rows]
+    same = (states == here.states[:rows, known]).all(axis=0)
+    telling = np.ptp(states, axis=0) > 0
+    if not np.array_equal(inputs, here.inputs[:rows]) or not (same & telling).any():
+        return "none"
+    return "all" if same.all() else "some"
+
+
+def _span(meta: Mapping[str, str], trial: Trial) -> tuple[float, float]:
+    """Return the start and the end of a trial on its log's clock [s]."""
+    start = int(meta["start_ns"]) * 1e-9
+    return start, start + trial.steps * trial.dt
+
+
+def repeated(workspace: Folder, path: Path, trial: Trial, data: bytes) -> str:
+    """Return the stored trial that a new run repeats to the last bit, or "".
+
+    The same bytes count as a new run, not as the old one ingested twice, if that candidate is
+    outstanding and the file was written after the stored one.
+    """
+    digest = sha256(data)
+    known = [one for one in workspace.store.list() if digest.startswith(one.digest)]
+    if not known or not trial.candidate:
+        return ""
+    waiting = standing_in(workspace).outstanding
+    files = log_files(path) if path.is_dir() else [path]
+    written = max(file.stat().st_mtime_ns for file in files)
+    fresh = written > known[-1].path.stat().st_mtime_ns
+    return known[-1].id if fresh and waiting and waiting.id == trial.candidate else ""
+
+
+def what_repeats(workspace: Folder) -> str:
+    """Explain an exact repeat: no noise, or a copy if other trials of a candidate differ."""
+    ran = [trial for trial in workspace.task_trials() if trial.candidate]
+    if scattered([trial.whole(workspace.task.horizon) for trial in ran]):
+        return (
+            "other trials of one candidate differ, so it is probably a copy, or from a program "
+            "with a fixed seed: `discard` it and run again"
+        )
+    taken = "the system is treated as deterministic"
+    return f"{taken}, and no candidate is run a second time from now on"

@@ -1,0 +1,148 @@
+"""Find a candidate's run in a log, and judge by its commands whether it is one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache, partial
+from typing import TYPE_CHECKING
+
+from grounded.frozen import Array
+from grounded.policy import Policy
+from grounded.result import listed
+from grounded.search.candidate import Candidate
+from grounded.search.returned.who_drove import (
+    suspicion,
+)
+from grounded.task import Task
+from grounded.trial import interpolate_gaps
+from grounded_trials.workspace.intake.locating.fell import fall_in, who_fell
+from grounded_trials.workspace.intake.locating.missed_steps import not_sent
+from grounded_trials.workspace.intake.locating.run_start import Recording, Start
+from grounded_trials.workspace.intake.opening.reading import Read, cut_log
+from grounded_trials.workspace.intake.recognising.sender import on_other_speeds, rival_in, sender_of
+
+if TYPE_CHECKING:
+    from grounded_trials.workspace.intake.opening.foreign import ForeignLog
+
+ALIGNED = 0.75  # starts closer than this, in sample intervals, are considered equal
+CLEARLY = 0.7  # a start is elsewhere if its difference is below this share of the first command's
+
+
+class Look:
+    """The search for a candidate's run in a log: where it begins, and whether it is its run.
+
+    Args:
+        read: the trial that would be stored.
+        log: the log in which its commands are judged; None if `read` was written by grounded.
+        own: the candidate.
+        candidates: candidates that may have been run instead.
+        task: the task of all candidates.
+    """
+
+    def __init__(
+        self,
+        read: Read,
+        log: ForeignLog | None,
+        own: Candidate,
+        candidates: list[Candidate],
+        task: Task,
+    ) -> None:
+        ran, judged = read.trial.candidate, partial(suspicion, task, own=own, others=candidates)
+        apart = None if log is read.log else log  # set if judged on other samples than stored
+        self.read, self.found, self.exact = read, None, False
+        self.old: Array | None = None  # ages of the samples acted on [s], (n,), if it is surely its
+        self.whole = interpolate_gaps(apart.cut(ran)[0] if apart else read.trial).trial
+        seen = judged(self.whole)
+        if read.bare and (alone := judged(self.whole, others=())).why:
+            seen = alone  # it may be of another workspace: resembling one of these is coincidence
+        self.log = log.recording if log else None
+        if log and read.log and self.log:
+            start_of = cache(partial(_start_of, self.log))
+            self.found = found = start_of(own)
+            if found and elsewhere(self.log, found, own.policy, seen.why):
+                self._cut(read.log, apart, found, own, task)
+                seen = judged(self.whole)
+            sender = sender_of(self.log, own, candidates, start_of)
+            self.exact = sender.own is not None and sender.own.exact
+            if sender.own is not None and sender.sure:
+                self.old = sender.own.old
+            if sender.sure:
+                seen = replace(seen, why="", other="")
+            elif sender.other:
+                seen = replace(seen, why=sender.why, other=sender.other)
+            elif (rival := rival_in(self.log, own, candidates, start_of)) is not None:
+                best = judged(rival)  # cut where the other candidate fits best
+                told = best if best.other else seen if seen.why else replace(seen, why=best.why)
+                seen = replace(told, ran=seen.ran)
+            guessed = [name for name in self.log.names[0] if name not in self.log.logged]
+            doubted = found and guessed and seen.why and not sender.sure
+            if found and doubted and on_other_speeds(self.log, own, candidates, start_of):
+                if self.read is read:
+                    self._cut(read.log, apart, found, own, task)
+                seen = replace(judged(self.whole), why="", other="")
+                notes = (*self.read.notes, _other_speeds(ran, guessed))
+                self.read = replace(self.read, notes=notes)
+        elif log and read.cut and log.spanned and (seen.why or seen.other) and log.anywhere:
+            begins = 1e-9 * (read.cut.start_ns - log.anywhere.whole.origin_ns)
+            given = Start(begins, 0.0, alike=True, opens_alike=True)
+            if sender_of(log.anywhere, own, [], lambda _: given).sure:
+                seen = replace(seen, why="", other="")
+        asked = read.log and not seen.other
+        self.fell = fall_in(task, own, self.read.trial, seen.ran) if asked else None
+        if self.fell and self.log:
+            first, steps = self.found.seconds if self.found else self.log.first, self.fell.steps
+            if name := who_fell(self.log, own, candidates, start_of, first + steps * task.dt):
+                self.fell, seen = None, replace(seen, other=name)
+        self.suspicion = seen
+
+    def _cut(
+        self, log: ForeignLog, apart: ForeignLog | None, found: Start, own: Candidate, task: Task
+    ) -> None:
+        """Cut the run from a log where it begins, with a note."""
+        ran, begins = own.id, found.seconds + (_sooner(apart, log) if apart else 0)
+        there = cut_log(log, ran, begins)
+        warnings, notes = list(there.warnings), list(self.read.notes)
+        if found.missed:
+            warnings.insert(0, not_sent(task, ran, found.missed))
+        else:
+            notes.append(f"the log begins {begins:.3f} s before {ran} does: that part is left out")
+        self.read = replace(there, warnings=tuple(warnings), notes=tuple(notes))
+        cut = apart.cut(ran, found.seconds)[0] if apart else self.read.trial
+        self.whole = interpolate_gaps(cut).trial
+
+    @property
+    def doubt(self) -> tuple[bool, float]:
+        """Whether it is another's run, and how far the commands are from the candidate's."""
+        ran = self.suspicion.ran
+        return bool(self.suspicion.why), math.inf if ran is None else ran.error
+
+
+def _start_of(log: Recording, candidate: Candidate) -> Start | None:
+    """Return where a candidate's run seems to begin in a log."""
+    return log.start_of(candidate.policy)
+
+
+def _other_speeds(ran: str, guessed: Sequence[str]) -> str:
+    """Return the note on a run whose program had other speeds than the smoother finds."""
+    return (
+        f"most of its commands are within a few percent of those of {ran} on the {listed(guessed)} "
+        "that [estimate] finds here; its program used its own. To have them judged exactly, let it "
+        "log its own, and map them in [log] too"
+    )
+
+
+def _sooner(log: ForeignLog, stored: ForeignLog) -> float:
+    """Return by how much the first sample of the stored log is earlier [s]."""
+    assert log.recording is not None and stored.recording is not None
+    return (log.recording.whole.origin_ns - stored.recording.whole.origin_ns) * 1e-9
+
+
+def elsewhere(log: Recording, found: Start, policy: Policy, why: str) -> bool:
+    """Return whether a run begins at the start found rather than at the log's first command."""
+    if found.missed or (found.between_rows and found.alike):
+        return True
+    if not found.opens_alike or abs(found.seconds - log.first) <= ALIGNED * log.interval:
+        return False
+    return bool(why) or found.exact or found.apart < CLEARLY * log.apart_at(policy, log.first)

@@ -1,0 +1,143 @@
+"""Find a run in a log whose program misused the candidate, wherever the run begins.
+
+A misuse is certain if it gives the logged commands to the last digits on the samples that the
+program acted on, in nearly all steps in which it differs from the right use. Both are compared
+there: a grid is too coarse for degrees passed as radians, with which a millisecond moves a command
+from one limit to the other. Where the run may begin is sought on the grid first, for each misuse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from grounded.search.candidate import Candidate
+from grounded.search.returned.as_predicted import apart
+from grounded.search.returned.misused import NEARLY_ALL, Way, likeliest, misused, ways
+from grounded.search.returned.other_scale import other_units
+from grounded.search.returned.who_drove import follows, latest
+from grounded.task import Task
+from grounded.trial import Trial
+from grounded_trials.workspace.intake.locating.acted_on import EXACT, FEW, acted_on, held_before
+from grounded_trials.workspace.intake.locating.run_start import BATCH, TRIED, Recording, least_of
+
+APART = 10 * EXACT  # smallest difference of two commands that exact ones tell apart
+NEAR = 0.02  # largest difference of a command, relative to its size, that is no stray
+MANY = 1_000_000  # largest number of commands that are computed for a misuse, roughly
+EACH, ALL = 2, 24  # numbers of instants that are examined for a misuse, and in all
+
+
+def exactly_misused(log: Recording, task: Task, own: Candidate) -> str:
+    """Return how a program misused its candidate, if its commands are that to the last digits.
+
+    Args:
+        log: a log in which no run of the candidate was found.
+        task: the task with the control step.
+        own: the candidate.
+
+    Returns:
+        The end of a sentence about its commands; "" if nothing reproduces them.
+    """
+    first, every = _steps_of(log, own)
+    misuses = ways(task.model, own, unsent=False)
+    tried = [(*one, way) for way in misuses for one in _begins(every, way)]
+    found = list[tuple[float, Way]]()
+    for _, k, way in sorted(tried, key=lambda one: one[0])[:ALL]:
+        at = first + k * log.dt
+        left = _left(log, own, way, at)
+        if left < EXACT and not _rather_logged(log, task, own, way, at):
+            found.append((left, way))
+    return likeliest(found).said if found else ""
+
+
+def misused_in(log: Recording, task: Task, own: Candidate) -> str:
+    """Return how the robot's program misused its candidate, and the remedy; or "".
+
+    Args:
+        log: a log in which no run of the candidate was found: its commands don't tell where.
+        task: the task with the control step.
+        own: the candidate.
+    """
+    for begins in dict.fromkeys([log.first, *log.openings[:TRIED]]):
+        if trial := log.trial_from(begins):
+            run = trial.until(min(trial.finite_steps, task.horizon))
+            plain = follows(own.policy, run, latest(task))
+            if plain and not plain.beyond and (told := misused(task, own, run, plain)):
+                return told
+    return ""
+
+
+def _steps_of(log: Recording, own: Candidate) -> tuple[float, Trial]:
+    """Return the steps of a whole log with the samples before each command, and their first [s]."""
+    first = log.on_step(own.policy, log.first)
+    middle = round((first - log.first) * log.parts / log.dt) + log.parts // 2
+    sent = log.whole.inputs[max(0, middle) :: log.parts]
+    return first, Trial(held_before(log, first, len(sent) + 1), sent, log.dt, *log.names)
+
+
+def _begins(every: Trial, way: Way) -> Iterator[tuple[float, int]]:
+    """Yield the share of strays, and the steps from which a misused run leaves fewest.
+
+    Commands at a limit that the policy sends as well don't count.
+    """
+    policy, steps = way.policy, every.steps
+    T = int(np.clip(MANY // max(steps, 1), least_of(policy.horizon), policy.horizon))
+    states = way.passed(every).states
+    sent = np.clip(every.inputs, policy.low, policy.high)
+    size = np.abs(sent).max(axis=0) + 1e-12
+    strays = np.full(steps, np.inf)
+    for first in range(0, steps, BATCH):
+        here = np.arange(first, min(first + BATCH, steps))[:, None] + np.arange(T)
+        known, here = here < steps, np.minimum(here, steps - 1)
+        u = sent[here]
+        asked = policy.commands(states[here], policy.past, u)
+        told = known[:, :, None] & ((asked != u) | ((u > policy.low) & (u < policy.high)))
+        stray = told & (np.abs(asked - u) / size > NEAR)
+        count, lost = (one.any(axis=2).sum(axis=1) for one in (told, stray))
+        strays[first : first + BATCH] = np.where(count < FEW, np.inf, lost / np.maximum(count, 1))
+    for k in np.argsort(strays, kind="stable")[:EACH]:
+        if np.isfinite(strays[k]):
+            yield float(strays[k]), int(k)
+
+
+def _left(log: Recording, own: Candidate, way: Way, at: float) -> float:
+    """Return the median difference that a misuse leaves; infinite if it does not explain a run."""
+    fit, plain = acted_on(_as_passed(log, way), way.policy, at), acted_on(log, own.policy, at)
+    if fit is None or plain is None or plain.exact or not fit.throughout:
+        return np.inf
+    differs = np.abs(fit.asked - plain.asked) > APART * fit.size
+    tells = np.isfinite(fit.off) & differs.any(axis=1)
+    moves = np.abs(np.diff(fit.asked[tells], axis=0)) > EXACT * fit.size
+    if moves.any(axis=1).sum() < FEW:  # many a program holds an input
+        return np.inf
+    return fit.left if np.mean(fit.off[tells] < EXACT) >= NEARLY_ALL else np.inf
+
+
+def _as_passed(log: Recording, way: Way) -> Recording:
+    """Return a log with its states as the program passed them."""
+    series = dict(log.series)
+    if way.exchanged:
+        one, other = way.names
+        series[one], series[other] = series[other], series[one]
+    else:
+        for name in way.names:
+            spec = series[name].spec
+            scaled = replace(spec, scale=spec.scale * way.factor, offset=spec.offset * way.factor)
+            series[name] = replace(series[name], spec=scaled)
+    return replace(log, series=series)
+
+
+def _rather_logged(log: Recording, task: Task, own: Candidate, way: Way, at: float) -> bool:
+    """Return whether the log is rather wrong than the program.
+
+    With its states mended, it is as predicted; or, if no feedback is seen in it, it is in its
+    place, with states in another unit.
+    """
+    if (trial := log.trial_from(at)) is None:
+        return False
+    if way.policy.gain is None and own.policy.gain is not None:
+        plain = follows(own.policy, trial.until(task.horizon), latest(task))
+        return other_units(task, trial, own, plain) != ((), 1.0)
+    return bool(way.names) and apart(own, way.passed(trial)) < apart(own, trial)

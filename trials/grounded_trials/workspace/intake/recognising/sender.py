@@ -1,0 +1,166 @@
+"""Decide which candidate sent the commands of a log, on the samples that its program acted on.
+
+The candidate that is said to have run is compared with the others that may be on the robot: a
+neighbour of it sends commands that differ by a few percent, so each is computed from the samples of
+the age that fits best (`acted_on`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.policy import Policy
+from grounded.search.candidate import Candidate
+from grounded.search.returned.who_drove import (
+    FINE,
+    LEAST,
+    SAME,
+    Following,
+    follows,
+    steps_alike,
+)
+from grounded.trial import Trial
+from grounded_trials.workspace.intake.locating.acted_on import ActedOn, acted_on
+from grounded_trials.workspace.intake.locating.run_start import Recording, Start
+
+LUCK = float(np.log(2) / 2)  # [nats] per step: half the squares, which lower gains also give
+THEIRS = 0.05  # largest median difference, relative to size, of another that is said to have run
+CLEARLY = 6.0  # [nats] of evidence, beyond LUCK, for another candidate
+LATEST = 3  # steps by which commands may be logged late
+ONE = 3e-3  # rms difference, relative to size, below which two candidates count as equal
+
+
+def nats(own: ActedOn, other: ActedOn) -> float:
+    """Return the evidence [nats] that another candidate sent the commands, not the own one.
+
+    It is the logarithm of the ratio of the differences that each leaves, summed over the steps,
+    which corresponds to heavy-tailed noise (lost packets). Ratios that chance or lower gains could
+    also give do not count.
+    """
+    T = min(len(own.off), len(other.off))
+    both = np.isfinite(own.off[:T] + other.off[:T])
+    a, b = (np.log(np.hypot(one.off[:T][both], FINE)) for one in (own, other))
+    gained = a - b - LUCK
+    return float(gained.sum()) / steps_alike(gained) if both.sum() >= LEAST else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Sender:
+    """The candidate that sent the commands of a log, judged on the samples that it acted on."""
+
+    own: ActedOn | None  # None if the log is too short
+    other: str = ""  # another candidate whose commands they are, or ""
+    why: str = ""  # the reason
+
+    @property
+    def sure(self) -> bool:
+        """Whether the own candidate sent them throughout, mostly to the last digits."""
+        return self.own is not None and self.own.throughout
+
+
+def sender_of(
+    log: Recording,
+    own: Candidate,
+    candidates: Sequence[Candidate],
+    start_of: Callable[[Candidate], Start | None],
+) -> Sender:
+    """Check whether another candidate than the stated one sent the commands of a log.
+
+    Args:
+        log: the log with the run.
+        own: the candidate that it is said to have run.
+        candidates: candidates that may have been run instead.
+        start_of: returns where a candidate's run seems to begin in the log.
+    """
+    found = start_of(own)
+    begins = log.first if found is None else found.seconds
+    mine = acted_on(log, own.policy, begins)
+    if mine is None or mine.exact:
+        return Sender(mine)
+    best, name, theirs = CLEARLY, "", mine
+    ran = _following(log, own.policy, begins)
+    late = ran is not None and ran.alike and ran.late != 0  # late commands belong to other steps
+    for one in reversed(candidates):
+        at = begins
+        if (found is None or not found.alike) and (begun := start_of(one)) and begun.opens_alike:
+            at = begun.seconds
+        fit = None if one.id == own.id else acted_on(log, one.policy, at)
+        if fit is None or _one(mine, fit):
+            continue
+        if fit.left > THEIRS or (for_it := nats(mine, fit)) <= best:
+            continue
+        if fit.exact or (not late and (there := _following(log, one.policy, at)) and there.alike):
+            best, name, theirs = for_it, one.id, fit
+        if name and theirs.left < FINE:
+            break
+    if not name:
+        return Sender(mine)
+    are = "are" if theirs.exact else "seem to be"
+    why = (
+        f"on the samples that it had, half of its commands are within {theirs.percent} of what "
+        f"{name} sends, but only within {mine.percent} of what {own.id} sends: they {are} those of "
+        f"{name}. Was {own.id} copied to the robot?"
+    )
+    return Sender(mine, name, why)
+
+
+def on_other_speeds(
+    log: Recording,
+    own: Candidate,
+    candidates: Sequence[Candidate],
+    start_of: Callable[[Candidate], Start | None],
+) -> bool:
+    """Return whether a log is the own candidate's run, whose program had other speeds than it has.
+
+    A program that differentiates positions has speeds that lag those of the smoother. Its commands
+    then differ most where they change fastest, by more than those of some candidates: so the usual
+    difference tells whose run it is, not the mean square.
+
+    Args:
+        log: the log, with speeds that were estimated.
+        own: the candidate that it is said to have run.
+        candidates: candidates that may have been run instead.
+        start_of: returns where a candidate's run seems to begin in the log.
+    """
+    found = start_of(own)
+    mine = acted_on(log, own.policy, log.first if found is None else found.seconds)
+    if mine is None or not mine.usually:
+        return False
+    for one in candidates:
+        begun = None if one.id == own.id else start_of(one)
+        fit = begun and acted_on(log, one.policy, begun.seconds)
+        if fit and not _one(mine, fit) and fit.left <= mine.left:
+            return False
+    return True
+
+
+def rival_in(
+    log: Recording,
+    own: Candidate,
+    candidates: Sequence[Candidate],
+    start_of: Callable[[Candidate], Start | None],
+) -> Trial | None:
+    """Return the log cut where another candidate fits much better than the own one anywhere."""
+    found = start_of(own)
+    best, bound = None, SAME * found.apart if found and found.alike else np.inf
+    for one in candidates:
+        start = start_of(one) if one.id != own.id else None
+        if start is not None and start.alike and start.apart < bound:
+            best, bound = log.trial_from(start.seconds), start.apart
+    return best
+
+
+def _one(mine: ActedOn, fit: ActedOn) -> bool:
+    """Return whether two candidates send the same commands within ONE."""
+    T = min(len(mine.asked), len(fit.asked))
+    apart = (mine.asked[:T] - fit.asked[:T]) / mine.size
+    return float(np.sqrt((apart**2).mean())) < ONE
+
+
+def _following(log: Recording, policy: Policy, start: float) -> Following | None:
+    """Compare commands with a policy's by `follows`; even of unrelated ones some is nearest."""
+    trial = log.trial_from(start)
+    return follows(policy, trial.until(policy.horizon), LATEST) if trial else None

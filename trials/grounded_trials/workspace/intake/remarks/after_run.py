@@ -1,0 +1,229 @@
+"""Warn of what the robot did after its run: it left [safety], or did not stay at its target.
+
+[reward] only judges the run. After it the runner sends the input that was held before the start. If
+that input does not hold the robot at its target (an arm against its weight, a hover), only another
+controller does. If it would, the robot arrived in motion: then the target and the weights of the
+rates are to be changed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.result import listed, measured_alike
+from grounded.search.planner import Planner
+from grounded.search.safety import coasting
+from grounded.task import Task
+from grounded.trial import Trial
+from grounded_trials.wording import with_unit
+from grounded_trials.workspace.off_target import (
+    position_axes,
+    rates_among,
+    reaches,
+    roles_of,
+    weighed_groups,
+)
+
+AWAY = 0.02  # drift after a run, relative to the target's extent, above which it is reported
+DEAR = 0.2  # of the run's cost: what its end would cost more where the robot came to be after it
+REACHED = 0.05  # of the target's extent: a plan that ends farther away does not reach it
+LAST_STEPS, AT_LIMIT = 3, 1e-3  # steps of a kick; distance from a limit, as a share of the range
+SETTLED = 5.0  # [s] for which an input is held until the memory of effects has settled
+CAUSED = 0.5  # share of the drift that the model must predict from rest, under the input held
+GROWS = 1.5  # of a push, not of a speed: the second half of the drift exceeds the first by this
+FASTER = 2.0  # and the drift exceeds by this what the speed at the end gives
+
+
+def afterwards(planner: Planner, whole: Trial) -> list[str]:
+    """Return warnings on what the robot did after the run: it left [safety], or moved on.
+
+    Args:
+        planner: the task, and the model with adopted effects.
+        whole: the run with the seconds that follow it.
+    """
+    return _left_afterwards(planner.task, whole) or _moved_on(planner, whole)
+
+
+def kicked(planner: Planner, run: Trial, held: Array) -> str:
+    """Return a warning if a plan reaches its target only by a last command at its limit; or "".
+
+    Weights of the last state alone are met by a kick in the last steps, for one sample: by the
+    model, the robot leaves the target in the next second.
+
+    Args:
+        planner: the task, and the model with adopted effects.
+        run: the predicted run, with the planning model's states.
+        held: the input that is sent after it (m,).
+    """
+    task = planner.task
+    groups = weighed_groups(task) if reaches(task) else []
+    ends = np.vstack([task.low, task.high])
+    full = np.ptp(np.where(np.isfinite(ends), ends, 0.0), axis=0) * AT_LIMIT
+    at = (np.abs(run.inputs[-LAST_STEPS:] - ends[:, None]) <= full).any(axis=(0, 1))
+    at &= ~(np.abs(held - ends) <= full).any(axis=0) & (full > 0)
+    if not groups or not at.any():
+        return ""
+    names, what = groups[0]
+    after = coasting(planner.plan, run, held)[: 1 + math.ceil(1.0 / task.dt), : task.model.n]
+    errors, way = _from_target(task, after, [task.model.state_names.index(name) for name in names])
+    off = np.linalg.norm(errors, axis=1)
+    worst = int(np.argmax(off))
+    if off[0] > REACHED * way or not off[worst] > max(AWAY * way, 2 * off[0]):
+        return ""
+    later, then = measured_alike([off[worst], off[0]], task.model.states[names[0]])
+    sent = listed(name for name, odd in zip(task.model.input_names, at, strict=True) if odd)
+    return (
+        f"it ends with {sent} at a limit and reaches its target for one sample only: the model "
+        f"predicts {what} {later} from it {worst * task.dt:.2g} s later, {then} at the end. Let "
+        "the target rest for longer (`grounded target --hold`), or lower [reward] terminal"
+    )
+
+
+def _moved_on(planner: Planner, whole: Trial) -> list[str]:
+    """Return a warning if a robot that was to reach a point drifts away from it after the run.
+
+    Only if the inputs are constant after the run, so that nobody drove it. What counts is how far
+    the first group of states moved, and what the end of the run would cost more where any group
+    came to be: late commands of its last steps turned a docked robot by 0.5 degrees.
+    """
+    task = planner.task
+    end, last = task.horizon, whole.finite_steps
+    groups = weighed_groups(task) if reaches(task) else []
+    held = whole.inputs[end:last]
+    if not groups or last <= end + 1 or np.ptp(held[1:], axis=0).any():
+        return []
+    cost = DEAR * -task.utility(whole.until(end))
+    for k, rate in enumerate(rates_among(task, groups)):
+        states = [task.model.state_names.index(name) for name in groups[k][0]]
+        off, way = _from_target(task, whole.states[: last + 1], states)
+        far, dear = np.linalg.norm(off, axis=1), off**2 @ task.reward.terminal[states]
+        worst = end + int(np.argmax(far[end:]))
+        away = not k and far[worst] > max(AWAY * way, 2 * far[end])
+        more = 0.0 if rate else dear[worst] - dear[end]
+        if away or (far[worst] > 2 * far[end] and more > cost):
+            break
+    else:
+        return []
+    later, then = measured_alike([far[worst], far[end]], task.model.states[groups[k][0][0]])
+    was = (
+        f"{(worst - end) * task.dt:.2g} s after the run {groups[k][1]} was {later} from its "
+        f"target, at its end {then}: "
+    )
+    drift = off[worst] - off[end]
+    if away and let_go(planner, whole, states, worst - end, drift):
+        return [was + _to_hold(planner, whole, held[-1])]
+    return [
+        f"{was}[reward] only judges the run. To make the robot stay there, {_to_stay(task, states)}"
+    ]
+
+
+def _from_target(task: Task, run: Array, states: Sequence[int]) -> tuple[Array, float]:
+    """Return how far states (T, n) are off the end of the target, (T, k), and its extent."""
+    off = task.model.difference(run, task.target[-1])[:, states]
+    extent = np.ptp(np.vstack([task.start, task.target])[:, states], axis=0)
+    return off, float(np.linalg.norm(extent))
+
+
+def let_go(planner: Planner, whole: Trial, states: Sequence[int], steps: int, drift: Array) -> bool:
+    """Return whether the input sent after a run does not hold the robot where the run ended.
+
+    Either the model predicts most of the drift although the robot rests at the end of the run and
+    the effects' memory has settled. Or the log shows a push: the drift grows ever faster, and is
+    more than the speed at the end explains.
+
+    Args:
+        planner: the task, and the model with adopted effects.
+        whole: the run with the seconds that follow it, under a constant input.
+        states: indices of the position that drifted.
+        steps: steps from the end of the run until it was farthest off.
+        drift: how far it had moved by then, (len(states),).
+    """
+    task, end = planner.task, planner.task.horizon
+    size = float(np.linalg.norm(drift))
+    settled = _at_rest(planner, whole)
+    with np.errstate(all="ignore"):
+        after = coasting(planner.plan, settled, whole.inputs[end + 1])[: steps + 1, : task.model.n]
+    moved = task.model.difference(after, after[:1])[:, states]
+    if len(moved) and float(np.linalg.norm(moved, axis=1).max()) > CAUSED * size:
+        return True
+    path = task.model.difference(whole.states[end : end + steps + 1], whole.states[end])[:, states]
+    along = path @ drift / size
+    before = max(1, min(steps, end, 4))
+    speed = task.model.difference(whole.states[end], whole.states[end - before])[states]
+    coasts = abs(float(speed @ drift / size)) / before * steps
+    half = float(along[len(along) // 2])
+    return bool(steps > 3 and size - half > GROWS * half and size > FASTER * coasts)
+
+
+def _at_rest(planner: Planner, whole: Trial) -> Trial:
+    """Return the robot at rest where a run ended, under the input that was sent after it."""
+    from grounded.places import integrals
+
+    task, end = planner.task, planner.task.horizon
+    x, u = whole.states[end].copy(), whole.inputs[end + 1]
+    x[[one.j for one in integrals(task.model) if one.exact]] = 0.0
+    steps = math.ceil(SETTLED / task.dt)
+    states, inputs = np.tile(x, (steps + 1, 1)), np.tile(u, (steps, 1))
+    return planner.lift(replace(whole, states=states, inputs=inputs, start_inputs=u))
+
+
+def _to_hold(planner: Planner, whole: Trial, held: Array) -> str:
+    """Return that the input sent after a run does not hold the robot, and what would."""
+    from grounded_trials.workspace.candidates.at_rest import resting
+
+    model, memory = planner.task.model, np.arange(planner.plan.model.n) >= planner.task.model.n
+    rest = _at_rest(planner, whole)
+    there = replace(planner.plan, start=rest.states[-1], past=held)
+    with np.errstate(all="ignore"):
+        found = resting(there, memory, replace(planner.loose, start=there.start, past=held))
+
+    def told(values: Array, digits: int = 3) -> str:
+        pairs = zip(model.inputs.items(), values + 0.0, strict=True)
+        return listed(
+            with_unit(f"{name} = {value:.{digits}g}", unit) for (name, unit), value in pairs
+        )
+
+    would = f" (by the model {told(found[len(memory) :], 2)} would)" if found is not None else ""
+    return (
+        f"after it the runner sends {told(held)}, which does not hold it there{would}. Switch to a "
+        "controller that holds it as soon as `runner.done(t)` is true; or, if the robot may have "
+        "the input that holds it before the run too, set that in [task] start. No weight in "
+        "[reward] changes this"
+    )
+
+
+def _to_stay(task: Task, states: Sequence[int]) -> str:
+    """Return what would make a robot stay at the end of its target that the task lacks."""
+    from grounded.places import integrals
+
+    end = task.target[-max(2, len(task.target) // 20) :, states]
+    rates = [one.j for one in integrals(task.model) if one.exact and one.i in states]
+    if {*states} & {*position_axes(task.model)}:
+        rates += roles_of(task.model).get("speed", [])  # of a boat or car, along its own axes
+    ways = ["let the target rest at its end (target --hold)"] * bool(np.ptp(end, axis=0).any())
+    if not rates or not (task.reward.terminal[rates] > 0).all():
+        ways.append("weigh the rates at the end ([reward] terminal)")
+    return ", or ".join(ways) or "let the target rest for longer (target --hold)"
+
+
+def _left_afterwards(task: Task, whole: Trial) -> list[str]:
+    """Return a warning if the robot left [safety] after a run that stayed inside."""
+    assert task.safety_low is not None and task.safety_high is not None
+    states = whole.states[: whole.finite_steps + 1]
+    out = np.maximum(task.safety_low - states, states - task.safety_high)
+    if (out[: task.horizon + 1] > 0).any() or not (out > 0).any():
+        return []
+    t, i = np.unravel_index(int(np.argmax(out)), out.shape)
+    first = int(np.argmax((out > 0).any(axis=1))) - task.horizon
+    name, unit = list(task.model.states.items())[int(i)]
+    low, high = task.safety_low[i], task.safety_high[i]
+    return [
+        f"{first * whole.dt:.2g} s after its end the robot left [safety] {name} = [{low:g}, "
+        f"{high:g}]: {name} was {with_unit(f'{states[t, i]:.3g}', unit)}. Stop it in time, or let "
+        "the target end at rest inside"
+    ]

@@ -1,0 +1,140 @@
+"""Tell how well the robot's program ran its candidate: late, on old samples, or oscillating.
+
+A policy's plan, gains and reference change from step to step, so its commands change even if no new
+states arrive. Where they stay the same to the last digit all the same, the step was not run. A loop
+at half the rate runs every other step and holds each command twice as long.
+
+A policy takes what it is given for where the robot is now. At 1.8 m/s a pose that is 6.8 ms old is
+12 mm behind, so the robot runs 12 mm ahead of its target, in every run. The first plan doesn't know
+that; later ones allow for the age that the commands show (`grounded.search.feedback.sample_age`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.result import figure, listed, measured_alike
+from grounded.search.candidate import Candidate, Tried
+from grounded.search.feedback.oscillation import SWINGS, calm_ranges, swings
+from grounded.search.feedback.sample_age import sample_age
+from grounded.search.returned.who_drove import LEAST
+from grounded.task import Task
+from grounded.trial import Trial, interpolate_gaps
+from grounded_trials.wording import with_unit
+from grounded_trials.workspace.folder import Folder
+
+CHANGES = 2e-3  # smallest change of a command by its step alone, relative to its size, that tells
+MOST = 0.3  # share of the steps that tell which may be lost in a run
+LEADS = 0.3  # share of a state's error over the run: a smaller motion since the sample is not told
+
+
+def steps_skipped(workspace: Folder, trial: Trial) -> str:
+    """Return the warning for a run in which many steps were not run; or "".
+
+    Args:
+        workspace: the workspace with the task and the candidate.
+        trial: the trial as stored.
+    """
+    if not (ran := trial.candidate):
+        return ""
+    trial, task = interpolate_gaps(trial).trial, workspace.task
+    policy = workspace.candidate(ran)[0].policy
+    T = min(trial.finite_steps, policy.horizon)
+    if T < LEAST:
+        return ""
+    sent = np.clip(trial.inputs[:T], policy.low, policy.high)
+    past = policy.past if trial.start_inputs is None else trial.start_inputs
+    before = policy.commands(trial.states[None, :T], past, sent[None])[0][:-1]
+    shifted = trial.states[None, np.r_[0, : T - 1]]  # no new states since the step before
+    after = policy.commands(shifted, past, sent[None])[0][1:]
+    size = np.maximum(np.abs(policy.feedforward).max(axis=0), np.abs(sent).max(axis=0)) + 1e-12
+    moved = np.abs(np.diff(sent, axis=0))
+    finest = np.where(moved > 0, moved, size).min(axis=0)  # to which the log is rounded
+    tells = (np.abs(after - before) > np.maximum(CHANGES * size, finest)).any(axis=1)
+    changed = np.flatnonzero(moved.any(axis=1))
+    held = tells & ~moved.any(axis=1)
+    if min(tells.sum(), len(changed)) < LEAST or held.sum() < MOST * tells.sum():
+        return ""
+    every = float(np.median(np.diff(changed)))
+    if every < 2:
+        return ""
+    ms, dt, lost = 1e3 * every * task.dt, 1e3 * task.dt, 100 - 100 / every
+    return (
+        f"its commands change every {ms:.3g} ms, dt is {dt:.3g} ms: {lost:.0f} % of "
+        f"the steps of {ran} were not run, or not logged. Call the runner every {dt:.3g} ms and "
+        f"log every command, and run {ran} again; if the robot can't, set [task] dt = "
+        f"{every * task.dt:.3g}"
+    )
+
+
+def old_samples(workspace: Folder, own: Candidate, trial: Trial, old: Array) -> list[str]:
+    """Return a note if the states that the program acted on had moved on by much of their errors.
+
+    Args:
+        workspace: whose task the run follows.
+        own: the candidate that was run, whose commands the log reproduces.
+        trial: its run.
+        old: mean age of each state's samples when commands were sent [s], (n,).
+    """
+    from grounded.fit.prediction import rms  # a slow import
+
+    task, effects = workspace.task, workspace.config.model.effects
+    delayed = [str(e["name"]) for e in effects if str(e["name"]).startswith("sensor_delay:")]
+    allowed = {n for name in delayed for n in name.partition(":")[2].split("+")}
+    states = trial.states[: task.horizon + 1]
+    if own.policy.gain is None or own.sample_age or len(states) < 2:
+        return []
+    error = task.model.difference(states, task.target[: len(states)])
+    rates = task.model.difference(states[1:], states[:-1]) / task.dt
+    off, speed = (rms(e) for e in (error, rates))
+    fed = np.abs(own.policy.gain[..., : states.shape[1]]).max(axis=(0, 1)) > 0  # not past inputs
+    counts = fed & (task.reward.state > 0) & (old > 0) & (old * speed > LEADS * off)
+    told = [i for i in np.flatnonzero(counts) if task.model.state_names[i] not in allowed]
+    if not told:
+        return []
+    names, units = task.model.state_names, list(task.model.states.values())
+    cost = []
+    for i in told:
+        moved, missed = measured_alike([old[i] * speed[i], off[i]], units[i])
+        cost.append(f"{names[i]} by {moved} (its error in this run: {missed} rms)")
+    ages = sorted({float(f"{1e3 * old[i]:.2g}") for i in told})
+    span = " to ".join(f"{age:g}" for age in dict.fromkeys((ages[0], ages[-1])))
+    fresh = "newer samples, or each moved on by its rate times its age"
+    then = f"{own.id} does not allow for that: pass `runner.action` {fresh}"
+    if sample_age(task, own, [trial]):
+        then = f"{own.id} does not allow for that, the next candidates do; better still are {fresh}"
+    return [
+        f"by the stamps, its program acted on samples that were {span} ms old on average; by then "
+        f"{listed(cost)} had moved on. {then}"
+    ]
+
+
+def swung(task: Task, tried: Tried | None, trial: Trial, history: Sequence[Tried]) -> list[str]:
+    """Return a warning that names the inputs that oscillated in a run; [] if none did.
+
+    Args:
+        task: the manoeuvre.
+        tried: the candidate that was run; None if it is none of the search.
+        trial: its run.
+        history: all candidates with their trials.
+    """
+    if tried is None or tried.candidate.policy.gain is None:
+        return []
+    made, model = tried.candidate, task.model
+    ids = [one.candidate.id for one in history]
+    sizes = calm_ranges(task, history)[ids.index(made.id)]
+    counts = swings(made, trial, sizes)
+    told = [
+        f"{model.input_names[i]} ({counts[i]} swings of more than "
+        f"{with_unit(figure(sizes[i], 2), model.inputs[model.input_names[i]])})"
+        for i in np.flatnonzero(counts >= SWINGS)
+    ]
+    if not told:
+        return []
+    return [
+        f"its feedback made {listed(told)} oscillate about the plan: the next candidates get "
+        "weaker feedback, or say if they can't"
+    ]

@@ -1,0 +1,177 @@
+"""Tell of a run that started away from [task] start, and whether that spoils its utility.
+
+By how much a start changes the utility, the model says: it runs the candidate from there and from
+s_0. A run whose utility it changes much says nothing about its candidate, and must be run again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.result import listed
+from grounded.search.planner import predicted
+from grounded.search.returned.who_drove import LEAST
+from grounded.search.scatter import Repeats, sample_noise
+from grounded.task import Task
+from grounded.trial import Trial, interpolate_gaps
+from grounded_trials.wording import in_digits_apart, with_unit
+from grounded_trials.workspace.candidates.standing_without import standing_without
+from grounded_trials.workspace.folder import Folder
+
+# share of the mean cost of a step above which a start away from s_0 brings a warning; for a state
+# without weight along the way, share of its range in the run
+FAR = 0.1
+SURE = 3.0  # the start must also be off by this many std of sensor noise and of earlier starts
+MUCH = 1.0  # share of a mean step's cost from which earlier starts that scatter are no excuse
+SPOILT = 0.2  # share of the run's cost by which the start changes it too much
+FEWEST = 2  # smallest number of earlier runs from which the scatter of starts is estimated
+
+
+@dataclass(frozen=True)
+class Begun:
+    """A run that started elsewhere.
+
+    Args:
+        told: the warning: the states, and one verdict on the run.
+        again: whether the run must be discarded and run again.
+    """
+
+    told: str
+    again: bool
+
+
+def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
+    """Return in which states a run did not start at s_0, beyond sensor noise; None if in none.
+
+    A state that [reward] weighs along the way is judged by the cost of its offset relative to a
+    mean step of the run, the most costly first; another state relative to its range in the run.
+    Offsets within the scatter of earlier starts are unavoidable, and tolerated unless they spoil
+    the utility by the model: by much of it, or by more than the run lost to the best candidate. A
+    change below the scatter of single runs spoils nothing. Of a run that left [safety], only the
+    part before counts: a robot on the floor makes every start seem near.
+
+    Args:
+        workspace: the workspace with the task, the model and the earlier runs.
+        trial: the trial as stored.
+    """
+    task = workspace.task
+    before, trial = _starts_before(workspace, trial.id), interpolate_gaps(trial).trial
+    trial = trial.until(task.horizon)
+    if not trial.candidate or trial.finite_steps < 0:
+        return None
+    off = task.model.difference(trial.states[0], task.start)
+    states = _inside(task, trial.states[: trial.finite_steps + 1])
+    failed = len(states) <= trial.finite_steps
+    usual = np.ptp(states, axis=0)
+    predicted = workspace.candidate(trial.candidate)[0].predicted_states
+    noise = sample_noise(trial.until(len(states) - 1), predicted)
+    known = -task.rewards(trial)[: len(states)]
+    known = known[np.isfinite(known)]
+    usually = known.sum() / max(len(known), 1)
+    weight = task.reward.state
+    with np.errstate(all="ignore"):
+        share = np.where(weight > 0, weight * off**2 / usually, np.abs(off) / usual)
+    told = (share > FAR) & (np.abs(off) > np.maximum(SURE * noise, 1e-9))
+    beyond = np.full(len(off), True)
+    if len(before) >= FEWEST:
+        beyond = (np.abs(off) > SURE * before.std(axis=0, ddof=1)) | (share > MUCH)
+    if not told.any():
+        return None
+    real = abs(task.utility(trial))
+    cost = real if np.isfinite(real) and not failed else -_promised(workspace, trial)
+    lost, scatter = _lost_by(workspace, trial), _scatter(workspace, trial, cost)
+    spoils, tolerated = list[int](), list[int]()
+    for i in sorted(np.flatnonzero(told).tolist(), key=lambda i: (weight[i] == 0, -share[i])):
+        changes = _changes(workspace, trial, off * (np.arange(len(off)) == i))
+        if abs(changes) > scatter and (abs(changes) > SPOILT * cost or 0 < lost < -changes):
+            spoils.append(i)
+        elif beyond[i]:
+            tolerated.append(i)
+    if not spoils and not tolerated:
+        return None
+    where = "; ".join(_placed(task, trial, i, off[i]) for i in (*spoils, *tolerated))
+    does = "The run counts, no need to repeat it. Place the robot nearer to the start next time"
+    if len(before) < FEWEST:
+        does += f" (after {FEWEST + 1} runs, offsets within their scatter are not told again)"
+    if spoils:
+        changes = _changes(workspace, trial, off * np.isin(np.arange(len(off)), spoils))
+        by = [task.model.state_names[i] for i in spoils] if tolerated else ["this"]
+        change = f"{listed(by)} change{'s' * (len(by) == 1)}"
+        does = (
+            f"By the model {change} its utility by {changes:+.3g}: "
+            f"`discard {trial.id}`, place the robot nearer to the start and run "
+            f"{trial.candidate} again. If it always starts there, set it in [task] start"
+        )
+    return Begun(
+        f"the run started with {where}, more than the noise in the log. {does}", bool(spoils)
+    )
+
+
+def _placed(task: Task, trial: Trial, i: int, off: float) -> str:
+    """Return where one state started, and by how much that is off."""
+    name, unit = list(task.model.states.items())[i]
+    began, start = in_digits_apart(float(trial.states[0, i]), float(task.start[i]))
+    turned = f" ({np.rad2deg(off):+.2g} degrees)" if unit == "rad" else ""
+    return (
+        f"{name} = {with_unit(began, unit)}, the task's start is {start}: "
+        f"{with_unit(f'{off:+.2g}', unit)}{turned} off"
+    )
+
+
+def _inside(task: Task, states: Array) -> Array:
+    """Return the states before they left [safety], at least a few; all if they never did."""
+    assert task.safety_low is not None and task.safety_high is not None
+    out = ((states < task.safety_low) | (states > task.safety_high)).any(axis=1)
+    return states[: max(int(np.argmax(out)), LEAST)] if out.any() else states
+
+
+def _lost_by(workspace: Folder, trial: Trial) -> float:
+    """Return by how much a run is worse than the best other candidate's mean; <= 0 if it is not."""
+    task, each = workspace.task, dict[str, list[float]]()
+    for one in workspace.task_trials():
+        if one.candidate and one.candidate != trial.candidate:
+            each.setdefault(one.candidate, []).append(task.utility(one))
+    best = max((sum(some) / len(some) for some in each.values()), default=-np.inf)
+    return float(best - task.utility(trial)) if np.isfinite(best) else 0.0
+
+
+def _scatter(workspace: Folder, trial: Trial, cost: float) -> float:
+    """Return the std of single runs of about this cost, by repeats among the others; 0 if unknown.
+
+    Args:
+        workspace: the workspace with the other runs.
+        trial: the run, whose own start must not count as scatter.
+        cost: what such runs cost.
+    """
+    others = standing_without(workspace, {trial.id}).history
+    return float(np.nan_to_num(np.sqrt(Repeats(others).near(-cost).variance)))
+
+
+def _starts_before(workspace: Folder, identity: str) -> Array:
+    """Return how far from s_0 the other runs of this task started, (N, n)."""
+    task = workspace.task
+    runs = [one for one in workspace.task_trials() if one.candidate and one.id != identity]
+    off = [task.model.difference(one.states[0], task.start) for one in runs]
+    return np.array(off).reshape(len(off), task.model.n)
+
+
+def _changes(workspace: Folder, trial: Trial, off: Array) -> float:
+    """Return by how much a start that is off by `off` (n,) changes the utility in the model."""
+    planner = workspace.planner
+    policy = workspace.candidate(trial.candidate)[0].policy
+    problem = planner.plan.problem(exact=True)
+    moved = problem.start.copy()
+    moved[: len(off)] += off
+    with np.errstate(all="ignore"):
+        from_there, from_s_0 = (
+            predicted(replace(problem, start=start), policy).utility
+            for start in (moved, problem.start)
+        )
+    return float(np.nan_to_num(from_there - from_s_0, nan=-np.inf))
+
+
+def _promised(workspace: Folder, trial: Trial) -> float:
+    return workspace.candidate(trial.candidate)[0].predicted_utility

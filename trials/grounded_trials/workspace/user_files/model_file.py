@@ -1,0 +1,144 @@
+"""Load the user's model.py, the only code in a workspace that is imported.
+
+An exception in it is the user's to fix and becomes a message with file and line.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import sys
+import traceback
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from grounded.adapters.beside import beside
+from grounded.errors import GroundedError, nearest
+from grounded.model import Model
+from grounded.trusted import check_own
+from grounded_trials.workspace.user_files.config import FILE
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+
+def load_module(
+    folder: Path, file: str = "", module: str = "", key: str = "[model] file"
+) -> ModuleType:
+    """Load the module of a model, from a file in the workspace or by its import name.
+
+    Args:
+        folder: the workspace.
+        file: the file of the model, relative to the workspace.
+        module: its import name, or a name among the entry points, instead of a file.
+        key: the key of grounded.toml that named the file, for messages.
+
+    Raises:
+        GroundedError: if it does not exist, lies outside the workspace, or fails while it runs.
+    """
+    if module:
+        check_own(folder, [folder / FILE])
+        return _installed(module)
+    path = (folder / file).resolve()
+    if not path.is_relative_to(folder.resolve()):
+        raise GroundedError(
+            f"grounded.toml: {key} = '{file}' lies outside the workspace {folder}; copy it inside"
+        )
+    if not path.is_file():
+        raise GroundedError(f"grounded.toml: {key} = '{file}': {path} does not exist")
+    between = [place for place in path.parents if place.is_relative_to(folder.resolve())]
+    check_own(folder, [folder / FILE, path, path.parent / "__pycache__", *between])
+    spec = importlib.util.spec_from_file_location(f"grounded_workspace_{path.stem}", path)
+    assert spec is not None and spec.loader is not None
+    found = importlib.util.module_from_spec(spec)
+    before, writes = set(sys.modules), sys.dont_write_bytecode
+    sys.dont_write_bytecode = True  # its times have 1 s resolution: a quick edit would be missed
+    sys.path.insert(0, str(folder))
+    sys.modules[spec.name] = found  # dataclasses look their module up there
+    try:
+        # a model's prints must not mix with our output; files it reads are relative to its folder
+        with contextlib.redirect_stdout(sys.stderr), beside(path.parent):
+            spec.loader.exec_module(found)
+    except GroundedError as error:
+        raise GroundedError(f"{path}: {error}") from None
+    except (Exception, SystemExit) as error:
+        raise GroundedError(_where(error, str(path))) from None
+    finally:
+        sys.dont_write_bytecode = writes
+        sys.path.remove(str(folder))
+        sys.modules.pop(spec.name, None)
+        _forget_neighbours(folder, before)
+    return found
+
+
+def _installed(name: str) -> ModuleType:
+    """Import a module by its name, or a model by its name among the entry points."""
+    registered: dict[str, EntryPoint] = {}
+    try:
+        if not _importable(name):  # listing the entry points is slow
+            from importlib.metadata import entry_points
+
+            registered = {point.name: point for point in entry_points(group="grounded.models")}
+        if name in registered:
+            found = ModuleType(name)
+            vars(found)["model"] = registered[name].load()
+            return found
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        raise GroundedError(
+            f"[model] module = '{name}' can't be imported: {error}; install its package in this "
+            f"environment, give file = 'model.py', or name one of {', '.join(sorted(registered))}"
+        ) from None
+    except Exception as error:
+        raise GroundedError(_where(error, name)) from None
+
+
+def _importable(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ModuleNotFoundError:  # its parent package is missing
+        return False
+
+
+def _forget_neighbours(folder: Path, before: set[str]) -> None:
+    """Unload modules imported from the model's folder: other workspaces have their own."""
+    for name in set(sys.modules) - before:
+        origin = getattr(sys.modules[name], "__file__", None)
+        if origin and Path(origin).resolve().is_relative_to(folder.resolve()):
+            del sys.modules[name]
+
+
+def model_in(module: ModuleType) -> Model:
+    """Return the `model` of a module.
+
+    Raises:
+        GroundedError: if there is none, or it is not a Model.
+    """
+    found: Any = getattr(module, "model", None)
+    if isinstance(found, Model):
+        return found
+    name = module.__file__ or module.__name__
+    if found is None:
+        names = [key for key, value in vars(module).items() if isinstance(value, Model)]
+        hint = f"; rename '{names[0]}' to 'model'" if names else "; see the README for an example"
+        raise GroundedError(f"{name} does not define `model = Model(...)`{hint}")
+    raise GroundedError(f"{name}: `model` must be a grounded.Model, found {type(found).__name__}")
+
+
+def _where(error: BaseException, name: str) -> str:
+    """Describe an error with the user's own line that failed."""
+    if isinstance(error, SyntaxError):
+        line = f" line {error.lineno}" if error.lineno else ""
+        return f"{error.filename or name}{line}: {error.msg}"
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).name in name]
+    line = f" line {frames[-1].lineno}" if frames else ""
+    return f"{name}{line}: {type(error).__name__}: {error}"
+
+
+def check_names(names: dict[str, Any] | Any, valid: list[str], what: str) -> None:
+    """Raise a GroundedError for the first name that is not valid."""
+    for name in names:
+        if name not in valid:
+            raise GroundedError(f"{what} '{name}' is not in the model: {nearest(name, valid)}")

@@ -1,0 +1,407 @@
+"""Build the Task of the method from grounded.toml, target.csv and a loaded model.
+
+target.csv has the desired states, one row per control step; a state without a column is free.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
+from io import TextIOWrapper
+from pathlib import Path
+
+import numpy as np
+
+from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.task import MAX_HORIZON, Task
+from grounded.utility import Reward
+from grounded_trials.plain_file import open_file
+from grounded_trials.workspace.user_files.config import Config
+from grounded_trials.workspace.user_files.model_file import check_names
+
+Reader = Callable[[Path], tuple[list[str], Array]]  # reads a target, as `read_target` does
+
+
+def build_task(config: Config, model: Model, folder: Path, read: Reader | None = None) -> Task:
+    """Build the task that the files describe.
+
+    Args:
+        config: the checked grounded.toml.
+        model: the model whose states and inputs the files name.
+        folder: the folder of the files.
+        read: the function that reads the target; None: `read_target`.
+
+    Raises:
+        GroundedError: for a name that is not in the model, or sizes that do not fit; the message
+            names the file and the key.
+    """
+    try:
+        return _build(config, model, folder, read or read_target)
+    except GroundedError as error:
+        named = str(error).startswith((config.file.name, str(folder), config.task.target))
+        where = "" if named else f"{config.file.name}: "
+        raise GroundedError(f"{where}{error}", error.then) from None
+
+
+def check_tables(config: Config, model: Model, rows: int) -> None:
+    """Check all of grounded.toml that a task is built from, whatever its target will be.
+
+    Args:
+        config: the checked grounded.toml.
+        model: the model whose states and inputs the file names.
+        rows: of the new target.
+
+    Raises:
+        GroundedError: as `build_task`.
+    """
+    untracked = replace(config, task=replace(config.task, target="", horizon=rows - 1))
+    build_task(untracked, model, config.file.parent)
+
+
+def _build(config: Config, model: Model, folder: Path, read: Reader) -> Task:
+    states, inputs = list(model.state_names), list(model.input_names)
+    table = config.task
+    check_names(table.start, [*states, *inputs], "[task] start: state")
+    check_names(table.latency, inputs, "[task] latency: input")
+    path = folder / table.target
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise GroundedError(f"[task] target = '{table.target}' lies outside the workspace")
+    if table.target:
+        target, input_target = target_arrays(path, states, inputs, table.dt, table.horizon, read)
+    else:
+        target, input_target = np.full((table.horizon + 1, len(states)), np.nan), None
+    first = np.where(np.isfinite(target[0]), target[0], 0.0)
+    start = np.array([table.start.get(s, first[i]) for i, s in enumerate(states)])
+    low, high = _limits(config, inputs)
+    held = np.zeros(len(inputs)) if input_target is None else input_target[0]
+    aimed = np.clip(held, low, high)  # default of the input held before a run
+    past = np.array([table.start.get(name, aimed[i]) for i, name in enumerate(inputs)])
+    safety = config.safety.pairs(states)
+    safe = np.array([safety.get(s, (-np.inf, np.inf)) for s in states])
+    return Task(
+        model=model,
+        dt=table.dt,
+        target=target,
+        reward=_reward(config, states, inputs),
+        start=start,
+        past=past,
+        low=low,
+        high=high,
+        feedback=table.feedback,
+        latency=np.array([table.latency.get(name, 0.0) for name in inputs]),
+        input_target=input_target,
+        safety_low=safe[:, 0],
+        safety_high=safe[:, 1],
+        smoothing=config.model.smoothing,
+    )
+
+
+def _limits(config: Config, inputs: list[str]) -> tuple[Array, Array]:
+    seen_in(config)
+    pairs = config.limits.pairs(inputs)
+    both = np.array([pairs.get(name, (-np.inf, np.inf)) for name in inputs])
+    return both[:, 0], both[:, 1]
+
+
+def seen_in(config: Config) -> str:
+    """Return the file name of the log that [limits] were taken from; "" if the user set them."""
+    log: str = config.limits.take("seen_in", str, "")
+    return log
+
+
+def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
+    table = config.reward
+    kinds = {"state": states, "terminal": states, "input": inputs, "input_change": inputs}
+    weights = {}
+    for kind, names in kinds.items():
+        given = table.numbers(kind, names)
+        weights[kind] = np.array([given.get(name, 0.0) for name in names])
+    table.finish()
+    reward = Reward(**weights)
+    if not config.task.target:  # nothing to follow: weights on errors have no meaning
+        none = np.zeros(len(states))
+        return replace(reward, state=none, terminal=none)
+    if not (reward.state.any() or reward.terminal.any()):
+        raise GroundedError(
+            "[reward] weighs no state, so there is nothing to follow; add for example "
+            f"state = {{ {states[0]} = 1.0 }}"
+        )
+    return reward
+
+
+DRAW = ": draw the manoeuvre, or write one row per control step, with columns t and states"
+SHAPE = NextCommand("target", ("SHAPE",))
+ROW_LIMIT = MAX_HORIZON + 2  # of target.csv; a longer one is not read to its end
+LEAST = 0.1  # smallest range of a target column used for its weight
+# a column counts as constant if its range is below STILL of its size (of LEAST if that is less), or
+# below HARDLY in its unit
+STILL, HARDLY = 0.01, 1e-4
+RATE = 0.1  # weight of a velocity beside its position, relative to that of other states
+NARROW = 0.2  # smallest range used for a position's axis, as a fraction of the largest one
+UNKNOWN = 1.0  # range assumed for a constant column if no column of its unit moves
+FULL = {"%": (-100.0, 100.0)}  # range assumed for an input without limits, by unit
+CHANGE = 0.01  # weight on the changes of an input with range -1 to 1
+CHANGES = 4 * CHANGE
+
+
+def read_target(path: Path, free: Collection[str] = ()) -> tuple[list[str], Array]:
+    """Read the names of the columns (`t` first) and their values, (rows, columns).
+
+    Args:
+        path: the CSV file.
+        free: names of columns that may hold NaN: of inputs, beside the states of a run.
+
+    Raises:
+        GroundedError: naming the line and the column of a value that is not a number.
+    """
+    try:
+        with TextIOWrapper(open_file(path), encoding="utf-8-sig", newline="") as stream:
+            reader = csv.reader(stream)
+            names = [name.strip() for name in next(reader, [])]
+            if not names:
+                raise GroundedError(f"{path.name} is empty{DRAW}", SHAPE)
+            _check_header(path, names)
+            rows: list[list[float]] = []
+            for line, row in enumerate(reader, start=2):
+                if len(rows) > ROW_LIMIT:
+                    raise GroundedError(f"{path.name} has more than {ROW_LIMIT} rows")
+                try:
+                    values = [*map(float, row)]
+                except ValueError:
+                    values = []
+                if len(values) != len(names) or not math.isfinite(sum(values)):
+                    if not any(cell.strip() for cell in row):
+                        continue
+                    values = _numbers(path, line, names, row, free)
+                rows.append(values)
+    except FileNotFoundError:
+        raise GroundedError(f"{path} does not exist, but [task] target names it") from None
+    except IsADirectoryError:
+        raise GroundedError(f"{path} is a folder; [task] target must name a CSV file") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise GroundedError(f"{path} can't be read as CSV: {error}") from None
+    return names, np.array(rows, dtype=float).reshape(len(rows), len(names))
+
+
+def _check_header(path: Path, names: list[str]) -> None:
+    if names[0] != "t":
+        raise GroundedError(
+            f"{path.name}: the first column must be 't', found '{names[0]}'; columns are separated "
+            "by commas"
+        )
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise GroundedError(f"{path.name}: there are two columns named '{twice[0]}'")
+
+
+def _numbers(
+    path: Path, line: int, names: list[str], row: list[str], free: Collection[str]
+) -> list[float]:
+    if len(row) != len(names):
+        raise GroundedError(
+            f"{path.name} line {line}: {len(row)} values for {len(names)} columns "
+            f"({', '.join(names)})"
+        )
+    values = []
+    for name, cell in zip(names, row, strict=True):
+        try:
+            value = float(cell)
+        except ValueError:
+            raise GroundedError(
+                f"{path.name} line {line}: '{cell}' in column '{name}' is not a number"
+            ) from None
+        if not math.isfinite(value) and name not in free:
+            raise GroundedError(
+                f"{path.name} line {line}: {cell.strip()} in column '{name}'; every tracked value "
+                "must be finite; omit the column if the state is free"
+            )
+        values.append(value)
+    return values
+
+
+def target_arrays(
+    path: Path,
+    states: list[str],
+    inputs: list[str],
+    dt: float,
+    horizon: int,
+    read: Reader | None = None,
+) -> tuple[Array, Array | None]:
+    """Return the target (H + 1, n), NaN where free, and the inputs' target (H, m) or None.
+
+    Args:
+        path: the CSV file.
+        states: the model's states, n.
+        inputs: the model's inputs, m.
+        dt: control interval [s].
+        horizon: control steps, H.
+        read: the function that reads the file; None: `read_target`.
+
+    Raises:
+        GroundedError: for an unknown column, too few rows, or times off the control grid.
+    """
+    names, values = (read or read_target)(path)
+    for name in names[1:]:
+        if name not in states and name not in inputs:
+            raise GroundedError(
+                f"{path.name}: column '{name}' is neither a state nor an input of the model: "
+                + nearest(name, [*states, *inputs])
+            )
+    if len(values) < 2:
+        rows = "one row" if len(values) else "no row"
+        raise GroundedError(f"{path.name} has {rows} below its header{DRAW}", SHAPE)
+    if len(values) < horizon + 1:
+        raise GroundedError(
+            f"{path.name} has {len(values)} rows, but a horizon of {horizon} steps needs "
+            f"{horizon + 1}: add rows or set [task] horizon = {max(len(values) - 1, 0)}"
+        )
+    t = values[: horizon + 1, 0]
+    off = np.abs(t - t[0] - dt * np.arange(horizon + 1))
+    if off.max() > 0.01 * dt:
+        _check_interval(path, values[:, 0], dt)
+        i = int(np.argmax(off > 0.01 * dt))
+        raise GroundedError(
+            f"{path.name} line {i + 2}: t = {t[i]:g} s, expected {t[0] + i * dt:g} s: rows must be "
+            f"[task] dt = {dt:g} s apart; resample them with the command below",
+            NextCommand("target", (str(path),)),
+        )
+    target = np.full((horizon + 1, len(states)), np.nan)
+    given = {name: values[: horizon + 1, names.index(name)] for name in names[1:]}
+    for i, name in enumerate(states):
+        if name in given:
+            target[:, i] = given[name]
+    if not any(name in given for name in inputs):
+        return target, None
+    columns = [given.get(name, np.zeros(horizon + 1))[:horizon] for name in inputs]
+    return target, np.stack(columns, axis=1)
+
+
+def _check_interval(path: Path, t: Array, dt: float) -> None:
+    """Raise an error that names [task] dt if the rows of a target have another, even interval.
+
+    A dt of at least the whole target is a mistake in dt, not in the target.
+    """
+    lasts = float(t[-1] - t[0])
+    each = lasts / (len(t) - 1)
+    if each <= 0 or np.abs(np.diff(t) - each).max() > 0.01 * each or abs(each - dt) < 0.01 * each:
+        return
+    rows = f"[task] dt = {dt:g} s, but the rows of {path.name} are {each:.6g} s apart"
+    if dt < lasts:
+        raise GroundedError(
+            f"{rows}: set dt = {each:.6g}, or resample the target with the command below",
+            NextCommand("target", (str(path),)),
+        )
+    unit = f" (in seconds: {dt:g} ms is {dt / 1000:g})" if dt / 1000 < lasts else ""
+    raise GroundedError(
+        f"{rows} and last {lasts:.4g} s in all: dt is the time from one command to the next{unit}; "
+        f"set dt = {each:.6g}"
+    )
+
+
+def limited_changes(config: Config, model: Model) -> dict[str, tuple[float, float]]:
+    """Return the weights on changes of inputs with [limits]: (ignoring the limits, using them)."""
+    both = zip(*_limits(config, list(model.input_names)), model.inputs.items(), strict=True)
+    return {
+        name: (change_weight(None, unit), float(f"{change_weight((low, high), unit):.4g}"))
+        for low, high, (name, unit) in both
+        if math.isfinite(high - low)
+    }
+
+
+def equal_weights(
+    columns: Mapping[str, Array],
+    units: Mapping[str, str],
+    together: Collection[str] = (),
+    rates: Collection[str] = (),
+) -> dict[str, float]:
+    """Return weights by which an error as large as a column's range (at least LEAST) costs 1.
+
+    That of a velocity beside its position costs RATE: its noise is a larger part of its range, and
+    a plan would leave the path for the sake of the speed.
+
+    A constant column has no range of its own. It gets the largest range or size among the columns
+    of its unit (a y that is constant while x moves; a step to a constant 5 m), or UNKNOWN if no
+    column of its unit moves or is larger than UNKNOWN.
+
+    Args:
+        columns: the columns of the target, by state.
+        units: the units of the model's states.
+        together: the axes of one position, which share a weight: that of the smallest range, but
+            of at least NARROW of the largest.
+        rates: the velocities of positions in the target (`off_target.rates_beside`).
+    """
+    ranges = {name: range_of(values) for name, values in columns.items()}
+    if axes := [own for name, own in ranges.items() if name in together and own > 0]:
+        narrow = max(min(axes), NARROW * max(axes))
+        ranges |= {name: narrow for name in ranges if name in together}
+    size: dict[str, float] = {}
+    for name, own in ranges.items():
+        unit = units.get(name, "")
+        size[unit] = max(size.get(unit, 0.0), own or float(np.abs(columns[name]).max()))
+    rest = {*without_range(columns, units)}
+    widths = {
+        name: max(own or (UNKNOWN if name in rest else size[units.get(name, "")]), LEAST)
+        for name, own in ranges.items()
+    }
+    return {name: (RATE if name in rates else 1.0) * w**-2 for name, w in widths.items()}
+
+
+def range_of(values: Array) -> float:
+    """Return the range of a target column, 0 if it hardly moves (from 0.02591 to 0.0259 rad)."""
+    own = float(np.ptp(values))
+    return own if own > max(STILL * min(float(np.abs(values).max()), LEAST), HARDLY) else 0.0
+
+
+def without_range(columns: Mapping[str, Array], units: Mapping[str, str]) -> list[str]:
+    """Return the states for whose unit no column moves or exceeds UNKNOWN.
+
+    The target does not show what a small error of such a state is.
+
+    Args:
+        columns: the columns of a target, by state.
+        units: the units of the model's states.
+    """
+    told = {
+        units.get(name, "")
+        for name, values in columns.items()
+        if range_of(values) > 0 or np.abs(values).max() > UNKNOWN
+    }
+    return [name for name in columns if units.get(name, "") not in told]
+
+
+def change_weight(limits: tuple[float, float] | None, unit: str) -> float:
+    """Return the default weight on an input's changes, scaled by its range.
+
+    Args:
+        limits: lowest and highest value; None if unknown: -1 to 1, or -100 to 100 for unit %.
+        unit: the unit of the input.
+    """
+    low, high = limits or FULL.get(unit, (-1.0, 1.0))
+    return CHANGES / (high - low) ** 2 if high > low else CHANGE
+
+
+def write_target(path: Path, dt: float, columns: dict[str, Array]) -> None:
+    """Write a target file, see `target_text`."""
+    from grounded_trials.store.store import write_atomically
+
+    write_atomically(path, target_text(dt, columns).encode())
+
+
+def target_text(dt: float, columns: dict[str, Array]) -> str:
+    """Format a target as CSV.
+
+    Args:
+        dt: control interval [s].
+        columns: states in the order of the file, (H + 1,) each.
+    """
+    H = len(next(iter(columns.values())))
+    lines = [",".join(["t", *columns])]
+    for i in range(H):
+        at = (round(float(values[i]), 12) + 0.0 for values in columns.values())  # no -0
+        row = [f"{i * dt:.10g}", *(f"{value:.9g}" for value in at)]
+        lines.append(",".join(row))
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,184 @@
+"""Say where to correct an instrument finding: in [log], or in the program that writes the trials.
+
+A finding refers to signals as they were read, so its correction is combined with the keys of [log]
+at that time: scales multiply, delays add. The metadata of each trial records these keys.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from grounded.instruments.finding import AS_LATE, Finding, late_effects
+from grounded.places import heading, position
+from grounded.result import listed
+from grounded_trials.workspace.identity import READ_BY
+from grounded_trials.workspace.user_files.task_file import seen_in
+
+if TYPE_CHECKING:
+    from grounded.trial import Trial
+    from grounded_trials.logs.log_table import LogMapping
+    from grounded_trials.workspace.folder import Folder
+
+PLAIN = {"scale": 1.0, "offset": 0.0, "delay_s": 0.0}  # keys of a signal that is read unchanged
+
+
+def read_by(mapping: LogMapping) -> dict[str, str]:
+    """Return the metadata of a trial with the keys of [log] that changed its signals, or {}."""
+    found = {}
+    for name, spec in {**mapping.states, **mapping.inputs}.items():
+        keys = {key: float(getattr(spec, key)) for key in PLAIN}
+        if changed := {key: value for key, value in keys.items() if value != PLAIN[key]}:
+            found[name] = changed
+    return {READ_BY: json.dumps(found)} if found else {}
+
+
+def where_to_mend(
+    workspace: Folder, used: Sequence[Trial], findings: Sequence[Finding]
+) -> tuple[Finding, ...]:
+    """Complete findings with the whole key of [log], or with advice if no trial was read by it."""
+    from grounded_trials.workspace.intake.opening.columns_by_name import no_angles  # a slow import
+
+    about = {one.stored.id: one.meta for one in workspace.trials()}
+    findings = _at_limits(workspace, used, findings)
+    feedback = workspace.config.task.feedback
+    read = [meta for trial in used if "source_sha256" in (meta := about[trial.id])]
+    if read:
+        strange = no_angles(workspace.base_model, workspace.log_mapping)
+        odd = [Finding(name, said, "mismatch") for name, said in strange.items()]
+        findings = (*odd, *findings)
+        ahead = (
+            "the robot's program also gets it late and should predict it ahead by as much, unless "
+            "the plan allows for it: `adopt` {} instead of delay_s"
+        )
+        return tuple(
+            replace(
+                one,
+                log=_whole(one, read[-1]),
+                advice=ahead.format(f"sensor_delay:{one.signal}")
+                if feedback and one.kind == "delay" and one.corrected and AS_LATE not in one.finding
+                else one.advice or _late_message(workspace, one, read[-1]),
+            )
+            for one in findings
+        )
+    fed = ": the runner's feedback also gets it late" * feedback
+    late = f"should read it with less delay, or filter it less{fed}"
+    mend = {"delay": late, "lag": late, "sign": "should flip its sign"}
+    mend["degrees"] = "should write it in the model's unit"
+    whose = "the program that writes the trials"
+    return tuple(
+        replace(one, log="", advice=f"{whose} {mend[one.kind]}")
+        if one.corrected and one.kind in mend
+        else one
+        for one in findings
+    )
+
+
+def one_message(workspace: Folder) -> tuple[str, ...]:
+    """Return the states of a pose if one message holds them, else none.
+
+    A message has one stamp, so its position and its heading are late together or not at all.
+    """
+    model, mapping = workspace.base_model, workspace.log_mapping
+    pose = [*position(model), *filter(None, [heading(model)])]
+    if mapping is None or len(pose) < 2 or not set(pose) <= set(mapping.states):
+        return ()
+    topics = {_topic(mapping.states[name].path) for name in pose}
+    return tuple(pose) if len(topics) == 1 else ()
+
+
+def _late_message(workspace: Folder, one: Finding, meta: Mapping[str, str]) -> str:
+    """Return what to set if a speed is early: no sensor is, so the message of the position is late.
+
+    "" for other findings, if both come in one message, or if its states were read differently.
+    """
+    where, mapping = position(workspace.base_model), workspace.log_mapping
+    states = mapping.states if mapping else {}
+    if one.kind != "delay" or one.delay_s >= 0 or not {*where, one.signal} <= {*states}:
+        return ""
+    topic = _topic(states[where[0]].path)
+    names = [name for name, spec in states.items() if _topic(spec.path) == topic]
+    whole = {_keys(meta, name).get("delay_s", 0.0) - one.delay_s for name in names}
+    if one.signal in names or not {*where} <= {*names} or len(whole) > 1:
+        return ""
+    ahead = " and let the robot's program predict them ahead by as much"
+    return (
+        f"{listed(names)} are in one message, more likely late: set delay_s = {whole.pop():.3g} "
+        f"for each in [log.state]{ahead * workspace.config.task.feedback}"
+    )
+
+
+def _topic(path: str) -> str:
+    return path.partition(".")[0]
+
+
+def in_time_now(workspace: Folder, findings: Sequence[Finding]) -> dict[str, float]:
+    """Return the delays found by a diagnosis that [log] now removes, by effect name [s].
+
+    Args:
+        workspace: the workspace with the current [log].
+        findings: the findings of the diagnosis, with the whole key of [log].
+    """
+    late = [one for one in findings if one.kind == "delay" and "delay_s = " in one.log]
+    if not late:
+        return {}
+    mapping = workspace.log_mapping
+    states, found = mapping.states if mapping else {}, dict[str, float]()
+    for one in late:
+        whole = float(dict(part.split(" = ") for part in one.log.split(", "))["delay_s"])
+        now = states[one.signal].delay_s if one.signal in states else 0.0
+        if now > whole - one.delay_s / 2:  # the trial was read with whole - delay_s
+            found |= dict.fromkeys(late_effects([one]), now)
+    return found
+
+
+def _at_limits(
+    workspace: Folder, used: Sequence[Trial], findings: Sequence[Finding]
+) -> Sequence[Finding]:
+    """Limit findings of saturated inputs to runs of candidates if [limits] were taken from a log.
+
+    The log itself reaches these limits by construction, and so do other manual drives.
+    """
+    from grounded.instruments.inputs import judge_limits
+
+    if not seen_in(workspace.config):
+        return findings
+    inputs = [trial.inputs[: trial.known_steps] for trial in used if trial.candidate]
+    left = judge_limits(workspace.task, np.concatenate(inputs)) if inputs else ()
+    real = {one.signal: one for one in left if one.kind == "saturated"}
+    return [
+        real.get(one.signal, one) if one.kind == "saturated" else one
+        for one in findings
+        if one.kind != "saturated" or one.signal in real
+    ]
+
+
+def _whole(finding: Finding, meta: Mapping[str, str]) -> str:
+    """Return the whole key of [log] for a finding, combined with the keys used for a trial."""
+    now = _keys(meta, finding.signal)
+    if not finding.log or not now:
+        return finding.log
+    keys = dict(part.split(" = ") for part in finding.log.split(", "))
+    if "scale" in keys:
+        by = float(keys["scale"])
+        keys["scale"] = f"{by * now['scale']:.8g}"
+        offset = by * now["offset"] + float(keys.get("offset", 0.0))
+        keys |= {"offset": f"{offset:.8g}"} if offset else {}
+    if "delay_s" in keys:
+        keys["delay_s"] = f"{float(keys['delay_s']) + now['delay_s']:.3g}"
+    return ", ".join(f"{key} = {value}" for key, value in keys.items())
+
+
+def _keys(meta: Mapping[str, str], signal: str) -> dict[str, float]:
+    """Return the keys by which a signal was read, {} if unchanged or invalid (untrusted file)."""
+    try:
+        found = json.loads(meta.get(READ_BY, "{}")).get(signal, {})
+        keys = PLAIN | {key: float(found[key]) for key in PLAIN if key in found}
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        return {}
+    return keys if all(map(math.isfinite, keys.values())) and keys != PLAIN else {}
