@@ -111,6 +111,9 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     words["target"] = all_called(model, targets)
     if isinstance(effect.family, ParamFamily):
         words["target"] = effect.site.target
+    axes = [*model.roles.get("position", ())][:2]
+    axes = axes if len(axes) == 2 else ["the first axis", "the second"]
+    words |= {"axis_1": axes[0], "axis_2": axes[1]}
     words |= {"log": "[log]", "driven": called(model, driven), "source": called(model, source)}
 
     def filled(found: re.Match[str]) -> str:

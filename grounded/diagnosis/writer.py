@@ -81,15 +81,17 @@ class Writer:
         """Whether as many effects as were looked for leave more than noise, or promise another one.
 
         That is also so if one of them was dropped: beside a further one it may be needed. Nothing
-        need be above a floor that may hold the model's own error too, as any without repeats does:
-        there evidence is asked.
+        need be above a floor that may hold the model's own error too, as any without repeats does,
+        nor where something small but lasting is left: there evidence is asked.
         """
         likely = len(self.search.chosen(self.most).hypothesis.names)
         if self.known.no_cause or max(likely, len(self.claims.names)) < self.most:
             return False
-        if any(one.above for one in self.measured.remainders()):
+        left = self.measured.remainders()
+        if any(one.above for one in left):
             return bool(self.claims.names)
-        full = len(self.claims.names) >= self.most and self.measured.source == "short horizon"
+        full = len(self.claims.names) >= self.most
+        full = full and (self.measured.source == "short horizon" or bool(left))
         return full and promised(self.search, self.best) > SURE
 
     def worth_more_than(self, other: Writer) -> bool:

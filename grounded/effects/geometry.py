@@ -246,7 +246,7 @@ lever_arm = RateFamily(
 slope = RateFamily(
     name="slope",
     equation="v' = model + a cos(psi) + b sin(psi)",
-    sentence="the ground slopes, by {a} towards the first axis and {b} towards the second",
+    sentence="the ground slopes, by {a} towards {axis_1} and {b} towards {axis_2}",
     targets=lambda model: [v] if _moving(model) and (v := places.speed(model)) else [],
     quantities=_two_drifts,
     lookalikes=("offset", "patch", "coulomb_friction"),

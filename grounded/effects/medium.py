@@ -123,7 +123,7 @@ def _felt(model: Model) -> tuple[Array, Array]:
 current = MediumFamily(
     name="current",
     equation="model of (u, v) through a medium that moves by (a, b) over ground",
-    sentence="the water or air moves, by {a} along the first axis and {b} along the second",
+    sentence="the water or air moves, by {a} along {axis_1} and {b} along {axis_2}",
     targets=_carried,
     quantities=lambda site: two_axes(site.unit(site.target)),
     lookalikes=("push_world", "offset", "slope", "drift_world", "drift_body"),
@@ -134,7 +134,7 @@ current = MediumFamily(
 push_world = RateFamily(
     name="push_world",
     equation="u' = model + a cos(psi) + b sin(psi), v' = model - a sin(psi) + b cos(psi)",
-    sentence="something pushes it, by {a} along the first axis and {b} along the second",
+    sentence="something pushes it, by {a} along {axis_1} and {b} along {axis_2}",
     targets=_pushed,
     quantities=lambda site: two_axes(per(site.unit(site.target))),
     lookalikes=("current", "offset", "slope", "patch"),

@@ -135,7 +135,8 @@ def stages() -> Iterator[Callable[[str], None]]:
         last, began = "", time.monotonic()
         while not ended.wait(EVERY):
             if now:
-                since = f", {time.monotonic() - began:.0f} s so far" * (now == last)
+                told = now != last or "so far" in now  # it says so itself
+                since = "" if told else f", {time.monotonic() - began:.0f} s so far"
                 _write(f"{now}{since} ...", sys.stderr)
             last = now
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from grounded.diagnosis.cause_words import ended, furthest_apart, value_of, with_worth
 from grounded.diagnosis.error_report import Correction, Gap
@@ -152,6 +152,11 @@ def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> st
     return f"calibrated with the effects: {named}" * bool(moved)
 
 
+def _between(some: Sequence[float]) -> str:
+    """Return `+0.5 to +2`, or one number if both would read alike."""
+    return " to ".join(dict.fromkeys(f"{one:+.2g}" for one in (min(some), max(some))))
+
+
 def held_sentence(diagnosis: Diagnosis) -> str:
     """Say which calibrated parameters depend on others that these trials cannot identify."""
     said, held = [], dict[str, list[float]]()
@@ -166,8 +171,7 @@ def held_sentence(diagnosis: Diagnosis) -> str:
         said.append(f"{one.parameter} changes by {listed(parts)} ({free} if all are free)")
     if len(said) > MOST:
         said = [
-            f"{len(some)} others change by {min(some):+.2g} to {max(some):+.2g} % with 1 % more "
-            f"{name}"
+            f"{len(some)} others change by {_between(some)} % with 1 % more {name}"
             for name, some in held.items()
         ]
     told = f"these trials cannot identify {listed(held)}: the values hold for the model's own"
