@@ -15,12 +15,13 @@ from cli import grounded
 from facts import holding, holds
 from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
+from grounded.search.sample_age import sample_age
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.intake.locating.run_start import recording
 from grounded_trials.workspace.intake.opening import foreign, reading
-from recorded import LOGGED, RATE, record, waiting
+from recorded import LOGGED, RATE, follow, record, waiting
 from workspaces import make
 
 
@@ -46,6 +47,30 @@ def test_a_run_with_feedback_is_found_to_the_log_s_sample(w, tmp_path, before, f
     k = round(before * RATE) + 5 * np.arange(policy.horizon)
     np.testing.assert_allclose(stored.inputs[:, 0], table[k, 3], atol=1e-4)
     np.testing.assert_allclose(stored.states[:-1], table[k, 1:3], atol=1e-3)
+
+
+@pytest.mark.parametrize("waits", [0, 20])
+def test_a_late_first_row_does_not_make_the_samples_of_all_others_old(w, tmp_path, waits):
+    """A busy computer wrote it 20 ms late: from there on all states were 20 ms after their rows.
+
+    The program acted on each row's own states.
+    """
+    made, rng = w.candidate("c0002")[0], np.random.default_rng(3)
+    policy, model = made.policy, w.task.model
+    late = np.r_[np.zeros(waits), 20, 5, rng.uniform(0, 1, policy.horizon + 18)]  # [ms]
+    z, clock, sent, rows = np.array(w.task.start, float), -1.0, policy.past.copy(), []
+    for k, wait in enumerate(late, -waits):
+        at, force = k * policy.dt + 1e-3 * wait, rows[-1][3] if rows else 0.0
+        push = 0.7 * force - 0.4 * np.tanh(20 * z[1]) if rows else 0.0
+        z = model.system.step(z[None], np.array([[push]]), model.values, at - clock)[0]
+        felt, clock = z + rng.normal(0, (0.002, 0.01)), at
+        runs = 0 <= k < policy.horizon
+        rows.append([1000 + at, *felt, float(follow(policy, k, felt, sent)[0]) if runs else 0.0])
+    np.savetxt(tmp_path / "a.csv", rows, "%.5f", ",", header="t,x,v,force", comments="")
+    found = w.ingest(tmp_path / "a.csv")
+    assert found.candidate == "c0002"
+    assert abs(sample_age(w.task, made, [w.trials()[-1].trial])) < 0.002
+    assert waits or any("first command was logged 19.4 ms" in note for note in found.notes)
 
 
 @pytest.mark.parametrize("before", [0.0, 1.0])

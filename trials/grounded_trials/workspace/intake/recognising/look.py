@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.intake.opening.foreign import ForeignLog
 
 ALIGNED = 0.75  # starts closer than this, in sample intervals, are considered equal
+PUNCTUAL = 0.1  # of a step: by more, a first command with a stamp of its own is late
 CLEARLY = 0.7  # a start is elsewhere if its difference is below this share of the first command's
 
 
@@ -106,8 +107,13 @@ class Look:
         warnings, notes = list(there.warnings), list(self.read.notes)
         if found.missed:
             warnings.insert(0, not_sent(task, ran, found.missed))
-        else:
+        elif begins > 0:
             notes.append(f"the log begins {begins:.3f} s before {ran} does: that part is left out")
+        else:
+            notes.append(
+                f"its first command was logged {1e3 * -begins:.3g} ms after {ran} began, by the "
+                "times of the others"
+            )
         self.read = replace(there, warnings=tuple(warnings), notes=tuple(notes))
         cut = apart.cut(ran, found.seconds)[0] if apart else self.read.trial
         self.whole = interpolate_gaps(cut).trial
@@ -140,9 +146,14 @@ def _sooner(log: ForeignLog, stored: ForeignLog) -> float:
 
 
 def elsewhere(log: Recording, found: Start, policy: Policy, why: str) -> bool:
-    """Return whether a run begins at the start found rather than at the log's first command."""
+    """Return whether a run begins at the start found rather than at the log's first command.
+
+    The first command of a busy computer may be late. If the run began with it, all others would be
+    early, and would be compared with states that the program did not have yet.
+    """
     if found.missed or (found.between_rows and found.alike):
         return True
-    if not found.opens_alike or abs(found.seconds - log.first) <= ALIGNED * log.interval:
-        return False
+    off = abs(found.seconds - log.first)
+    if not found.opens_alike or off <= ALIGNED * log.interval:
+        return found.alike and off > PUNCTUAL * log.dt and not log.late.any()
     return bool(why) or found.exact or found.apart < CLEARLY * log.apart_at(policy, log.first)
