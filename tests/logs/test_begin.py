@@ -24,7 +24,8 @@ from grounded_trials.starting.first_toml import held_first
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, hinges, path_target, swing_up
 from grounded_trials.workspace.candidates.exporting import void_exports
-from grounded_trials.workspace.off_target import rates_beside
+from grounded_trials.workspace.next_step import to_plan
+from grounded_trials.workspace.off_target import logged_target, rates_beside
 from grounded_trials.workspace.user_files.task_file import equal_weights, read_target, without_range
 from ros_bags import arm_bag, boat_bag, car_bag, commanded_arm_bag, rover_bag, thruster_bag
 from shared_data import data
@@ -1054,3 +1055,28 @@ def test_a_hover_that_trembles_within_its_noise_is_a_rest(seed):
     assert not held_first(model, columns, ramp, 0.02, ranges)
     sinks = {**columns, "z": columns["z"] - 0.3 * t}
     assert not held_first(model, sinks, sent, 0.02, ranges)
+
+
+SLED = """from grounded import Model, Param
+
+def f(s, a, p):
+    return {"x": s.v, "v": (a.force - 2 * s.v) / p.m}
+
+model = Model(states={"x": "m", "v": "m/s"}, inputs={"force": "N"},
+              params={"m": Param(1.0, "kg", 0.5, 2.0)}, derivative=f)
+"""
+
+
+def test_a_log_whose_first_row_is_off_the_grid_is_known_again_in_its_target(tmp_path):
+    """After `ingest --data`, which starts at a step of the commands, no `target` was asked for."""
+    (tmp_path / "model.py").write_text(SLED)
+    t = np.r_[0.0083, 0.04 * np.arange(1, 200)]
+    force = np.sin(2 * t) + np.sin(5.3 * t)
+    x, v = np.cumsum(np.cumsum(force)) * 0.04**2, np.cumsum(force) * 0.04
+    table = np.column_stack([t, x + 1e-3 * np.sin(99 * t), v + 0.01 * np.cos(77 * t), force])
+    np.savetxt(tmp_path / "hand.csv", table, "%.6f", ",", header="t,x,v,force", comments="")
+    begin(tmp_path / "w", tmp_path / "hand.csv", model=tmp_path / "model.py")
+    taken = Workspace(tmp_path / "w").ingest(tmp_path / "hand.csv", data=True)
+    assert any("is used from 0.032 s on" in note for note in taken.notes)
+    assert logged_target(Workspace(tmp_path / "w")) == "t0001"
+    assert to_plan(Workspace(tmp_path / "w")).verb == "target"

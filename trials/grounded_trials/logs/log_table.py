@@ -13,6 +13,7 @@ from typing import Any, Literal, cast
 from grounded.errors import GroundedError
 from grounded.result import listed
 from grounded_trials.formats.message_path import parse_path
+from grounded_trials.formats.messages import Floats
 from grounded_trials.logs.resample import Crossing, Gridded, Span, to_grid
 from grounded_trials.logs.signals import Clock, Series, SignalSpec, read_signals
 from grounded_trials.toml_table import Table
@@ -124,6 +125,8 @@ def read_log(
     states: Sequence[str] | None = None,
     angles: Sequence[str] = (),
     steps: int | None = None,
+    rest: Floats | None = None,
+    rates: Sequence[str] = (),
 ) -> Gridded:
     """Read a log and sample it every dt.
 
@@ -134,6 +137,8 @@ def read_log(
         states: the mapped states to read, in array order; all of them by default.
         angles: states to unwrap.
         steps: at most this many steps.
+        rest: (m,) inputs at rest: the start is moved to a step of the commands, see `to_grid`.
+        rates: states that are velocities, see `to_grid`.
 
     Raises:
         GroundedError: see `signals.read_signals` and `resample.to_grid`.
@@ -141,7 +146,17 @@ def read_log(
     states = list(mapping.states) if states is None else states
     inputs = list(mapping.inputs)
     series = mapped_signals(paths, mapping, states, inputs)
-    return to_grid(series, dt, states, inputs, mapping.span, angles=angles, steps=steps)
+    return to_grid(
+        series,
+        dt,
+        states,
+        inputs,
+        mapping.span,
+        angles=angles,
+        steps=steps,
+        rest=rest,
+        rates=rates,
+    )
 
 
 def mapped_signals(

@@ -382,14 +382,28 @@ def _recorded(
     dt: float,
     write: Callable[..., None],
 ) -> tuple[str, int, tuple[str, ...]]:
-    """Write target.csv from the run in the log, or a placeholder if that can't be sampled."""
+    """Write target.csv from the run in the log, or a placeholder if that can't be sampled.
+
+    The run begins where `ingest --data` lets it begin, by which `logged_target` knows it again.
+    """
+    from grounded_trials.workspace.intake.foreign import rates_of  # slow
+
     here = Folder(folder)
     measured = [guess.name for guess in states if guess.path]
     mapping = log_mapping(here.config.log, model.state_names, model.input_names)
     try:
         if mapping is None or not measured:
             raise GroundedError("no signal of the log matches a state")
-        found = read_log(files, mapping, dt, states=measured, angles=model.angles, steps=HORIZON)
+        found = read_log(
+            files,
+            mapping,
+            dt,
+            states=measured,
+            angles=model.angles,
+            steps=HORIZON,
+            rest=np.zeros(len(mapping.inputs)),
+            rates=rates_of(model),
+        )
     except GroundedError as error:
         write({model.state_names[0]: np.zeros(HORIZON + 1)}, HORIZON)
         return "zeros, to be replaced", HORIZON, (f"the run can't be sampled yet: {error}",)

@@ -75,7 +75,7 @@ class ForeignLog:
             angles=model.angles,
             steps=task.horizon if candidate else None,
             rest=None if candidate else rest,
-            rates=() if candidate else _rates(model),
+            rates=() if candidate else rates_of(model),
             past=self.workspace.task.past if candidate and start is not None else None,
         )
         logged = tuple(one for one in found.reports if one.name in self.series), found.warnings
@@ -311,7 +311,7 @@ def hashed(files: Sequence[Path]) -> str:
     return hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode())
 
 
-def _rates(model: Model) -> tuple[str, ...]:
+def rates_of(model: Model) -> tuple[str, ...]:
     """Return the states that are velocities, which are zero while the robot is at rest."""
     from grounded.places import integrals
 
