@@ -100,6 +100,9 @@ def instrument_lines(findings: Iterable[Finding]) -> list[str]:
         done = "; corrected here" * (one.corrected and not (left_out or cut))
         if left_out and one.kind == "delay":
             done = f"; {left_out.finding}"
+        if one.log and one.log in one.advice:  # says when to set it
+            lines.append(f"{one.signal}: {one.finding}{done}. {one.advice}")
+            continue
         more = f"; to correct it for good, set {one.log} in its table of [log]" * bool(one.log)
         more += f"; {one.advice}" * bool(one.advice)
         lines.append(f"{one.signal}: {one.finding}{done}{more}")

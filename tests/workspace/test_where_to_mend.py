@@ -72,7 +72,10 @@ def test_a_late_sensor_of_a_foreign_log_is_mended_in_its_table(tmp_path):
     one = found_in(w)
     assert one.log.startswith("delay_s = 0.1")
     # before any candidate ran, a first run swung
-    assert holds(one.advice, "the robot's program", "late", "sensor_delay:v", "instead of delay_s")
+    (line,) = (line for line in instrument_lines([one]))
+    assert line.count(one.log) == 1  # once it said "for good", and then to adopt instead
+    assert holds(line, "If the robot's program gets v as late", "`adopt` sensor_delay:v")
+    assert holds(line, "Otherwise (only the log is late", f"set {one.log}", "Do not do both")
     toml = w.folder / "grounded.toml"
     toml.write_text(toml.read_text().replace("[task]\n", "[task]\nfeedback = false\n"))
     assert not found_in(w).advice

@@ -52,19 +52,15 @@ def where_to_mend(
         strange = no_angles(workspace.base_model, workspace.log_mapping)
         odd = [Finding(name, said, "mismatch") for name, said in strange.items()]
         findings = (*odd, *findings)
-        ahead = (
-            "the robot's program also gets it late and should predict it ahead by as much, unless "
-            "the plan allows for it: `adopt` {} instead of delay_s"
-        )
+        whole = (replace(one, log=_whole(one, read[-1])) for one in findings)
         return tuple(
             replace(
                 one,
-                log=_whole(one, read[-1]),
-                advice=ahead.format(f"sensor_delay:{one.signal}")
-                if feedback and one.kind == "delay" and one.corrected and AS_LATE not in one.finding
+                advice=_either(one)
+                if feedback and one.log and late_effects([one]) and AS_LATE not in one.finding
                 else one.advice or _late_message(workspace, one, read[-1]),
             )
-            for one in findings
+            for one in whole
         )
     fed = ": the runner's feedback also gets it late" * feedback
     late = f"should read it with less delay, or filter it less{fed}"
@@ -76,6 +72,16 @@ def where_to_mend(
         if one.corrected and one.kind in mend
         else one
         for one in findings
+    )
+
+
+def _either(one: Finding) -> str:
+    """Return what to do about a late sensor, by whether the robot's program gets it as late."""
+    name = one.signal
+    return (
+        f"If the robot's program gets {name} as late as this log does, `adopt` sensor_delay:{name}:"
+        f" the plan then allows for it. Otherwise (only the log is late, or the program predicts "
+        f"{name} ahead by as much) set {one.log} in its table of [log]. Do not do both"
     )
 
 
