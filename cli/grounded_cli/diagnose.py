@@ -93,7 +93,8 @@ def command(
             odd = [one.to_json() for one in findings]
             return show_json({"preflight": odd, "unheld": list(alone)})
         _instruments(findings, workspace.base_model.inputs)
-        return _unheld(alone, bool(findings))
+        _unheld(alone, bool(findings))
+        return show(f"\n{next_line(workspace.status().then)}")
     families = [name for text in without for name in names_in(text)]
     with stages() as tell:
         found = workspace.diagnose(

@@ -970,6 +970,69 @@ def test_who_goes_on_after_steps_that_lost_is_told_of_a_diagnosis(tmp_path, monk
     assert not any("2 steps were lost" in note for note in notes), notes
 
 
+def test_a_log_that_is_read_otherwise_now_is_ingested_again_before_anything_is_adopted(
+    tmp_path, monkeypatch
+):
+    """In metres at last, `status` still told to adopt what was diagnosed in millimetres."""
+    monkeypatch.chdir(tmp_path)
+    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
+    log = record(w, tmp_path / "hand.csv", w.propose().candidate.policy, 0.0)
+    next((w.folder / "candidates").iterdir()).unlink()
+    assert last(grounded("-C", w.folder, "ingest", "--data", log)).endswith("diagnose")
+    (w.folder / "reports").mkdir()
+    diagnosed(w.folder, diagnosed={"trials": ["t0001"], "adopted": [], "params": {}})
+    assert "adopt viscous_friction:v" in last(grounded("-C", w.folder, "status"))
+    written = (w.folder / "grounded.toml").read_text()
+    late = {"signal": "v", "finding": "late", "kind": "delay", "log": "delay_s = 0.02"}
+    found = DIAGNOSIS | {"preflight": [late | {"corrected": True, "delay_s": 0.02}]}
+    for name, now in (
+        ("v", 'path = "/csv.v"\nscale = 0.5'),
+        ("x", 'path = "/csv.y"'),
+        ("v", 'path = "/csv.v"\ndelay_s = 0.02'),
+    ):
+        changed = written.replace(f'path = "/csv.{name}"', now)
+        (w.folder / "grounded.toml").write_text(changed)
+        corrected = "delay_s" in now  # the diagnosis did that itself
+        if corrected:
+            diagnosed(w.folder, **found, diagnosed={"trials": ["t0001"]})
+        told = grounded("-C", w.folder, "status")
+        assert holds(told.out, "[log] was changed since", f"reads {name}") is not corrected
+        assert (" ingest hand.csv --data" in last(told)) is not corrected
+        assert ("adopt viscous_friction:v" in last(told)) is corrected
+    changed = written.replace('path = "/csv.v"', 'path = "/csv.v"\nscale = 0.5')
+    (w.folder / "grounded.toml").write_text(changed)
+    diagnosed(w.folder, diagnosed={"trials": ["t0001"], "adopted": [], "params": {}})
+    refused = grounded("-C", w.folder, "ingest", "--data", log)
+    assert refused.code == 1 and "discard" in refused.err.split("next:")[1]
+    assert last(grounded("-C", w.folder, "discard", "t0001")).endswith("ingest hand.csv --data")
+    assert last(grounded("-C", w.folder, "status")).endswith("ingest hand.csv --data")
+    assert last(grounded("-C", w.folder, "ingest", "--data", log)).endswith("diagnose")
+    assert last(grounded("-C", w.folder, "status")).endswith("diagnose")
+
+
+def test_without_the_effects_of_its_diagnosis_a_model_is_diagnosed_before_it_plans(tmp_path):
+    """After `adopt --undo` and another model.py a plan with the crude model was to be run."""
+    folder = make(tmp_path / "w").folder
+    assert grounded("-C", folder, "learn", "--trials", 2).code == 0
+    for name in ("reports", "candidates"):
+        (folder / name).mkdir(exist_ok=True)
+    effect = {"name": "viscous_friction:v", "k": 0.1}
+    made = {"trials": ["t0001", "t0002"], "adopted": [effect], "params": {}}
+    diagnosed(folder, diagnosed=made)
+    assert last(grounded("-C", folder, "status")) == "grounded diagnose"
+    none = {"kind": "none", "effects": [], "sentence": "None."}
+    diagnosed(folder, diagnosed=made, verdict=none, ranking=[])
+    assert last(grounded("-C", folder, "status")) == "grounded propose"
+    diagnosed(folder, diagnosed=made)
+    set_in_model(folder / "grounded.toml", effects=[effect | {"k": 0.2}])
+    assert last(grounded("-C", folder, "status")) == "grounded propose"
+
+
+def test_a_look_at_the_instruments_ends_with_what_is_next(cart, tmp_path):
+    done = grounded("-C", copied(cart, tmp_path / "w"), "diagnose", "--instruments")
+    assert last(done) == "grounded adopt viscous_friction:v"
+
+
 def test_what_differs_between_two_robots_is_not_adopted(cart, tmp_path):
     w = Workspace(copied(cart, tmp_path / "w"))
     both = ["t0001", "t0002"]

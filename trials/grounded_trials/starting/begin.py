@@ -386,7 +386,7 @@ def _recorded(
 
     The run begins where `ingest --data` lets it begin, by which `logged_target` knows it again.
     """
-    from grounded_trials.workspace.intake.foreign import rates_of  # slow
+    from grounded_trials.workspace.intake.opening.foreign import rates_of  # slow
 
     here = Folder(folder)
     measured = [guess.name for guess in states if guess.path]

@@ -1,26 +1,24 @@
 """Set trials aside, and choose the command to type next.
 
-A log in a wrong unit is ingested again once [log] is corrected; after a run the search says what is
+A log in a wrong unit is ingested again once [log] is corrected, or if it was; after a run the search says what is
 next, usually to run its candidate again.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
 from grounded.trial import interpolate_gaps
-from grounded_trials.logs.log_files import log_files
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.candidates.proposing import status_of
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.read_before import again, read_otherwise
 from grounded_trials.workspace.unknown_id import unknown_trial
 
 STATUS = NextCommand("status")
@@ -83,20 +81,9 @@ def _instead(workspace: Folder, name: str) -> NextCommand | None:
     trial, meta, _ = read_trial(workspace.store.read(stored), stored.path.name)
     if not workspace.fits(trial):
         return None
-    faults = log_faults(workspace, interpolate_gaps(trial).trial) if "source" in meta else ()
-    if any(one.mend for one in faults):
-        what = ("--candidate", trial.candidate) if trial.candidate else ("--data",)
-        return NextCommand("ingest", (_found(workspace, meta), *what))
+    if "source" in meta:
+        faults = log_faults(workspace, interpolate_gaps(trial).trial)
+        mended = read_otherwise(meta, workspace.log_mapping)
+        if mended or any(one.mend for one in faults):
+            return again(workspace, meta, trial.candidate)
     return status_of(workspace, standing_in(workspace)).then if trial.candidate else None
-
-
-def _found(workspace: Folder, meta: Mapping[str, str]) -> str:
-    """Return the path of a trial's log if it is in or beside a folder in use, else LOG."""
-    from grounded_trials.workspace.intake.opening.foreign import hashed
-
-    name, home = Path(meta["source"]).name, workspace.folder.resolve()
-    for folder in (Path.cwd(), home, home.parent):
-        with suppress(GroundedError, OSError, ValueError):  # its name may be none
-            if hashed(log_files(folder / name)) == meta.get("source_sha256"):
-                return os.path.relpath(folder / name)
-    return "LOG"

@@ -192,13 +192,13 @@ class Folder:
         found = {one.id: self.noted.why_aside(one) for one in entries}
         return {name: why for name, why in found.items() if why is not None}
 
-    def aside_trials(self) -> Iterator[Trial]:
+    def aside_trials(self) -> Iterator[StoredTrial]:
         """Yield the trials that are set aside and not damaged, with short gaps bridged."""
         aside = self.discarded()
         for stored in self.store.list() if aside else ():
             if stored.id in aside:
                 with suppress(GroundedError):
-                    yield self._whole(stored).trial
+                    yield self._whole(stored)
 
     def fits(self, trial: Trial) -> bool:
         """Return whether a trial has this model's states and inputs, and this task's dt."""

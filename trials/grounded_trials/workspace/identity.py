@@ -28,7 +28,7 @@ from grounded_trials.store.store import Damaged, Store, Stored
 ROWS = "rows_s"  # time between rows of a table that repeats commands
 ESTIMATED_WITH = "estimated_with"  # adopted effects of the model that estimated its speeds
 LASTED = "source_seconds"  # duration of the log
-READ_BY = "read_by"  # keys of [log] that changed its signals
+READ_BY = "read_by"  # how [log] read its signals
 # a candidate's metadata, in the order of the file
 _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "id": str,

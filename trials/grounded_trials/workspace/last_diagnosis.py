@@ -16,8 +16,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.result import listed
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.store.store import made_folder
+from grounded_trials.workspace.read_before import changed_since
 from grounded_trials.workspace.unknown_id import named_trials
 
 if TYPE_CHECKING:
@@ -104,6 +106,7 @@ class Since:
     adopted: tuple[str, ...] = ()  # effects that are part of the model now, claimed ones first
     missing: tuple[str, ...] = ()  # claimed effects that are not, if others are
     changed: bool = False  # the diagnosis was made with another model
+    reread: tuple[str, ...] = ()  # signals that [log] reads in another way now
     further: bool = False  # it left more to be found than it was allowed to claim
 
     @property
@@ -120,6 +123,8 @@ class Since:
     def sentence(self) -> str:
         """Why the diagnosis is outdated; "" if it is not."""
         parts = []
+        if self.reread:
+            parts.append(f"[log] was changed since: it reads {listed(self.reread)} in another way")
         if self.newer:
             parts.append(f"diagnosed with {self.used} of {self.usable} trials")
         if self.adopted:
@@ -164,6 +169,7 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
         adopted=adopted,
         missing=missing if adopted else (),
         changed=not same or params not in (None, dict(model.params)),
+        reread=changed_since(workspace, diagnosis, usable),
         further=diagnosis.verdict.look_for > 0 or diagnosis.verdict.again,
     )
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from grounded.errors import NextCommand
+from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import whole_number
 from grounded.result import Result
 from grounded.search.candidate import Candidate
@@ -96,7 +96,12 @@ def next_in(workspace: Folder, log: Path, candidate: str | None, *, runner: bool
 
     Nothing is proposed from a log that should be discarded.
     """
-    taken = ingest_log(workspace, log, candidate)
+    try:
+        taken = ingest_log(workspace, log, candidate)
+    except GroundedError as error:
+        if error.then and error.then.verb == "ingest" and "--data" not in error.then.arguments:
+            error.then = NextCommand("next", error.then.arguments)
+        raise
     workspace.forget()
     if taken.then.verb == "discard":
         return NextRun(taken, None, None)

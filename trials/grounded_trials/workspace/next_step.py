@@ -27,6 +27,7 @@ from grounded_trials.workspace.last_diagnosis import (
     usable_ids,
 )
 from grounded_trials.workspace.off_target import logged_target
+from grounded_trials.workspace.read_before import changed_since, last_again
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
@@ -98,12 +99,23 @@ def _follows(
         return then or (DIAGNOSE if teach else PROPOSE)
     if now.phase == "propose":
         logs = follow is not None and not now.history
-        return DIAGNOSE if logs or doubted(now, since, usable) else PROPOSE
+        due = logs or _of_another_model(workspace, diagnosis, since)
+        return DIAGNOSE if due or doubted(now, since, usable) else PROPOSE
     if not since.settled and not _came_true(workspace, now, diagnosis):
         return DIAGNOSE
     if now.ending == "too doubtful" and now.incumbent and len(now.incumbent.trials) < AGAIN:
         return to_run(workspace, now.incumbent.candidate.id, "best")
     return another_trial(workspace, now) if diagnosis.no_cause else EXPORT
+
+
+def _of_another_model(workspace: Folder, diagnosis: Diagnosis, since: Since) -> bool:
+    """Return whether a gap was found in another model, of which nothing is adopted any more.
+
+    That is so after `adopt --undo`, which often precedes a better model.py.
+    """
+    model = workspace.config.model
+    kept = model.effects or model.params
+    return since.changed and not kept and since.usable > 0 and diagnosis.kind != "none"
 
 
 def _came_true(workspace: Folder, now: Standing, diagnosis: Diagnosis) -> bool:
@@ -226,8 +238,11 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     """Return the command that acts on the claims of a diagnosis, or None if there is none.
 
     Filters and delays of sensors are adopted too if states are fed back: feedback gains designed
-    without them make the robot oscillate.
+    without them make the robot oscillate. Nothing is adopted if [log] reads the trials in another
+    way now, or if they were all set aside: then their log is ingested again.
     """
+    if (first := _to_read_again(workspace, diagnosis)) is not None:
+        return first
     from grounded.diagnosis.cause_words import sign_only
     from grounded.diagnosis.error_report import gain
 
@@ -255,6 +270,19 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
         if gain(diagnosis.prediction_error, "crude", "with_effects") <= 0:
             return NextCommand("adopt", late) if late else None
     return NextCommand("adopt", (*new, *late))
+
+
+def _to_read_again(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
+    """Return the command to type before the claims of a diagnosis are adopted, or None."""
+    seen, usable = {*made_from(diagnosis).trials}, usable_ids(workspace)
+    if seen and seen.isdisjoint(usable):
+        if usable:
+            return DIAGNOSE
+        aside = [one for one in workspace.aside_trials() if one.stored.id in seen]
+        return last_again(workspace, aside)
+    if not changed_since(workspace, diagnosis, usable):
+        return None
+    return last_again(workspace, [one for one in workspace.trials() if one.stored.id in usable])
 
 
 def not_adopted(workspace: Folder, diagnosis: Diagnosis | None) -> str:

@@ -296,7 +296,7 @@ def logged_target(workspace: Folder) -> str:
         return ""
     task = workspace.task
     asked = np.isfinite(task.target).any(axis=0)
-    for trial in (*(one.trial for one in workspace.whole_trials()), *workspace.aside_trials()):
+    for trial in (one.trial for one in (*workspace.whole_trials(), *workspace.aside_trials())):
         rows = len(task.target)
         if trial.candidate or trial.steps + 1 < rows or not workspace.fits(trial):
             continue

@@ -18,24 +18,12 @@ from grounded.instruments.finding import AS_LATE, Finding, late_effects
 from grounded.places import heading, position
 from grounded.result import listed
 from grounded_trials.workspace.identity import READ_BY
+from grounded_trials.workspace.read_before import PLAIN
 from grounded_trials.workspace.user_files.task_file import seen_in
 
 if TYPE_CHECKING:
     from grounded.trial import Trial
-    from grounded_trials.logs.log_table import LogMapping
     from grounded_trials.workspace.folder import Folder
-
-PLAIN = {"scale": 1.0, "offset": 0.0, "delay_s": 0.0}  # keys of a signal that is read unchanged
-
-
-def read_by(mapping: LogMapping) -> dict[str, str]:
-    """Return the metadata of a trial with the keys of [log] that changed its signals, or {}."""
-    found = {}
-    for name, spec in {**mapping.states, **mapping.inputs}.items():
-        keys = {key: float(getattr(spec, key)) for key in PLAIN}
-        if changed := {key: value for key, value in keys.items() if value != PLAIN[key]}:
-            found[name] = changed
-    return {READ_BY: json.dumps(found)} if found else {}
 
 
 def where_to_mend(

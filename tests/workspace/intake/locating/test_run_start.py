@@ -10,12 +10,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from grounded.search.sample_age import sample_age
 
 from cli import grounded
 from facts import holding, holds
 from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
-from grounded.search.sample_age import sample_age
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.store.trial_file import read_trial, write_trial
@@ -442,6 +442,11 @@ def test_a_run_in_other_units_says_so_and_a_name_that_is_none_is_answered(tmp_pa
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
     assert holds(str(refused.value), *said)
+    assert refused.value.then.arguments[0] == str(path)  # once that is mended
+    with pytest.raises(GroundedError) as refused:
+        w.next(path)
+    own = "runner.action" in " ".join(said)  # in the program, not in the log
+    assert refused.value.then.verb == ("ingest" if own else "next")
     with pytest.raises(GroundedError, match="no candidate 'c0009'"):
         w.ingest(path, candidate="c0009")
 

@@ -24,19 +24,18 @@ from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signa
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.samples import MIXED_S
 from grounded_trials.logs.signals import Series, read_signals
-from grounded_trials.store.store import hash_file
 from grounded_trials.wording import count
 from grounded_trials.workspace.adopted import but_late_sensors, planner_of
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, StoredTrial, sha256
+from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, StoredTrial
 from grounded_trials.workspace.intake.locating.run_start import Recording, recording
 from grounded_trials.workspace.intake.opening.estimating import (
     EstimateTable,
     read_estimate,
     with_estimates,
 )
+from grounded_trials.workspace.read_before import hashed, read_by
 from grounded_trials.workspace.user_files.config import FILE
-from grounded_trials.workspace.where_to_mend import read_by
 
 SLOWER = 1.5  # commands with intervals above this multiple of dt were sent on another grid
 FEW = 12  # largest number of a log's signals that a message lists
@@ -303,12 +302,6 @@ def _numbers(path: Path) -> str:
     """List the numbers in a log that change, if they are few; else ""."""
     found = [f.path for t in inspect_log(path).topics for f in t.fields if f.low != f.high]
     return f". {path.name} has {', '.join(found)}" if 0 < len(found) <= FEW else ""
-
-
-def hashed(files: Sequence[Path]) -> str:
-    """Return the SHA-256 of a log's file, or of the hashes if it has several files."""
-    hashes = [hash_file(file) for file in files]
-    return hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode())
 
 
 def rates_of(model: Model) -> tuple[str, ...]:

@@ -106,6 +106,7 @@ def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None)
     why, other = seen.why, seen.other
     fell, stored = look.fell, read.log.stored if read.log else ()
     task = workspace.task
+    again = NextCommand("ingest", (str(path) if read.log else "LOG",))  # LOG: of another run
     if accepted := [one.trial.steps for one in stored if one.trial.candidate == ran]:
         return cut_short(read, fell.steps, "") if fell and fell.steps in accepted else read
     units, by = other_units(task, whole, own, seen.ran)
@@ -116,7 +117,7 @@ def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None)
         units, by = odd_columns(task.model, own, whole, tried)
     if not why and not units:
         if candidate is None and log and (off := zero_in(log, task, own, whole, seen.ran)):
-            raise GroundedError(f"{path} ran {ran}, but {off}")
+            raise GroundedError(f"{path} ran {ran}, but {off}", again)
         told = _unfed(own, whole, seen.ran) or _like(read, ran, seen.ran)
         if fell:
             read = cut_short(read, fell.steps, fell.told)
@@ -153,9 +154,9 @@ def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None)
         if log and its and (how := misused_in(log, task, own)):
             raise _misused(path, own, how)
         other_unit = units_told(task, units, by, read.log is not None)
-        raise GroundedError(f"{path} ran {ran}, {other_unit}")
+        raise GroundedError(f"{path} ran {ran}, {other_unit}", again)
     if pace:
-        raise GroundedError(f"{path} ran {ran}, but {pace}")
+        raise GroundedError(f"{path} ran {ran}, but {pace}", again)
     if read.bare:
         raise GroundedError(
             f"{path} says that it ran {ran}, but contains no copy of it, and {why}. If it ran the "
@@ -180,7 +181,7 @@ def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None)
     if not named and not other and not seen.silent:
         named += filter(None, [misled(log, task, own)])
     if named:
-        raise GroundedError(f"{path} can't be read as a run of {ran}: {'; '.join(named)}")
+        raise GroundedError(f"{path} can't be read as a run of {ran}: {'; '.join(named)}", again)
     if log and not other and whole.inputs.any() and (how := misused_in(log, task, own)):
         raise _misused(path, own, how)
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
