@@ -1,7 +1,7 @@
 """Set trials aside, and choose the command to type next.
 
-A log in a wrong unit is ingested again once [log] is corrected, or if it was; after a run the search says what is
-next, usually to run its candidate again.
+The log of a trial is ingested again if [log] reads it in another way now, or should. After a run
+the search says what is next, usually to run its candidate again.
 """
 
 from __future__ import annotations
