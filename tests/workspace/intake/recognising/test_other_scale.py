@@ -178,4 +178,4 @@ def test_a_command_in_percent_of_its_limit_is_told(tmp_path, before, by, named):
     with pytest.raises(GroundedError) as refused:
         w.ingest(log)
     assert holds(str(refused.value), "ran c0001", "force", named, f"by {1 / by:g}", "[log]")
-    assert refused.value.then is None
+    assert refused.value.then.arguments == (str(log),)
