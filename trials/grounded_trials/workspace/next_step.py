@@ -274,15 +274,13 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
 
 def _to_read_again(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     """Return the command to type before the claims of a diagnosis are adopted, or None."""
-    seen, usable = {*made_from(diagnosis).trials}, usable_ids(workspace)
-    if seen and seen.isdisjoint(usable):
-        if usable:
-            return DIAGNOSE
-        aside = [one for one in workspace.aside_trials() if one.stored.id in seen]
-        return last_again(workspace, aside)
-    if not changed_since(workspace, diagnosis, usable):
-        return None
-    return last_again(workspace, [one for one in workspace.trials() if one.stored.id in usable])
+    seen, trials = {*made_from(diagnosis).trials}, workspace.whole_trials()
+    here = {one.stored.id for one in trials}
+    if seen and seen.isdisjoint(here):
+        aside = (one for one in workspace.aside_trials() if one.stored.id in seen)
+        return DIAGNOSE if here else last_again(workspace, [*aside])
+    changed = changed_since(workspace, diagnosis, here)
+    return last_again(workspace, trials) if changed else None
 
 
 def not_adopted(workspace: Folder, diagnosis: Diagnosis | None) -> str:

@@ -10,12 +10,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from grounded.search.sample_age import sample_age
 
 from cli import grounded
 from facts import holding, holds
 from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
+from grounded.search.feedback.sample_age import sample_age
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.store.trial_file import read_trial, write_trial
