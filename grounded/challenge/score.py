@@ -184,7 +184,8 @@ def judge(
         marks["detectable"] = known.evidence > DETECTABLE
         marks["distinguishable"] = known.evidence > max(known.rival, 0.0) + DETECTABLE
         marks["each_detectable"] = all(v > DETECTABLE for v in known.each.values())
-        marks["gap_ratio"] = diagnosis["gap"]["after"] / max(known.gap_after, 1e-9)
+        left = diagnosis["gap"]["after"]  # null for a case that was refused: all is left
+        marks["gap_ratio"] = np.inf if left is None else left / max(known.gap_after, 1e-9)
         marks["units_ratio"] = _ratio(diagnosis, known.errors)
     marks |= _values(label, diagnosis)
     return marks

@@ -1,6 +1,7 @@
 """The blind challenge on disk: nothing in a workspace says the answer, and seals hold."""
 
 import json
+import shutil
 
 import pytest
 from click.testing import CliRunner
@@ -9,10 +10,11 @@ from cli import grounded
 from facts import holding, holds
 from grounded.errors import GroundedError
 from grounded_cli.main import cli
-from grounded_trials.challenge import open_label, read_manifest, score_case
+from grounded_trials.challenge import diagnose_case, open_label, read_manifest, score_case
 from grounded_trials.store.documents import write_document
 from grounded_trials.store.store import Store
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.last_diagnosis import read_diagnosis
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +97,26 @@ def test_cases_are_run_and_scored_as_jobs_and_a_run_goes_on(tmp_path):
     row = scored["summary"]["none"]
     assert row["cases"] == 2 and row["cpu_s_mean"] == found["cpu_s"]["none-0001"]
     assert sum(row["verdicts"].values()) == 2
+
+
+def test_a_case_that_is_refused_counts_and_the_others_go_on(made, tmp_path, monkeypatch):
+    """An alarm of the instruments in one of 100 cases ended their run."""
+    folder, labels, document = made
+    name = document["cases"][0]
+    case = tmp_path / name
+    shutil.copytree(folder / name, case)
+
+    def refuse(*args, **kwargs):
+        raise GroundedError("the clocks of states and commands differ")
+
+    monkeypatch.setattr("grounded_trials.challenge.diagnose_in", refuse)
+    assert diagnose_case(str(tmp_path), name, ())["case"] == name
+    found = read_diagnosis(Folder(case).reports)
+    assert found is not None and found.verdict.kind == "unknown" and not found.effects
+    assert found.verdict.sentence == "refused: the clocks of states and commands differ"
+    entry = read_manifest(folder)[name]
+    mark = score_case(str(tmp_path), str(labels), name, entry)
+    assert mark["verdict"] == "unknown" and not mark["named"]
 
 
 def test_labels_inside_the_cases_are_refused(tmp_path):

@@ -9,7 +9,7 @@ import grounded as gr
 from facts import holds
 from grounded import Model, Param
 from grounded.errors import GroundedError
-from grounded.instruments.predictions.clocks import answers_early, judge_clocks
+from grounded.instruments.predictions.clocks import Early, answers_early, judge_clocks
 from grounded.trial import Trial
 
 
@@ -221,3 +221,19 @@ def test_short_runs_gaps_and_commands_that_never_change_tell_nothing():
     states = np.array(trial.states)
     states[100:200] = np.nan
     assert answers_early(craft(), replace(trial, states=states), range(4)) is not None
+
+
+@pytest.mark.parametrize(("odd", "gain", "told"), [(1, 1.2, False), (1, 2.0, True), (2, 1.2, True)])
+def test_one_swing_of_several_that_looks_early_is_not_the_clock(monkeypatch, odd, gain, told):
+    """A robot's logs have one clock: an arm that stuck in one of three was refused."""
+    model = cart()
+    trials = [driven(model, seed=seed) for seed in range(3)]
+    early = iter([Early(0.1, 0, 0.5, 0.2, gain)] * odd + [None] * 3)
+    monkeypatch.setattr(
+        "grounded.instruments.predictions.clocks.answers_early", lambda *_: next(early)
+    )
+    if told:
+        with pytest.raises(GroundedError, match="clocks"):
+            judge_clocks(model, trials)
+    else:
+        judge_clocks(model, trials)

@@ -29,6 +29,7 @@ from grounded_trials.store.trial_file import trial_bytes
 from grounded_trials.workspace.diagnosing import diagnose_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import FILE as DIAGNOSIS
+from grounded_trials.workspace.last_diagnosis import write_diagnosis
 from grounded_trials.workspace.user_files.config import FILE
 from grounded_trials.workspace.user_files.task_file import write_target
 
@@ -229,9 +230,17 @@ def undiagnosed(folder: Path, *, again: bool = False) -> list[str]:
 
 
 def diagnose_case(folder: str, name: str, without: Sequence[str]) -> dict[str, Any]:
-    """Diagnose one case in its workspace (a job); return its name and CPU time [s]."""
-    begin = time.process_time()
-    diagnose_in(Folder(Path(folder) / name), without=without)
+    """Diagnose one case in its workspace (a job); return its name and CPU time [s].
+
+    A case whose logs are refused counts as unknown: nothing is named, and the others go on.
+    """
+    from grounded.diagnosis.report import Diagnosis, Verdict
+
+    begin, case = time.process_time(), Folder(Path(folder) / name)
+    try:
+        diagnose_in(case, without=without)
+    except GroundedError as error:
+        write_diagnosis(case.reports, Diagnosis(Verdict("unknown", sentence=f"refused: {error}")))
     return {"case": name, "cpu_s": time.process_time() - begin}
 
 

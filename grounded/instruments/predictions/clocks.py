@@ -39,6 +39,7 @@ CHORD_S = 0.5  # [s] chord over which distance is measured: noise lengthens shor
 LEAST_M = 1.0  # shorter distances (by positions or by the speed) are not compared
 PART = 0.25  # of a trial: the largest shift tried
 HINT, CLEAR = 0.5, 0.8  # [nats] least reduction of the errors: uncalibrated, calibrated
+SURELY = 1.6  # [nats] the same in fewer than half of the trials: all have one clock, mostly
 HALF = 0.5  # the error of at least one state must fall to this share
 LIKE = 4.0  # an input's gain must be within this factor of the model's
 LEADS = (0.1, 0.3)  # [s] lead times of commands extrapolated by their slope
@@ -55,12 +56,14 @@ class Early:
         state: the state whose prediction improves most with the later commands.
         logged: its rms error a quarter of a second ahead with the log as it is, in its unit.
         mended: the same with the later commands.
+        gain: by how much the later commands reduce all errors [nats].
     """
 
     seconds: float
     state: int
     logged: float
     mended: float
+    gain: float
 
 
 def judge_clocks(model: Model, trials: Sequence[Trial], hidden: Sequence[str] = ()) -> None:
@@ -77,6 +80,8 @@ def judge_clocks(model: Model, trials: Sequence[Trial], hidden: Sequence[str] = 
     shown = [i for i, name in enumerate(model.state_names) if name not in hidden]
     each = [answers_early(model, one, shown) for one in trials]
     found = {k: early for k, early in enumerate(each) if early}
+    few = 2 * len(found) < len(each)  # a swing that sticks may look like it once
+    found = {k: early for k, early in found.items() if not few or early.gain > SURELY}
     if not found:
         return
     early = found[first := min(found)]
@@ -150,7 +155,8 @@ def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | N
     if before.score - fits[k].score < CLEAR or parts.min() > HALF:
         return None
     state = min(seen, key=lambda i: float(parts[i]))
-    return Early(k * trial.dt, state, float(before.rms[state]), float(fits[k].rms[state]))
+    errors = float(before.rms[state]), float(fits[k].rms[state])
+    return Early(k * trial.dt, state, *errors, gain=before.score - fits[k].score)
 
 
 def _known(trial: Trial, shown: Sequence[int]) -> list[int]:
