@@ -140,7 +140,7 @@ def diagnose(
         )
     if not isinstance(options, DiagnosisOptions | None):
         raise GroundedError(f"options must be DiagnosisOptions(...), got a {type_of(options)}")
-    options, tick = options or DiagnosisOptions(), Stages(progress, USUAL)
+    options, tick = options or DiagnosisOptions(), Stages(progress, MOST)
     model = subject.model if isinstance(subject, Task) else subject
     if model.n + model.m > MOST_NAMES:
         raise GroundedError(
@@ -266,4 +266,4 @@ def _again(effect: Effect, known: float, data: Data) -> Effect:
 
 
 MOST_NAMES = 50  # 36 states and 12 inputs already give 1,649 effects, each of which is filtered
-USUAL = (120, 1000)  # progress ticks of most diagnoses: stages, and blocks of hypotheses refined
+MOST = 1000  # progress ticks that few diagnoses exceed: stages, and blocks of hypotheses refined

@@ -753,8 +753,8 @@ def test_after_an_unknown_verdict_a_search_that_has_ended_says_so(cart, tmp_path
     monkeypatch.setattr("grounded_trials.workspace.diagnosing._probe", lambda *_, **__: ("", ""))
     done, best = w.diagnose(), w.status().standing.incumbent
     assert done.then == EXPORT == w.status().then and best is not None
-    assert best.candidate.id in done.next_trial and "Run another." in done.next_trial
-    assert done.next_trial.endswith("Run another.")
+    assert best.candidate.id in done.next_trial and "run another." in done.next_trial
+    assert done.next_trial.endswith("run another.")
     kept = read_diagnosis(w.reports)
     assert kept is not None and kept.next_trial == "Run another."  # of the search nothing is kept
 
@@ -1050,7 +1050,7 @@ def test_a_gap_that_the_verdict_states_is_not_repeated_when_the_search_has_ended
     left = {"channel": "v", "error": 0.02, "floor": 0.01, "horizon_s": 1.0, "error_unit": "m/s"}
     told = Diagnosis.from_json({**DIAGNOSIS, "leftover": [left], "next_trial": "Run another."})
     assert told.leftover[0].sentence() not in nothing_to_do(told, "c0001")
-    assert nothing_to_do(told, "c0001").endswith("To learn more: Run another.")
+    assert nothing_to_do(told, "c0001").endswith("To learn more: run another.")
     errors = ({"v": 0.1}, {}, {"v": 0.3})  # of the crude model, calibrated, as diagnosed
     worse = RulerRow(1.0, False, {"v": "m/s"}, "trials", *errors)
     contested = replace(told, prediction_error=(worse,), next_trial="Adopt nothing yet.")

@@ -12,8 +12,8 @@ with k free values and N time steps. The second term applies to thresholds, freq
 that were scanned on a grid; the third to families that could have been blamed at many targets. A
 parameter of the model pays by its prior (standard deviation a fifth of its size) instead. A
 negative friction, which reduces the model's own, pays by the same prior in addition. Effects that
-cancel are rejected, as are implausible sizes: a gain that more than doubles in a trial, or a log
-twice too large (`Quantity.absurd`).
+cancel are rejected, as are implausible sizes: a gain that more than doubles in a trial, a log twice
+too large (`Quantity.absurd`), or a rate limit that no command in the log reaches.
 """
 
 from __future__ import annotations
@@ -187,6 +187,8 @@ def price(
         return math.inf
     if effect.family.name == "slew_limit" and values.get("r", math.inf) < _seen_rate(data, effect):
         return math.inf
+    if effect.family.name == "rate_limit" and values.get("r", 0.0) > _fastest(data, effect):
+        return math.inf
     numbers = len(effect.free) + sum(q.tuned for q in effect.quantities)
     cost = 0.5 * numbers * math.log(max(data.steps, 2)) + effect.family.vague
     cost += _of_less_friction(effect, values)
@@ -208,6 +210,17 @@ def _seen_rate(data: Data, effect: Effect) -> float:
     known = np.asarray(data.valid.T > 0)[steps - 1 :] & np.isfinite(moved)
     rates = np.abs(moved[known]) / (steps * data.dt)
     return float(TOO_SLOW * np.quantile(rates, OFTEN)) if len(rates) else 0.0
+
+
+def _fastest(data: Data, effect: Effect) -> float:
+    """Return the fastest change that a command of the log asks for, its largest step over dt.
+
+    A limit above it delays no command by a whole step: of a servo with a range of 0.7 rad and a dt
+    of 20 ms, one of 167 rad/s. What such a limit explains are details within the step.
+    """
+    own = [data.model.input_names.index(name) for name in effect.site.targets]
+    sent = np.concatenate([data.held[:, None], data.commands], axis=1)[..., own]
+    return float(np.nanmax(np.abs(np.diff(sent, axis=1)), initial=0.0) / data.dt)
 
 
 def cancelling(predictor: Predictor, h: Hypothesis) -> bool:

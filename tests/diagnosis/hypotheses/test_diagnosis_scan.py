@@ -64,10 +64,14 @@ def test_a_delay_of_a_hundredth_of_a_step_is_a_matter_of_time_stamps():
         ("input_gain:torque", {"g": 1.0}, {"g": 5.0}),
         ("viscous_friction:omega", {"k": 5.0}, {"k": 1.04e136}),
         ("coulomb_friction:omega", {"c": 5.0}, {"c": 81.0}),
+        ("rate_limit:torque", {"r": 0.9}, {"r": 1.2}),
     ],
 )
 def test_absurd_sizes_are_not_claimed(name, sound, absurd):
-    """Logs in degrees: the command got 494 % stronger every second, a log was 181 % too large."""
+    """Logs in degrees: the command got 494 % stronger every second, a log was 181 % too large.
+
+    A servo was limited to 167 rad/s, and no command changed faster than 35 rad/s.
+    """
     t = np.arange(60) * 0.05
     states = 2 * np.sin(0.05 * np.arange(61))[:, None] * [1.0, 1.0]
     trial = Trial(states, np.sin(t)[:, None], 0.05, ("theta", "omega"), ("torque",))
