@@ -122,7 +122,9 @@ class Candidate(Result):
         off = f"more than the whole cost of {self.base}" if self.likely_off > cost > 0 else off
         stop = ""
         if best and self.predicted_gain < LITTLE * abs(best.utility):
-            stop = f". You may stop here, with {best.candidate.id}, the best so far"
+            stop = (
+                f". Run it if runs are cheap, else stop with {best.candidate.id}, the best so far"
+            )
         may = "may well lose"
         if best and best.candidate.doubtful:  # it has won, so that such a likely error says less
             may = f"may lose, as was said of {best.candidate.id}, which won"

@@ -221,7 +221,7 @@ def beyond_one_trial(made: Candidate, best: Tried, repeats: int = 1) -> str:
     if not 0 < gain < least:
         return ""
     runs = runs_to_show(gain, best)
-    stop = f". You may stop here, with {own}" * (not made.doubtful)  # `Candidate.doubt` says it
+    stop = f". If that is too many, stop with {own}" * (not made.doubtful)  # else `doubt` says it
     return (
         f"{made.id} promises {gain:.2g} over {own}, less than its trial can show: the utilities of "
         f"single runs scatter by {best.deviation:.2g}, so a gain below {least:.2g} may be luck. To "

@@ -783,8 +783,8 @@ def test_trust_sets_the_promised_gain_against_the_last_misses(tmp_path):
     assert holds(said[2], *measured_alike(missed[:2], ""), f"{gain:.4g}")
     assert ("less than such an error" in " ".join(said[2].split())) == (gain < missed[1])
     little = gain < missed[1] and gain < 0.1 * abs(ran[1].utility)
-    assert holds(" ".join(said[2].split()), "stop here", "c0002") == little
-    assert "stop here" not in said[1]  # which promises all of the cost
+    assert holds(" ".join(said[2].split()), "else stop with c0002") == little
+    assert "stop with" not in said[1]  # which promises all of the cost
     made, best, task = ran[2].candidate, ran[1], Workspace(folder).task
     assert made.base == best.candidate.id and "model" not in _so_far(made, best, task)
     poor = replace(made, predicted_gain=made.predicted_gain - 2)  # a trial worse than its policy
@@ -799,7 +799,7 @@ def test_trust_sets_the_promised_gain_against_the_last_misses(tmp_path):
     few = replace(made, id="c9", likely_off=0.0, **few)
     for miss, may in ((0.4, True), (0.6, False)):  # a model that is far off tells no end
         off = replace(ran[1].candidate, predicted_utility=(1 + miss) * ran[1].utility)
-        assert ("stop here" in _came_true(few, [replace(ran[1], candidate=off)], now)) == may
+        assert ("stop with" in _came_true(few, [replace(ran[1], candidate=off)], now)) == may
 
 
 def ran_standing(folder, best):
@@ -811,11 +811,13 @@ def test_who_is_told_that_a_candidate_may_lose_is_told_where_to_stop(tmp_path, m
     grounded("-C", folder, "learn", "--trials", "1")
     monkeypatch.setattr(Candidate, "doubtful", property(lambda made: bool(made.base)))
     done = grounded("-C", folder, "propose")
-    assert "c0002 may well lose" in " ".join(done.err.split()) and "stop here" not in done.err
+    assert "c0002 may well lose" in " ".join(done.err.split()) and "stop with" not in done.err
     monkeypatch.setattr("grounded.search.candidate.LITTLE", 10.0)
     done = grounded("-C", folder, "propose")
-    assert holds(" ".join(done.err.split()), "c0002 may well lose", "stop here, with c0001")
-    assert "stop here" not in done.out and last(done) == "grounded run"
+    assert holds(
+        " ".join(done.err.split()), "c0002 may well lose", "if runs are cheap", "stop with c0001"
+    )
+    assert "stop with" not in done.out and last(done) == "grounded run"
 
 
 def test_an_adoption_in_vain_is_told_how_to_be_undone(tmp_path, monkeypatch):
