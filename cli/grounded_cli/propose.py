@@ -159,7 +159,7 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
     mean = task.utility(mean_trial(best.trials, task.model.angle_mask)) - sum(each) / len(each)
     reasons = (
         (start, f"runs that began off [task] start, by {listed(elsewhere.values())}"),
-        (mean, "noise in the runs, which it leaves out"),
+        (mean, "noise in the runs that it leaves out"),
     )
     parts = [(part, why) for part, why in reasons if abs(part) > told]
     rest = same - best.utility - sum(part for part, _ in parts)
@@ -167,7 +167,7 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
         within = abs(rest) <= LUCKY * best.standard_error
         parts.append((rest, "the scatter of the runs" if within else "its own error"))
     elif parts:
-        parts.append((rest, "noise or its own error, which one run can't tell apart"))
+        parts.append((rest, "noise or its own error (one run can't tell which)"))
     most = max((abs(part) for part, _ in parts), default=0.0)
     large = [(part, why) for part, why in parts if abs(part) > max(told, MINOR * most)]
     if len(large) == 1 and (large[0][0] > 0) == (same > best.utility):

@@ -492,6 +492,14 @@ def test_a_probe_tells_two_explanations_apart():
     assert not alone.little
     surely = probe(task, base, replace(found, indistinguishable=()), trials * 40)
     assert surely.little and surely.about == alone.about
+    sure = replace(
+        found.ranking[0],
+        params={"c": replace(found.ranking[0].params["c"], std=1e-5)},
+    )
+    known = replace(found, ranking=(sure, *found.ranking[1:]), indistinguishable=())
+    gap = replace(known, leftover=(Remainder("v", error=0.2, floor=0.1),))
+    assert "well known already" in probe(task, base, gap, trials).sentence  # and there is a gap
+    assert "well known already" not in probe(task, base, known, trials).sentence
     none = replace(found, verdict=replace(found.verdict, effects=()), parameters={})
     assert probe(task, base, replace(none, indistinguishable=()), trials) is None
 

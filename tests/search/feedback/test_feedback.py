@@ -244,8 +244,8 @@ def test_the_noise_of_a_filtered_speed_is_no_start_elsewhere():
             np.nan,
             (
                 "predicts -8.000: the -9.000 measured; -0.5000 for runs that began off",
-                "; +1.500 for noise or its own error, which one run",
-                "apart. Compare c0002 with that: it is 1.000 better",
+                "; +1.500 for noise or its own error (one run",
+                "which). Compare c0002 with that: it is 1.000 better",
             ),
             (),
         ),
