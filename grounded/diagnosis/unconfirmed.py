@@ -170,11 +170,13 @@ def _another_way(task: Task | None, trials: Sequence[Trial]) -> str:
     last, names = trials[-1], [*trials[-1].input_names]
     few = len(names) <= MENTIONED
     limits = []
-    for name in names if few and task is not None else ():
-        j = task.model.input_names.index(name)
-        if np.isfinite([task.low[j], task.high[j]]).all():
-            ends = f"{number(task.low[j])} to {number(task.high[j])}"
-            limits.append(with_unit(f"{name} from {ends}", task.model.inputs[name]))
+    if few and task is not None:
+        for (name, unit), low, high in zip(
+            task.model.inputs.items(), task.low, task.high, strict=True
+        ):
+            if np.isfinite([low, high]).all():
+                ends = f"{number(low)} to {number(high)}"
+                limits.append(with_unit(f"{name} from {ends}", unit))
     inside = f", inside [limits] ({'; '.join(limits)})" if limits else ", inside its limits"
     by_hand = next((trial.id for trial in reversed(trials) if not trial.candidate), "")
     who = f"drive it by hand, as in {by_hand}," if by_hand else "drive it by hand"
