@@ -12,8 +12,8 @@ with k free values and N time steps. The second term applies to thresholds, freq
 that were scanned on a grid; the third to families that could have been blamed at many targets. A
 parameter of the model pays by its prior (standard deviation a fifth of its size) instead. A
 negative friction, which reduces the model's own, pays by the same prior in addition. Effects that
-cancel are rejected, as are implausible sizes: a gain that more than doubles in a trial, a log twice
-too large (`Quantity.absurd`), or a rate limit that no command in the log reaches.
+cancel are rejected, as are implausible sizes: a gain that more than doubles in a trial, or a log
+twice too large (`Quantity.absurd`).
 """
 
 from __future__ import annotations
@@ -50,12 +50,15 @@ class FittedHypotheses:
         self._cancelling: dict[object, bool] = {}
         self.tempering = Tempering()
         self._prices: dict[tuple[object, ...], float] = {}
+        self.refused: set[str] = set()  # effects that are no cause, whatever their evidence
         self.fits: dict[tuple[Structure, float, tuple[str, ...]], Fitted] = {}
         families = [e.family.name for e in candidates]
         self.crowd = {e.name: families.count(e.family.name) for e in candidates}
 
     def price(self, effect: Effect, values: Mapping[str, float]) -> float:
         """Return the price of an effect at given values [nats]."""
+        if effect.name in self.refused:
+            return math.inf
         key = (effect.name, len(effect.free), *sorted(values.items()))
         if key not in self._prices:
             targets = self.crowd.get(effect.name, 1)
@@ -187,8 +190,6 @@ def price(
         return math.inf
     if effect.family.name == "slew_limit" and values.get("r", math.inf) < _seen_rate(data, effect):
         return math.inf
-    if effect.family.name == "rate_limit" and values.get("r", 0.0) > _fastest(data, effect):
-        return math.inf
     numbers = len(effect.free) + sum(q.tuned for q in effect.quantities)
     cost = 0.5 * numbers * math.log(max(data.steps, 2)) + effect.family.vague
     cost += _of_less_friction(effect, values)
@@ -212,15 +213,19 @@ def _seen_rate(data: Data, effect: Effect) -> float:
     return float(TOO_SLOW * np.quantile(rates, OFTEN)) if len(rates) else 0.0
 
 
-def _fastest(data: Data, effect: Effect) -> float:
-    """Return the fastest change that a command of the log asks for, its largest step over dt.
+def unreached(data: Data, h: Hypothesis) -> list[str]:
+    """Return the rate limits of a hypothesis that no command of the log reaches.
 
-    A limit above it delays no command by a whole step: of a servo with a range of 0.7 rad and a dt
-    of 20 ms, one of 167 rad/s. What such a limit explains are details within the step.
+    Such a limit is above the largest step of the command over dt, so it delays none by a whole
+    step: 167 rad/s, of a servo with a range of 0.7 rad and a dt of 20 ms. What it explains are
+    details within the step. It may stand for these while other effects are searched (refused at
+    once, the search ends elsewhere), but is no cause.
     """
-    own = [data.model.input_names.index(name) for name in effect.site.targets]
-    sent = np.concatenate([data.held[:, None], data.commands], axis=1)[..., own]
-    return float(np.nanmax(np.abs(np.diff(sent, axis=1)), initial=0.0) / data.dt)
+    sent = np.concatenate([data.held[:, None], data.commands], axis=1)
+    fastest = np.nanmax(np.abs(np.diff(sent, axis=1)), axis=(0, 1), initial=0.0) / data.dt
+    of = dict(zip(data.model.input_names, fastest.tolist(), strict=True))
+    limits = [(e, v) for e, v in h.pairs if e.family.name == "rate_limit"]
+    return [e.name for e, v in limits if v["r"] > max(of[name] for name in e.site.targets)]
 
 
 def cancelling(predictor: Predictor, h: Hypothesis) -> bool:
