@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.hypotheses.attribution import USUAL_EFFECTS, attribute, grown, so_far
-from grounded.diagnosis.hypotheses.explored import unreached
+from grounded.diagnosis.hypotheses.explored import no_limits
 from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data, prepare
 from grounded.diagnosis.likelihood.fitted import Fitted
@@ -252,7 +252,7 @@ def diagnose(
                 tick.beside = "one more effect; Ctrl-C keeps what was found"
                 tick("more effects")
                 before, best = best, grown(search, best, most)
-            while beyond := unreached(data, written.decision.fit.hypothesis):
+            while beyond := no_limits(data, written.decision.fit.hypothesis):
                 search.refused.update(beyond)
                 written = writer_of(search.chosen(most))
         except KeyboardInterrupt:

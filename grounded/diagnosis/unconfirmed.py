@@ -19,7 +19,7 @@ import numpy as np
 
 from grounded.diagnosis.cause_words import meaning
 from grounded.diagnosis.error_report import RulerRow
-from grounded.diagnosis.hypotheses.explored import CLAIM, unreached
+from grounded.diagnosis.hypotheses.explored import CLAIM, no_limits
 from grounded.diagnosis.next_trial import LOG, LOST
 from grounded.diagnosis.report import Ranked, Unconfirmed
 from grounded.diagnosis.validation.claims import Claims
@@ -55,7 +55,7 @@ def unconfirmed(
         return ()
     tied = {name for group in groups for name in group}
     left = [one for one in doubtful if one.name not in tied]
-    left = [one for one in left if one.name not in unreached(claims.data, one.fit.hypothesis)]
+    left = [one for one in left if one.name not in no_limits(claims.data, one.fit.hypothesis)]
     found = [_seen(claims, one) for one in left if row is None or not _trifling(claims, one, row)]
     return tuple([one for one in found if one is not None][:MENTIONED])
 

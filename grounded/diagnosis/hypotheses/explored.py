@@ -188,8 +188,6 @@ def price(
         return math.inf
     if any(abs(values.get(q.name, 0.0)) > q.absurd for q in effect.free):
         return math.inf
-    if effect.family.name == "slew_limit" and values.get("r", math.inf) < _seen_rate(data, effect):
-        return math.inf
     numbers = len(effect.free) + sum(q.tuned for q in effect.quantities)
     cost = 0.5 * numbers * math.log(max(data.steps, 2)) + effect.family.vague
     cost += _of_less_friction(effect, values)
@@ -213,19 +211,25 @@ def _seen_rate(data: Data, effect: Effect) -> float:
     return float(TOO_SLOW * np.quantile(rates, OFTEN)) if len(rates) else 0.0
 
 
-def unreached(data: Data, h: Hypothesis) -> list[str]:
-    """Return the rate limits of a hypothesis that no command of the log reaches.
+def no_limits(data: Data, h: Hypothesis) -> list[str]:
+    """Return the limits of rates in a hypothesis that the log refutes.
 
-    Such a limit is above the largest step of the command over dt, so it delays none by a whole
-    step: 167 rad/s, of a servo with a range of 0.7 rad and a dt of 20 ms. What it explains are
-    details within the step. It may stand for these while other effects are searched (refused at
-    once, the search ends elsewhere), but is no cause.
+    No command reaches a limit of an input's rate above the largest step of that command over dt:
+    167 rad/s, of a servo with a range of 0.7 rad and a dt of 20 ms. What it explains are details
+    within the step. And a state can't change faster than its limit. Both may stand for something
+    else while effects are sought (refused at once, the search ends elsewhere), but are no causes.
     """
     sent = np.concatenate([data.held[:, None], data.commands], axis=1)
     fastest = np.nanmax(np.abs(np.diff(sent, axis=1)), axis=(0, 1), initial=0.0) / data.dt
     of = dict(zip(data.model.input_names, fastest.tolist(), strict=True))
-    limits = [(e, v) for e, v in h.pairs if e.family.name == "rate_limit"]
-    return [e.name for e, v in limits if v["r"] > max(of[name] for name in e.site.targets)]
+    found = []
+    for effect, values in h.pairs:
+        kind = effect.family.name
+        if kind == "rate_limit" and values["r"] > max(of[name] for name in effect.site.targets):
+            found.append(effect.name)
+        if kind == "slew_limit" and values["r"] < _seen_rate(data, effect):
+            found.append(effect.name)
+    return found
 
 
 def cancelling(predictor: Predictor, h: Hypothesis) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.hypotheses.explored import CLAIM, TIE, parametric, unreached
+from grounded.diagnosis.hypotheses.explored import CLAIM, TIE, no_limits, parametric
 from grounded.diagnosis.hypotheses.lookalike import lookalikes, of_parameters, one_thing
 from grounded.diagnosis.hypotheses.one_clock import one_clock
 from grounded.diagnosis.hypotheses.stand_in import moving, swap, twins
@@ -102,7 +102,7 @@ class Claims:
         likely = (  # no absurd values
             f
             for f in others
-            if math.isfinite(self.whole.score(f)) and not unreached(self.data, f.hypothesis)
+            if math.isfinite(self.whole.score(f)) and not no_limits(self.data, f.hypothesis)
         )
         sized = (f for f in likely if has_size(f.hypothesis.effects[0], self.estimates(f)[0]))
         singles = list(islice(sized, max(RANKED - len(rows), 3)))
@@ -286,7 +286,7 @@ class Claims:
             # not if parameters that predictions refused make it likelier, or make all of it
             as_likely = abs(score(f) - score(self.best)) < TIE and score(f) > without + CLAIM
             needed = (h.spread > 0) == free or as_likely
-            beyond = other in unreached(self.data, h)
+            beyond = other in no_limits(self.data, h)
             if other not in (name, *found) and needed and not beyond and self._ties(name, other, f):
                 found[other] = f
         return list(found.items())[:2]

@@ -8,7 +8,7 @@ import pytest
 from grounded import Model, Param
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses import scan
-from grounded.diagnosis.hypotheses.explored import unreached
+from grounded.diagnosis.hypotheses.explored import no_limits
 from grounded.diagnosis.hypotheses.grid_points import between, elsewhere
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
@@ -65,7 +65,20 @@ def test_a_rate_that_no_command_asks_for_is_no_limit():
     data = prepare(pendulum, [trial, trial])
     effect = Library().effect("rate_limit:torque", pendulum, data.scales)
     for r, beyond in ((0.9, []), (1.2, [effect.name])):
-        assert unreached(data, Hypothesis().plus(effect, {"r": r})) == beyond
+        assert no_limits(data, Hypothesis().plus(effect, {"r": r})) == beyond
+
+
+def test_a_state_is_not_limited_below_the_rates_in_the_log():
+    """With two thrusters exchanged, a boat could not turn at all: a limit of 0, which was claimed."""
+    (name, *_) = (f"slew_limit:{t}" for t in Library().family("slew_limit").targets(car))
+    i = car.state_names.index(name.partition(":")[2])
+    states = np.zeros((61, car.n))
+    states[:, i] = 0.05 * np.arange(61)  # one unit a second
+    names = car.state_names, car.input_names
+    data = prepare(car, [Trial(states, np.zeros((60, car.m)), 0.05, *names)] * 2)
+    effect = Library().effect(name, car, data.scales)
+    for r, refuted in ((0.1, [name]), (1.1, [])):
+        assert no_limits(data, Hypothesis().plus(effect, {"r": r})) == refuted
 
 
 @pytest.mark.parametrize(("late", "claimed"), [(0.2, set()), (1.5, {"rate_limit:u"})])
