@@ -69,7 +69,7 @@ def test_a_rate_that_no_command_asks_for_is_no_limit():
 
 
 def test_a_state_is_not_limited_below_the_rates_in_the_log():
-    """With two thrusters exchanged, a boat could not turn at all: a limit of 0, which was claimed."""
+    """With two thrusters exchanged, a boat was told to be unable to turn: r = 0."""
     (name, *_) = (f"slew_limit:{t}" for t in Library().family("slew_limit").targets(car))
     i = car.state_names.index(name.partition(":")[2])
     states = np.zeros((61, car.n))
