@@ -68,19 +68,6 @@ def test_a_rate_that_no_command_asks_for_is_no_limit():
         assert no_limits(data, Hypothesis().plus(effect, {"r": r})) == beyond
 
 
-def test_a_state_is_not_limited_below_the_rates_in_the_log():
-    """With two thrusters exchanged, a boat was told to be unable to turn: r = 0."""
-    (name, *_) = (f"slew_limit:{t}" for t in Library().family("slew_limit").targets(car))
-    i = car.state_names.index(name.partition(":")[2])
-    states = np.zeros((61, car.n))
-    states[:, i] = 0.05 * np.arange(61)  # one unit a second
-    names = car.state_names, car.input_names
-    data = prepare(car, [Trial(states, np.zeros((60, car.m)), 0.05, *names)] * 2)
-    effect = Library().effect(name, car, data.scales)
-    for r, refuted in ((0.1, [name]), (1.1, [])):
-        assert no_limits(data, Hypothesis().plus(effect, {"r": r})) == refuted
-
-
 @pytest.mark.parametrize(("late", "claimed"), [(0.2, set()), (1.5, {"rate_limit:u"})])
 def test_what_is_late_within_a_step_is_no_rate_limit(late, claimed):
     """Of what a command of 1 loses by coming `late` steps late, a limit of 2.5 a step says as much.
