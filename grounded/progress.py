@@ -32,16 +32,16 @@ class Stages:
     """Reports each stage with the time taken and the time that is left, from the number of calls.
 
     The number of calls is known within wide limits only: it grows with the data, and whether a
-    diagnosis looks for one more effect depends on what the last one left. So the time left is told
-    as a range, and not at all after more calls than most computations take.
+    diagnosis looks for one more effect depends on what the last one left. So only the most time
+    that may be left is told, and none after more calls than most computations take.
 
     Args:
         tell: shows a line; None for no output.
-        usual: fewest and most calls of most computations of this kind.
+        most: the number of calls that few computations of this kind exceed.
     """
 
     tell: Callable[[str], None] | None
-    usual: tuple[int, int]
+    most: int
     began: float = field(default_factory=time.monotonic)
     count: int = 0
     so_far: str = "nothing was found yet"  # the result so far, for Ctrl-C
@@ -54,24 +54,13 @@ class Stages:
             return
         taken = time.monotonic() - self.began
         text = f"{stage}{f' ({self.beside})' * bool(self.beside)}, {duration(taken)} so far"
-        if SEEN < self.count <= self.usual[1]:  # beyond, nothing is known of what is left
-            least, most = (taken * (n / self.count - 1) for n in self.usual)
-            text += f", {_range(max(least, 0.0), most)} left"
+        if SEEN < self.count <= self.most:  # beyond, nothing is known of what is left
+            left = _round(taken * (self.most / self.count - 1))
+            text += f", up to about {duration(left).replace('.0 ', ' ')} left" * (left > 0)
         self.tell(text)
 
 
 SEEN = 10  # calls from which on the time left is told
-
-
-def _range(least: float, most: float) -> str:
-    """Format a range of durations: `about 10 s to 2 min`, `up to about 40 s`."""
-    low, high = (duration(_round(end)).replace(".0 ", " ") for end in (least, most))
-    if low == high or most < NOW:
-        return f"about {high}"
-    return f"up to about {high}" if least < NOW else f"about {low} to {high}"
-
-
-NOW = 1.0  # [s] durations below it are not told
 
 
 def _round(seconds: float) -> float:

@@ -129,7 +129,8 @@ def _otherwise(candidate: Candidate, best: Tried) -> bool:
 def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection[str] = ()) -> str:
     """Return the best one's utility and, if it differs clearly, what the model gives it and why.
 
-    The difference is split into three parts: the start (the model's own run starts at s_0, the real
+    Its gain is counted from what the model gives the best one, which therefore ends the text. The
+    difference is split into three parts: the start (the model's own run starts at s_0, the real
     ones elsewhere, if by more than their sensors show), the noise in the runs' mean (which the
     model replays: it costs less than they do, because their scatter is averaged out), and the rest,
     which is the model's own error if it exceeds the scatter of the runs, if that is known.
@@ -144,32 +145,36 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
     own = f"{text}. For {best.candidate.id} itself the model predicts {number(same)}"
     if same < ASTRAY * best.utility:
         return f"{own}, so it does not reproduce those runs"
+    gain, then = candidate.predicted_gain, ""
+    if candidate.promised_over(best) == gain:
+        more = f"{number(abs(gain))} {'better' if gain > 0 else 'worse'}"
+        then = f". Compare {candidate.id} with that: it is {more}"
     better = "better" if same > best.utility else "worse"
-    own += f", {number(abs(same - best.utility))} {better} than measured"
+    apart = f"{own}, {number(abs(same - best.utility))} {better} than measured"
     if not math.isfinite(candidate.base_as_run):
-        return own
+        return f"{apart}{then}"
     elsewhere = began_elsewhere(task, best.trials, best.candidate.predicted_states, estimated)
     start = same - candidate.base_as_run if elsewhere else 0.0
     each = [task.utility(trial) for trial in best.trials]
     mean = task.utility(mean_trial(best.trials, task.model.angle_mask)) - sum(each) / len(each)
     reasons = (
-        (start, f"because its runs began off [task] start, by {listed(elsewhere.values())}"),
-        (mean, "by noise in the runs, which the model leaves out"),
+        (start, f"runs that began off [task] start, by {listed(elsewhere.values())}"),
+        (mean, "noise in the runs that it leaves out"),
     )
     parts = [(part, why) for part, why in reasons if abs(part) > told]
     rest = same - best.utility - sum(part for part, _ in parts)
     if math.isfinite(best.standard_error):
         within = abs(rest) <= LUCKY * best.standard_error
-        why = "within the scatter of its runs" if within else "by the model's own error"
-        parts.append((rest, why))
+        parts.append((rest, "the scatter of the runs" if within else "its own error"))
     elif parts:
-        parts.append((rest, "by noise or by the model's error, which one run can't tell apart"))
+        parts.append((rest, "noise or its own error (one run can't tell which)"))
     most = max((abs(part) for part, _ in parts), default=0.0)
     large = [(part, why) for part, why in parts if abs(part) > max(told, MINOR * most)]
     if len(large) == 1 and (large[0][0] > 0) == (same > best.utility):
-        return f"{own}, {large[0][1]}"
-    said = "; ".join(f"{'+' * (part > 0)}{number(part)} {why}" for part, why in large)
-    return f"{own}: {said}" if said else own
+        return f"{apart}, which is {large[0][1]}{then}"
+    said = "; ".join(f"{'+' * (part > 0)}{number(part)} for {why}" for part, why in large)
+    added = f"{own}: the {number(best.utility)} measured; {said}"
+    return f"{added if said else apart}{then}"
 
 
 def noise_share(best: Tried) -> str:
@@ -342,7 +347,7 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     blind = missed[-1] > MISSED * abs(last[-1].utility)
     if blind or candidate.doubtful or not gain < LITTLE * abs(best.utility):  # a note may say it
         return doubt
-    return f"{doubt}: you may stop here, with {best.candidate.id}, the best so far"
+    return f"{doubt}: run it if runs are cheap, else stop with {best.candidate.id}, the best so far"
 
 
 def _measured(workspace: Workspace) -> str:

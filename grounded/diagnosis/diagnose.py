@@ -28,8 +28,10 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.hypotheses.attribution import USUAL_EFFECTS, attribute, grown, so_far
+from grounded.diagnosis.hypotheses.explored import no_limits
 from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data, prepare
+from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Diagnosis
@@ -140,7 +142,7 @@ def diagnose(
         )
     if not isinstance(options, DiagnosisOptions | None):
         raise GroundedError(f"options must be DiagnosisOptions(...), got a {type_of(options)}")
-    options, tick = options or DiagnosisOptions(), Stages(progress, USUAL)
+    options, tick = options or DiagnosisOptions(), Stages(progress, MOST)
     model = subject.model if isinstance(subject, Task) else subject
     if model.n + model.m > MOST_NAMES:
         raise GroundedError(
@@ -210,28 +212,31 @@ def diagnose(
     def found_so_far() -> str:
         return so_far(search, most, written.claims.names if written else None)
 
+    def writer_of(best: Fitted) -> Writer:
+        ruler = Ruler(search.predictor, options.origin)
+        decision = decide(search, best, ruler, most)
+        tick("leftover")
+        return Writer(
+            decision,
+            ruler,
+            known,
+            (*options.but, *options.delays),
+            options.horizon,
+            most,
+            tick,
+            task,
+            used,
+            first,
+            exact,
+            uncertain,
+        )
+
     here = interruptible(found_so_far)
     with np.errstate(all="ignore"), here, running(engine):
         try:
             while True:
                 tick("predict")
-                ruler = Ruler(search.predictor, options.origin)
-                decision = decide(search, best, ruler, most)
-                tick("leftover")
-                writer = Writer(
-                    decision,
-                    ruler,
-                    known,
-                    (*options.but, *options.delays),
-                    options.horizon,
-                    most,
-                    tick,
-                    task,
-                    used,
-                    first,
-                    exact,
-                    uncertain,
-                )
+                writer = writer_of(best)
                 if written and not writer.worth_more_than(written):
                     written.most = most  # one more was sought
                     # two effects may be needed for what neither predicts better alone
@@ -247,6 +252,9 @@ def diagnose(
                 tick.beside = "one more effect; Ctrl-C keeps what was found"
                 tick("more effects")
                 before, best = best, grown(search, best, most)
+            while beyond := no_limits(data, written.decision.fit.hypothesis):
+                search.refused.update(beyond)
+                written = writer_of(search.chosen(most))
         except KeyboardInterrupt:
             if written is None:
                 raise
@@ -266,4 +274,4 @@ def _again(effect: Effect, known: float, data: Data) -> Effect:
 
 
 MOST_NAMES = 50  # 36 states and 12 inputs already give 1,649 effects, each of which is filtered
-USUAL = (120, 1000)  # progress ticks of most diagnoses: stages, and blocks of hypotheses refined
+MOST = 1000  # progress ticks that few diagnoses exceed: stages, and blocks of hypotheses refined

@@ -48,6 +48,20 @@ class Region(Document):
         """The region with its unit: `v > 0.5 m/s`."""
         return with_unit(self.when, self.unit)
 
+    @property
+    def of_time(self) -> bool:
+        """Whether it is a part of the run's time, `t > 3.2`, to which no robot can go."""
+        return self.when.startswith("t ")
+
+    @property
+    def phrase(self) -> str:
+        """The region in a sentence: `where v > 0.5 m/s`, `after 3.2 s`, `in the first 3.2 s`."""
+        if not self.of_time:
+            return f"where {self.told}"
+        _, sign, level = self.when.split()
+        at = with_unit(level, self.unit)
+        return f"after {at}" if sign == ">" else f"in the first {at}"
+
 
 @dataclass(frozen=True, eq=False)
 class Parts(Document):
@@ -323,7 +337,7 @@ class Remainder(Document):
 
     def sentence(self) -> str:
         """Return it as one clause."""
-        where = "" if self.region is None else f", mostly where {self.region.told}"
+        where = "" if self.region is None else f", mostly {self.region.phrase}"
         if not math.isfinite(self.error):
             return f"{self.channel} is off by {number(self.size)} {self.unit} rms{where}"
         ahead, name = f"{number(self.horizon_s)} s ahead", self.channel

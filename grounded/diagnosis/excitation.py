@@ -21,7 +21,9 @@ The predicted `+-` is the one that the next diagnosis will state. That includes 
 trials, which does not trust a value determined by one trial alone (`intervals.foretold`). So if a
 second run would reduce it much further, the prediction is for two runs. If predictions miss by more
 than the noise, those of a new motion will, too, and J is reduced accordingly. States that no trial
-measured are not measured in the probe's run, either.
+measured are not measured in the probe's run, either. F and J are those of a linear model, and a
+limit is a kink: nothing better than a tenth of the present `+-` is promised. A value that is known
+to WELL is no reason for a probe while there is a gap without a cause, or an unconfirmed effect.
 
 The probe stays inside the limits of the inputs, and the runs of both hypotheses inside the task's
 safety limits.
@@ -61,6 +63,8 @@ ADAPTED = 12  # iterations in which a rival is fitted to a run
 TWICE = 0.8  # two runs are asked for if they leave less than this part of what one leaves of `+-`
 SETTLED = 4  # iterations in which the track of an unmeasured state is found
 TEACHES = 0.1  # smallest relative reduction of a value's `+-` for which a probe is advised
+MOST = 0.1  # smallest fraction of a value's `+-` that is promised
+WELL = 0.005  # `+-` relative to a value, below which it is well known
 LITTLE = 1e-6  # fraction of a value's information, and of its size, that counts as zero
 
 
@@ -177,21 +181,21 @@ def _teaching(
     """Find the probe that gives most information on claimed and calibrated values."""
     known, task = _calibrated(task, diagnosis)
     scales, h = _scales(task, trials), Hypothesis()
-    spreads: dict[str, tuple[float, str]] = {}  # by column: standard deviation, unit
+    spreads: dict[str, Estimate] = {}  # by column
     for name in (n for n in diagnosis.joining if not n.startswith("parameter:")):
         row, effect = diagnosis.ranked(name), _effect(library, name, task, diagnosis, scales)
         if row is None:
             return None
         h = h.plus(effect, row.values)
-        spreads |= {f"{q.name} of {name}": (row.params[q.name].std, q.unit) for q in effect.free}
+        spreads |= {f"{q.name} of {name}": row.params[q.name] for q in effect.free}
     noise, best = _Noise.of(task.model, diagnosis), None
     data = noise.data(task, trials)
     sizes = {data.model.param_names[i]: float(param_scale(data.model)[i]) for i in calibrated(data)}
     if known:
         h = replace(h, shift=np.zeros(data.model.system.k), spread=1.0)
-        stds = {n: known[n].std / s if n in known else 0.0 for n, s in sizes.items()}
-        spreads |= {n: (stds[n], data.model.params[n].unit) for n in sizes}
-    std = np.array([s if np.isfinite(s) else 0.0 for s, _ in spreads.values()])
+        spreads |= {n: known.get(n, Estimate(0.0, 0.0)) for n in sizes}
+    each = {name: e.std / sizes.get(name, 1.0) for name, e in spreads.items()}
+    std = np.array([s if np.isfinite(s) else 0.0 for s in each.values()])
     if not std.any():
         return None
     groups = _information(task, trials, h, noise)
@@ -218,19 +222,19 @@ def _teaching(
     if best is None:
         return None
     gain, chosen, words, J = best
-    before = foretold(groups, prior)
-    wider = np.median((std / (before * unit_of))[std > 0])  # than if the model were right
-    J = J / max(_misfit(diagnosis) / wider, 1.0) ** 2
-    once, twice = (foretold(np.concatenate([groups, *[J] * n]), prior) / before for n in (1, 2))
-    k = int(np.argmin(np.where(std > 0, twice, np.inf)))
+    once, twice = _left(groups, J, prior, std / unit_of, _misfit(diagnosis))
+    values = np.array([e.value / sizes.get(n, 1.0) for n, e in spreads.items()])
+    well = bool(diagnosis.leftover or diagnosis.unconfirmed) & (std < WELL * np.abs(values))
+    k = int(np.argmin(np.where((std > 0) & (~well | well[std > 0].all()), twice, np.inf)))
     again = bool(twice[k] < TWICE * once[k])
-    shrunk = twice[k] if again else once[k]
+    shrunk = max(float(twice[k] if again else once[k]), MOST)
     name = list(spreads)[k]
-    unit = f" {spreads[name][1]}" * (spreads[name][1] != "1")
-    now = float(std[k]) * sizes.get(name, 1.0)
-    then = now * float(shrunk)
-    little = False
-    tells = f"would determine {name} to +- {then:.2g}{unit} (now +- {now:.2g}{unit})"
+    of = data.model.params[name].unit if name in sizes else spreads[name].unit
+    unit = f" {of}" * (of not in ("", "1"))
+    now = float(spreads[name].std)
+    then, little = now * shrunk, False
+    about = "perhaps to about" if shrunk == MOST else "to"
+    tells = f"would determine {name} {about} +- {then:.2g}{unit} (now +- {now:.2g}{unit})"
     sentence = f"{words}{', run twice,' if again else ':'} {tells}"
     if diagnosis.motions == 1 < len(trials) and words != BASE:
         sentence = f"{words}: would show whether {name}, so far from one motion, holds in another"
@@ -243,7 +247,32 @@ def _teaching(
             f"known to {ends[0]} ({same})"
         )
         little = True
+    elif well[k]:
+        sentence = f"the value that a probe would tell most about, {name}, is well known already"
+        little = True
     return Probe(chosen, gain, (name,), sentence, little, then, 1 + again)
+
+
+def _left(groups: Array, J: Array, prior: Array, stated: Array, misfit: float) -> tuple[Array, ...]:
+    """Return what a run, and two, leave of the stated standard deviations, as fractions, (C,) each.
+
+    A value that one trial alone determines has no expected jackknife: without that trial nothing is
+    known of it. What was stated is less, and counts: of a limit that one of seven runs had reached,
+    a thousandth of its `+-` was promised to remain, and a third did.
+
+    Args:
+        groups: information of each trial so far (S, C, C).
+        J: that of the probe's run (1, C, C).
+        prior: information that no trial adds (C, C).
+        stated: standard deviations that the diagnosis states, (C,); 0 if it states none.
+        misfit: by how much predictions miss more than by noise.
+    """
+    told = stated > 0
+    before = np.where(told, np.minimum(foretold(groups, prior), stated), 1.0)
+    wider = float(np.median((stated / before)[told]))  # than if the model were right
+    J = J / max(misfit / wider, 1.0) ** 2
+    after = (foretold(np.concatenate([groups, *[J] * n]), prior) for n in (1, 2))
+    return tuple(np.minimum(std / before, 1.0) for std in after)
 
 
 def _misfit(diagnosis: Diagnosis) -> float:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from grounded.diagnosis.report import Unconfirmed
 from grounded.diagnosis.verdict import parameters_off, tied, told_apart
 from grounded.model import all_at_bounds
+from grounded.result import number
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.validation.claims import Claims
@@ -79,8 +80,12 @@ def next_trial(
         why = (unrepeatable or {}).get(one.trial)
         if why is None:
             return f"Repeat trial {one.trial}: few others show {one.effect}."
-        there = "" if one.region is None else f" that goes where {one.region.told}"
-        better = f"run a gentler one{there}" if why == LOST else f"record another one{there}"
+        better = "run a gentler one" if why == LOST else "record another one"
+        if one.region and one.region.of_time:
+            begin, end = number(one.start), number(one.end)
+            better += f" that moves as {one.trial} does from {begin} to {end} s"
+        elif one.region:
+            better += f" that goes {one.region.phrase}"
         return f"Trial {one.trial} shows {one.effect} best, but it {why}: {better}."
     if not claims.names and look:
         return look

@@ -136,7 +136,8 @@ class Unconfirmed(Document):
             made = f"{few} of {all_}" if few < all_ else f"all {all_}"
             rest = f"or anything else that repeats with the motion of {made} trials"
             return f"unconfirmed: {self.meaning}, {rest}"
-        where = "" if self.region is None else f", mostly where {self.region.told}"
+        place = self.region if self.region and not self.region.of_time else None
+        where = f", mostly {place.phrase}" if place else ""
         start, end = number(self.start), number(self.end)
         when = (
             f"trial {self.trial}, {f'{start} to {end}' if start != end else f'at {end}'} s{where}"

@@ -50,10 +50,16 @@ def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[lis
     for key in ("outset", "calibrated"):
         if not any(getattr(row, key) for row in ahead):
             del columns[key]
-    if ahead and not diagnosis.verdict.causes and all(r.with_effects == r.crude for r in ahead):
-        del columns["with_effects"]  # nothing was found: the same numbers once more
+    told_rows = (*ahead, *(whole if whole_trials or not ahead else ()))
+    pairs = [
+        [_cell(row, key, name) for key in ("crude", "with_effects")]
+        for row in told_rows
+        for name in row.unit_by_channel
+    ]
+    if not diagnosis.verdict.causes and all(now == then for now, then in pairs):
+        del columns["with_effects"]  # nothing is claimed: the same figures once more
     rows: list[Cells] = []
-    for row in (*ahead, *(whole if whole_trials or not ahead else ())):
+    for row in told_rows:
         when = "whole trial" if row.whole_trial else f"{row.horizon_s:.3g} s ahead"
         for name, unit in row.unit_by_channel.items():
             if math.isnan(row.crude.get(name, math.nan)):

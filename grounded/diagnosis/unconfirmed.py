@@ -19,7 +19,7 @@ import numpy as np
 
 from grounded.diagnosis.cause_words import meaning
 from grounded.diagnosis.error_report import RulerRow
-from grounded.diagnosis.hypotheses.explored import CLAIM
+from grounded.diagnosis.hypotheses.explored import CLAIM, no_limits
 from grounded.diagnosis.next_trial import LOG, LOST
 from grounded.diagnosis.report import Ranked, Unconfirmed
 from grounded.diagnosis.validation.claims import Claims
@@ -27,6 +27,7 @@ from grounded.diagnosis.validation.decide import Doubtful
 from grounded.diagnosis.validation.prediction_error import by_region
 from grounded.diagnosis.validation.visits import acting, few_trials
 from grounded.frozen import Array
+from grounded.result import listed, number, with_unit
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -54,6 +55,7 @@ def unconfirmed(
         return ()
     tied = {name for group in groups for name in group}
     left = [one for one in doubtful if one.name not in tied]
+    left = [one for one in left if one.name not in no_limits(claims.data, one.fit.hypothesis)]
     found = [_seen(claims, one) for one in left if row is None or not _trifling(claims, one, row)]
     return tuple([one for one in found if one is not None][:MENTIONED])
 
@@ -144,14 +146,15 @@ def another_look(
         task: the task of the candidates; None for bare trials.
         trials: the trials that were diagnosed.
         left: the channel whose error has no known cause.
-        when: the region that holds most of it; "" if none does.
+        when: where most of it is, as `Region.phrase`; "" if that is no place.
         noise: whether all of that error may be noise, so that it is not called a gap.
     """
     what = f"how much of what is left in {left} is noise" if noise else f"the gap in {left}"
     runs = Counter(trial.candidate or trial.inputs.tobytes() for trial in trials)
     if max(runs.values(), default=0) > 1:
-        where = f"spends more time where {when}" if when else f"moves {left} in another way"
-        return f"Run a trial that {where}, to investigate {what}."
+        where = f"spends more time {when}" if when else f"moves {left} in another way"
+        how = "" if when else f": {_another_way(task, trials)}"
+        return f"Run a trial that {where}, to investigate {what}{how}."
     why = f"to see {what}" if noise else f"to see whether {what} repeats"
     ran = [trial for trial in trials if trial.candidate] if task else []
     best = max(ran, key=task.utility, default=None) if task else None
@@ -161,6 +164,28 @@ def another_look(
             f"feedback: the same setpoints, from the same start), {why}."
         )
     return f"Run {best.candidate} twice more, {why}."
+
+
+def _another_way(task: Task | None, trials: Sequence[Trial]) -> str:
+    """Say how to move a robot as no trial did: by which commands, within which limits, by whom."""
+    last, names = trials[-1], [*trials[-1].input_names]
+    few = len(names) <= MENTIONED
+    limits = []
+    if few and task is not None:
+        for (name, unit), low, high in zip(
+            task.model.inputs.items(), task.low, task.high, strict=True
+        ):
+            if np.isfinite([low, high]).all():
+                ends = f"{number(low)} to {number(high)}"
+                limits.append(with_unit(f"{name} from {ends}", unit))
+    inside = f", inside [limits] ({'; '.join(limits)})" if limits else ", inside its limits"
+    by_hand = next((trial.id for trial in reversed(trials) if not trial.candidate), "")
+    who = f"drive it by hand, as in {by_hand}," if by_hand else "drive it by hand"
+    other = "; or draw another manoeuvre and run its candidates" if last.candidate else ""
+    return (
+        f"{who} with short steps of {listed(names) if few else 'every input'} of different sizes, "
+        f"both ways by turns, then with slow sweeps{inside}{other}"
+    )
 
 
 def _far(task: Task, trial: Trial, best: Trial | None) -> bool:

@@ -127,7 +127,8 @@ class Writer:
         off, region = open_noise(rows), None
         if remainder:
             off, region = remainder[0].channel, remainder[0].region
-        when = region.told if region and region.occupancy < HALF else ""
+        there = region is not None and region.occupancy < HALF and not region.of_time
+        when = region.phrase if region and there else ""
         noise = not remainder  # no gap is named then
         look = another_look(self.task, self.trials, off, when, noise=noise) if off else ""
         named = [row.effect for row in ranking if row.claimed]

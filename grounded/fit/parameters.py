@@ -98,7 +98,7 @@ def fit(
     if max(r.steps for r in records) < 3:
         raise GroundedError("a fit needs a trial of at least 3 steps")
     rng = np.random.default_rng(0) if rng is None else rng
-    held, tick = unknowns, Stages(progress, USUAL)
+    held, tick = unknowns, Stages(progress, MOST)
     with interruptible(lambda: tick.so_far), running(engine):
         while True:
             found = _fitted(model, records, measurement, unknowns, hold_out, horizon_s, rng, tick)
@@ -116,7 +116,7 @@ def _of(found: Fit, model: Model) -> Fit:
     return replace(found, model=model.with_values(values))
 
 
-USUAL = (3, 50)  # fewest and most rounds and scans of a fit
+MOST = 50  # rounds and scans of a fit that few exceed
 MOST_STATES = 50  # with twice as many, 200 steps take minutes
 
 

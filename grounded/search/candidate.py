@@ -122,7 +122,9 @@ class Candidate(Result):
         off = f"more than the whole cost of {self.base}" if self.likely_off > cost > 0 else off
         stop = ""
         if best and self.predicted_gain < LITTLE * abs(best.utility):
-            stop = f". You may stop here, with {best.candidate.id}, the best so far"
+            stop = (
+                f". Run it if runs are cheap, else stop with {best.candidate.id}, the best so far"
+            )
         may = "may well lose"
         if best and best.candidate.doubtful:  # it has won, so that such a likely error says less
             may = f"may lose, as was said of {best.candidate.id}, which won"
@@ -174,7 +176,8 @@ class Tried(Result):
     accepted: bool | None  # None: undecided, trials are missing
     in_doubt: bool = False  # undecided because the incumbent is to be run again
     pieces: Array | None = None  # (runs, PIECES) parts of the utilities, see `scatter`; of repeats
-    noise_cost: float = 0.0  # cost of sensor noise in its logs; of the best, and for `promised`
+    noise_cost: float = 0.0  # cost of sensor noise in its logs
+    noise_missed: float = 0.0  # the part of it that its prediction lacks, see `scatter`
     deviation: float = float("nan")  # standard deviation of a single run, from repeats (`scatter`)
     probability: float = float("nan")  # that it beats the best before it; NaN: nothing is repeated
     gone: tuple[str, ...] = ()  # trials that it was made from and that were discarded since
@@ -186,9 +189,8 @@ class Tried(Result):
 
     @property
     def promised(self) -> float:
-        """Predicted utility of its logs, including sensor noise (which a replayed trial has)."""
-        noise = 0.0 if self.candidate.grounded else self.noise_cost
-        return self.candidate.predicted_utility - noise
+        """Predicted utility of its logs, including all of the sensor noise that these contain."""
+        return self.candidate.predicted_utility - self.noise_missed
 
     @cached_property
     def standard_error(self) -> float:

@@ -19,6 +19,7 @@ from grounded.search.scatter import (
     by_pieces,
     by_states,
     noise_cost,
+    noise_missed,
     sensor_noise,
     with_errors,
 )
@@ -85,10 +86,8 @@ def judged(
                 tried = replace(tried, accepted=None, in_doubt=True)
         history.append(tried)
     best_one = incumbent and incumbent.candidate
-    asked = [t.candidate is best_one or not t.candidate.grounded for t in history]
     noise = sensor_noise(trials, task.model.n)
-    noisy = [_with_noise(task, t, noise) if a else t for a, t in zip(asked, history, strict=True)]
-    told = with_chances(with_errors(noisy))
+    told = with_chances(with_errors([_with_noise(task, tried, noise) for tried in history]))
     best = next((t for t in told if t.candidate is best_one), None)
     return told, best, iteration
 
@@ -97,7 +96,9 @@ def _with_noise(task: Task, tried: Tried, noise: Array) -> Tried:
     """Return the candidate with the mean cost of the noise in its logs; unchanged without logs."""
     if not tried.trials:
         return tried
-    return replace(tried, noise_cost=noise_cost(task, tried.candidate.policy, noise))
+    made = tried.candidate
+    cost, missed = noise_cost(task, made.policy, noise), noise_missed(task, made, noise)
+    return replace(tried, noise_cost=cost, noise_missed=missed)
 
 
 def _settled(tried: Tried) -> Tried:
@@ -221,7 +222,7 @@ def beyond_one_trial(made: Candidate, best: Tried, repeats: int = 1) -> str:
     if not 0 < gain < least:
         return ""
     runs = runs_to_show(gain, best)
-    stop = f". You may stop here, with {own}" * (not made.doubtful)  # `Candidate.doubt` says it
+    stop = f". If that is too many, stop with {own}" * (not made.doubtful)  # else `doubt` says it
     return (
         f"{made.id} promises {gain:.2g} over {own}, less than its trial can show: the utilities of "
         f"single runs scatter by {best.deviation:.2g}, so a gain below {least:.2g} may be luck. To "

@@ -15,8 +15,9 @@ Biometrics Bulletin 2, 1946), less nu, and at most PIECES - 1, so that many repe
 assumption that the parts are independent. This is a conjugate prior on the variance (Gelman et al.,
 *Bayesian Data Analysis*, 2013, section 2.6); Student's t has nu + mu degrees of freedom.
 
-Sensor noise also lowers every utility, since logged states are judged. A model that has seen no
-trial predicts a run without it (`noise_cost`).
+Sensor noise also lowers every utility, since logged states are judged (`noise_cost`). A model that
+has seen no trial predicts a run without it; one that replays the mean of a candidate's trials
+predicts a run with the noise of that mean, which is less than that of a log (`noise_missed`).
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ import numpy as np
 
 from grounded.frozen import Array, median, white_noise
 from grounded.policy import Policy
-from grounded.search.candidate import Tried
+from grounded.search.candidate import Candidate, Tried
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -143,6 +144,24 @@ def noise_cost(task: Task, policy: Policy, noise: Array) -> float:
     moved = policy.gain[:, :, : task.model.n] ** 2 @ noise**2  # (H, m): variances of inputs
     changes = moved + np.vstack([np.zeros_like(moved[:1]), moved[:-1]])
     return cost + float((moved @ reward.input + changes @ reward.input_change).sum())
+
+
+def noise_missed(task: Task, made: Candidate, noise: Array) -> float:
+    """Return how much of the cost of sensor noise in a log a candidate's prediction lacks; >= 0.
+
+    All of it, if the model that predicted it replays no trial. Otherwise the bias of that model
+    contains the noise of the trials that it replays, and the predicted run shows it: as much as a
+    log after a single run, of which nothing must be added twice, and 1 / sqrt(N) of it after N runs
+    whose mean is replayed. How much it shows is measured as in the logs, with the same estimate, as
+    a step may also have smoothed it.
+
+    Args:
+        task: its reward judges the log.
+        made: the candidate.
+        noise: standard deviations of the sensors' white noise, (n,), in the states' units.
+    """
+    shown = white_noise(made.predicted_states) if made.grounded else np.zeros_like(noise)
+    return noise_cost(task, made.policy, np.sqrt(np.maximum(noise**2 - shown**2, 0.0)))
 
 
 class Repeats:

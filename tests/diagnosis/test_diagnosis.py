@@ -451,7 +451,7 @@ def test_the_document_is_plain_json():
 
 
 @pytest.mark.slow
-def test_a_probe_tells_two_explanations_apart():
+def test_a_probe_tells_two_explanations_apart(monkeypatch):
     model, trials = pushed_cart(dead=0.1, steps=60, trials=3)
     H = 100
     task = Task(
@@ -492,6 +492,12 @@ def test_a_probe_tells_two_explanations_apart():
     assert not alone.little
     surely = probe(task, base, replace(found, indistinguishable=()), trials * 40)
     assert surely.little and surely.about == alone.about
+    monkeypatch.setattr("grounded.diagnosis.excitation.WELL", 1.0)
+    left = (Remainder("v", error=0.2, floor=0.1),)  # nothing else is to be known, beside a gap
+    for gap, told in ((left, True), ((), False)):
+        known = replace(found, indistinguishable=(), leftover=gap)
+        made = probe(task, base, known, trials)
+        assert ("well known already" in made.sentence) == told == made.little
     none = replace(found, verdict=replace(found.verdict, effects=()), parameters={})
     assert probe(task, base, replace(none, indistinguishable=()), trials) is None
 

@@ -203,6 +203,15 @@ def test_a_slow_plant_is_spoken_of_by_whole_trials():
     assert telling((whole,)) is None and telling(()) is None
 
 
+def test_the_same_figures_are_not_shown_twice():
+    """A boat's `now` and `as diagnosed` were the same to all digits shown: nothing was claimed."""
+    alike = row({"x": 0.02518153, "v": 0.5}, {"x": 0.02518557, "v": 0.5})
+    better = row({"x": 0.02518153, "v": 0.5}, {"x": 0.024, "v": 0.5})
+    for one, causes, columns in ((alike, (), 1), (better, (), 2), (alike, ("b",), 2)):
+        found = SimpleNamespace(prediction_error=(one,), verdict=SimpleNamespace(causes=causes))
+        assert len({"crude", "now", "as diagnosed"} & {*error_table(found)[1]}) == columns
+
+
 def test_nothing_is_said_where_nothing_lost_or_only_within_the_noise():
     assert worsened(()) == ""
     assert worsened((row({"x": 0.2}, {"x": 0.205}),)) == ""
@@ -282,6 +291,22 @@ def test_neither_a_crash_nor_a_log_by_hand_is_to_be_repeated():
     assert "gentler" in said[LOST] and "gentler" not in said[LOG]
 
 
+def test_no_robot_is_sent_to_a_place_in_time():
+    """`record another one that goes where t > 19.1 s`"""
+    late = Region("t > 19.1", unit="s")
+    seen = Unconfirmed("patch:v", "a patch", trial="t6", start=23.24, end=26.16, region=late)
+    for why in (LOG, LOST):
+        said = next_trial(_claims(), "", (), (seen,), (), {"t6": why})
+        assert "t >" not in said and holds(said, "t6 does from 23.2 to 26.2 s")
+    assert "19.1" not in seen.sentence()  # it tells its time already
+    left = Remainder("x", 0.1, "m/s", region=late)
+    assert "mostly after 19.1 s" in left.sentence()
+    early = replace(late, when="t < 2", unit="s").phrase
+    assert (
+        early == "in the first 2 s" and Region("|v| > 2", unit="m/s").phrase == "where |v| > 2 m/s"
+    )
+
+
 def test_headings_are_spoken_of_where_there_are_some():
     def advice(model):
         claims = _claims(data=SimpleNamespace(model=model))
@@ -341,8 +366,14 @@ def test_repeats_are_asked_for_where_there_are_none_as_they_can_be_made():
     single = [ran(1, "c0001"), ran(2, "c0002")]
     best = max(single, key=task.utility).candidate
     assert holds(another_look(task, single, "x"), f"Run {best} twice more", "gap in x")
-    twice = another_look(task, [*single, ran(3, "c0002")], "x", "|v| > 1")
+    three = [*single, ran(3, "c0002")]
+    twice = another_look(task, three, "x", "where |v| > 1")
     assert "twice" not in twice and holds(twice, "x", "|v| > 1")
+    # it asked to move x in another way, and a student asked how: by hand? which way? how far?
+    anyhow = another_look(task, three, "x")
+    assert holds(anyhow, "in another way", "by hand", "steps", "sweeps", "inside", "manoeuvre")
+    driven = another_look(task, [*three, ran(4, "")], "x")
+    assert holds(driven, "by hand, as in t4") and "manoeuvre" not in driven
     noise = another_look(task, single, "x", noise=True)  # no gap was named: it asked for `the gap`
     assert holds(noise, f"Run {best} twice more", "in x is noise") and "gap" not in noise
     by_hand = another_look(task, [ran(1, ""), ran(2, "")], "x")

@@ -91,6 +91,19 @@ def test_a_value_stays_as_sure_as_it_was_adopted_after_a_diagnosis_that_claims_n
     assert "k = 0.3" in plain(grounded("-C", adopted, "status").out)
 
 
+def test_a_part_of_what_was_adopted_that_may_be_zero_is_not_told(cart, tmp_path):
+    """`b = 0.034 +- 0.19` was `3.43 % higher at 1, its largest command in the log`."""
+    curve = {"a": {"value": 0.403, "std": 0.03, "unit": ""}, "b": {"value": 0.034, "std": 0.19}}
+    named = {"kind": "effect", "effects": ["input_curve:force"], "sentence": "It is curved."}
+    row = {"effect": "input_curve:force", "params": curve, "evidence": 90.0, "claimed": True}
+    folder = written(copied(cart, tmp_path / "w"), verdict=named, ranking=[row], parameters={})
+    assert grounded("-C", folder, "adopt", "input_curve:force").code == 0
+    [clause] = grounded("-C", folder, "report", "--html", "--json").json["adopted"]["clauses"]
+    assert "for positive commands than for negative" in clause and "near zero" not in clause
+    page = (folder / "reports" / "report.html").read_text()
+    assert "for positive commands" in page and "its largest command" not in page
+
+
 def test_a_parameter_that_stays_behind_is_told_and_no_gain_is_claimed(cart, tmp_path):
     """The effect was fitted beside a mass of 1.4 kg, which the trials do not tell."""
     lost = {"parameter": "mass", "verdict": "not identifiable"}

@@ -96,7 +96,7 @@ def promising(gain, utilities=(-1.2, -1.0), deviation=0.1, doubtful=False):
 def test_a_gain_that_a_trial_cannot_show_is_called_so_with_the_runs_it_takes():
     """A belt drive was promised 0.0019 where runs scatter by 0.0012."""
     found = beyond_one_trial(*promising(0.05))
-    assert holds(found, "c2", "0.05", "0.1", "0.2", "22 runs", "may stop")
+    assert holds(found, "c2", "0.05", "0.1", "0.2", "22 runs", "stop with c")
     assert runs_to_show(0.05, promising(0.05)[1]) == 22
     error = 0.1 * (2 / 22) ** 0.5  # of the difference of two means
     assert norm.cdf(0.05 / error) == pytest.approx(0.95, abs=0.01)
@@ -104,7 +104,7 @@ def test_a_gain_that_a_trial_cannot_show_is_called_so_with_the_runs_it_takes():
     made, best = promising(0.05)
     made.base = "c0"  # it was made before that best one, or is that one
     assert beyond_one_trial(made, best) == ""
-    assert "may stop" not in beyond_one_trial(*promising(0.05, doubtful=True))  # `doubt` says it
+    assert "stop with" not in beyond_one_trial(*promising(0.05, doubtful=True))  # `doubt` says it
 
 
 @pytest.mark.parametrize("deviation", [np.nan, 0.0])

@@ -117,6 +117,30 @@ def test_what_noise_in_a_log_costs_is_no_doubt_in_the_model():
     assert min(each) < more.noise_cost < max(each)
 
 
+def test_noise_that_a_prediction_replays_is_not_added_to_it_again():
+    """A ball's later plans were told without the 0.038 of noise of every log: a miss of the model.
+
+    The mean of four runs has a quarter of what each costs by noise; a single one has all of it.
+    """
+    task, size = cart_task(), {"x": 0.02, "v": 0.02}
+    noisy = Plant(other(task.model), noise=Noise(measurement=size))
+    for repeats, shares in ((1, (0.0, 0.1)), (4, (0.6, 0.9))):
+        options = SearchOptions(repeats=repeats)
+        first = propose(task, [], [], options).candidate
+        runs = [drive(task, noisy, first, 100 + seed) for seed in range(repeats)]
+        made = propose(task, [first], runs, options, identity="c0002").candidate
+        assert made.grounded
+        more = [drive(task, noisy, made, 1000 + seed) for seed in range(20)]
+        own = [replace(run, candidate="c0002", id=f"r{k}") for k, run in enumerate(more)]
+        now = standing(task, [first, made], [*runs, *own], SearchOptions(), made.model)
+        told = now.history[-1]
+        assert shares[0] <= told.noise_missed / told.noise_cost < shares[1]
+        assert told.promised == made.predicted_utility - told.noise_missed
+    missed = made.predicted_utility - told.utility
+    assert missed > 0.2 * -told.utility  # four logs of 41 rows tell the noise to a third or so
+    assert abs(told.promised - told.utility) < 0.6 * missed
+
+
 def test_a_notebook_shows_the_candidates_and_the_phase():
     """It showed the keys of the JSON document under the title "Standing"."""
     task = cart_task()

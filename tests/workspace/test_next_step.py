@@ -753,8 +753,8 @@ def test_after_an_unknown_verdict_a_search_that_has_ended_says_so(cart, tmp_path
     monkeypatch.setattr("grounded_trials.workspace.diagnosing._probe", lambda *_, **__: ("", ""))
     done, best = w.diagnose(), w.status().standing.incumbent
     assert done.then == EXPORT == w.status().then and best is not None
-    assert best.candidate.id in done.next_trial and "Run another." in done.next_trial
-    assert done.next_trial.endswith("Run another.")
+    assert best.candidate.id in done.next_trial and "run another." in done.next_trial
+    assert done.next_trial.endswith("run another.")
     kept = read_diagnosis(w.reports)
     assert kept is not None and kept.next_trial == "Run another."  # of the search nothing is kept
 
@@ -783,8 +783,8 @@ def test_trust_sets_the_promised_gain_against_the_last_misses(tmp_path):
     assert holds(said[2], *measured_alike(missed[:2], ""), f"{gain:.4g}")
     assert ("less than such an error" in " ".join(said[2].split())) == (gain < missed[1])
     little = gain < missed[1] and gain < 0.1 * abs(ran[1].utility)
-    assert holds(" ".join(said[2].split()), "stop here", "c0002") == little
-    assert "stop here" not in said[1]  # which promises all of the cost
+    assert holds(" ".join(said[2].split()), "else stop with c0002") == little
+    assert "stop with" not in said[1]  # which promises all of the cost
     made, best, task = ran[2].candidate, ran[1], Workspace(folder).task
     assert made.base == best.candidate.id and "model" not in _so_far(made, best, task)
     poor = replace(made, predicted_gain=made.predicted_gain - 2)  # a trial worse than its policy
@@ -799,7 +799,7 @@ def test_trust_sets_the_promised_gain_against_the_last_misses(tmp_path):
     few = replace(made, id="c9", likely_off=0.0, **few)
     for miss, may in ((0.4, True), (0.6, False)):  # a model that is far off tells no end
         off = replace(ran[1].candidate, predicted_utility=(1 + miss) * ran[1].utility)
-        assert ("stop here" in _came_true(few, [replace(ran[1], candidate=off)], now)) == may
+        assert ("stop with" in _came_true(few, [replace(ran[1], candidate=off)], now)) == may
 
 
 def ran_standing(folder, best):
@@ -811,11 +811,13 @@ def test_who_is_told_that_a_candidate_may_lose_is_told_where_to_stop(tmp_path, m
     grounded("-C", folder, "learn", "--trials", "1")
     monkeypatch.setattr(Candidate, "doubtful", property(lambda made: bool(made.base)))
     done = grounded("-C", folder, "propose")
-    assert "c0002 may well lose" in " ".join(done.err.split()) and "stop here" not in done.err
+    assert "c0002 may well lose" in " ".join(done.err.split()) and "stop with" not in done.err
     monkeypatch.setattr("grounded.search.candidate.LITTLE", 10.0)
     done = grounded("-C", folder, "propose")
-    assert holds(" ".join(done.err.split()), "c0002 may well lose", "stop here, with c0001")
-    assert "stop here" not in done.out and last(done) == "grounded run"
+    assert holds(
+        " ".join(done.err.split()), "c0002 may well lose", "if runs are cheap", "stop with c0001"
+    )
+    assert "stop with" not in done.out and last(done) == "grounded run"
 
 
 def test_an_adoption_in_vain_is_told_how_to_be_undone(tmp_path, monkeypatch):
@@ -1050,7 +1052,7 @@ def test_a_gap_that_the_verdict_states_is_not_repeated_when_the_search_has_ended
     left = {"channel": "v", "error": 0.02, "floor": 0.01, "horizon_s": 1.0, "error_unit": "m/s"}
     told = Diagnosis.from_json({**DIAGNOSIS, "leftover": [left], "next_trial": "Run another."})
     assert told.leftover[0].sentence() not in nothing_to_do(told, "c0001")
-    assert nothing_to_do(told, "c0001").endswith("To learn more: Run another.")
+    assert nothing_to_do(told, "c0001").endswith("To learn more: run another.")
     errors = ({"v": 0.1}, {}, {"v": 0.3})  # of the crude model, calibrated, as diagnosed
     worse = RulerRow(1.0, False, {"v": "m/s"}, "trials", *errors)
     contested = replace(told, prediction_error=(worse,), next_trial="Adopt nothing yet.")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded.diagnosis.excitation import probe
+from grounded.diagnosis.excitation import _left, probe
 from grounded.diagnosis.likelihood.intervals import foretold
 from grounded.effects import Library
 from grounded_trials import Workspace
@@ -71,3 +71,14 @@ def test_one_trial_that_knows_most_is_not_believed_alone():
     np.testing.assert_allclose(
         foretold(groups[-1:], np.eye(3)) ** 2, np.diag(np.linalg.inv(groups[-1] + np.eye(3)))
     )
+
+
+def test_no_more_is_promised_of_a_value_that_one_trial_knows_than_its_runs_can_tell():
+    """The limit of a beam's rate, which one of seven runs had reached, to 6.7e-06 rad/s of 3.5.
+
+    It stood at +- 0.0088 before the probe, and at 0.0032 after both its runs.
+    """
+    groups = np.zeros((7, 1, 1))
+    groups[0] = 1.0  # in units of the 0.0088 rad/s
+    once, twice = _left(groups, np.full((1, 1, 1), 0.85), np.full((1, 1), 1e-6), np.ones(1), 1.0)
+    assert 0.3 < twice[0] < 0.9 and twice[0] < once[0] <= 1.0

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TextIO
 
+from grounded.progress import duration
 from grounded.result import plain
 from grounded_cli.console.workspace_option import given
 from grounded_trials.wording import MARKS, columns, figure, glued, placed, wrapped
@@ -21,6 +22,7 @@ from grounded_trials.wording import MARKS, columns, figure, glued, placed, wrapp
 number = figure
 BARS = "▁▂▃▄▅▆▇█"
 LABEL = 10  # width of the label column
+SO_FAR = re.compile(r", [^,]* so far.*")  # the time in a stage's text (`grounded.progress`)
 EVERY = 30.0  # seconds between progress lines when stderr is not a terminal
 
 
@@ -135,9 +137,9 @@ def stages() -> Iterator[Callable[[str], None]]:
         last, began = "", time.monotonic()
         while not ended.wait(EVERY):
             if now:
-                told = now != last or "so far" in now  # it says so itself
-                since = "" if told else f", {time.monotonic() - began:.0f} s so far"
-                _write(f"{now}{since} ...", sys.stderr)
+                taken = f", {duration(time.monotonic() - began)} so far"
+                text = f"{SO_FAR.sub('', now)}{taken}" if now == last else now
+                _write(f"{text} ...", sys.stderr)
             last = now
 
     if not live:

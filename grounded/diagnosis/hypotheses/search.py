@@ -292,7 +292,7 @@ class HypothesisSearch(FittedHypotheses):
     def under(self, structure: Structure, spread: float) -> HypothesisSearch | None:
         """Return the fits under one noise structure and prior width; None without a null."""
         other, exact = self._empty(), (structure, 0.0, ())
-        other._prices = self._prices
+        other._prices, other.refused = self._prices, self.refused
         kept = [f for k, f in self.fits.items() if k[:2] == (structure, spread) or k == exact]
         other.keep(kept)  # which also sets the tempering, by the likeliest of them
         return other if exact in other.fits else None

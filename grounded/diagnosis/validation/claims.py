@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.hypotheses.explored import CLAIM, TIE, parametric
+from grounded.diagnosis.hypotheses.explored import CLAIM, TIE, no_limits, parametric
 from grounded.diagnosis.hypotheses.lookalike import lookalikes, of_parameters, one_thing
 from grounded.diagnosis.hypotheses.one_clock import one_clock
 from grounded.diagnosis.hypotheses.stand_in import moving, swap, twins
@@ -99,7 +99,11 @@ class Claims:
                 rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
                 listed.append(name)
         others = (f for f in self.whole.of_size(1) if f.hypothesis.names[0] not in listed)
-        likely = (f for f in others if math.isfinite(self.whole.score(f)))  # no absurd values
+        likely = (  # no absurd values
+            f
+            for f in others
+            if math.isfinite(self.whole.score(f)) and not no_limits(self.data, f.hypothesis)
+        )
         sized = (f for f in likely if has_size(f.hypothesis.effects[0], self.estimates(f)[0]))
         singles = list(islice(sized, max(RANKED - len(rows), 3)))
         gaps = gaps_of(self.predictor, singles, where)
@@ -282,7 +286,8 @@ class Claims:
             # not if parameters that predictions refused make it likelier, or make all of it
             as_likely = abs(score(f) - score(self.best)) < TIE and score(f) > without + CLAIM
             needed = (h.spread > 0) == free or as_likely
-            if other not in (name, *found) and needed and self._ties(name, other, f):
+            beyond = other in no_limits(self.data, h)
+            if other not in (name, *found) and needed and not beyond and self._ties(name, other, f):
                 found[other] = f
         return list(found.items())[:2]
 

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses import scan
+from grounded.diagnosis.hypotheses.explored import no_limits
 from grounded.diagnosis.hypotheses.grid_points import between, elsewhere
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
@@ -54,6 +56,43 @@ def test_a_delay_of_a_hundredth_of_a_step_is_a_matter_of_time_stamps():
     effect = Library().effect("delay:torque", pendulum, data.scales)
     assert search.price(effect, {"d": 0.0005}) == math.inf
     assert search.price(effect, {"d": 0.02}) < 20
+
+
+def test_a_rate_that_no_command_asks_for_is_no_limit():
+    """A servo was limited to 167 rad/s, and no command changed faster than 35 rad/s."""
+    t = np.arange(60) * 0.05
+    trial = Trial(np.zeros((61, 2)), np.sin(t)[:, None], 0.05, ("theta", "omega"), ("torque",))
+    data = prepare(pendulum, [trial, trial])
+    effect = Library().effect("rate_limit:torque", pendulum, data.scales)
+    for r, beyond in ((0.9, []), (1.2, [effect.name])):
+        assert no_limits(data, Hypothesis().plus(effect, {"r": r})) == beyond
+
+
+@pytest.mark.parametrize(("late", "claimed"), [(0.2, set()), (1.5, {"rate_limit:u"})])
+def test_what_is_late_within_a_step_is_no_rate_limit(late, claimed):
+    """Of what a command of 1 loses by coming `late` steps late, a limit of 2.5 a step says as much.
+
+    By more than a step it is a limit that commands reach, and the only effect that is offered.
+    """
+    rng, trials = np.random.default_rng(0), []
+    for k in range(3):
+        u = np.repeat(rng.choice([-0.5, 0.5], 30), 4)
+        before = np.concatenate([np.zeros(2), u])
+        whole, part = int(late), late % 1
+        acts = (1 - part) * before[2 - whole :][:120] + part * before[1 - whole :][:120]
+        v = np.concatenate([[0.0], np.cumsum(0.1 * acts)]) + 1e-3 * rng.standard_normal(121)
+        trials.append(Trial(v[:, None], u[:, None], 0.1, ("v",), ("u",), id=f"t{k}"))
+    cart = Model(
+        states={"v": "m/s"},
+        inputs={"u": "m/s^2"},
+        params={},
+        derivative=lambda s, a, p: {"v": a.u},
+        integrator="euler",
+    )
+    options = DiagnosisOptions(library=Library((Library().family("rate_limit"),)))
+    found = diagnose(cart, trials, options)
+    assert set(found.effects) == claimed and not found.unconfirmed
+    assert {row.effect for row in found.ranking} == claimed
 
 
 @pytest.mark.parametrize(

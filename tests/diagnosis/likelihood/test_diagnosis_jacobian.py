@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from grounded.challenge.cases import make
-from grounded.diagnosis.hypotheses.explored import price
+from grounded.diagnosis.hypotheses.explored import no_limits, price
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -159,8 +159,7 @@ def test_a_dead_zone_in_which_nothing_rests_was_not_searched_for(cars):
 def test_a_limit_of_a_rate_is_not_below_the_rates_in_the_log(cars):
     """With two commands exchanged, a limit of 0 rad/s^2 was claimed, and advised for adoption."""
     _, data = cars
-    predictor, limit = Predictor(data), effect(data, "slew_limit:v")
-    assert price(predictor, limit, {"r": 0.0}) == price(predictor, limit, {"r": 1e-3}) == np.inf
-    i = data.model.state_names.index("v")
+    limit, i = effect(data, "slew_limit:v"), data.model.state_names.index("v")
     fastest = np.abs(np.diff(data.y[..., i], axis=0)).max() / data.dt
-    assert np.isfinite(price(predictor, limit, {"r": fastest}))
+    for r, refuted in ((0.0, [limit.name]), (1e-3, [limit.name]), (fastest, [])):
+        assert no_limits(data, Hypothesis().plus(limit, {"r": r})) == refuted

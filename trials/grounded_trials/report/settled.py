@@ -61,11 +61,12 @@ def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> 
         since: changes since then.
     """
     table, task = workspace.config.model, workspace.origin
-    clauses = [_clause(effect, task.model) for effect in table.effects]
+    known = _Known(diagnosis, as_adopted(workspace))
+    clauses = [_clause(effect, task.model, known) for effect in table.effects]
     clauses += _moved(task.model, table.params, diagnosis.jointly if diagnosis else set())
     if not clauses:
         return None
-    rows = tuple(_rows(task.model, table, diagnosis, as_adopted(workspace)))
+    rows = tuple(_rows(task.model, table, known))
     found = Settled(tuple(clauses), rows=rows)
     if diagnosis is None or diagnosis.no_cause:
         return found
@@ -157,46 +158,59 @@ def _as_claimed(diagnosis: Diagnosis, table: ModelTable) -> bool:
     return bool(names) and now == wanted and dict(made.params or {}) | own == dict(table.params)
 
 
-def _clause(entry: Mapping[str, Any], model: Model) -> str:
-    """Return an adopted effect in words, with its values."""
+class _Known:
+    """How well adopted values are known: as well as the last diagnosis knows them.
+
+    Otherwise as well as when they were adopted (`before`): a diagnosis that finds nothing new
+    estimates nothing.
+    """
+
+    def __init__(self, diagnosis: Diagnosis | None, before: Mapping[str, Estimate]) -> None:
+        from grounded.effects import param_name
+
+        fitted = {} if diagnosis is None else dict(diagnosis.parameters)
+        for ranked in () if diagnosis is None else diagnosis.ranking:
+            fitted |= {param_name(ranked.effect, q): e for q, e in ranked.params.items()}
+        self.both = fitted, before
+
+    def estimate(self, name: str, value: float, unit: str) -> Estimate:
+        """Return an adopted value with its standard deviation, NaN if that is unknown."""
+        for own in (one[name] for one in self.both if name in one):
+            if math.isclose(own.value, value, rel_tol=WRITTEN):
+                return replace(own, unit=unit)
+        return Estimate(value, unit=unit)
+
+
+def _clause(entry: Mapping[str, Any], model: Model, known: _Known) -> str:
+    """Return an adopted effect in words, with its values; those that may be zero are left out."""
     from grounded.diagnosis.cause_words import meaning
+    from grounded.effects import param_name
     from grounded_trials.workspace.adopted import installed_effects
 
     name, given = str(entry["name"]), {k: v for k, v in entry.items() if k != "name"}
     try:
         effect = installed_effects().effect(name, model)
         units = {q.name: q.unit for q in effect.quantities}
-        values = {q: Estimate(float(v), unit=units[q]) for q, v in given.items() if q in units}
+        values = {
+            q: known.estimate(param_name(name, q), float(v), units[q])
+            for q, v in given.items()
+            if q in units
+        }
         return meaning(effect, values)
     except (GroundedError, TypeError, ValueError):
         return f"{name} ({', '.join(f'{k} = {v}' for k, v in given.items())})"
 
 
-def _rows(
-    model: Model,
-    table: ModelTable,
-    diagnosis: Diagnosis | None,
-    before: Mapping[str, Estimate],
-) -> Iterator[tuple[str, str]]:
-    """Yield the name and the values of each adopted effect, then of each adopted parameter.
-
-    A value has the standard deviation by which the last diagnosis knows it, or else the one that
-    it was adopted with (`before`): a diagnosis that finds nothing new estimates nothing.
-    """
+def _rows(model: Model, table: ModelTable, known: _Known) -> Iterator[tuple[str, str]]:
+    """Yield the name and the values of each adopted effect, then of each adopted parameter."""
     from grounded.diagnosis.cause_words import give_or_take
     from grounded.effects import param_name
     from grounded_trials.workspace.adopted import installed_effects
 
     library = installed_effects()
-    fitted = {} if diagnosis is None else dict(diagnosis.parameters)
-    for ranked in () if diagnosis is None else diagnosis.ranking:
-        fitted |= {param_name(ranked.effect, q): e for q, e in ranked.params.items()}
 
-    def known(name: str, value: float, unit: str) -> str:
-        for own in (one[name] for one in (fitted, before) if name in one):
-            if math.isclose(own.value, value, rel_tol=WRITTEN):
-                return give_or_take(replace(own, unit=unit))
-        return give_or_take(Estimate(value, unit=unit))
+    def told(name: str, value: float, unit: str) -> str:
+        return give_or_take(known.estimate(name, value, unit))
 
     for entry in table.effects:
         name = str(entry["name"])
@@ -206,12 +220,12 @@ def _rows(
             quantities = ()
         units = {q.name: q.unit for q in quantities if q.name in entry}
         units = units or {key: "" for key in entry if key != "name"}
-        told = (f"{q} = {known(param_name(name, q), entry[q], unit)}" for q, unit in units.items())
-        yield name, ", ".join(told)
+        each = (f"{q} = {told(param_name(name, q), entry[q], unit)}" for q, unit in units.items())
+        yield name, ", ".join(each)
     for name, value in table.params.items():
         if name in model.params and model.params[name].value != value:
             first, unit = model.params[name].value, model.params[name].unit
-            yield name, f"{known(name, value, unit)}, was {number(first)}"
+            yield name, f"{told(name, value, unit)}, was {number(first)}"
 
 
 def _moved(model: Model, params: Mapping[str, float], jointly: set[str]) -> list[str]:

@@ -208,8 +208,13 @@ def nothing_to_do(found: Diagnosis, best: str) -> str:
     return (
         f"None is needed for the manoeuvre: the search has ended, with {best}. "
         + "To learn more: " * (not found.contested)
-        + found.next_trial
+        + (found.next_trial if found.contested else _inside(found.next_trial))
     )
+
+
+def _inside(sentence: str) -> str:
+    """Return a sentence to follow a colon."""
+    return f"{sentence[:1].lower()}{sentence[1:]}"
 
 
 def _standing_ahead(workspace: Folder) -> Standing:

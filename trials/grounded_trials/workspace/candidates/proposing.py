@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
-from grounded.search.scatter import noise_cost, sensor_noise
+from grounded.search.scatter import noise_missed, sensor_noise
 from grounded_trials.wording import ranges, rendered
 from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.candidates.handover import Void, checked_candidate, outside_limits
@@ -158,10 +158,8 @@ def propose_in(workspace: Folder) -> Proposed:
     path = workspace.candidate_path(candidate.id)
     # the user should first correct the held input; a second `propose` hands the candidate out
     then = PROPOSE if held else to_run(workspace, candidate.id)
-    cost = 0.0
-    if not candidate.grounded:  # else the model replays a log, and its noise is included
-        noise = sensor_noise(workspace.task_trials(), workspace.base_model.n)
-        cost = noise_cost(workspace.task, candidate.policy, noise)
+    noise = sensor_noise(workspace.task_trials(), workspace.base_model.n)
+    cost = noise_missed(workspace.task, candidate, noise)
     off_target = off_target_of(workspace.task, [candidate.predicted_run])
     return Proposed(proposal, path, then, cost, off_target, lacks)
 
