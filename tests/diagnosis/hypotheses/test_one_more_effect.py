@@ -23,7 +23,9 @@ GONE_ON = {"above": True, "source": "repeats", "promise": 0.0}
         (0, 4, 4, GONE_ON, False),  # nothing pays
         (4, 4, 4, {"above": False, "source": "short horizon", "promise": 80.0}, True),
         (4, 4, 4, {"above": False, "source": "short horizon", "promise": 5.0}, False),
-        (4, 4, 4, {"above": False, "source": "repeats", "promise": 80.0}, False),
+        (4, 4, 4, {"above": False, "source": "repeats", "promise": 80.0}, True),  # small, lasting
+        (4, 4, 4, {"above": False, "source": "repeats", "promise": 5.0}, False),
+        (4, 4, 4, {"above": None, "source": "repeats", "promise": 80.0}, False),  # nothing is left
         (3, 4, 4, {"above": False, "source": "short horizon", "promise": 80.0}, False),
     ],
 )
@@ -36,7 +38,7 @@ def test_one_more_is_sought_while_the_likely_ones_leave_more_than_noise(
     made.search = SimpleNamespace(chosen=lambda most: chosen)
     made.known, made.most, made.best = SimpleNamespace(no_cause=False), most, None
     made.claims = SimpleNamespace(names=names[:claimed])
-    row = SimpleNamespace(above=left["above"])
-    made.measured = SimpleNamespace(remainders=lambda: (row,), source=left["source"])
+    rows = () if left["above"] is None else (SimpleNamespace(above=left["above"]),)
+    made.measured = SimpleNamespace(remainders=lambda: rows, source=left["source"])
     monkeypatch.setattr(writer, "promised", lambda search, best: left["promise"])
     assert made.unfinished is expected

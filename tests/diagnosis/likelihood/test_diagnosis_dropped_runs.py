@@ -32,10 +32,21 @@ def known(monkeypatch):
         names = (model.state_names, model.input_names)
         found.append(Trial(np.array(x), u, DT, *names, start_inputs=np.zeros(1)))
     monkeypatch.setattr(diagnosis_data, "MOST_NUMBERS", 7.5 * 150 * model.n**2 * 4)
+    monkeypatch.setattr(diagnosis_data, "SESSION", 0)
     predictor = Predictor(prepare(model, found))
     assert predictor.data.time[0, :].tolist().count(0.0) == 3  # the beginnings of 0, 1 and 3
     assert len(predictor.data.valid) == 7
     return predictor, SimpleNamespace(hypothesis=Hypothesis(), states=predictor.data.y), found
+
+
+def test_the_runs_of_a_session_are_all_kept(known, monkeypatch):
+    """Noise was called unknown though three candidates had been run twice: repeats were left out."""
+    predictor, _, trials = known
+    monkeypatch.setattr(diagnosis_data, "SESSION", 16)
+    data = prepare(predictor.data.model, trials)
+    assert data.skipped == 0 and len(data.valid) == 12
+    monkeypatch.setattr(diagnosis_data, "MOST_NUMBERS", 4.5 * 150 * data.model.n**2 * 4)
+    assert prepare(predictor.data.model, trials).skipped == 8  # too much memory for all
 
 
 def test_a_utility_is_predicted_from_the_trials_own_start(known):
