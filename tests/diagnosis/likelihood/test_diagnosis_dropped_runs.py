@@ -40,7 +40,7 @@ def known(monkeypatch):
 
 
 def test_the_runs_of_a_session_are_all_kept(known, monkeypatch):
-    """Noise was called unknown though three candidates had been run twice: repeats were left out."""
+    """Noise was called unknown though candidates had been run twice: repeats were left out."""
     predictor, _, trials = known
     monkeypatch.setattr(diagnosis_data, "SESSION", 16)
     data = prepare(predictor.data.model, trials)
