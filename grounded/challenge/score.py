@@ -266,8 +266,8 @@ def _values(label: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str,
             continue
         for name, estimate in row["params"].items():
             true = float(entry["params"][name])
-            low, high = estimate["interval"]
-            covered.append(bool(low <= true <= high))
+            if (interval := estimate.get("interval")) is not None:  # its std may be unknown
+                covered.append(bool(interval[0] <= true <= interval[1]))
             if abs(true) > 1e-12:
                 errors.append(abs(estimate["value"] - true) / abs(true))
     return {"covered": covered, "errors": errors}

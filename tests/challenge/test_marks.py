@@ -120,6 +120,19 @@ def marks_of(truth, named, *, errors=(1.0, 1.0), kind="single", param_error=0.0,
     return judge(label, found, known)
 
 
+def test_a_value_whose_uncertainty_is_unknown_counts_as_an_error_but_covers_nothing():
+    """A patch far from the motion had no std: the score of 200 cases ended in a traceback."""
+    label = {"effects": [{"effect": "patch:a", "params": {"c": 2.0, "x0": 1.0}}], "case": "x"}
+    label |= {"kind": "single", "noise": "white", "system": "car", "param_error": 0.0}
+    row = {"whole_trial": False, "crude": {"v": 1.0}, "with_effects": {"v": 0.5}}
+    params = {"c": {"value": 3.0, "std": None}, "x0": {"value": 1.1, "interval": [0.9, 1.3]}}
+    found = {"verdict": {"kind": "effect", "effects": ["patch:a"]}, "indistinguishable": []}
+    found["ranking"] = [{"effect": "patch:a", "params": params, "claimed": True}]
+    found |= {"gap": {"after": 1.0}, "leftover": [], "prediction_error": [row]}
+    marks = judge(label, found, None)
+    assert marks["covered"] == [True] and marks["errors"] == pytest.approx([0.5, 0.1])
+
+
 def test_a_second_name_that_nothing_makes_is_counted():
     assert not marks_of("delay:a", ["delay:a"])["false_second"]
     assert marks_of("delay:a", ["delay:a", "stall:a"])["false_second"]
