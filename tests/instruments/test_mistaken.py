@@ -104,11 +104,12 @@ def test_exchanged_commands_are_named_and_a_crude_model_is_no_exchange(crude, la
     assert holds(said, "port and starboard", "r, east and psi")  # the mirror image does it, too
 
 
-def test_an_exchange_behind_a_lag_and_a_dead_zone_is_named(tmp_path):
+@pytest.mark.parametrize("late", [0, 6])
+def test_an_exchange_behind_a_lag_and_a_dead_zone_is_named(tmp_path, late):
     """A diagnosis claimed that the turn rate can't change faster than 0 rad/s^2."""
     for folder, swapped in (("right", False), ("crossed", True)):
         w = tmp_path / folder
-        log = thruster_bag(tmp_path / f"{folder}-bag", swapped=swapped, names=True)
+        log = thruster_bag(tmp_path / f"{folder}-bag", swapped, names=True, late=late)
         assert grounded("init", w, "--from", log).code == 0
         said = grounded("-C", w, "ingest", "--data", log)
         assert said.code == 0

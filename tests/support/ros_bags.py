@@ -311,13 +311,14 @@ def crane_bag(folder, joint="trolley", load="/sway/state"):
     return bag(folder, topics, messages)
 
 
-def thruster_bag(folder, swapped=False, names=False):
+def thruster_bag(folder, swapped=False, names=False, late=0):
     """Write a bag of a boat whose two thrusters lag by 0.2 s, commanded in one array.
 
     Args:
         folder: of the bag.
         swapped: the array is [right, left].
         names: the thrusters' commands are on a topic each, /thruster/left and /thruster/right.
+        late: samples by which positions are late.
     """
     rng, h = np.random.default_rng(3), 0.02
     array, number = T["std_msgs/msg/Float64MultiArray"], T["std_msgs/msg/Float64"]
@@ -327,7 +328,8 @@ def thruster_bag(folder, swapped=False, names=False):
         topics |= dict.fromkeys(("/thruster/left", "/thruster/right"), "std_msgs/msg/Float64")
     else:
         topics["/thrusters/cmd"] = "std_msgs/msg/Float64MultiArray"
-    messages, (x, y, psi, u, v, r), felt, sent = [], np.zeros(6), np.zeros(2), np.zeros(2)
+    messages, way, (x, y, psi, u, v, r) = [], [], np.zeros(6)
+    felt, sent = np.zeros(2), np.zeros(2)
     for k in range(3000):
         t = START + k * 20_000_000
         if k % 60 == 0:
@@ -339,7 +341,10 @@ def thruster_bag(folder, swapped=False, names=False):
                     messages.append((f"/thruster/{side}", t, number(data=float(one))))
             else:
                 messages.append(("/thrusters/cmd", t, array(layout=layout, data=np.array(told))))
-        seen = np.array([x, y, psi, u, r]) + rng.normal(0, [8e-3, 8e-3, 4e-3, 0.015, 6e-3])
+        way.append((x, y))
+        seen = np.array([*way[max(k - late, 0)], psi, u, r]) + rng.normal(
+            0, [8e-3, 8e-3, 4e-3, 0.015, 6e-3]
+        )
         pose = odometry(t, *seen)
         pose.twist.twist.linear.y = v + 0.015 * rng.normal()
         messages.append(("/odom", t, pose))

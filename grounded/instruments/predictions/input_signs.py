@@ -90,6 +90,24 @@ def how_inputs_act(model: Model, trial: Trial, shown: Sequence[int]) -> tuple[Ac
     return found
 
 
+def act_on_each(model: Model, trial: Trial, shown: Sequence[int]) -> dict[int, tuple[Acts, ...]]:
+    """Return how each input acts on each state by itself, with commands that act at once.
+
+    Arguments as of `how_inputs_act`; empty if too little is known.
+    """
+    known = trial.until(max(trial.known_steps, 0))
+    some = [i for i in shown if np.isfinite(known.states[:, i]).any()]
+    if not some or not np.isfinite(known.inputs).all():
+        return {}
+    ahead = Ahead(model, known, some, STARTS, (0.0,))
+    if not ahead.enough:
+        return {}
+    with np.errstate(all="ignore"):
+        prompt = Acting(ahead, 0)
+        fits = {i: prompt.strengths(prompt.even, k) for k, i in enumerate(some)}
+    return {i: tuple(map(_acts, fit.factors, fit.errors)) for i, fit in fits.items() if fit}
+
+
 def _acts(share: float, error: float) -> Acts:
     wrong = share < min(-SHOWN, -SURE * error)
     return Acts(-1 if wrong else int(share > max(SHOWN, USUAL * error)), share, error)
@@ -213,17 +231,19 @@ class Acting:
         even = ((strays <= BENT * does + TINY**2) & (does < FARTHEST**2)).all(axis=1)
         self.even: NDArray[np.bool_] = even & np.isfinite(off).all(axis=(0, 2))
 
-    def strengths(self, rows: NDArray[np.bool_]) -> Strengths | None:
+    def strengths(self, rows: NDArray[np.bool_], only: int | None = None) -> Strengths | None:
         """Fit how strongly each input acts; None with too few predictions.
 
         Args:
             rows: which predictions to use (N,).
+            only: the state to fit, of those shown; None: all.
         """
         found, error = np.full((2, self.ahead.model.m), np.nan)
         if rows.sum() < LEAST:
             return None
         linear, size_of = basis(self.ahead.first[rows][:, self.ahead.shown]), self.ahead.size
-        off, by = self.off[rows], self.by[rows]
+        counts = np.ones(self.off.shape[1]) if only is None else np.eye(self.off.shape[1])[only]
+        off, by = self.off[rows] * counts, self.by[rows] * counts[:, None]
         off = off - linear @ (linear.T @ off)
         by = by - np.einsum("nc,cki->nki", linear, np.einsum("nc,nki->cki", linear, by))
         size = size_of(off)

@@ -21,7 +21,7 @@ from grounded import places
 from grounded.frozen import Array
 from grounded.instruments.finding import DEGREES, Finding, unusable
 from grounded.instruments.inputs import OVER
-from grounded.instruments.predictions.input_signs import SHOWN, how_inputs_act
+from grounded.instruments.predictions.input_signs import act_on_each
 from grounded.instruments.predictions.short_runs import Ahead, Fit
 from grounded.model import Model
 from grounded.places import integrals
@@ -300,26 +300,26 @@ def _each(
             if fits is None and _act_exchanged(model, trial, change, known):
                 before = logged.best([*_signed(model, change), *_odd_signs(model, change)])
                 after = mended.best([np.ones(model.m)])
-                fits = (before, after) if before.score - after.score > HINT else None
+                fits = (before, after) if after.score < before.score else None
             yield change, fits
 
 
 def _act_exchanged(model: Model, trial: Trial, change: Mistake, known: Sequence[int]) -> bool:
     """Check whether two inputs act as in the model only if their columns are exchanged.
 
-    A model that lacks a lag or a dead zone predicts little better with the right columns, but how
-    the robot answers each command is measured to a few percent.
+    A model that lacks a lag or a dead zone predicts little better with the right columns. But if
+    the wheels or thrusters of its two sides are exchanged, the robot turns the other way, by which
+    both seem to act the other way round, and goes ahead as it should, by which neither does.
     """
     if not change.inputs or not change.swap:
         return False
     logged, mended = (
-        [how_inputs_act(model, one, known)[j] for j in change.inputs]
-        for one in (trial, change.mended(trial))
+        {i: [acts[j].sign for j in change.inputs] for i, acts in each.items()}
+        for each in (act_on_each(model, one, known) for one in (trial, change.mended(trial)))
     )
-    return all(one.sign > 0 for one in mended) and all(
-        one.share < SHOWN and one.share < HALF * other.share
-        for one, other in zip(logged, mended, strict=True)
-    )
+    turned = [i for i in logged if max(logged[i]) < 0 < min(mended.get(i, [0]))]
+    right = [i for i in logged if min(logged[i]) > 0]
+    return bool(turned and right) and all(min(signs) >= 0 for signs in mended.values())
 
 
 def _compared(
