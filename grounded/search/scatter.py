@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.frozen import Array, median, white_noise
+from grounded.frozen import MEDIAN, Array, median, white_noise
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate, Tried
 from grounded.task import Task
@@ -76,7 +76,7 @@ def by_states(task: Task, trials: Sequence[Trial]) -> Array:
 
 CHANCE = 3.0  # standard deviations of sensor noise by which one sample may differ
 SLOW_S, SLOWER = 0.1, 3.0  # [s] of second differences; times the white noise, at most
-WHITE = 0.6745 * 6**0.5  # median of absolute second differences of white noise of std 1
+WHITE = MEDIAN * 6**0.5  # median of absolute second differences of white noise of std 1
 FEWEST = 10  # least number of second differences
 NOTHING = 1e-9  # difference treated as zero, in the state's unit or relative to its value
 

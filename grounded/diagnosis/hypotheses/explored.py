@@ -211,6 +211,13 @@ def _seen_rate(data: Data, effect: Effect) -> float:
     return float(TOO_SLOW * np.quantile(rates, OFTEN)) if len(rates) else 0.0
 
 
+def _sent_rate(data: Data, effect: Effect) -> float:
+    """Return the fastest change of an effect's inputs from step to step, as they were commanded."""
+    which = [data.model.input_names.index(name) for name in effect.site.targets]
+    sent = np.concatenate([data.held[:, None], data.commands], axis=1)[..., which]
+    return float(np.nanmax(np.abs(np.diff(sent, axis=1)), initial=0.0) / data.dt)
+
+
 def no_limits(data: Data, h: Hypothesis) -> list[str]:
     """Return the limits of rates in a hypothesis that the log refutes.
 
@@ -219,17 +226,15 @@ def no_limits(data: Data, h: Hypothesis) -> list[str]:
     within the step. And a state can't change faster than its limit. Both may stand for something
     else while effects are sought (refused at once, the search ends elsewhere), but are no causes.
     """
-    sent = np.concatenate([data.held[:, None], data.commands], axis=1)
-    fastest = np.nanmax(np.abs(np.diff(sent, axis=1)), axis=(0, 1), initial=0.0) / data.dt
-    of = dict(zip(data.model.input_names, fastest.tolist(), strict=True))
-    found = []
-    for effect, values in h.pairs:
-        kind = effect.family.name
-        if kind == "rate_limit" and values["r"] > max(of[name] for name in effect.site.targets):
-            found.append(effect.name)
-        if kind == "slew_limit" and values["r"] < _seen_rate(data, effect):
-            found.append(effect.name)
-    return found
+    refuted = {
+        "rate_limit": lambda effect, r: r > _sent_rate(data, effect),
+        "slew_limit": lambda effect, r: r < _seen_rate(data, effect),
+    }
+    return [
+        effect.name
+        for effect, values in h.pairs
+        if (beyond := refuted.get(effect.family.name)) and beyond(effect, values["r"])
+    ]
 
 
 def cancelling(predictor: Predictor, h: Hypothesis) -> bool:

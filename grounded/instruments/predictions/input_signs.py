@@ -73,12 +73,7 @@ def how_inputs_act(model: Model, trial: Trial, shown: Sequence[int]) -> tuple[Ac
         trial: of its states and inputs; only its part without gaps is used.
         shown: indices of the states with a sensor.
     """
-    known = trial.until(max(trial.known_steps, 0))
-    some = [i for i in shown if np.isfinite(known.states[:, i]).any()]
-    if not some or not np.isfinite(known.inputs).all():
-        return (UNKNOWN,) * model.m
-    ahead = Ahead(model, known, some, STARTS, (0.0,))
-    if not ahead.enough:
+    if (ahead := _ahead_of(model, trial, shown)) is None:
         return (UNKNOWN,) * model.m
     with np.errstate(all="ignore"):
         prompt = Acting(ahead, 0)
@@ -95,17 +90,22 @@ def act_on_each(model: Model, trial: Trial, shown: Sequence[int]) -> dict[int, t
 
     Arguments as of `how_inputs_act`; empty if too little is known.
     """
-    known = trial.until(max(trial.known_steps, 0))
-    some = [i for i in shown if np.isfinite(known.states[:, i]).any()]
-    if not some or not np.isfinite(known.inputs).all():
-        return {}
-    ahead = Ahead(model, known, some, STARTS, (0.0,))
-    if not ahead.enough:
+    if (ahead := _ahead_of(model, trial, shown)) is None:
         return {}
     with np.errstate(all="ignore"):
         prompt = Acting(ahead, 0)
-        fits = {i: prompt.strengths(prompt.even, k) for k, i in enumerate(some)}
+        fits = {i: prompt.strengths(prompt.even, k) for k, i in enumerate(ahead.shown)}
     return {i: tuple(map(_acts, fit.factors, fit.errors)) for i, fit in fits.items() if fit}
+
+
+def _ahead_of(model: Model, trial: Trial, shown: Sequence[int]) -> Ahead | None:
+    """Return predictions of a trial's part without gaps; None if too little is known."""
+    known = trial.until(max(trial.known_steps, 0))
+    some = [i for i in shown if np.isfinite(known.states[:, i]).any()]
+    if not some or not np.isfinite(known.inputs).all():
+        return None
+    ahead = Ahead(model, known, some, STARTS, (0.0,))
+    return ahead if ahead.enough else None
 
 
 def _acts(share: float, error: float) -> Acts:

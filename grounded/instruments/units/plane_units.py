@@ -141,14 +141,14 @@ def _lengths(model: Model, trial: Trial, known: Sequence[int]) -> Positions | No
         return None  # one signal alone is off: see `other_units`
     with np.errstate(all="ignore"):
         logged = _missed(model, trial, known, fast)
-        if logged is None:
+        if logged is None or not (logged > MISSED).any():  # as it is in nearly every log
             return None
         for factor in ALL:
             states = np.array(trial.states)
             states[:, lengths] /= factor
             other = replace(trial, states=states)
             divided, ahead = _missed(model, other, known, fast), predicted(model, other, known)
-            if divided is None or ahead is None or not len(fast):
+            if divided is None or ahead is None:
                 continue
             k = int(np.argmax(logged - divided))
             start, then, seen = (x[:, [fast[k]]] for x in ahead)

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from grounded.errors import GroundedError, nearest
-from grounded_trials.logs.inspection.inspect_guess import NAMES_BY_UNIT
+from grounded_trials.logs.inspection.inspect_guess import NAMES_BY_UNIT, PARTS
 from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport, TopicReport
 from grounded_trials.logs.inspection.inspect_pairs import rates_among
 from grounded_trials.logs.inspection.joint_names import from_base, slides
@@ -42,8 +42,6 @@ ACTUATOR = re.compile("servo|actuator")  # either a command or a measured positi
 EFFORT = re.compile("force|thrust|power")  # an input if nothing else looks like one
 EFFORT_UNITS = NAMES_BY_UNIT.keys() - {"A"}  # a current in a log is mostly a measured one
 
-# no signals by themselves
-NO_SIGNALS = re.compile(r"covariance|layout|(orientation|rotation|quaternion)\.[xyzw]$")
 HEADING = re.compile(r"(^|[/._])(yaw|psi|heading|theta|th|orientation)([/._\d]|$)")
 SENSED = re.compile(
     "encoder|tick|position|current|effort|bumper|cliff|range|sonar|feedback|measured"
@@ -65,7 +63,7 @@ def moving(log: LogReport) -> dict[str, FieldReport]:
     their group, too: linear_x.
     """
     fields = [one for t in log.topics for one in t.fields if one.low != one.high]
-    fields = [one for one in fields if not NO_SIGNALS.search(one.path)]
+    fields = [one for one in fields if not PARTS.search(one.path)]
     found: dict[str, FieldReport] = {}
     for one in fields:
         name, grouped = _word(one.path), _in_group(one.path)

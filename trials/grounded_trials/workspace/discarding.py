@@ -81,9 +81,9 @@ def _instead(workspace: Folder, name: str) -> NextCommand | None:
     trial, meta, _ = read_trial(workspace.store.read(stored), stored.path.name)
     if not workspace.fits(trial):
         return None
-    if "source" in meta:
-        faults = log_faults(workspace, interpolate_gaps(trial).trial)
-        mended = read_otherwise(meta, workspace.log_mapping)
-        if mended or any(one.mend for one in faults):
-            return again(workspace, meta, trial.candidate)
+    if "source" in meta and (
+        read_otherwise(meta, workspace.log_mapping)
+        or any(one.mend for one in log_faults(workspace, interpolate_gaps(trial).trial))
+    ):
+        return again(workspace, meta, trial.candidate)
     return status_of(workspace, standing_in(workspace)).then if trial.candidate else None

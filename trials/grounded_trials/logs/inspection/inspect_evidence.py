@@ -36,6 +36,7 @@ from grounded.result import listed
 from grounded_trials.logs.inspection.inspect_groups import by_groups
 from grounded_trials.logs.inspection.inspect_guess import (
     COMMAND_TOPIC,
+    PARTS,
     SIMULATED_S,
     Guess,
     clock_of,
@@ -64,7 +65,6 @@ from grounded_trials.logs.stated_units import Stated, factor_between, may_be, un
 LATEST = 0.5  # s: a command is sought up to this long before the angle that follows it
 JOINT = re.compile(r"\.(position|velocity)\[\d+\]$")  # numbers of a JointState
 FEW = 3  # command topics named in a reason
-PARTS = re.compile(r"covariance|layout|(orientation|rotation)\.[xyzw]$")  # no signals by themselves
 MOST = 20  # largest number of candidates
 
 

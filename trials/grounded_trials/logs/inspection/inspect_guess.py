@@ -82,6 +82,8 @@ _RATES = {"rate", "rates", "dot", "vel", "velocity"}  # words of a rate, not of 
 _COMMANDED = ("ref", "desired", "des", "target", "setpoint", "goal", "cmd", "command")
 COMMAND_TOPIC = re.compile("control|cmd|command|setpoint|ref|target")
 _ANGLES = ("roll", "pitch", "yaw")
+# no signals by themselves
+PARTS = re.compile(r"covariance|layout|(orientation|rotation|quaternion)\.[xyzw]$")
 _QUATERNION = tuple(f"{name}.{part}" for name in ("orientation", "rotation") for part in "xyzw")
 _POSE = ("position.x", "position.y", "@rpy.yaw")
 _POSES = ("/PoseStamped", "/PoseWithCovarianceStamped", "/TransformStamped")
