@@ -24,7 +24,13 @@ from grounded.diagnosis.likelihood.polish import polished
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.effects import Effect, ParamFamily, SensorLagFamily, one_friction
+from grounded.effects import (
+    Effect,
+    ParamFamily,
+    SensorDelayFamily,
+    SensorLagFamily,
+    one_friction,
+)
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 
@@ -35,6 +41,7 @@ TAUS = (0.05, 0.1, 0.3)  # correlation times of coloured noise [s]
 SLOW = (1.0, 2.0, 6.0)  # the same in steps, where a step is longer than all of TAUS
 BESIDE = 4  # effects that are fitted with the parameters freed
 LOUD = 0.45  # initial noise of a delayed sensor, as a fraction of its one-step residual's variance
+SOME_DELAYS = 3  # grid values at which the delay of one sensor is tried
 LATE = slice(1, 4, 2)  # grid values from which the common delay of two states starts
 LARGE_GAIN = 50.0  # nats above which a hypothesis is also fitted from a start of its own
 TO_THE_TOP = 25  # most iterations of fits that decide; most converge earlier
@@ -68,7 +75,9 @@ class HypothesisSearch(FittedHypotheses):
         self.most = SHORTLIST // 2 if large else SHORTLIST
         self.beside = BESIDE // 2 if large else BESIDE
         # the scan can't find them, since its noise and track belong to a log without delay
-        self.together = [e for e in candidates if len(delayed([e])) > 1]
+        late = [e for e in candidates if isinstance(e.family, SensorDelayFamily)]
+        self.together = [e for e in late if len(e.site.targets) > 1]
+        self.alone = [e for e in late if len(e.site.targets) == 1]
 
     def refined(
         self,
@@ -263,7 +272,7 @@ class HypothesisSearch(FittedHypotheses):
             fit: what is extended.
             count: length of the shortlist; 0: the usual one.
             iterations: most iterations of each fit.
-            late: include common delays of two states.
+            late: include delays of sensors that the scan did not find.
         """
         starts = self.one_more(fit, count or self.most, late=late)
         return self.refined([fit, *starts], iterations, rivals=True)[1:]
@@ -278,10 +287,35 @@ class HypothesisSearch(FittedHypotheses):
             if isinstance(look.effect.family, SensorLagFamily):
                 # the signal before a sensor's filter is much faster, and so is its noise
                 starts.append(self.anew(fit, look.effect, look.values))
-        for effect in self.together if late else ():
-            if not delayed([effect]) & delayed(fit.hypothesis.effects):
-                starts += [self.anew(fit, effect, {"d": d}) for d in effect.free[0].grid[LATE]]
+        if late:
+            for effect in self.together:
+                if not delayed([effect]) & delayed(fit.hypothesis.effects):
+                    starts += [self.anew(fit, effect, {"d": d}) for d in effect.free[0].grid[LATE]]
+            size = len(fit.hypothesis.effects)
+            if not size or self.score(fit) >= self.score(self.of_size(size)[0]):
+                starts += self.late_sensors(fit)
         return starts
+
+    def late_sensors(self, fit: Fitted) -> list[Start]:
+        """Return the starts of a fit with a delay of one sensor that is likelier than none.
+
+        Each is filtered at a few delays with the noise and the track of the fit. The scan takes a
+        late sample for the present state plus an offset, and the process noise of the fit for that
+        of a log without delay: a position 50 ms late, 73 nats likelier, seemed to gain 0.6.
+        """
+        known = delayed(fit.hypothesis.effects)
+        starts = [
+            (fit.hypothesis.plus(effect, {"d": d}), fit.noise, fit.track)
+            for effect in self.alone
+            if not delayed([effect]) & known
+            for d in effect.free[0].grid[:SOME_DELAYS]
+        ]
+        found = refine(self.predictor, starts, iterations=1, fixed_noise=True)
+        best: dict[str, Fitted] = {}
+        for one in sorted(found, key=self.score):
+            if self.score(one) > self.score(fit):
+                best[one.hypothesis.names[-1]] = one
+        return [(one.hypothesis, one.noise, one.track) for one in best.values()]
 
     def without(self, fit: Fitted, name: str) -> Fitted:
         """Return a fit without one effect, noise and track kept, beside which rivals are sought."""

@@ -68,6 +68,47 @@ def test_a_rate_that_no_command_asks_for_is_no_limit():
         assert no_limits(data, Hypothesis().plus(effect, {"r": r})) == beyond
 
 
+def test_noise_of_a_state_is_no_rate_that_refutes_a_limit():
+    """A steering angle with 0.045 rad of noise was limited to 0.094 rad/s."""
+    t, rng = np.arange(301) * 0.02, np.random.default_rng(0)
+    slow = 0.1 * np.abs((t + 0.5) % 2 - 1)  # at 0.1 rad/s, up and down
+    for noise in (0.0, 0.045):
+        states = np.zeros((301, car.n))
+        states[:, 0] = slow + noise * rng.standard_normal(301)
+        inputs = np.column_stack([np.sin(t[:-1]), np.zeros(300)])
+        trial = Trial(states, inputs, 0.02, car.state_names, car.input_names)
+        data = prepare(car, [trial, trial])
+        effect = Library().effect("slew_limit:delta", car, data.scales)
+        for r, refuted in ((0.1, []), (0.0, [effect.name])):
+            assert no_limits(data, Hypothesis().plus(effect, {"r": r})) == refuted
+
+
+def test_a_late_position_is_tried_with_a_filter_of_its_own():
+    """In the scan, a position 50 ms late of an aircraft seemed to gain 0.6 nats of 73."""
+    rng, trials = np.random.default_rng(3), []
+    for _ in range(3):
+        u = np.repeat(rng.uniform(-1, 1, 15), 10)
+        v = np.concatenate([[0.0], np.cumsum(0.02 * u)]) + 5.0
+        x = np.concatenate([[0.0], np.cumsum(0.02 * v[:-1])])
+        late = x - 0.05 * v + 0.01 * rng.standard_normal(151)
+        states = np.column_stack([late, v + 0.01 * rng.standard_normal(151)])
+        trials.append(Trial(states, u[:, None], 0.02, ("x", "v"), ("u",)))
+    cart = Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"u": "m/s^2"},
+        params={},
+        derivative=lambda s, a, p: {"x": s.v, "v": a.u},
+    )
+    data = prepare(cart, trials)
+    search = HypothesisSearch(data, Library().candidates(cart, data.scales))
+    null = search.nulls()
+    starts = search.late_sensors(null)
+    assert [h.names for h, _, _ in starts] == [("sensor_delay:x",)]
+    (fit,) = search.refined(starts, 12)
+    assert search.score(fit) > search.score(null) + 3
+    assert fit.hypothesis.values[0]["d"] == pytest.approx(0.05, abs=0.015)
+
+
 @pytest.mark.parametrize(("late", "claimed"), [(0.2, set()), (1.5, {"rate_limit:u"})])
 def test_what_is_late_within_a_step_is_no_rate_limit(late, claimed):
     """Of what a command of 1 loses by coming `late` steps late, a limit of 2.5 a step says as much.
