@@ -20,7 +20,8 @@ under every other noise structure, are compared by the `ruler`:
        explains nearly as much.
     5. The remaining effects must be likelier than none.
     6. A hypothesis is not claimed if predictions hardly gain in any channel at any horizon, except
-       sensors' faults with very high evidence, which need not matter for what comes next.
+       sensors' faults with very high evidence, which need not matter for what comes next, and
+       likely causes beside white innovations whose small gain is far beyond its scatter.
     7. A likely effect that was dropped is reported as doubtful; perhaps too few trials show it.
 
 A cause is an effect or the calibration of the model's own parameters.
@@ -56,6 +57,7 @@ WHITE = 0.9  # tempering factor above which the innovations count as white
 OVERRULES = (3.0, 0.1)  # the same for a rival that is likely under another noise structure only
 FROM_NONE = (3.0, 0.3)  # the same if the likeliest hypothesis has no cause: that noise is all
 SEEN = 0.08  # log gain of a claim, in some channel at some horizon, below which it is not made
+SLIGHTLY = (4.0, 0.04)  # scatters and largest log gain from which it may be less, if likely
 NO_HELP = 0.005  # mean log gain below which predictions are as good without a cause
 SLIGHT = 0.02  # smallest share of the total gain, in some channel, of a cause that is named
 AMOUNTS = 0.1  # a rival's advantage must be this part of what the likeliest gains,
@@ -231,11 +233,14 @@ def _seen(search: HypothesisSearch, ruler: Ruler, crude: Fitted, fit: Fitted) ->
     """Check whether the claim as a whole shows in predictions, in some channel at some horizon.
 
     Evidence of dozens of nats for causes that change predictions by a few percent was, on blind
-    cases, nearly always evidence of something else. A sensor's fault need not change what comes
-    next: it counts by very high evidence alone.
+    cases, nearly always evidence of something else, unless the innovations are white and the gain
+    is many times its scatter. A sensor's fault need not change what comes next: it counts by very
+    high evidence alone.
     """
-    if not ruler.held_out or ruler.gain(crude, fit).largest > SEEN:
+    if not ruler.held_out or (gain := ruler.gain(crude, fit)).largest > SEEN:
         return True
+    if search.tempering.factor > WHITE and gain.beyond(*SLIGHTLY):
+        return search.score(fit) - search.score(search.best_null()) > LIKELY
     sensed = all(isinstance(e.family, SensorFamily) for e in fit.hypothesis.effects)
     return sensed and search.score(fit) - search.score(search.best_null()) > LARGE_GAIN
 
