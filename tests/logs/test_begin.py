@@ -27,7 +27,15 @@ from grounded_trials.workspace.candidates.exporting import void_exports
 from grounded_trials.workspace.next_step import to_plan
 from grounded_trials.workspace.off_target import logged_target, rates_beside
 from grounded_trials.workspace.user_files.task_file import equal_weights, read_target, without_range
-from ros_bags import arm_bag, boat_bag, car_bag, commanded_arm_bag, rover_bag, thruster_bag
+from ros_bags import (
+    arm_bag,
+    balancer_bag,
+    boat_bag,
+    car_bag,
+    commanded_arm_bag,
+    rover_bag,
+    thruster_bag,
+)
 from shared_data import data
 
 
@@ -550,6 +558,30 @@ def test_a_robot_that_balances_gets_its_equations(tmp_path, names, kind):
     moved = model.system.step(leant, np.array([[0.0], [5.0]]), model.values, 0.01)
     assert moved[0, 3] > 0.005  # it falls to where it leans
     assert moved[1, 1] > 0 > moved[1, 3]  # driven forwards, it leans back
+
+
+def test_a_robot_that_balances_is_known_by_its_encoders(tmp_path):
+    """Its position was a turn rate that is always 0, though the wheels' angles were in the log."""
+    found = begin(tmp_path / "w", balancer_bag(tmp_path / "bag"))
+    guesses = {g.name: g for g in (*found.states, *found.inputs)}
+    assert found.kind == "balance" and guesses["motor_voltage"].path == "/motor_voltage.data"
+    for name, end in (("x", "position"), ("v", "velocity")):
+        assert guesses[name].path == f"/joint_states.{end}[0]" and not guesses[name].sure
+        assert guesses[name].scale == 0.035 and "left_wheel" in guesses[name].reasons[0]
+    names = "x,v,pitch,pitch_rate,voltage [V]"
+    t = 0.01 * np.arange(600)
+    rows = [t, np.sin(t), np.cos(t), 0.1 * np.sin(2 * t), 0.2 * np.cos(2 * t), np.cos(3 * t)]
+    log = tmp_path / "log.csv"
+    np.savetxt(log, np.column_stack(rows), "%.5f", ",", header=f"t,{names}", comments="")
+    begin(tmp_path / "over_ground", log)
+    plain, own = (Workspace(tmp_path / one).base_model for one in ("over_ground", "w"))
+    turned = np.array([[0.2, 0.5, 0.1, 0.4]])  # the wheels against the body, which leans
+    over_ground = turned + [[0.035 * 0.1, 0.035 * 0.4, 0.0, 0.0]]
+    u, h = np.array([[1.5]]), 1e-6
+    by_ground = (plain.system.step(over_ground, u, plain.values, h) - over_ground)[0] / h
+    by_wheels = (own.system.step(turned, u, own.values, h) - turned)[0] / h
+    assert by_wheels[2:] == pytest.approx(by_ground[2:], rel=1e-4)
+    assert by_wheels[:2] == pytest.approx(by_ground[:2] - 0.035 * by_ground[2:], rel=1e-4)
 
 
 @pytest.mark.parametrize("names", ["left_encoder,right_encoder", "port,right"])

@@ -357,3 +357,34 @@ def thruster_bag(folder, swapped=False, names=False, late=0):
         x += h * (u * np.cos(psi) - v * np.sin(psi))
         y += h * (u * np.sin(psi) + v * np.cos(psi))
     return bag(folder, topics, messages)
+
+
+def balancer_bag(folder):
+    """Write a bag of a balancing robot: an IMU, encoders of both wheels and a voltage."""
+    topics = {
+        "/imu": "sensor_msgs/msg/Imu",
+        "/joint_states": "sensor_msgs/msg/JointState",
+        "/motor_voltage": "std_msgs/msg/Float64",
+    }
+    messages, none = [], np.zeros(9)
+    for k in range(600):
+        t, s = START + k * 10**7, DT * k
+        pitch, rate = 0.1 * np.sin(2 * s), 0.2 * np.cos(2 * s)
+        q, w = np.full(2, 8 * np.sin(0.7 * s)), np.full(2, 5.6 * np.cos(0.7 * s))
+        turn = T["geometry_msgs/msg/Quaternion"](
+            x=0.0, y=np.sin(pitch / 2), z=0.0, w=np.cos(pitch / 2)
+        )
+        imu = T["sensor_msgs/msg/Imu"](
+            header=header(t),
+            orientation=turn,
+            orientation_covariance=none,
+            angular_velocity=vector("Vector3", 0.0, rate, 0.0),
+            angular_velocity_covariance=none,
+            linear_acceleration=vector("Vector3", 0.0, 0.0, 9.81),
+            linear_acceleration_covariance=none,
+        )
+        messages.append(("/imu", t, imu))
+        messages.append(("/joint_states", t, joints(t, ["left_wheel", "right_wheel"], q, w, 0 * q)))
+        if k % 2 == 0:
+            messages.append(("/motor_voltage", t, T["std_msgs/msg/Float64"](data=np.cos(3 * s))))
+    return bag(folder, topics, messages)

@@ -43,7 +43,15 @@ from grounded_trials.starting.examples import fresh_folder
 from grounded_trials.starting.first_toml import held_first, write_first
 from grounded_trials.starting.in_degrees import in_degrees
 from grounded_trials.starting.interval import interval_of, too_coarse
-from grounded_trials.starting.kinds import KINDS, Joints, called_input, kind_in, moving, skeleton
+from grounded_trials.starting.kinds import (
+    KINDS,
+    Joints,
+    by_encoders,
+    called_input,
+    kind_in,
+    moving,
+    skeleton,
+)
 from grounded_trials.starting.own_model import OwnModel, own_model
 from grounded_trials.store.store import write_atomically
 from grounded_trials.wording import count
@@ -219,6 +227,8 @@ def _begin(
     units = {**found.states, **found.inputs}
     both = from_the_rest((*states, *inputs), units, report, joint_units(joints))
     states, inputs = both[: found.n], only_commands(both[: found.n], both[found.n :], report)
+    if chosen == "balance" and not own:
+        states = tuple(by_encoders(states, report, joints, found.params["r"].value))
     if ask is not None:
         said = Stated.by(files)
         states, inputs = (

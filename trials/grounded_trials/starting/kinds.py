@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from grounded.errors import GroundedError, nearest
-from grounded_trials.logs.inspection.inspect_guess import NAMES_BY_UNIT, PARTS
+from grounded_trials.logs.inspection.inspect_guess import NAMES_BY_UNIT, PARTS, POSES, Guess, clock_of
 from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport, TopicReport
 from grounded_trials.logs.inspection.inspect_pairs import rates_among
 from grounded_trials.logs.inspection.joint_names import from_base, slides
@@ -25,6 +25,7 @@ from grounded_trials.starting.skeletons import (
     PENDULUM,
     ROVER,
     Skeleton,
+    against_the_body,
     arm,
     drone,
 )
@@ -325,6 +326,37 @@ def _driven_by(command: str, volts: bool) -> Skeleton:
     return replace(BALANCE, inputs={command: "1"}, before=before, params=params)
 
 
+def encoders(log: LogReport, joints: Joints) -> str:
+    """Return the JointState topic whose joints are all wheels, "" if positions come with it."""
+    driven = any(
+        one.path.endswith(("position.x", "twist.linear.x")) and one.low != one.high
+        for topic in log.topics
+        if topic.type.endswith(("/Odometry", *POSES))
+        for one in topic.fields
+    )
+    wheels = set(joints) - set(of_arms(joints))
+    moves = {f.path for t in log.topics for f in t.fields if f.low != f.high}
+    turned = [topic for topic in joints if topic in wheels and f"{topic}.position[0]" in moves]
+    return "" if driven or not turned else turned[0]
+
+
+def by_encoders(states: Sequence[Guess], log: LogReport, joints: Joints, r: float) -> list[Guess]:
+    """Give x and v of a balancing robot the first wheel's angle and speed, times a radius r [m]."""
+    if not (where := encoders(log, joints)):
+        return list(states)
+    fields = {f.path: (topic, f) for topic in log.topics for f in topic.fields}
+    wheel, ends, found = joints[where][0], {"x": "position", "v": "velocity"}, []
+    for guess in states:
+        path = f"{where}.{ends.get(guess.name, '')}[0]"
+        if path in fields and guess.name in ends:
+            topic, field = fields[path]
+            why = f"of '{wheel}', times the radius r: enter yours here and in model.py"
+            own = Guess(guess.name, path, clock_of(log, topic), False, (), field, (why,), r)
+            guess = own if field.low != field.high else guess
+        found.append(guess)
+    return found
+
+
 def _drone(log: LogReport) -> Skeleton:
     """Return the drone's skeleton: its yaw is a constant if the log's hardly changes."""
     yaws = [(t, f) for t in log.topics for f in t.fields if f.path.endswith("@rpy.yaw")]
@@ -389,7 +421,8 @@ def skeleton(
     if kind == "crane":
         return _crane(log, units or {})
     if kind == "balance" and (command := _balancing(log)):
-        return _driven_by(command, _in_volts(command, moving(log)[command].path, units or {}))
+        plain = _driven_by(command, _in_volts(command, moving(log)[command].path, units or {}))
+        return against_the_body(plain) if encoders(log, joints) else plain
     if kind == "drone":
         return _drone(log)
     return fixed[kind] if kind in fixed else generic(log, inputs, units)

@@ -264,6 +264,17 @@ BALANCE = Skeleton(
 )
 
 
+def against_the_body(plain: Skeleton) -> Skeleton:
+    """Return the balancing robot as encoders see it: wheels turn against the body, which leans."""
+    old, new = "coupled * fall) / det", "coupled * fall) / det - p.r * turn"
+    lines = [line.replace(old, new) for line in plain.lines]
+    lines[-1] = '"pitch_rate": turn'
+    before = [line.replace("s.v / p.r - s.pitch_rate", "s.v / p.r") for line in plain.before]
+    before.append("turn = (mass * fall - coupled * push) / det")
+    text = "A robot balancing on two wheels, x and v by their encoders; enter its masses"
+    return replace(plain, text=text, lines=lines, before=before)
+
+
 CRANE = Skeleton(
     "crane",
     "A trolley on a rail with a load below it at x + L sin(theta): theta = 0 hanging down",

@@ -86,7 +86,7 @@ _ANGLES = ("roll", "pitch", "yaw")
 PARTS = re.compile(r"covariance|layout|(orientation|rotation|quaternion)\.[xyzw]$")
 _QUATERNION = tuple(f"{name}.{part}" for name in ("orientation", "rotation") for part in "xyzw")
 _POSE = ("position.x", "position.y", "@rpy.yaw")
-_POSES = ("/PoseStamped", "/PoseWithCovarianceStamped", "/TransformStamped")
+POSES = ("/PoseStamped", "/PoseWithCovarianceStamped", "/TransformStamped")
 _NO_WHEELS = re.compile(  # topics with odometry messages that is not from wheels
     "mocap|vicon|optitrack|qualisys|truth|filter|fused|ekf|gps|gnss|slam|lidar|visual|vio"
 )
@@ -206,7 +206,7 @@ def _of_unit(log: LogReport, candidates: list[_Candidate], unit: str) -> list[_C
     """Drop a state's candidates in another unit, if one that fits is left.
 
     If all candidates by name have another unit, every changing number in the right unit becomes a
-    candidate.
+    candidate; if there is none, those of another unit that change.
     """
     fit = [c for c in candidates if _may_be(c.field.path, unit)]
     good = [c for c in candidates if c.score >= LEAST]
@@ -219,7 +219,7 @@ def _of_unit(log: LogReport, candidates: list[_Candidate], unit: str) -> list[_C
         for field in topic.fields
         if field.low != field.high and unit_of(field.path) == unit
     ]
-    return moving or candidates
+    return moving or [c for c in candidates if c.field.low is None or c.field.low != c.field.high]
 
 
 def _of_stem(log: LogReport, name: str, unit: str) -> list[_Candidate]:
@@ -416,7 +416,7 @@ def _measured(best: _Candidate, ranked: list[_Candidate]) -> _Candidate | None:
     if kind is None or not _reckons(best.topic):
         return None
     often = AS_OFTEN * best.topic.rate_hz  # a pose updated twice a second shows no motion
-    poses = (c for c in ranked if c.topic.type.endswith(_POSES) and c.topic.rate_hz >= often)
+    poses = (c for c in ranked if c.topic.type.endswith(POSES) and c.topic.rate_hz >= often)
     fits = (c for c in poses if c.field.path.endswith(kind) and c.score > best.score - SURE)
     return next(fits, None)
 
