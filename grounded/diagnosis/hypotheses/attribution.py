@@ -256,9 +256,9 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         starts = _starts(search, size, best)
         done |= {frozenset(fit.hypothesis.names) for fit in starts}
         halves = _halves(search, starts) if size == 1 else []
-        grown = [search.extended(start, AT_FIRST) for start in starts]
-        grown += [search.extended(half, 4) for half in halves]
-        firsts = [max(fits, key=search.score) for fits in grown if fits]  # noise differs between
+        added = [search.extended(start, AT_FIRST) for start in starts]
+        added += [search.extended(half, 4) for half in halves]
+        firsts = [max(fits, key=search.score) for fits in added if fits]  # noise differs between
         search.finished(list(dict.fromkeys([*search.of_size(size + 1)[:HOPEFUL], *firsts])), 10)
         search.again(search.of_size(size + 1)[:2])
         reordered(search, search.of_size(size + 1)[:HOPEFUL])
@@ -281,6 +281,12 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         _nested(search, chosen)
         if search.chosen(most) is chosen:
             break
+    chosen = search.chosen(most)
+    size = len(chosen.hypothesis.effects)
+    if size < most and (late := search.late_sensors(chosen)):
+        search.settled(search.refined(late, TO_THE_TOP))
+        if len(search.chosen(most).hypothesis.effects) > size:
+            return grown(search, search.chosen(most), most)
     settle(search, most)
     return search.chosen(most)
 
