@@ -1,14 +1,15 @@
-"""Losses of an input to the motion that it drives: friction and inertia of a joint.
+"""Losses of an input to the motion that it drives: friction, inertia and stiffness of a joint.
 
     u_eff = u - T(w),      target `tau<-w`: the input tau, and the velocity w that it drives
+    u_eff = u - k q,       target `tau<-q`: the same of a spring, and the joint's position q
 
 A joint's friction is a torque. Through the inertia matrix, M(q)^-1 T, it acts on all accelerations,
 not only on the joint's own. So it is subtracted where the model's own torque enters, and needs only
 the model's step, be it NumPy, MuJoCo or any black box. `losses` solves for it within a step.
 
 If tau drives w alone through a constant inertia, the friction equals a Coulomb and a viscous
-friction of w, and an added inertia equals a gain of its rate. These names are used then
-(`renamed`).
+friction of w, an added inertia equals a gain of its rate, and a spring equals a coupling of w with
+the position. These names are used then (`renamed`).
 
 Pairs are found from the model: tau always pushes w in the same direction. (This holds for a torque
 and its own joint's velocity, since diagonals of the inverse inertia matrix are positive; elements
@@ -213,6 +214,11 @@ def renamed(model: Model) -> dict[str, str]:
         if alone(model, tau, w):
             found |= {f"joint_friction:{pair}": f"coulomb_friction:{w}"}
             found |= {f"added_inertia:{pair}": f"rate_gain:{w}"}
+    for pair in springs_of(model):
+        tau, _, q = pair.partition("<-")
+        w = places.integrated(model)[q][0]
+        if alone(model, tau, w):
+            found |= {f"joint_spring:{pair}": f"coupling:{w}<-{q}"}
     return found
 
 
@@ -252,6 +258,37 @@ load_friction = LossFamily(
     ),
 )
 
+
+def springs_of(model: Model) -> list[str]:
+    """Return `tau<-q` for every effort and the position of the joint that it drives."""
+    axes = places.integrated(model)
+    positions = {w: [q for q, (speed, _) in axes.items() if speed == w] for w, _ in axes.values()}
+    pairs = (pair.split("<-") for pair in pairs_of(model))
+    return [f"{tau}<-{positions[w][0]}" for tau, w in pairs if len(positions.get(w, ())) == 1]
+
+
+def _stiffness(site: Site) -> tuple[Quantity, ...]:
+    tau, q = coupled(site)
+    return (Quantity("k", f"{site.unit(tau)}/{site.unit(q)}"),)
+
+
+def _pull(q: Any, free: Any, gain: Any, u: Any, c: Any, dt: Any) -> Any:
+    """Return the mean of k q over a step that would end at the position `free`."""
+    return 0.5 * c["k"] * (q + free) / np.maximum(1 + 0.5 * c["k"] * gain, 0.1)
+
+
+joint_spring = LossFamily(
+    name="joint_spring",
+    equation="u_eff = u - k q   (u<-q)",
+    sentence="a spring (a cable, a flexure, a hose) pulls {source} back to 0, by {k} of {driven}",
+    targets=springs_of,
+    quantities=_stiffness,
+    lookalikes=("coupling", "input_bias", "parameter"),
+    loss=_pull,
+    early=_pull,
+    torque=lambda q, rate, gain, u, c: c["k"] * q,
+)
+
 added_inertia = LossFamily(
     name="added_inertia",
     equation="u_eff = u - J w'   (u<-w)",
@@ -264,4 +301,4 @@ added_inertia = LossFamily(
     torque=lambda w, rate, gain, u, c: c["J"] * rate,
 )
 
-FAMILIES = (joint_friction, load_friction, added_inertia)
+FAMILIES = (joint_friction, load_friction, added_inertia, joint_spring)

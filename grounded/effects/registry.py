@@ -225,6 +225,10 @@ class _Rates:
             tau, _, w = pair.partition("<-")
             by, rate = f_u[:, :, model.input_names.index(tau)], own[:, [model.state_names.index(w)]]
             self.named[f"added_inertia:{pair}"] = (by * rate)[:, kept]
+        for pair in joint.springs_of(model):  # such as a stiffness that is a parameter
+            tau, _, q = pair.partition("<-")
+            by, at = f_u[:, :, model.input_names.index(tau)], x[:, [model.state_names.index(q)]]
+            self.named[f"joint_spring:{pair}"] = (by * at)[:, kept]
         inputs = {f"input_bias:{n}": f_u[:, kept, j] for j, n in enumerate(model.input_names)}
         params = {f"parameter:{n}": f_p[:, kept, k] for k, n in enumerate(model.param_names)}
         self.slopes = inputs | params

@@ -20,6 +20,7 @@ from grounded.effects.joint import FAMILIES, has_viscous, like_a_load, pairs_of
 from grounded.effects.losses import dry
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
+from grounded.models.lift import model as lift
 from grounded.models.pendulum import model as pendulum
 
 DT = 0.02
@@ -54,20 +55,21 @@ arm = Model(
     derivative=dynamics,
 )
 PAIRS = ["t1<-w1", "t2<-w2"]
+SPRINGS = ["t1<-q1", "t2<-q2"]
 
 
-def rates(x, u, c, J):
-    """ds/dt of the real arm: friction in its joints, inertia on their axes."""
+def rates(x, u, c, J, k=(0.0, 0.0)):
+    """ds/dt of the real arm: friction and springs in its joints, inertia on their axes."""
     p, s = Named("parameter", ("m2",), [1.0]), Named("state", arm.state_names, x)
-    left = u - np.array(c) * np.tanh(x[2:] / 2e-3)
+    left = u - np.array(c) * np.tanh(x[2:] / 2e-3) - np.array(k) * x[:2]
     own = dynamics(s, Named("input", arm.input_names, left), p)
     m11, m12, m22 = mass(s, None, p)
     M = np.array([[m11, m12], [m12, m22]])
     return np.concatenate([x[2:], np.linalg.solve(M + np.diag(J), M @ [own["w1"], own["w2"]])])
 
 
-def real_trials(count=3, steps=100, c=(0.0, 0.0), J=(0.0, 0.0)):
-    """The arm with friction in its joints, by the midpoint rule in 40 parts of a step; noise."""
+def real_trials(count=3, steps=100, c=(0.0, 0.0), J=(0.0, 0.0), k=(0.0, 0.0)):
+    """The arm with friction and springs in its joints, 40 midpoint steps a control step; noise."""
     rng, found, h = np.random.default_rng(1), [], DT / 40
     for _ in range(count):
         t, w = DT * np.arange(steps), rng.uniform(2, 7, 4)
@@ -76,7 +78,7 @@ def real_trials(count=3, steps=100, c=(0.0, 0.0), J=(0.0, 0.0)):
         x, states = np.zeros(4), [np.zeros(4)]
         for row in u:
             for _ in range(40):
-                x = x + h * rates(x + 0.5 * h * rates(x, row, c, J), row, c, J)
+                x = x + h * rates(x + 0.5 * h * rates(x, row, c, J, k), row, c, J, k)
             x = x + np.array([0, 0, 2e-3, 4e-3]) * rng.standard_normal(4)
             states.append(x)
         y = np.array(states) + np.array([5e-4, 5e-4, 1e-2, 1e-2]) * rng.standard_normal(
@@ -91,6 +93,9 @@ def test_a_pair_is_a_torque_and_the_velocity_of_its_own_joint():
     assert pairs_of(pendulum) == ["torque<-omega"]
     names = [effect.name for effect in Library().candidates(arm)]
     assert {f"joint_friction:{pair}" for pair in PAIRS} <= set(names)
+    assert {f"joint_spring:{pair}" for pair in SPRINGS} <= set(names)
+    single = [effect.name for effect in Library().candidates(lift)]
+    assert "coupling:w<-z" in single and "joint_spring:volts<-z" not in single
 
 
 def test_gains_of_several_joints_of_an_arm_are_like_a_load():
@@ -152,12 +157,14 @@ def test_a_loss_at_one_moment_is_that_of_a_short_step(family, w, rate, u):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("family", ["joint_friction", "load_friction", "added_inertia"])
+@pytest.mark.parametrize(
+    "family", ["joint_friction", "load_friction", "added_inertia", "joint_spring"]
+)
 def test_an_adopted_loss_is_the_one_that_was_diagnosed(family):
     trials = real_trials(2, 60)
     predictor, h, model = Predictor(prepare(arm, trials)), Hypothesis(), arm
     values = {"c": 0.3, "b": 0.1, "width": 0.02, "k": 0.1, "J": 0.05}
-    for pair in PAIRS:
+    for pair in SPRINGS if family == "joint_spring" else PAIRS:
         effect = Library().effect(f"{family}:{pair}", arm, predictor.data.scales)
         own = {q.name: values[q.name] for q in effect.quantities}
         h = h.plus(effect, own)
@@ -194,13 +201,20 @@ def test_a_position_moves_by_the_loss_as_it_grows_within_the_step(w, push):
     assert got[1] == pytest.approx(fine[1], abs=2e-3)
 
 
-@pytest.mark.parametrize("family", ["joint_friction", "added_inertia"])
-def test_the_jacobian_goes_through_a_loss(family):
+@pytest.mark.parametrize(
+    ("family", "values"),
+    [
+        ("joint_friction", {"c": 0.3, "b": 0.2}),
+        ("added_inertia", {"J": 0.05}),
+        ("joint_spring", {"k": 2.0}),
+    ],
+)
+def test_the_jacobian_goes_through_a_loss(family, values):
     predictor = Predictor(prepare(arm, real_trials(2, 60)))
     h = Hypothesis()
-    for pair in PAIRS:
+    for pair in SPRINGS if family == "joint_spring" else PAIRS:
         effect = Library().effect(f"{family}:{pair}", arm, predictor.data.scales)
-        h = h.plus(effect, {"c": 0.3, "b": 0.2} if family == "joint_friction" else {"J": 0.05})
+        h = h.plus(effect, values)
     track, u = predictor.data.y, predictor.inputs(h)
     F = step_jacobian(predictor, h, track)
     both, f_p = sensitivities_of(predictor, h, track[:-1], u)
@@ -232,6 +246,27 @@ def test_an_inertia_that_was_left_out_is_found():
     found = gr.diagnose(arm, real_trials(J=(0.08, 0.0)))
     assert found.effects == ("added_inertia:t1<-w1",)
     assert found.ranking[0].params["J"].value == pytest.approx(0.08, rel=0.03)
+
+
+def test_a_step_with_a_spring_is_that_of_many_small_ones():
+    x, u, k = np.array([0.4, -0.3, 1.0, 2.0]), np.array([1.0, -0.2]), (3.0, 0.5)
+    model, fine, parts = arm, x.copy(), 2000
+    for pair, one in zip(SPRINGS, k, strict=True):
+        model = wrap(Library().effect(f"joint_spring:{pair}", model), {"k": one}, DT)
+    got = model.system.step(x[None], u[None], model.values, DT)[0]
+    none = arm.system.step(x[None], u[None], arm.values, DT)[0]
+    for _ in range(parts):
+        middle = fine + 0.5 * DT / parts * rates(fine, u, (0.0, 0.0), (0.0, 0.0), k)
+        fine = fine + DT / parts * rates(middle, u, (0.0, 0.0), (0.0, 0.0), k)
+    assert np.abs(got - fine).max() < 0.02 * np.abs(none - fine).max()
+
+
+@pytest.mark.slow
+def test_a_cable_at_a_joint_is_found():
+    """Seen on a rotary pendulum: two couplings stood in, and errors were a hundred times larger."""
+    found = gr.diagnose(arm, real_trials(k=(2.0, 0.0)))
+    assert found.effects == ("joint_spring:t1<-q1",)
+    assert found.ranking[0].params["k"].value == pytest.approx(2.0, rel=0.03)
 
 
 def crane(unit):

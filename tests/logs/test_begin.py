@@ -576,7 +576,7 @@ def test_a_robot_that_balances_is_known_by_its_encoders(tmp_path):
     begin(tmp_path / "over_ground", log)
     plain, own = (Workspace(tmp_path / one).base_model for one in ("over_ground", "w"))
     turned = np.array([[0.2, 0.5, 0.1, 0.4]])  # the wheels against the body, which leans
-    over_ground = turned + [[0.035 * 0.1, 0.035 * 0.4, 0.0, 0.0]]
+    over_ground = turned + np.array([0.035 * 0.1, 0.035 * 0.4, 0.0, 0.0])
     u, h = np.array([[1.5]]), 1e-6
     by_ground = (plain.system.step(over_ground, u, plain.values, h) - over_ground)[0] / h
     by_wheels = (own.system.step(turned, u, own.values, h) - turned)[0] / h

@@ -11,7 +11,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from grounded.errors import GroundedError, nearest
-from grounded_trials.logs.inspection.inspect_guess import NAMES_BY_UNIT, PARTS, POSES, Guess, clock_of
+from grounded_trials.logs.inspection.inspect_guess import (
+    NAMES_BY_UNIT,
+    PARTS,
+    POSES,
+    Guess,
+    clock_of,
+)
 from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport, TopicReport
 from grounded_trials.logs.inspection.inspect_pairs import rates_among
 from grounded_trials.logs.inspection.joint_names import from_base, slides
