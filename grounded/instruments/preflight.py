@@ -82,7 +82,7 @@ from grounded.instruments.units.odd_trial import (
 )
 from grounded.instruments.units.other_units import judge_stamps, judge_units
 from grounded.model import Model
-from grounded.places import Integral, integrals, speed
+from grounded.places import Integral, integrals, partner, speed
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -319,7 +319,8 @@ class _Bench:
         elif lag.off(OFF):
             yield scaled(w, q, lag.scale, self.model.states[w])
         elif relation.exact and lag.one_size:
-            self.refuted |= {f"sensor_scale:{w}", f"sensor_scale:{q}", f"rate_gain:{q}"}
+            self.refuted |= {f"sensor_scale:{w}", f"sensor_scale:{q}"}
+            self.refuted |= self.of_position("rate_gain", q, w)
 
     def turns_away(self, i: int) -> bool:
         """Check whether the course travelled agrees with the heading only if its sign reverses."""
@@ -393,7 +394,8 @@ class _Bench:
         """Drop a velocity that a filter computes from its position: neither is a delay or scale."""
         q, w = (self.model.state_names[k] for k in (relation.i, relation.j))
         if abs(found.gain - 1) + SURELY * found.gain_std < SAME:
-            self.refuted |= {f"sensor_scale:{w}", f"sensor_scale:{q}", f"rate_gain:{q}"}
+            self.refuted |= {f"sensor_scale:{w}", f"sensor_scale:{q}"}
+            self.refuted |= self.of_position("rate_gain", q, w)
         return replace(self.smoothed(relation, found.over), finding=derived_from(q, found.age))
 
     def positions(self) -> Iterator[Finding]:
@@ -413,7 +415,7 @@ class _Bench:
         if found is None:
             return
         if found.refuted:
-            self.refuted |= {f"sensor_bias:{w}", f"offset:{q}"}
+            self.refuted |= {f"sensor_bias:{w}"} | self.of_position("offset", q, w)
         elif found.found:
             unit, v = self.model.states[w], speed(self.model)
             more = "more" if (found.pull or found.value) > 0 else "less"
@@ -424,6 +426,13 @@ class _Bench:
                 text = f"shows {size} {more} than the rate of {q}"
                 why = "wheels of unequal size, or a pull to one side"
             yield Finding(w, f"{text}: {why}", "offset")
+
+    def of_position(self, family: str, q: str, w: str) -> set[str]:
+        """Return an effect on the rate of q that a sensor of w without it rules out, if any.
+
+        A heading rate that is only carried along shows what turns the robot, effects included.
+        """
+        return set() if partner(self.model, q) == w else {f"{family}:{q}"}
 
     def plane(self) -> Iterator[Finding]:
         """Check a heading and a speed against the course travelled."""

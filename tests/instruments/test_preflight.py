@@ -187,6 +187,24 @@ def test_a_constant_that_few_or_noisy_samples_would_not_show_may_be_there():
     assert "sensor_bias:w" not in preflight(ARM, noisy).settled
 
 
+@pytest.mark.slow
+def test_a_heading_rate_that_is_only_carried_rules_out_no_effect_on_the_heading():
+    """A car that turned by -0.43 rad/s was told as a patch of ground, with ten times the error."""
+    rng, trials = np.random.default_rng(2), []
+    real = wrap(Library().effect("offset:psi", car), {"c": -0.4}, DT)
+    for _ in range(4):
+        t, w = DT * np.arange(200), rng.uniform(1, 6, 3)
+        u = np.stack(
+            [0.3 * np.sin(w[0] * t) + 0.2 * np.sin(w[1] * t), 0.5 + 0.2 * np.sin(w[2] * t)]
+        )
+        x = real.system.march(-0.4 * GYRO[None], u.T[:, None], real.values, DT)[:, 0]
+        noise = np.array([5e-3, 1e-2, 2e-3, 2e-3, 2e-3, 1e-2]) * rng.standard_normal(x.shape)
+        trials.append(Trial(x + noise, u.T, DT, car.state_names, car.input_names))
+    settled = preflight(car, trials).settled
+    assert "sensor_bias:psi_rate" in settled and not {"offset:psi", "rate_gain:psi"} & settled
+    assert diagnose(car, trials).effects == ("offset:psi",)
+
+
 @pytest.mark.parametrize(("scale", "settled"), [(1.0, True), (1.01, False), (0.994, False)])
 def test_a_scale_between_two_sensors_that_agree_is_no_candidate(scale, settled):
     found = preflight(ARM, arm(columns(w=lambda x: scale * x)))
