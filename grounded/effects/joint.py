@@ -209,16 +209,14 @@ def _uncertain_inertia(model: Model) -> bool:
 def renamed(model: Model) -> dict[str, str]:
     """Return effects of a joint with constant inertia that are equivalent: {dropped: kept}."""
     found: dict[str, str] = {}
+    springs = dict(pair.split("<-") for pair in springs_of(model))
     for pair in pairs_of(model):
         tau, _, w = pair.partition("<-")
         if alone(model, tau, w):
             found |= {f"joint_friction:{pair}": f"coulomb_friction:{w}"}
             found |= {f"added_inertia:{pair}": f"rate_gain:{w}"}
-    for pair in springs_of(model):
-        tau, _, q = pair.partition("<-")
-        w = places.integrated(model)[q][0]
-        if alone(model, tau, w):
-            found |= {f"joint_spring:{pair}": f"coupling:{w}<-{q}"}
+            if q := springs.get(tau):
+                found[f"joint_spring:{tau}<-{q}"] = f"coupling:{w}<-{q}"
     return found
 
 
