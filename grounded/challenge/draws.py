@@ -143,6 +143,9 @@ def _value(
         return 2 * size / scales.peak(target.partition("<-")[2])
     if family in ("joint_friction", "load_friction", "added_inertia"):
         return _joint(quantity, size, scales, *target.split("<-"))
+    if family == "joint_spring":
+        tau, _, q = target.partition("<-")
+        return size * scales.peak(tau) / (scales.peak(q) if quantity == "k" else 5.0)
     if family == "grip_limit":
         return (1 - size) * max(effect.free[0].grid) / 2
     if family == "lever_arm":

@@ -1,7 +1,7 @@
 """Losses of an input to the motion that it drives: friction, inertia and stiffness of a joint.
 
     u_eff = u - T(w),      target `tau<-w`: the input tau, and the velocity w that it drives
-    u_eff = u - k q,       target `tau<-q`: the same of a spring, and the joint's position q
+    u_eff = u - k q - b,   target `tau<-q`: the same of a spring, and the joint's position q
 
 A joint's friction is a torque. Through the inertia matrix, M(q)^-1 T, it acts on all accelerations,
 not only on the joint's own. So it is subtracted where the model's own torque enters, and needs only
@@ -267,24 +267,25 @@ def springs_of(model: Model) -> list[str]:
 
 def _stiffness(site: Site) -> tuple[Quantity, ...]:
     tau, q = coupled(site)
-    return (Quantity("k", f"{site.unit(tau)}/{site.unit(q)}"),)
+    return (Quantity("k", f"{site.unit(tau)}/{site.unit(q)}"), Quantity("b", site.unit(tau)))
 
 
 def _pull(q: Any, free: Any, gain: Any, u: Any, c: Any, dt: Any) -> Any:
-    """Return the mean of k q over a step that would end at the position `free`."""
-    return 0.5 * c["k"] * (q + free) / np.maximum(1 + 0.5 * c["k"] * gain, 0.1)
+    """Return the mean of k q + b over a step that would end at the position `free`."""
+    return (0.5 * c["k"] * (q + free) + c["b"]) / np.maximum(1 + 0.5 * c["k"] * gain, 0.1)
 
 
 joint_spring = LossFamily(
     name="joint_spring",
-    equation="u_eff = u - k q   (u<-q)",
-    sentence="a spring (a cable, a flexure, a hose) pulls {source} back to 0, by {k} of {driven}",
+    equation="u_eff = u - k q - b   (u<-q)",
+    sentence="a spring (a cable, a flexure, a hose) pulls {source} back by {k} of {driven}, "
+    "and {b} where it is 0",
     targets=springs_of,
     quantities=_stiffness,
     lookalikes=("coupling", "input_bias", "parameter"),
     loss=_pull,
     early=_pull,
-    torque=lambda q, rate, gain, u, c: c["k"] * q,
+    torque=lambda q, rate, gain, u, c: c["k"] * q + c["b"],
 )
 
 added_inertia = LossFamily(

@@ -206,7 +206,7 @@ def test_a_position_moves_by_the_loss_as_it_grows_within_the_step(w, push):
     [
         ("joint_friction", {"c": 0.3, "b": 0.2}),
         ("added_inertia", {"J": 0.05}),
-        ("joint_spring", {"k": 2.0}),
+        ("joint_spring", {"k": 2.0, "b": 0.1}),
     ],
 )
 def test_the_jacobian_goes_through_a_loss(family, values):
@@ -252,7 +252,7 @@ def test_a_step_with_a_spring_is_that_of_many_small_ones():
     x, u, k = np.array([0.4, -0.3, 1.0, 2.0]), np.array([1.0, -0.2]), (3.0, 0.5)
     model, fine, parts = arm, x.copy(), 2000
     for pair, one in zip(SPRINGS, k, strict=True):
-        model = wrap(Library().effect(f"joint_spring:{pair}", model), {"k": one}, DT)
+        model = wrap(Library().effect(f"joint_spring:{pair}", model), {"k": one, "b": 0.0}, DT)
     got = model.system.step(x[None], u[None], model.values, DT)[0]
     none = arm.system.step(x[None], u[None], arm.values, DT)[0]
     for _ in range(parts):
@@ -267,6 +267,7 @@ def test_a_cable_at_a_joint_is_found():
     found = gr.diagnose(arm, real_trials(k=(2.0, 0.0)))
     assert found.effects == ("joint_spring:t1<-q1",)
     assert found.ranking[0].params["k"].value == pytest.approx(2.0, rel=0.03)
+    assert found.ranking[0].params["b"].value == pytest.approx(0.0, abs=0.03)
 
 
 def crane(unit):
