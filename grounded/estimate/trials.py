@@ -128,7 +128,8 @@ def _estimates(
 ) -> list[Estimated]:
     found, g = [], filtered.gains
     assert g.P is not None
-    S = g.measured @ g.P @ g.measured.swapaxes(-1, -2)
+    with np.errstate(all="ignore"):  # a filter that diverged says so in its status
+        S = g.measured @ g.P @ g.measured.swapaxes(-1, -2)
     np.einsum("...ii->...i", S)[:] += g.system.R[1:]
     for b, record in enumerate(records):
         rows = slice(0, record.steps + 1)

@@ -84,6 +84,27 @@ def test_a_start_that_a_target_gives_is_told_for_each_target_where_its_sensor_ha
     assert told() == ""
 
 
+def test_an_arm_that_its_friction_holds_needs_no_input_before_the_start(tmp_path):
+    """A rotary pendulum, pulled by its cable with 0.05 V and held by 0.28 V, was said to move."""
+    hanging = BALANCED.replace("10 * s.th", "-10 * s.th").replace('"m', '"rad')
+    (tmp_path / "mine.py").write_text(hanging)
+    w = Workspace.create(tmp_path / "w", model=tmp_path / "mine.py")
+    file = w.folder / "grounded.toml"
+    text = file.read_text().replace("[limits]", "[limits]\nu = [-3, 3]")
+    text = re.sub(r"(?m)^start = .*$", "start = { }", text)
+    spring = '{name = "joint_spring:u<-x", k = 0.5, b = -0.25}'
+
+    def told(*effects: str) -> str:
+        file.write_text(text.replace("[task]", f"effects = [{', '.join(effects)}]\n[task]", 1))
+        to = {"x": np.linspace(0, 0.4, 41), **{name: np.zeros(41) for name in ("th", "v", "w")}}
+        Workspace(w.folder).target(to)
+        notes = [n for n in Workspace(w.folder).propose().proposal.notes if "the plan assumes" in n]
+        return " ".join(notes).partition("start = ")[2]
+
+    assert told(spring) == "{ u = -0.25 }"
+    assert told(spring, '{name = "joint_friction:u<-v", c = 0.3, b = 0.0, width = 0.005}') == ""
+
+
 def test_a_plan_that_begins_from_no_input_is_not_handed_out_before_it_was_said(tmp_path):
     """A helicopter's `next:` was to export a plan from 0 V, which a note said to mend first."""
     (tmp_path / "lifted.py").write_text(LIFTED)

@@ -108,7 +108,8 @@ def _as_given(task: Task, stands: Array, target: Array) -> Array:
     """Return states and inputs at rest with each input as given if the robot rests under that too.
 
     In SETTLED steps, or a second, no state but the rates may then move, except for SLOW of its
-    range in the target. Within a dead zone, for example, it rests anywhere, not only at the edge.
+    range in the target, or of the largest in its unit. Within a dead zone, for example, it rests
+    anywhere, not only at the edge; an arm that dry friction holds creeps.
 
     Args:
         task: the task.
@@ -117,7 +118,9 @@ def _as_given(task: Task, stands: Array, target: Array) -> Array:
     """
     n, stands, own = task.model.n, stands.copy(), target.shape[1]
     ranges = np.nan_to_num(np.ptp(target, axis=0))
-    units = [*task.model.states.values()][:own]
+    units = np.array([*task.model.states.values()][:own])
+    alike = np.array([ranges[units == unit].max() for unit in units])  # one may stay, or be free
+    ranges = np.where(ranges > 0, ranges, alike)
     rates = np.array([unit.endswith("/s") for unit in units])
     by = np.where(ranges > 0, SLOW * ranges, np.where(rates & ranges.any(), np.inf, NOTHING))
     most = _drift(task, stands, own) + by
