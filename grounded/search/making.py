@@ -480,7 +480,8 @@ class Maker:
         if not (found.ok and np.isfinite(run.z).all()):
             return policy
         plan, columns = self.planner.plan, base_columns(problem, self.planner.plan)
-        K = measured_gains(gentle, run.z, run.inputs, found.gains.K, self.planner.task.model.n)
+        n, units = self.planner.task.model.n, plan.model.states
+        K = measured_gains(gentle, run.z, run.inputs, found.gains.K, n, units)
         made = plan.policy(run.inputs, K[:, :, columns], run.z[:-1, columns])
         return self.planner.narrowed(for_late_samples(made, problem))
 

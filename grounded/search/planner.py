@@ -185,12 +185,13 @@ class Planner:
         if self.plan.model.n == self.task.model.n or policy.gain is None:
             return policy, found
         task, n = cautious(self.aim, caution), self.task.model.n
-        made = [measured_gains(task.problem(), found.z, found.u, found.K, n)]
+        units = task.model.states
+        made = [measured_gains(task.problem(), found.z, found.u, found.K, n, units)]
         exact = self.plan.problem(exact=True)
         for factor in DEARER if self.widths else ():
             dear = self.dearer(task.problem(exact=True), factor)
             K = sweep(dear, found.z, found.u).gains.K
-            made.append(measured_gains(dear, found.z, found.u, K, n))
+            made.append(measured_gains(dear, found.z, found.u, K, n, units))
         policies = [dataclasses.replace(policy, gain=K) for K in made]
         return max(policies, key=lambda one: predicted(exact, one).utility), found
 

@@ -59,7 +59,7 @@ def direction(
     found = ddp.solve(problem, grounding.inputs, gains.K, z[:-1], PLANNING)
     K = found.K
     if measured is not None and measured < task.model.n:
-        K = measured_gains(problem, found.z, found.u, K, measured)
+        K = measured_gains(problem, found.z, found.u, K, measured, task.model.states)
     columns = base_columns(problem, task)
     return task.policy(found.u, K[:, :, columns], found.z[:-1, columns])
 
