@@ -34,7 +34,7 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Effect, InputFamily, MediumFamily, ParamFamily, RateFamily
 from grounded.effects.wrap import SURE
 from grounded.filter.tempering import Tempering, tempering
-from grounded.frozen import MEDIAN, Array
+from grounded.frozen import Array, median, white_noise
 
 CLAIM = 3.0  # nats from which an effect is claimed
 TIE = 3.0  # nats within which two explanations are indistinguishable
@@ -212,8 +212,8 @@ def _seen_rate(data: Data, effect: Effect) -> float:
     if not known.any():
         return 0.0
     changed = float(np.quantile(np.abs(moved[known]), OFTEN))
-    bent = np.abs(np.diff(data.y[..., i], n=2, axis=0)[np.asarray(data.valid.T > 0)[1:]])
-    noise = float(np.median(bent)) / (MEDIAN * math.sqrt(6)) if len(bent) else 0.0
+    run = np.concatenate([np.ones_like(data.valid[:, :1]), data.valid], axis=1).T > 0
+    noise = float(median(white_noise(np.where(run, data.y[..., i], np.nan))))
     of_noise = NOISE_CHANGES * math.sqrt(2) * noise
     return TOO_SLOW * math.sqrt(max(changed**2 - of_noise**2, 0.0)) / (steps * data.dt)
 
