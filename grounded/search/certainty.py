@@ -161,13 +161,14 @@ def chance(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
     The part of the gain that is due to different start states does not count.
 
     Returns:
-        The probability; NaN if no candidate of similar utility was repeated.
+        The probability; NaN if no candidate of similar utility was repeated, or if they began
+        apart and no model tells what that is worth.
     """
     if not math.isfinite(before.utility):  # it failed
         return 1.0
     gain = after.utility - before.utility - owed_to_start(before, after, history)
     error, freedom = error_between(before, after, history)
-    if not freedom:
+    if not freedom or (error and _start_unknown(before, after, history)):
         return math.nan
     return student(gain / error, freedom) if error else float(gain > 0)
 
@@ -191,6 +192,12 @@ def last_improvement(history: Sequence[Tried], again: str = "run the best one ag
             "to be sure"
         )
     error, freedom = error_between(before, after, history)
+    if freedom and error and _start_unknown(before, after, history):
+        return (
+            f"the last gain is {with_error(gain, error)} by the scatter of repeats, but "
+            f"{before.candidate.id} and {after.candidate.id} began from different start states, "
+            "and how much of it is due to that is not known: run both from [task] start to be sure"
+        )
     if not freedom:
         return (
             f"the last gain is {gain:.3g}; candidates of similar utility were run only once, so "
@@ -235,8 +242,19 @@ def owed_to_start(before: Tried, after: Tried, history: Sequence[Tried]) -> floa
 
     The models that were grounded on these trials give the estimate: U^ of the run from s_0 less U^
     of the run from where the trials began. It is 0 if both began alike, or if a candidate that
-    began elsewhere has no such model.
+    began elsewhere has no such model (`_start_unknown`).
     """
+    gain, start = after.utility - before.utility, _of_start(before, after, history)
+    return start if abs(start) > PART * abs(gain) and math.isfinite(start) else 0.0
+
+
+def _start_unknown(before: Tried, after: Tried, history: Sequence[Tried]) -> bool:
+    """Return whether two candidates began apart, and no model tells what that is worth."""
+    return math.isnan(_of_start(before, after, history))
+
+
+def _of_start(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
+    """Return the model's part of a gain that is due to the start; 0 if alike, NaN if unknown."""
     if not (before.trials and after.trials and _began_apart(before, after)):
         return 0.0
 
@@ -250,8 +268,7 @@ def owed_to_start(before: Tried, after: Tried, history: Sequence[Tried]) -> floa
         known = [start for start in starts if math.isfinite(start)]
         return known[-1] if known else math.nan
 
-    gain, start = after.utility - before.utility, worth(before) - worth(after)
-    return start if abs(start) > PART * abs(gain) and math.isfinite(start) else 0.0
+    return worth(before) - worth(after)
 
 
 def _began_apart(one: Tried, other: Tried) -> bool:

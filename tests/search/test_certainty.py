@@ -202,6 +202,8 @@ def test_what_a_start_is_worth_is_no_improvement():
     assert owed_to_start(first, same, [first, same]) == 0.0  # both began 7 cm away
     away = ran("c0002", "c0001", -3.9, off=-0.07, as_run=-5.9)
     assert owed_to_start(first, away, [first, away]) == 0.0  # nothing tells what -7 cm is worth
+    told = last_improvement([first, away])
+    assert holds(told, "2.1000 +- 0.0071", "start", "not known") and "probability" not in told
     little = ran("c0002", "c0001", -3.9, off=0.0, as_run=-4.1)
     assert owed_to_start(first, little, [first, little]) == 0.0
 
