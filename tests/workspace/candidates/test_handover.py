@@ -186,6 +186,20 @@ def test_a_bound_that_the_start_is_nearest_to_is_no_news(tmp_path):
     assert "the upper bound of x" in note and "at 0 s" not in note and "lower" not in note
 
 
+def test_speeds_that_are_fed_back_but_not_logged_are_told_with_the_first_candidate(tmp_path):
+    """A student's program had to guess that it computes two speeds that no column held."""
+    x, estimate = '[log.state.x]\npath = "/csv.x"\n', "[estimate]\nmeasured = { x = 0.002 }\n"
+    u, v = '[log.input.force]\npath = "/csv.u"\n', '[log.state.v]\npath = "/csv.v"\n'
+    w = Workspace(make(tmp_path / "w", config=CONFIG + x + u + estimate).folder)
+    made = w.propose()
+    assert np.abs(made.proposal.candidate.policy.gain[:, :, 1]).max() > 0
+    (note,) = [n for n in made.proposal.notes if "feeds back" in n]
+    assert holds(note, "c0001", "v", "no column") and note in w.export("c0001").notes
+    for name, table in (("logged", x + u + v + estimate), ("measured", x + u + v)):
+        whole = Workspace(make(tmp_path / name, config=CONFIG + table).folder)
+        assert not [n for n in whole.propose().proposal.notes if "feeds back" in n]
+
+
 def test_a_first_plan_that_safety_forbids_says_what_to_do_and_not_to_diagnose(tmp_path):
     """There was no trial, and `next:` was to diagnose it; then it was to propose it again."""
     w = Workspace(make(tmp_path / "w", config=CONFIG + SAFETY.format(high=0.5)).folder)

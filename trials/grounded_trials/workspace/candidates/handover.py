@@ -25,6 +25,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
+from grounded.result import listed
 from grounded.rollout import seen_late
 from grounded.search.candidate import Candidate
 from grounded.search.certainty import beyond_one_trial
@@ -268,6 +269,7 @@ class Check:
             yield f"the model was changed since {name} was made; {again}"
         if self.same_task and not self.standing.trials:
             yield from self._untried()
+            yield from self._not_logged()
         if self.same_task and (coasts := self._coasting()):
             yield coasts
 
@@ -321,6 +323,24 @@ class Check:
             yield (
                 f"[safety] was only checked on the prediction, which no run has tested: {made.id} "
                 f"is predicted to come {told}. The robot may go further: be ready to stop it"
+            )
+
+    def _not_logged(self) -> Iterator[str]:
+        """Yield which states are fed back although [log] has no column of them, only estimates."""
+        gain, config = self.candidate.policy.gain, self.workspace.config
+        mapped = self.workspace.log_mapping if config.estimate.names() else None
+        if gain is None or mapped is None:
+            return
+        names = self.workspace.base_model.state_names
+        used = np.abs(gain[:, :, : len(names)]).max(axis=(0, 1)) > 0
+        told = [n for n, u in zip(names, used, strict=True) if u and n not in mapped.states]
+        if told:
+            it = "them" if len(told) > 1 else "it"
+            yield (
+                f"{self.candidate.id} feeds back {listed(told)}, of which the log has no column: "
+                f"your program has to compute {it} while it runs (differences, a filter). Let it "
+                f"log {it}, and map {it} in [log] too: a run is recognised by the commands that "
+                "follow from these values"
             )
 
     def _coasting(self) -> str:
