@@ -27,6 +27,7 @@ from grounded.effects import (
     SensorFamily,
     SensorLagFamily,
 )
+from grounded.effects.drive import speed
 from grounded.effects.family import coupled
 from grounded.effects.medium import over_ground, through_it
 from grounded.frozen import Array
@@ -185,10 +186,11 @@ class _Run:
         own = dict(model.derivative(s, a, self.p))
         for effect, values in self.truth.effects:
             if isinstance(effect.family, LossFamily):
-                tau, w = coupled(effect.site)
+                tau = coupled(effect.site)[0]
                 more = model.derivative(s, _with(a, tau, a[tau] + NUDGE), self.p)
-                gain = (more[w] - own[w]) / NUDGE
-                lost = effect.family.torque(s[w], own[w], gain, a[tau], values)
+                w, rate, then = (speed(effect, one) for one in (s, own, more))
+                gain = (then - rate) / NUDGE
+                lost = effect.family.torque(w, rate, gain, a[tau], values)
                 a = _with(a, tau, a[tau] - lost)
                 own = dict(model.derivative(s, a, self.p))
         total = {n: float(own[n]) for n in self.names}

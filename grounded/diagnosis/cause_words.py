@@ -116,6 +116,9 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     words |= {"axis_1": axes[0], "axis_2": axes[1]}
     words |= {"log": "[log]", "driven": called(model, driven), "source": called(model, source)}
 
+    if driven in model.inputs and len(targets) > 1:  # a wheel's: several velocities at once
+        words["source"] = "its speed"
+
     def filled(found: re.Match[str]) -> str:
         name, percent, more, less = found.groups()
         if percent is None or name not in params:

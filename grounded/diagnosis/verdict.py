@@ -195,6 +195,8 @@ def with_faults(said: Verdict, findings: Iterable[Finding]) -> Verdict:
     """Add what was left out, and the faults that the stored trials still have."""
     findings = list(findings)
     more = [f"{one.signal} {one.finding}." for one in findings if one.kind == "unresolved"]
+    long = [one for one in findings if one.kind == "time step"]
+    more += [f"In each step {one.signal} {one.finding}; {one.advice}." for one in long]
     if odd := in_the_log(findings):
         told = "; ".join(f"{one.signal} {one.finding}" for one in odd)
         more.append(f"Corrected here, but not in the stored trials: {told}.")

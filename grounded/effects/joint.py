@@ -13,7 +13,8 @@ the position. These names are used then (`renamed`).
 
 Pairs are found from the model: tau always pushes w in the same direction. (This holds for a torque
 and its own joint's velocity, since diagonals of the inverse inertia matrix are positive; elements
-off the diagonal change sign.)
+off the diagonal change sign.) A wheel turns with several velocities of the model at once, and has
+the target `tau<-w+w2` (`drive`).
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from grounded import places
+from grounded.effects.drive import combined_speeds, motion_of, speed_weights
 from grounded.effects.family import Effect, LossFamily, Quantity, Site, coupled, width
 from grounded.effects.losses import PARTS, dry
 from grounded.frozen import Array
@@ -41,7 +43,7 @@ def _friction(site: Site) -> tuple[Quantity, ...]:
     tau, w = coupled(site)
     unit, most = site.unit(tau), _strongest(site)
     by = f"{unit} s/{site.unit(w).removesuffix('/s')}".removeprefix("1 ")
-    viscous = Quantity("b", by, low=0.0, fixed=has_viscous(site.model, tau, w))
+    viscous = Quantity("b", by, low=0.0, fixed=has_viscous(site.model, "+".join(site.targets)))
     return (Quantity("c", unit, low=0.0, high=most), viscous, width(site, w))
 
 
@@ -52,17 +54,18 @@ def _per_acceleration(site: Site) -> str:
     return {"N m": "kg m^2", "N": "kg"}.get(tau, other)
 
 
-def has_viscous(model: Model, tau: str, w: str) -> bool:
+def has_viscous(model: Model, target: str) -> bool:
     """Check whether uncertain parameters already describe viscous friction.
 
     That is the case if k w d f / d tau = d f / d p for one of them, or for a combination: a motor's
     gain K and time constant T in w' = (K u - w) / T can imitate any viscous friction. Constants (a
     back-EMF from the data sheet) don't count, since they are not fitted.
     """
+    tau, weights = target.partition("<-")[0], speed_weights(model, target)
     uncertain = [i for i, p in enumerate(model.params.values()) if p.spread > 0]
     dt, (x, u) = places.probe(model, 1e-4), places.samples(model, 8 * (1 + len(uncertain)))
     _, f_u, f_p = model.system.sensitivities(x, u, model.values, dt)
-    speed = x[:, model.state_names.index(w)]
+    speed = np.stack([k * x[:, model.state_names.index(w)] for w, k in weights.items()]).sum(axis=0)
     ours = (f_u[:, :, model.input_names.index(tau)] * speed[:, None]).reshape(-1)
     theirs = f_p.reshape(len(ours), -1)
     known = [i for i in uncertain if theirs[:, i].any()]
@@ -87,7 +90,8 @@ def pairs_of(model: Model) -> list[str]:
     """Return `tau<-w` for every effort and the velocity that it always pushes the same way.
 
     Efforts are inputs in N, N m, V or A; of a simulator, also inputs without a unit; and any input
-    that moves several velocities through an inertia.
+    that moves several velocities through an inertia. A drive whose speed is a combination of
+    velocities, such as a wheel's, has all of them: `left<-v+yaw_rate`.
     """
     own, units = getattr(model.step, "timestep", 0.0), model.inputs.items()
     efforts = [n for n, unit in units if unit.startswith(FORCES) or (own and unit == "1")]
@@ -101,6 +105,10 @@ def pairs_of(model: Model) -> list[str]:
         found = {tau: _pushed(model, f_u, tau, velocities) for tau in efforts}
     if not own and len(found) < model.m:
         found |= _coupled(model, [n for n in model.input_names if n not in found])
+    units_of = ("1", *FORCES)
+    for tau, speeds in combined_speeds(model).items():
+        if model.inputs[tau].startswith(units_of):
+            found[tau] = "+".join(speeds)
     return [f"{tau}<-{found[tau]}" for tau in model.input_names if found.get(tau)]
 
 
@@ -186,8 +194,8 @@ def like_a_load(model: Model, names: Collection[str]) -> bool:
     gains = {name for name in names if name.partition(":")[0] in GAINS}
     if len(gains) < 2 or _uncertain_inertia(model):
         return False
-    coupled = [pair.split("<-") for pair in pairs_of(model)]
-    coupled = [pair for pair in coupled if not alone(model, *pair)]
+    drives = [pair.split("<-") for pair in pairs_of(model)]
+    coupled = [(tau, w) for tau, w in drives if "+" not in w and not alone(model, tau, w)]
     said = {f"input_gain:{tau}" for tau, _ in coupled} | {f"rate_gain:{w}" for _, w in coupled}
     said |= {f"added_inertia:{tau}<-{w}" for tau, w in coupled}
     return len(said & gains) > 1
@@ -212,7 +220,7 @@ def renamed(model: Model) -> dict[str, str]:
     springs = dict(pair.split("<-") for pair in springs_of(model))
     for pair in pairs_of(model):
         tau, _, w = pair.partition("<-")
-        if alone(model, tau, w):
+        if "+" not in w and alone(model, tau, w):
             found |= {f"joint_friction:{pair}": f"coulomb_friction:{w}"}
             found |= {f"added_inertia:{pair}": f"rate_gain:{w}"}
             if q := springs.get(tau):
@@ -222,7 +230,7 @@ def renamed(model: Model) -> dict[str, str]:
 
 def one_friction(one: Effect, other: Effect) -> bool:
     """Check whether two effects describe the same friction (dry or viscous) of one motion."""
-    (a, of), (b, at) = ((e.family.name, e.site.target.rpartition("<-")[2]) for e in (one, other))
+    (a, of), (b, at) = ((e.family.name, motion_of(e)) for e in (one, other))
     joints = {joint_friction.name, load_friction.name}
     if of == at and "viscous_friction" in (a, b) and joints & {a, b}:
         return any(q.name == "b" for e in (one, other) for q in e.free)
@@ -261,7 +269,7 @@ def springs_of(model: Model) -> list[str]:
     """Return `tau<-q` for every effort and the position of the joint that it drives."""
     axes = places.integrated(model)
     positions = {w: [q for q, (speed, _) in axes.items() if speed == w] for w, _ in axes.values()}
-    pairs = (pair.split("<-") for pair in pairs_of(model))
+    pairs = (pair.split("<-") for pair in pairs_of(model))  # of a wheel, none
     return [f"{tau}<-{positions[w][0]}" for tau, w in pairs if len(positions.get(w, ())) == 1]
 
 

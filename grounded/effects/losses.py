@@ -37,6 +37,7 @@ import numpy as np
 
 from grounded.compile import System, system_of
 from grounded.compile.names import Named
+from grounded.effects.drive import speed
 from grounded.effects.family import Effect, LossFamily, coupled
 from grounded.frozen import Array
 
@@ -89,10 +90,11 @@ def loads_from(
     pairs: Pairs, s: Any, a: Mapping[str, Any], free: Any, answers: Mapping[str, Any]
 ) -> Loads:
     """Return the same from the state after a step without losses, and its slopes by the inputs."""
-    drives = [coupled(effect.site) for effect, _ in pairs]
-    gain = [[answers[tau][w] for tau, _ in drives] for _, w in drives]
-    speeds, ends = ([x[w] for _, w in drives] for x in (s, free))
-    taken, own = [a[tau] for tau, _ in drives], [answers[tau] for tau, _ in drives]
+    effects = [effect for effect, _ in pairs]
+    inputs = [coupled(effect.site)[0] for effect in effects]
+    gain = [[speed(effect, answers[tau]) for tau in inputs] for effect in effects]
+    speeds, ends = ([speed(effect, x) for effect in effects] for x in (s, free))
+    taken, own = [a[tau] for tau in inputs], [answers[tau] for tau in inputs]
     return Loads(speeds, ends, gain, taken, own)
 
 

@@ -27,6 +27,7 @@ import numpy as np
 from grounded import places
 from grounded.effects import actuator, friction, geometry, joint, medium, rate, sensor
 from grounded.effects.correction import correction
+from grounded.effects.drive import speed_weights
 from grounded.effects.family import (
     Effect,
     Family,
@@ -222,8 +223,9 @@ class _Rates:
                 f"rate_gain:{name}": (one * own)[:, kept],
             }
         for pair in joint.pairs_of(model):  # such as the mass of a cart
-            tau, _, w = pair.partition("<-")
-            by, rate = f_u[:, :, model.input_names.index(tau)], own[:, [model.state_names.index(w)]]
+            tau, weights = pair.partition("<-")[0], speed_weights(model, pair)
+            rates = (k * own[:, [model.state_names.index(n)]] for n, k in weights.items())
+            by, rate = f_u[:, :, model.input_names.index(tau)], sum(rates)
             self.named[f"added_inertia:{pair}"] = (by * rate)[:, kept]
         for pair in joint.springs_of(model):  # such as a stiffness that is a parameter
             tau, _, q = pair.partition("<-")

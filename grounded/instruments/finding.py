@@ -29,7 +29,8 @@ class Finding(Document):
         finding: one clause that continues a sentence after the signal's name.
         kind: delay, lag, smoothed, scale, sign, degrees, wrapped, offset, stuck, held, dropout,
             missing, quantised, saturated, beyond (its limits), constant, copy, mismatch (with
-            others) or unresolved (too fast for the model's time step).
+            others), unresolved (too fast for the model's time step) or time step (of the
+            integrator, which is too long for the model).
         delay_s: delay of the signal [s].
         std_s: standard deviation of the delay [s].
         scale: measured value over true value.

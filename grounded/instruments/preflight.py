@@ -12,6 +12,7 @@ kinematics/way            speeds in world axes or in knots, compass headings
 kinematics/late_position  both positions of a plane later than velocities and heading
 predictions/clocks        stamps at a wrong rate behind several scale errors
 predictions/unresolved    a trial that becomes too fast for the model's time step
+predictions/time_step     an integrator's step that is too long for the model
 
 `sound_trials` adds those that need the model's predictions: exchanged states before these, other
 units of positions, clocks, exchanged commands and signs of inputs after them.
@@ -63,6 +64,7 @@ from grounded.instruments.kinematics.velocities import Derived, constant_of, der
 from grounded.instruments.kinematics.way import judge_way, rate_agrees
 from grounded.instruments.lag import LEAST_S, SAME, SURE, SURELY, Lag, earlier
 from grounded.instruments.predictions.clocks import told_by_the_clock
+from grounded.instruments.predictions.time_step import judge_time_step
 from grounded.instruments.predictions.unresolved import judge_resolution
 from grounded.instruments.single import judge_signal, signal_of
 from grounded.instruments.units.mismatch import (
@@ -133,6 +135,7 @@ def preflight(
             *bench.plane(),
             *unexplained(model, bench.trials, bench.rows),
             *judge_inputs(subject, bench.trials),
+            *judge_time_step(model, bench.trials, bench.shown),
         ]
     in_step, refuted = frozenset(bench.in_step), frozenset(bench.refuted)
     found = told_by_the_clock(model, trials, found, refuted)

@@ -124,8 +124,8 @@ def test_where_inertia_is_constant_the_joint_has_its_old_names():
 
 
 def test_viscous_friction_that_the_model_has_is_not_offered_twice():
-    assert has_viscous(pendulum, "torque", "omega")
-    assert not has_viscous(arm, "t1", "w1")
+    assert has_viscous(pendulum, "torque<-omega")
+    assert not has_viscous(arm, "t1<-w1")
     effect = Library().effect("joint_friction:torque<-omega", pendulum)
     assert [q.name for q in effect.free] == ["c"]
 

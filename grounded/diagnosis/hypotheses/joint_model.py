@@ -32,6 +32,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.effects import Effect
+from grounded.effects.drive import motion_of
 from grounded.effects.family import coupled
 from grounded.effects.joint import added_inertia
 from grounded.frozen import Array
@@ -79,7 +80,7 @@ def _joints(search: HypothesisSearch) -> list[tuple[Effect, Effect]]:
     inertias = [e for e in search.candidates if e.family.name == added_inertia.name]
     found = []
     for inertia in inertias:
-        if (friction := search.joints.get(coupled(inertia.site)[1])) is not None:
+        if (friction := search.joints.get(motion_of(inertia))) is not None:
             found.append((candidates.get(friction.name, friction), inertia))
     return found
 

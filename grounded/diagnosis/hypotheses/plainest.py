@@ -21,6 +21,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.effects import Effect
+from grounded.effects.drive import motion_of, speed
 from grounded.effects.family import coupled
 from grounded.effects.joint import joint_friction, load_friction
 
@@ -51,7 +52,7 @@ def _key(fit: Fitted) -> tuple[Structure, float, tuple[str, ...]]:
 
 def plain_forms(search: HypothesisSearch, h: Hypothesis) -> Iterator[Hypothesis]:
     """Yield the hypothesis with each dry friction replaced by its plain form."""
-    by_family = {(e.family.name, _motion(e)): (e, v) for e, v in h.pairs}
+    by_family = {(e.family.name, motion_of(e)): (e, v) for e, v in h.pairs}
     for (family, motion), (effect, values) in by_family.items():
         joint = search.joints.get(motion)
         if family == load_friction.name and joint is not None:
@@ -66,10 +67,6 @@ def plain_forms(search: HypothesisSearch, h: Hypothesis) -> Iterator[Hypothesis]
             yield h.minus(effect.name).plus(dry, values)
 
 
-def _motion(effect: Effect) -> str:
-    return effect.site.target.rpartition("<-")[2]
-
-
 def _of_joint(joint: Effect, values: Mapping[str, float]) -> dict[str, float]:
     """Return the values of a load-dependent friction without the dependence on the load."""
     return {q.name: float(values[q.name]) for q in joint.quantities}
@@ -77,8 +74,10 @@ def _of_joint(joint: Effect, values: Mapping[str, float]) -> dict[str, float]:
 
 def push(joint: Effect) -> float:
     """Return the median acceleration per unit of the joint's input."""
-    model, (tau, w) = joint.site.model, coupled(joint.site)
+    model, (tau, _) = joint.site.model, coupled(joint.site)
     dt, (x, u) = places.probe(model, 1e-5), places.samples(model, 8)
     _, f_u = model.system.linearise(x, u, model.values, dt)
-    by = f_u[:, model.state_names.index(w), model.input_names.index(tau)]
+    by = speed(
+        joint, dict(zip(model.state_names, f_u[..., model.input_names.index(tau)].T, strict=True))
+    )
     return float(np.median(by)) / dt

@@ -31,6 +31,7 @@ from grounded.effects import (
     SensorLagFamily,
     one_friction,
 )
+from grounded.effects.drive import motion_of
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 
@@ -65,7 +66,7 @@ class HypothesisSearch(FittedHypotheses):
         joints: Sequence[Effect] = (),
     ) -> None:
         super().__init__(data, candidates)
-        self.joints = {effect.site.target.rpartition("<-")[2]: effect for effect in joints}
+        self.joints = {motion_of(effect): effect for effect in joints}
         self.crowd |= dict.fromkeys((effect.name for effect in joints), len(joints))
         self.tick = tick or (lambda what: None)
         large = data.model.n > LARGE or simulated(data.model)

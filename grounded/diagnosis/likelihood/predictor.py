@@ -47,6 +47,7 @@ from grounded.effects import (
     SensorLagFamily,
     acting_order,
 )
+from grounded.effects.drive import speed_weights
 from grounded.effects.family import braked, coupled
 from grounded.effects.losses import Left, Loads, ahead, loads, loads_from, solved
 from grounded.effects.medium import medium_of, through_it
@@ -289,7 +290,7 @@ class Predictor(SentOnce):
     def loads(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Loads:
         """Return what losses are solved from: speeds before, after without loss, gains, inputs."""
         names, p = self.data.model.input_names, self.params(h)
-        drives = tuple(coupled(effect.site) for effect, _ in losses_of(h))
+        drives = tuple(effect.site.targets for effect, _ in losses_of(h))
         rows = blake2b(x.tobytes() + u.tobytes() + p.tobytes()).digest()
         if (found := self._loads.get(key := (drives, dt, rows))) is not None:
             return found  # only the values of the losses differ, which this does not depend on
@@ -303,7 +304,8 @@ class Predictor(SentOnce):
             found = loads(losses_of(h), self.named(x), a, step)
         else:  # cached slopes by the inputs are accurate enough
             by_u = slopes[1].reshape(*x.shape, len(names))
-            answers = {tau: self.named(by_u[..., names.index(tau)]) for tau, _ in drives}
+            driving = {coupled(effect.site)[0] for effect, _ in losses_of(h)}
+            answers = {tau: self.named(by_u[..., names.index(tau)]) for tau in driving}
             found = loads_from(losses_of(h), self.named(x), a, step(a), answers)
         if len(self._loads) > LOADS_KEPT // x.size:
             self._loads.clear()
@@ -322,20 +324,22 @@ class Predictor(SentOnce):
         by_x, by_p = (np.zeros((*x.shape[:-1], m, f.shape[-1])) for f in (f_x, f_p))
         if not pairs:
             return by_x, by_p
-        drives, at = [coupled(effect.site) for effect, _ in pairs], self.loads(h, x, u)
+        driving, at = [coupled(effect.site)[0] for effect, _ in pairs], self.loads(h, x, u)
         base = solved(pairs, at, self.data.dt)
-        for i, (_, source) in enumerate(drives):
-            k = self.seen.index(source)
-            size = 1e-6 * self.data.scales.peak(source)
+        for i, (effect, _) in enumerate(pairs):
+            weights = speed_weights(effect.site.model, "+".join(effect.site.targets))
+            size = 1e-6 * self.data.scales.peak(next(iter(weights)))
             more = [value + size if j == i else value for j, value in enumerate(at.w)]
             ends = [value + size if j == i else value for j, value in enumerate(at.free)]
             started = solved(pairs, at._replace(w=more), self.data.dt)
             ended = solved(pairs, at._replace(free=ends), self.data.dt)
-            for (tau, _), was, by_w, by_end in zip(drives, base, started, ended, strict=True):
+            for tau, was, by_w, by_end in zip(driving, base, started, ended, strict=True):
                 row, slope = names.index(tau), (by_end - was)[..., None] / size
-                by_x[..., row, :] += slope * f_x[..., k, :]
-                by_x[..., row, k] += (by_w - was) / size
-                by_p[..., row, :] += slope * f_p[..., k, :]
+                for name, weight in weights.items():
+                    k = self.seen.index(name)
+                    by_x[..., row, :] += slope * (weight * f_x[..., k, :])
+                    by_x[..., row, k] += weight * (by_w - was) / size
+                    by_p[..., row, :] += slope * (weight * f_p[..., k, :])
         return by_x, by_p
 
     def limited(self, h: Hypothesis, x: Array, u: Array, t: Array) -> tuple[Array, Array]:

@@ -229,8 +229,10 @@ def knowable(
     memory = {data.model.state_names[i] for i in data.hidden}
     kept = []
     for effect in effects:
-        targets = {part for t in effect.site.targets for part in t.split("<-")}
-        family = effect.family
+        family, joined = effect.family, effect.site.targets
+        if isinstance(family, LossFamily):
+            joined = joined[:1]  # a wheel turns, even if the robot does not
+        targets = {part for t in joined for part in t.split("<-")}
         if targets & memory:
             continue
         lost = still - targets if effect.name in whole and not targets <= still else still

@@ -69,9 +69,9 @@ def fitted(search, *effects, start=(-0.1, 0.01)):
 
 
 def test_a_gain_and_a_lag_together_are_the_viscous_part():
-    assert has_viscous(MOTOR, "volt", "w")
+    assert has_viscous(MOTOR, "volt<-w")
     lagged = replace(MOTOR, params={**MOTOR.params, "K": Param(1.0, "rad/s/V")})
-    assert not has_viscous(lagged, "volt", "w")
+    assert not has_viscous(lagged, "volt<-w")
     assert "b" in Library().effect(JOINT, MOTOR).fixed
 
 

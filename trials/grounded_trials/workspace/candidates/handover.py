@@ -270,6 +270,7 @@ class Check:
         if self.same_task and not self.standing.trials:
             yield from self._untried()
             yield from self._not_logged()
+            yield from self._too_long()
         if self.same_task and (coasts := self._coasting()):
             yield coasts
 
@@ -341,6 +342,19 @@ class Check:
                 f"your program has to compute {it} while it runs (differences, a filter). Let it "
                 f"log {it}, and map {it} in [log] too: a run is recognised by the commands that "
                 "follow from these values"
+            )
+
+    def _too_long(self) -> Iterator[str]:
+        """Yield that the integrator's steps are too long for the model, if they are."""
+        from grounded.instruments.predictions.time_step import too_long
+
+        made, model = self.candidate, self.workspace.base_model
+        states, inputs = made.predicted_states[:-1], made.predicted_inputs
+        if found := too_long(model, states, inputs, made.policy.dt):
+            file = self.workspace.config.model.file or self.workspace.config.model.module
+            yield (
+                f"in each step of the predicted run {found.state} {found.told}: {found.advice} in "
+                f"{file}, and propose again"
             )
 
     def _coasting(self) -> str:

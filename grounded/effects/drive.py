@@ -1,0 +1,109 @@
+"""The speed of a drive: one velocity of the model, or a wheel's, which several of them turn.
+
+A joint's motor turns as fast as the joint. The wheels of a robot that drives by two of them don't
+move with any velocity of its model, but with a combination,
+
+    left wheel   v - h psi' (- r q', if its body pitches)
+    right wheel  v + h psi'
+
+and so do the losses in its motors and gears. The combination is read from the model. If the model
+has what a motor's own speed costs it (back-EMF, viscous friction), then
+
+    d(accelerations) / d(velocities) = -F W,      F = d(accelerations) / d(inputs)
+
+and row j of W is the combination of input j. W is found by least squares over several states; the
+mean over opposite velocities removes centrifugal terms. It counts if F W explains the whole, so
+that no friction of another origin is taken for a motor's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from grounded import places
+from grounded.effects.family import Effect
+from grounded.frozen import Array
+from grounded.model import Model
+
+WHOLE = 0.02  # largest part of the accelerations' slopes that F W may leave unexplained
+PART = 1e-3  # smallest weight of a velocity, relative to the largest
+MOST = 3  # velocities in a combination
+KEPT = 64  # models whose drives are remembered
+
+
+@lru_cache(maxsize=KEPT)
+def combined_speeds(model: Model) -> Mapping[str, Mapping[str, float]]:
+    """Return the speeds of drives that are combinations: {input: {velocity: weight}}.
+
+    The velocity with the largest weight is first, and has the weight 1. Drives of a single velocity
+    are left out, and simulators with a step of their own.
+    """
+    model = _bare(model)
+    names = [name for name in places.velocities(model) if name in model.state_names]
+    if getattr(model.step, "timestep", 0.0) or len(names) < 2:
+        return {}
+    F, slopes = _slopes(model, [model.state_names.index(name) for name in names])
+    flat = F.reshape(-1, model.m)
+    if np.linalg.matrix_rank(flat) < model.m:
+        return {}
+    W = -np.linalg.lstsq(flat, slopes.reshape(-1, len(names)), rcond=None)[0]
+    left = np.linalg.norm(slopes + F @ W, axis=(0, 2))
+    if (left > WHOLE * np.linalg.norm(slopes, axis=(0, 2)) + 1e-9).any():
+        return {}
+    found = {}
+    for j, tau in enumerate(model.input_names):
+        main = int(np.argmax(np.abs(W[j])))
+        weights = {n: w / W[j, main] for n, w in zip(names, W[j], strict=True) if W[j, main]}
+        own = {n: float(w) for n, w in weights.items() if abs(w) > PART}
+        if 1 < len(own) <= MOST and F[:, main, j].min() > 0 and W[j, main] > 0:
+            found[tau] = {names[main]: 1.0} | own
+    return found
+
+
+def _slopes(model: Model, at: list[int]) -> tuple[Array, Array]:
+    """Return slopes of the accelerations by inputs (S, v, m) and by velocities (S, v, v)."""
+    dt, (x, u) = places.probe(model, places.SHORT), places.samples(model, 8)
+    back = x.copy()
+    back[:, at] *= -1
+    ways = [model.system.linearise(states, u, model.values, dt) for states in (x, back)]
+    f_x, f_u = (np.mean([way[k] for way in ways], axis=0) for k in (0, 1))
+    slopes = (f_x[:, at][:, :, at] - np.eye(len(at))) / dt
+    return f_u[:, at] / dt, slopes
+
+
+def _bare(model: Model) -> Model:
+    """Return the model inside all adopted effects, with the current parameters."""
+    found = model
+    while True:
+        shell = getattr(found.step, "shell", None)
+        inner = shell.effect.site.model if shell else found
+        for around in ("joined", "losing"):
+            inner = getattr(inner.step, around, (inner, ()))[0]
+        if inner is found:
+            return inner.with_values({name: model.params[name].value for name in inner.params})
+        found = inner
+
+
+def speed_weights(model: Model, target: str) -> Mapping[str, float]:
+    """Return the velocities in the speed that a loss at `tau<-w` or `tau<-w+w2` depends on."""
+    tau, _, w = target.partition("<-")
+    return combined_speeds(model)[tau] if "+" in w else {w: 1.0}
+
+
+def speed(effect: Effect, values: Any) -> Any:
+    """Return the speed that a loss depends on, given values by state, or their changes."""
+    total: Any = 0.0
+    for name, weight in speed_weights(effect.site.model, "+".join(effect.site.targets)).items():
+        total = total + (values[name] if weight == 1.0 else weight * values[name])
+    return total
+
+
+def motion_of(effect: Effect) -> str:
+    """Return the motion that an effect opposes: a state, or the whole target of a combination."""
+    if len(effect.site.targets) > 1 and "<-" in effect.site.target:
+        return "+".join(effect.site.targets)
+    return effect.site.target.rpartition("<-")[2]

@@ -1,0 +1,134 @@
+"""The speed of a wheel: found from the model, kept under adopted effects, and what it loses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import grounded as gr
+from grounded import Model, Param, Trial
+from grounded.effects import Library, wrap
+from grounded.effects.drive import combined_speeds
+from grounded.effects.joint import pairs_of, springs_of
+from grounded.models.arm import model as arm
+
+DT, HALF_TRACK = 0.02, 0.15
+LEFT, RIGHT = "joint_friction:left<-v+r", "joint_friction:right<-v+r"
+
+
+def drives(s, a, p):
+    """Force of each wheel [N]: its voltage less the back-EMF of its own speed."""
+    left, right = s.v - p.h * s.r, s.v + p.h * s.r
+    return p.k * (a.left - p.e * left), p.k * (a.right - p.e * right)
+
+
+def moved(s, a, p):
+    left, right = drives(s, a, p)
+    return {
+        "x": s.v * np.cos(s.psi),
+        "y": s.v * np.sin(s.psi),
+        "psi": s.r,
+        "v": (left + right) / p.m,
+        "r": p.h * (right - left) / p.I,
+    }
+
+
+rover = Model(
+    name="rover",
+    states={"x": "m", "y": "m", "psi": "rad", "v": "m/s", "r": "rad/s"},
+    inputs={"left": "V", "right": "V"},
+    params={
+        "m": Param(4.0, "kg", 2.0, 8.0),
+        "I": Param(0.12, "kg m^2", 0.05, 0.3),
+        "h": Param(HALF_TRACK, "m"),
+        "k": Param(2.0, "N/V"),
+        "e": Param(6.0, "V s/m"),
+    },
+    angles=("psi",),
+    derivative=moved,
+)
+
+
+def test_a_wheel_turns_with_the_speed_and_the_yaw_rate():
+    """The right wheel was the yaw rate's drive, and the left one the speed's."""
+    speeds = combined_speeds(rover)
+    assert pairs_of(rover) == ["left<-v+r", "right<-v+r"] and springs_of(rover) == []
+    for name, side in (("left", -1), ("right", 1)):
+        assert speeds[name] == pytest.approx({"v": 1.0, "r": side * HALF_TRACK})
+    assert combined_speeds(arm) == {}
+
+
+def other(**terms):
+    """The rover with other rates, which `terms` compute from s."""
+
+    def dynamics(s, a, p):
+        rates = moved(s, a, p)
+        return rates | {name: rates[name] + more(s) for name, more in terms.items()}
+
+    return replace(rover, derivative=dynamics)
+
+
+def test_a_friction_of_another_origin_is_no_motors():
+    dragged = other(x=lambda s: 0 * s.v, v=lambda s: -0.5 * s.v, r=lambda s: -2.0 * s.r)
+    assert combined_speeds(dragged)  # forces of the wheels can account for it
+    rudder = replace(rover, inputs={"left": "V", "right": "V", "sail": "N"}, derivative=sailed)
+    assert combined_speeds(rudder) == {}
+
+
+def sailed(s, a, p):
+    """A third input, which no velocity opposes, makes the wheels' shares ambiguous."""
+    rates = moved(s, a, p)
+    return rates | {"v": rates["v"] + a.sail / p.m}
+
+
+def test_adopted_effects_change_no_drives_speed():
+    effect = Library().effect(LEFT, rover)
+    stiff = wrap(effect, {"c": 0.6, "b": 0.0}, DT)
+    late = wrap(Library().effect("delay:left+right", stiff), {"d": 0.03}, DT)
+    for model in (stiff, late):
+        assert combined_speeds(model)["right"] == pytest.approx(combined_speeds(rover)["right"])
+        assert "right<-v+r" in pairs_of(model)
+
+
+def test_the_loss_of_a_wheel_turns_the_robot():
+    """0.6 V of dry friction on the left wheel alone: as if its voltage were less by that."""
+    stiff = wrap(Library().effect(LEFT, rover), {"c": 0.6, "b": 0.0}, DT)
+    x = np.array([[0.0, 0.0, 0.0, 0.5, 0.4]])
+    u = np.array([[4.0, 4.0]])
+    after = stiff.system.step(x, u, stiff.values, DT)
+    less = rover.system.step(x, u - np.array([0.6, 0.0]), rover.values, DT)
+    assert after == pytest.approx(less, abs=1e-6)
+    back = np.array([[0.0, 0.0, 0.0, 0.1, 2.0]])  # the left wheel turns backwards
+    after = stiff.system.step(back, u, stiff.values, DT)
+    more = rover.system.step(back, u + np.array([0.6, 0.0]), rover.values, DT)
+    assert after == pytest.approx(more, abs=1e-6)
+
+
+def driven(seed, dry, steps=400, parts=10):
+    """A run of the real rover [V]: dry friction of each wheel, 4.4 kg for 4, 0.135 kg m^2."""
+    rng, model = np.random.default_rng(seed), rover.with_values({"m": 4.4, "I": 0.135})
+    f, phase = rng.uniform(1.2, 5.0, (2, 3)), rng.uniform(0, 6.28, (2, 3))
+    t = DT * np.arange(steps)
+    u = np.clip(2.2 * np.sin(f[:, :, None] * t + phase[:, :, None]).sum(axis=1).T + 1.5, -8, 8)
+    x, states = np.zeros(5), [np.zeros(5)]
+    for sent in u:
+        for _ in range(parts):
+            wheels = x[3] + HALF_TRACK * x[4] * np.array([-1.0, 1.0])
+            lost = dry * np.tanh(wheels / 0.004)
+            x = model.system.step(x[None], (sent - lost)[None], model.values, DT / parts)[0]
+        states.append(x)
+    noise = rng.standard_normal((steps + 1, 5)) * [0.002, 0.002, 0.002, 0.005, 0.01]
+    return Trial(np.array(states) + noise, u, DT, rover.state_names, rover.input_names)
+
+
+@pytest.mark.slow
+def test_friction_of_two_wheels_is_named_and_the_parameters_are_right():
+    """It was a gain of -20.5 % of both inputs and two curves, and left psi 89 mrad off."""
+    found = gr.diagnose(rover, [driven(k, np.array([0.6, 0.9])) for k in range(3)])
+    assert {*found.verdict.effects} == {LEFT, RIGHT}
+    values = {one.effect: one.params for one in found.ranking}
+    assert values[LEFT]["c"].value == pytest.approx(0.6, abs=0.02)
+    assert values[RIGHT]["c"].value == pytest.approx(0.9, abs=0.02)
+    assert "its speed" not in found.verdict.sentence  # no viscous part is told
+    masses = {one.parameter: one for one in found.identifiable}
+    assert masses["I"].verdict == masses["m"].verdict == "identifiable"
