@@ -8,7 +8,7 @@ from html import escape
 from typing import TYPE_CHECKING
 
 from grounded.diagnosis.cause_words import OWN, times_of
-from grounded.diagnosis.error_report import RulerRow, furthest
+from grounded.diagnosis.error_report import CALIBRATION, RulerRow, furthest
 from grounded.diagnosis.ruler_words import told_row
 from grounded.result import figure, html_table, percent, shown, spread, with_unit
 
@@ -135,11 +135,11 @@ def effect_table(diagnosis: Diagnosis, *, rivals: bool = True) -> tuple[list[Cel
             ("* " if r.claimed else "  ") + r.effect,
             credit_of(diagnosis, r.effect),
             *((_evidence(r), "") if r in own else ("", _evidence(r)))[:columns],
-            _values(r),
+            values_of(r),
         )
         for r in (*own, *others)
     ]
-    if rows and (share := credit_of(diagnosis, "calibration")):
+    if rows and (share := credit_of(diagnosis, CALIBRATION)):
         blank = ("", "")[:columns]
         rows.insert(0, ("  (calibration)", share, *blank, OWN))
     evidence = ("evidence [nats]", "alone [nats]")[:columns]
@@ -174,7 +174,7 @@ def _evidence(row: Ranked) -> str:
     return "-" if math.isnan(row.evidence) else f"{row.evidence:,.{decimals}f}"
 
 
-def _values(row: Ranked) -> str:
+def values_of(row: Ranked) -> str:
     """Format the quantities of an effect with their standard deviations and units."""
     unknown = {
         name

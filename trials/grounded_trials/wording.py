@@ -32,7 +32,7 @@ _GLUE = re.compile(
     r"(?<=[<>]) (?=[\d.-])| (?=[<>] )| (?=-> )| (?=%)"
     r"| (?=(?:\+-|±) )|(?<= (?:\+-)) |(?<= ±) |^ |(?<=^[ *]) "
     r"|(?<=\d) (?=(?:[mµc]?(?:m|s|rad)|deg|kg|N|Nm|V|A|Hz|nats)\b)| (?=[+-]\d[\d.]* %)"
-    r"|(?<=noise:) |(?<=\bN) (?=m\b)|(?<=\bN m) (?=s\b)"
+    r"| (?== -?\d)|(?<= =) (?=-?\d)|(?<=noise:) |(?<=\bN) (?=m\b)|(?<=\bN m) (?=s\b)"
 )  # blanks at which a line must not be broken
 
 

@@ -45,7 +45,7 @@ class Block:
 
     text, soft, heading    a sentence
     command                a command to copy; `name` is its id
-    verdict                `lines`, one below the other
+    verdict                `lines`, one below the other; `strong` ones are the items of a list
     table                  `name`, `header` (text columns end with a blank), `rows`; `strong` rows
                            are bold
     figure                 `figure`; with `wide` two panels per row
