@@ -7,6 +7,7 @@ so that it can be read back.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from functools import cache
@@ -79,6 +80,13 @@ def number(value: float) -> str:
 def shown(unit: str) -> str:
     """Return the unit as shown in a table: "" for "1", which would look like a digit."""
     return "" if unit == "1" else unit
+
+
+def per_second(unit: str) -> str:
+    """Return the unit of a rate of change: rad/s for rad, m/s^2 for m/s, 1/s for 1."""
+    if found := re.fullmatch(r"(.*)/ ?s(?:\^(\d+))?", unit):
+        return f"{found[1]}/s^{int(found[2] or 1) + 1}"
+    return f"{unit} per s" if "/" in unit else f"{unit or '1'}/s"
 
 
 def with_unit(text: str, unit: str) -> str:

@@ -23,7 +23,22 @@ def test_the_unit_one_is_not_printed():
     assert shown("1") == "" and shown("m/s") == "m/s"
     assert with_unit("0.146", "1") == "0.146" and with_unit("0.3", "m") == "0.3 m"
     assert labelled("throttle", "1") == "throttle" and labelled("v", "m/s") == "v [m/s]"
-    assert per_second("1") == "1/s" and per_second("rad") == "rad/s"
+
+
+@pytest.mark.parametrize(
+    ("unit", "rate"),
+    [
+        ("1", "1/s"),
+        ("rad", "rad/s"),
+        ("rad/s", "rad/s^2"),
+        ("m/s^2", "m/s^3"),
+        ("V", "V/s"),
+        ("N m", "N m/s"),
+        ("kg/h", "kg/h per s"),
+    ],
+)
+def test_a_rate_has_the_unit_of_its_state_per_second(unit, rate):
+    assert per_second(unit) == rate
 
 
 @pytest.mark.parametrize(

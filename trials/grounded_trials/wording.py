@@ -11,6 +11,7 @@ from textwrap import TextWrapper
 
 from grounded.errors import NextCommand
 from grounded.result import figure as figure
+from grounded.result import per_second as per_second
 from grounded.result import percent as percent
 from grounded.result import shown as shown
 from grounded.result import spread as spread
@@ -98,13 +99,6 @@ def labelled(name: str, unit: str) -> str:
 def misread(bias: float, unit: str) -> str:
     """Return by how much a biased sensor reads wrong: `0.0044 rad too high`."""
     return f"{with_unit(f'{abs(bias):.3g}', unit)} too {'low' if bias < 0 else 'high'}"
-
-
-def per_second(unit: str) -> str:
-    """Return the unit of a rate of change: rad/s for rad, m/s^2 for m/s."""
-    if found := re.fullmatch(r"(.*)/s(?:\^(\d))?", unit):
-        return f"{found[1]}/s^{int(found[2] or 1) + 1}"
-    return f"{unit} per s" if set(unit) & set("/ ") else f"{unit}/s"
 
 
 def wrapped(text: str, first: str, rest: str) -> list[str]:
