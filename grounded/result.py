@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 SCALED = ("m", "rad", "s")  # units that may get the prefixes m and µ, as may their rates
 SMALL = 1e-3  # values below this get a prefix
 FIXED = 1e-4  # values from here on are shown without a power of ten when they are compared
+ROUNDING = 1e-9  # share of its scale below which a number is what rounding left of 0
+UNSEEN = 0.005  # of a standard deviation: a smaller value is 0 in two digits of it
 # exceptions that reading a malformed document may raise
 MALFORMED = (ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError)
 
@@ -60,6 +62,27 @@ def listed(names: Iterable[str]) -> str:
     """Join names as in `a`, `a and b` or `a, b and c`."""
     *most, last = [*names] or [""]
     return f"{', '.join(most)} and {last}" if most else last
+
+
+def or_zero(value: float, *scale: float) -> float:
+    """Return 0 for a value that is rounding noise beside the numbers that it belongs to.
+
+    Args:
+        value: a number to be shown, such as one end of a range.
+        scale: others of its kind and unit, such as the other end, or its standard deviation.
+    """
+    size = max((abs(one) for one in scale if isfinite(one)), default=0.0)
+    return 0.0 if abs(value) <= ROUNDING * size else value
+
+
+def seen(value: float, std: float) -> float:
+    """Return 0 for a value that two digits of its standard deviation don't show."""
+    return 0.0 if abs(value) < UNSEEN * std < math.inf else value
+
+
+def extent(low: float, high: float) -> tuple[float, float]:
+    """Return the ends of a range, 0 for one that is rounding noise beside the other."""
+    return or_zero(low, high), or_zero(high, low)
 
 
 def percent(share: float) -> str:
@@ -101,6 +124,7 @@ def measured(value: float, unit: str) -> str:
 
 def measured_alike(values: Sequence[float], unit: str) -> list[str]:
     """Format errors that are compared, like `measured`, in the unit of their geometric mean."""
+    values = [or_zero(v, *values) for v in values]
     known = [v for v in values if 0 < v < math.inf]
     middle = math.exp(sum(map(math.log, known)) / len(known)) if known else 0.0
     return [_told(value, *_scale(middle, unit), FIXED) for value in values]

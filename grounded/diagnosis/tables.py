@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from grounded.diagnosis.cause_words import OWN, times_of
 from grounded.diagnosis.error_report import CALIBRATION, RulerRow, furthest
 from grounded.diagnosis.ruler_words import told_row
-from grounded.result import figure, html_table, percent, shown, spread, with_unit
+from grounded.result import figure, html_table, or_zero, percent, seen, shown, spread, with_unit
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis, Ranked
@@ -72,7 +72,7 @@ def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[lis
 
 
 def _cell(row: RulerRow, column: str, name: str) -> str:
-    value = getattr(row, column).get(name, math.nan)
+    value = or_zero(getattr(row, column).get(name, math.nan), row.crude.get(name, 0.0))
     if not row.tells(name, column):
         return "diverges"
     return figure(value, 3) if math.isfinite(value) else "-"
@@ -186,7 +186,7 @@ def values_of(row: Ranked) -> str:
     return ", ".join(
         f"{name} is not determined"
         if name in unknown
-        else with_unit(f"{name} = {figure(e.value, 3)}{_spread(e.std)}", e.unit)
+        else with_unit(f"{name} = {figure(seen(e.value, e.std), 3)}{_spread(e.std)}", e.unit)
         for name, e in row.params.items()
     )
 

@@ -10,9 +10,12 @@ from itertools import pairwise
 from textwrap import TextWrapper
 
 from grounded.errors import NextCommand
+from grounded.result import extent as extent
 from grounded.result import figure as figure
+from grounded.result import or_zero as or_zero
 from grounded.result import per_second as per_second
 from grounded.result import percent as percent
+from grounded.result import seen as seen
 from grounded.result import shown as shown
 from grounded.result import spread as spread
 from grounded.result import with_unit as with_unit
@@ -79,6 +82,7 @@ def moved(old: float, new: float, unit: str, least: int = 3) -> str:
 
 def in_digits_apart(one: float, other: float, least: int = 3) -> tuple[str, str]:
     """Format two numbers with enough digits to distinguish them, at least `least`."""
+    one, other = extent(one, other)
     for digits in range(least, 9):
         if float(f"{one:.{digits}g}") != float(f"{other:.{digits}g}"):
             return figure(one, digits), figure(other, digits)

@@ -16,6 +16,7 @@ from grounded_trials.wording import (
     figure,
     percent,
     ranges,
+    seen,
     spread,
     with_unit,
 )
@@ -118,7 +119,7 @@ def _difference(one: Changed) -> Estimate:
 
 
 def _with_spread(estimate: Estimate) -> str:
-    text = f"{figure(estimate.value, 3)} +- {spread(estimate.std)}"
+    text = f"{figure(seen(estimate.value, estimate.std), 3)} +- {spread(estimate.std)}"
     return with_unit(text, estimate.unit)
 
 
