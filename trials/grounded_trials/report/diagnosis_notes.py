@@ -75,7 +75,7 @@ def where_line(found: Diagnosis) -> str:
 
 
 def note_lines(found: Diagnosis, before: Mapping[str, float]) -> list[tuple[str, str]]:
-    """Return (title, text) of all notes to a diagnosis.
+    """Return (title, text) of all notes to a diagnosis, with all terms of sums.
 
     Args:
         found: the result.
@@ -84,7 +84,8 @@ def note_lines(found: Diagnosis, before: Mapping[str, float]) -> list[tuple[str,
     lines = [("caveat", text) for text in caveats(found)]
     if found.no_cause:
         return lines
-    lines += [line for line in error_lines(found, before) if line[0] not in ELSEWHERE]
+    told = error_lines(found, before, whole=True)
+    lines += [line for line in told if line[0] not in ELSEWHERE]
     lines += agreement_lines(found)
     if found.prediction_error:
         lines.append(("errors", f"open loop, {held_out(found)}"))

@@ -22,10 +22,13 @@ from grounded_trials.wording import (
 )
 
 DIVERGED = 100.0  # times the spread of measured utilities: larger errors are not stated
+TERMS = 2  # of a sum in a sentence, the largest; a third is told if it is the last
 MOST = 3  # parameters whose dependence on held ones is stated one by one
 
 
-def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple[str, str]]:
+def error_lines(
+    diagnosis: Diagnosis, before: Mapping[str, float], *, whole: bool = False
+) -> list[tuple[str, str]]:
     """Return (title, text) of the details: calibrated parameters, utility, look-alikes.
 
     Empty if there were too few data to name a cause: what was fitted then is not a finding.
@@ -33,13 +36,14 @@ def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple
     Args:
         diagnosis: the result.
         before: values of the model's parameters before it.
+        whole: whether to give all terms of long sums, as a page does.
     """
     if diagnosis.no_cause:
         return []
     found = []
     if text := calibrated_sentence(diagnosis, before):
         found.append(("parameters", text))
-    if text := held_sentence(diagnosis):
+    if text := held_sentence(diagnosis, whole=whole):
         found.append(("held", text))
     if text := utility_sentence(diagnosis):
         found.append(("utility", text))
@@ -158,8 +162,21 @@ def _between(some: Sequence[float]) -> str:
     return " to ".join(dict.fromkeys(f"{one:+.2g}" for one in (min(some), max(some))))
 
 
-def held_sentence(diagnosis: Diagnosis) -> str:
-    """Say which calibrated parameters depend on others that these trials cannot identify."""
+def _largest(given: Mapping[str, float], most: int) -> list[str]:
+    """Return the terms of a sum, the largest first; more than `most` and one end with a remark."""
+    order = sorted(given, key=lambda name: -abs(given[name]))
+    shown = order if len(order) <= most + 1 else order[:most]
+    parts = [f"{given[name]:+.2g} % with 1 % more {name}" for name in shown]
+    return parts if len(shown) == len(order) else [*parts, "smaller terms"]
+
+
+def held_sentence(diagnosis: Diagnosis, *, whole: bool = False) -> str:
+    """Say which calibrated parameters depend on others that these trials cannot identify.
+
+    Args:
+        diagnosis: the result.
+        whole: whether to give all terms of a sum; else the largest.
+    """
     said, held = [], dict[str, list[float]]()
     for one in (one for one in diagnosis.identifiable if one.given):
         e = diagnosis.parameters.get(one.parameter)
@@ -167,7 +184,7 @@ def held_sentence(diagnosis: Diagnosis) -> str:
             continue
         for name, by in one.given.items():
             held.setdefault(name, []).append(by)
-        parts = [f"{by:+.2g} % with 1 % more {name}" for name, by in one.given.items()]
+        parts = _largest(one.given, len(one.given) if whole else TERMS)
         free = with_unit(f"+- {figure(one.prior * one.left, 2)}", e.unit)
         said.append(f"{one.parameter} changes by {listed(parts)} ({free} if all are free)")
     if len(said) > MOST:

@@ -27,6 +27,7 @@ from grounded_trials.report.forecast import SECONDS
 from grounded_trials.wording import figure, or_zero, rendered, shown
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.last_diagnosis import Since
+from grounded_trials.workspace.next_step import outlook
 from grounded_trials.workspace.off_target import (
     WITHIN,
     rates_among,
@@ -110,6 +111,11 @@ class Findings:
     def next_command(self) -> str:
         """The next command, with the workspace as the user named it."""
         return rendered(self.then, self.folder)
+
+    @property
+    def outlook(self) -> str:
+        """The sentence on the search, and whether another model may go on with it."""
+        return outlook(self.standing, self.then)
 
     @property
     def next_trial(self) -> str:

@@ -48,7 +48,7 @@ from grounded_trials.report.page.tables import (
 )
 from grounded_trials.report.settled import told
 from grounded_trials.report.three_lines import gained_most
-from grounded_trials.wording import count, figure, glued, placed, rendered
+from grounded_trials.wording import count, figure, glued, percent, placed, rendered
 from grounded_trials.workspace.candidates.proposing import not_counted
 from grounded_trials.workspace.next_step import DIAGNOSE
 
@@ -244,12 +244,12 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
         gain = ""
         if -math.inf < first.utility < 0 and best.utility <= 0:
             share = 1 - best.utility / first.utility
-            gain = f": cost reduced by {100 * share:.1f} %"
+            gain = f": cost reduced by {percent(share)}"
             tried = {one.candidate.id: one for one in findings.history}
             two = tried[first.candidate.id], tried[best.candidate.id]
             if start := owed_to_start(*two, findings.history):
-                part = -100 * start / first.utility
-                gain += f", {part:.1f} % due to different start states, as the model predicts"
+                part = percent(-start / first.utility)
+                gain += f", {part} due to different start states, as the model predicts"
             if _probability(findings) < SURE:
                 gain += ", which the scatter of repeats may explain"
         moved = f"{figure(first.utility)} → {figure(best.utility)}"
