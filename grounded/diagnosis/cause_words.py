@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from grounded.diagnosis.report import Changed, Estimate, TrialValue
 from grounded.model import Model
-from grounded.result import listed, number, or_zero, percent, seen, spread, with_unit
+from grounded.result import figure, listed, number, or_zero, percent, seen, spread, with_unit
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.error_report import Credit
@@ -22,6 +22,7 @@ TURNED = (
     ": flip its sign in model.py, or, if only the log has it so, set {log} scale = -1, discard the "
     "trials and ingest their logs again"
 )
+LARGE = 1e3  # values from here on have no power of ten that a few digits would give them
 MOST_DIGITS = 6  # significant digits of a value
 DISAGREE = "but the trials disagree"
 KNOWN = 2.0  # standard deviations from zero that a value needs to be worded
@@ -42,8 +43,9 @@ def give_or_take(estimate: Estimate) -> str:
     value = seen(value, std)
     places = math.floor(math.log10(max(abs(value), std))) - math.floor(math.log10(std)) + 2
     digits = min(max(places, 3), MOST_DIGITS)
-    scatter = spread(std) if 1e-6 <= std < 1e-4 else f"{std:#.2g}".rstrip(".")
-    shown = f"{value:#.{digits}g}".rstrip(".") if value else "0"  # zeros at its end count
+    scatter = spread(std)
+    shown = figure(value, digits) if abs(value) >= LARGE else f"{value:#.{digits}g}".rstrip(".")
+    shown = shown if value else "0"
     return with_unit(f"{shown} +- {scatter}", estimate.unit)
 
 

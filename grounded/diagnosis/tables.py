@@ -7,13 +7,13 @@ from collections.abc import Iterable
 from html import escape
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.cause_words import OWN, times_of
+from grounded.diagnosis.cause_words import OWN, give_or_take, times_of
 from grounded.diagnosis.error_report import CALIBRATION, RulerRow, furthest
 from grounded.diagnosis.ruler_words import told_row
-from grounded.result import figure, html_table, or_zero, percent, seen, shown, spread, with_unit
+from grounded.result import figure, html_table, or_zero, percent, shown, with_unit
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.report import Diagnosis, Ranked
+    from grounded.diagnosis.report import Diagnosis, Estimate, Ranked
     from grounded.instruments.finding import Finding
 
 Cells = tuple[str, ...]
@@ -184,9 +184,7 @@ def values_of(row: Ranked) -> str:
     if unknown and unknown == set(row.params):
         return "its values are not determined"
     return ", ".join(
-        f"{name} is not determined"
-        if name in unknown
-        else with_unit(f"{name} = {figure(seen(e.value, e.std), 3)}{_spread(e.std)}", e.unit)
+        f"{name} is not determined" if name in unknown else f"{name} = {_value(e)}"
         for name, e in row.params.items()
     )
 
@@ -196,10 +194,10 @@ def undetermined(width: float, value: float) -> bool:
     return width > max(WIDEST * abs(value), UNBOUNDED)
 
 
-def _spread(std: float) -> str:
-    if not math.isfinite(std):
-        return " (any value fits)"
-    return f" +- {spread(std)}" if std else ""
+def _value(e: Estimate) -> str:
+    if not math.isfinite(e.std):
+        return with_unit(f"{figure(e.value, 3)} (any value fits)", e.unit)
+    return give_or_take(e) if e.std else with_unit(figure(e.value, 3), e.unit)
 
 
 def as_html(diagnosis: Diagnosis, everything: str) -> str:

@@ -66,6 +66,8 @@ def test_what_rounding_left_of_zero_reads_zero():
         (-2e-5, 0.01, "0 +- 0.010 N"),
         (2e-4, 0.01, "0.000200 +- 0.010 N"),
         (0.3, 1e-18, "0.3 N"),
+        (1234.0, 300.0, "1,234 +- 300 N"),
+        (0.018089, 0.00088, "0.01809 +- 0.00088 N"),
     ],
 )
 def test_a_value_is_zero_where_its_deviation_shows_no_digit_of_it(value, std, text):

@@ -15,7 +15,6 @@ from grounded.result import figure as figure
 from grounded.result import or_zero as or_zero
 from grounded.result import per_second as per_second
 from grounded.result import percent as percent
-from grounded.result import seen as seen
 from grounded.result import shown as shown
 from grounded.result import spread as spread
 from grounded.result import with_unit as with_unit

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from grounded.diagnosis.cause_words import ended, furthest_apart, value_of, with_worth
+from grounded.diagnosis.cause_words import ended, furthest_apart, give_or_take, value_of, with_worth
 from grounded.diagnosis.error_report import Correction, Gap
 from grounded.diagnosis.report import Changed, Diagnosis, Estimate
 from grounded.result import listed
@@ -16,8 +16,6 @@ from grounded_trials.wording import (
     figure,
     percent,
     ranges,
-    seen,
-    spread,
     with_unit,
 )
 
@@ -90,14 +88,14 @@ def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         rows = [
             (
                 "changed",
-                f"{value_of(one, adopted)} = {_with_spread(one.first)} in the first trials, "
-                f"{_with_spread(one.second)} in the second ({figure(one.evidence, 3)} nats)",
+                f"{value_of(one, adopted)} = {give_or_take(one.first)} in the first trials, "
+                f"{give_or_take(one.second)} in the second ({figure(one.evidence, 3)} nats)",
             )
             for one in diagnosis.changed
         ]
         rows = rows or [("changed", "nothing that these trials could show")]
         same = [
-            f"{value_of(one, adopted)}, by {_with_spread(_difference(one))}"
+            f"{value_of(one, adopted)}, by {give_or_take(_difference(one))}"
             for one in diagnosis.unchanged
         ]
         return [*rows, ("unchanged", f"within +-: {'; '.join(same)}")] if same else rows
@@ -108,7 +106,7 @@ def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
             values = [v for v in values if v.quantity == one.quantity]
             low, high = furthest_apart(values)
             ends = (Estimate(v.value, v.std, unit=one.estimate.unit) for v in (low, high))
-            lowest, highest = map(_with_spread, ends)
+            lowest, highest = map(give_or_take, ends)
             text = (
                 f"trials disagree on {one.quantity} of {one.effect}: {lowest} in {low.trial}, "
                 f"{highest} in {high.trial}"
@@ -120,11 +118,6 @@ def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 def _difference(one: Changed) -> Estimate:
     by, std = one.second.value - one.first.value, math.hypot(one.first.std, one.second.std)
     return Estimate(by, std, unit=one.first.unit)
-
-
-def _with_spread(estimate: Estimate) -> str:
-    text = f"{figure(seen(estimate.value, estimate.std), 3)} +- {spread(estimate.std)}"
-    return with_unit(text, estimate.unit)
 
 
 def gap_sentence(gap: Gap) -> str:
