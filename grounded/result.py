@@ -7,6 +7,7 @@ so that it can be read back.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from functools import cache
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 SCALED = ("m", "rad", "s")  # units that may get the prefixes m and µ, as may their rates
 SMALL = 1e-3  # values below this get a prefix
 FIXED = 1e-4  # values from here on are shown without a power of ten when they are compared
+ROUNDING = 1e-9  # share of its scale below which a number is what rounding left of 0
+UNSEEN = 0.005  # of a standard deviation: a smaller value is 0 in two digits of it
 # exceptions that reading a malformed document may raise
 MALFORMED = (ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError)
 
@@ -61,6 +64,27 @@ def listed(names: Iterable[str]) -> str:
     return f"{', '.join(most)} and {last}" if most else last
 
 
+def or_zero(value: float, *scale: float) -> float:
+    """Return 0 for a value that is rounding noise beside the numbers that it belongs to.
+
+    Args:
+        value: a number to be shown, such as one end of a range.
+        scale: others of its kind and unit, such as the other end, or its standard deviation.
+    """
+    size = max((abs(one) for one in scale if isfinite(one)), default=0.0)
+    return 0.0 if abs(value) <= ROUNDING * size else value
+
+
+def seen(value: float, std: float) -> float:
+    """Return 0 for a value that two digits of its standard deviation don't show."""
+    return 0.0 if abs(value) < UNSEEN * std < math.inf else value
+
+
+def extent(low: float, high: float) -> tuple[float, float]:
+    """Return the ends of a range, 0 for one that is rounding noise beside the other."""
+    return or_zero(low, high), or_zero(high, low)
+
+
 def percent(share: float) -> str:
     """Format a share as a percentage, with one decimal below 10 % and from 90 to 100 %."""
     if math.isnan(share):
@@ -81,6 +105,13 @@ def shown(unit: str) -> str:
     return "" if unit == "1" else unit
 
 
+def per_second(unit: str) -> str:
+    """Return the unit of a rate of change: rad/s for rad, m/s^2 for m/s, 1/s for 1."""
+    if found := re.fullmatch(r"(.*)/ ?s(?:\^(\d+))?", unit):
+        return f"{found[1]}/s^{int(found[2] or 1) + 1}"
+    return f"{unit} per s" if "/" in unit else f"{unit or '1'}/s"
+
+
 def with_unit(text: str, unit: str) -> str:
     """Join a number and its unit."""
     return f"{text} {shown(unit)}".rstrip()
@@ -93,6 +124,7 @@ def measured(value: float, unit: str) -> str:
 
 def measured_alike(values: Sequence[float], unit: str) -> list[str]:
     """Format errors that are compared, like `measured`, in the unit of their geometric mean."""
+    values = [or_zero(v, *values) for v in values]
     known = [v for v in values if 0 < v < math.inf]
     middle = math.exp(sum(map(math.log, known)) / len(known)) if known else 0.0
     return [_told(value, *_scale(middle, unit), FIXED) for value in values]

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded.result import listed
 from grounded_cli.console import completion as complete
 from grounded_cli.console.options import as_json, chosen_trials, parallel
 from grounded_cli.console.terminal import (
@@ -29,8 +28,7 @@ if TYPE_CHECKING:
     from grounded.engine import Engine
     from grounded.instruments.finding import Finding
 
-LEAST_SHARE = 0.005  # of the gap: a channel below it is not listed
-CHANNELS, REGIONS = 2, 3  # named in a line, in the details
+REGIONS = 3  # named in the details
 
 
 @click.command("diagnose")
@@ -126,6 +124,7 @@ def _show(
 ) -> None:
     """Print a diagnosis: what a person needs to decide, or with `details` everything."""
     from grounded.diagnosis.tables import error_table
+    from grounded_trials.report.diagnosis_notes import caveats, held_out
     from grounded_trials.report.diagnosis_words import (
         agreement_lines,
         correction_line,
@@ -135,15 +134,14 @@ def _show(
 
     show(_verdict(found))
     _instruments(found.preflight, inputs)
-    for text in found.unknowable:
-        if text != found.verdict.limit:
-            show(field("caveats", text))
+    for text in caveats(found):
+        show(field("caveats", text))
     if not found.no_cause:
         if found.prediction_error:
             rows, header = error_table(found, whole_trials=details)
             show("\n" + table(rows, header))
             adopted = "model.py: without what was adopted; now: with it; " * ("now" in header)
-            _note(f"{adopted}open loop, {_held_out(found)}")
+            _note(f"{adopted}open loop, {held_out(found)}")
         _effects(found, details=details)
     _places(found, details=details)
     if details:
@@ -155,35 +153,6 @@ def _show(
         show(field("correction", correction_line(found.correction)))
     for title, text in agreement_lines(found):
         show(field(title, text))
-
-
-def _held_out(found: Diagnosis) -> str:
-    """Say how the errors were held out and what the noise floor is from."""
-    from grounded.diagnosis.error_report import furthest
-
-    row = found.prediction_error[0]
-    by = {
-        "trials": "each trial predicted with values from the others",
-        "pieces": "each piece of the log predicted with values from the others",
-    }
-    noise = {
-        "repeats": "the scatter of repeats",
-        "alike": "at most the scatter of trials whose commands agree to 2 %",
-        "short horizon": "extrapolated from one-step errors",
-    }
-    if row.floor_at_most:
-        noise["short horizon"] = (
-            "not known, but at most that and perhaps far less: extrapolated from one-step errors, "
-            "which hold errors of the model too (repeat a run to know)"
-        )
-    text = f"{by.get(row.held_out, 'not held out')}; noise: {noise.get(row.floor_from, 'unknown')}"
-    last = furthest(found.prediction_error)
-    if last and any(one.drowned for one in found.prediction_error if not one.whole_trial):
-        text += (
-            f"; beyond {last.horizon_s:.3g} s noise alone grows past everything measured (as for a "
-            "robot that falls without feedback), so errors of whole trials say little"
-        )
-    return text
 
 
 def _instruments(findings: Sequence[Finding], inputs: Collection[str]) -> None:
@@ -226,19 +195,13 @@ def _verdict(found: Diagnosis) -> str:
 def _places(found: Diagnosis, *, details: bool) -> None:
     """Print where the gap lies: a line, or with `details` a table of channels and regions."""
     from grounded.diagnosis.error_report import furthest
+    from grounded_trials.report.diagnosis_notes import LEAST_SHARE, regions, where_line
 
-    where = found.where
-    channels = [c for c in where.channels if c.share >= LEAST_SHARE]  # NaN: the gap is noise
-    regions = [
-        f"{percent(one.share)} in the {percent(one.occupancy)} of the time in which {one.told}"
-        for one in where.regions[: REGIONS if details else 1]
-    ]
-    if not channels:
+    if not (line := where_line(found)):
         return
     if not details:
-        parts = [f"{percent(c.share)} in {c.name}" for c in channels[:CHANNELS]]
-        text = f"of the one-step errors beyond the noise, {'; '.join([listed(parts), *regions])}"
-        return show("\n" + field("where", text))
+        return show("\n" + field("where", line))
+    channels = [c for c in found.where.channels if c.share >= LEAST_SHARE]
     rows = [(c.name, percent(c.share), with_unit(number(c.rms, 3), c.unit)) for c in channels]
     show("\n" + table(rows, ("where", "share of the gap", "rms")))
     row = furthest(found.prediction_error)
@@ -247,13 +210,14 @@ def _places(found: Diagnosis, *, details: bool) -> None:
         "share: of the squared one-step errors beyond the noise; rms: of the predictions of the "
         f"model before this diagnosis{ahead}"
     )
-    for text in regions:
+    for text in regions(found, REGIONS):
         show(field("", text))
 
 
 def _effects(found: Diagnosis, *, details: bool) -> None:
     """Print the claimed effects and what ties with them, or with `details` all rivals."""
     from grounded.diagnosis.tables import WITHOUT, effect_table, of_delays
+    from grounded_trials.report.diagnosis_notes import deviations
 
     rows, header = effect_table(found, rivals=details)
     tied = " (a tied effect: in place of the claimed one)" * bool(found.indistinguishable)
@@ -263,14 +227,6 @@ def _effects(found: Diagnosis, *, details: bool) -> None:
             f"{WITHOUT}; evidence: log-likelihood lost without it"
             + tied
             + "; alone: log-likelihood gained by it alone" * ("alone [nats]" in header)
-            + "; +-: one standard deviation"
-            + _if_right(found)
+            + f"; {deviations(found)}"
             + (f"; {rows_apart}" if (rows_apart := of_delays(found)) else "")
         )
-
-
-def _if_right(found: Diagnosis) -> str:
-    """Say what standard deviations leave out: errors of the equations themselves."""
-    if found.leftover:
-        return ", but a gap remains, so true values may be further off"
-    return ", if the equations and the model's constants are right"

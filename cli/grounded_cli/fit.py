@@ -22,7 +22,7 @@ from grounded_cli.console.terminal import (
     table,
 )
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
-from grounded_trials.wording import count, shown
+from grounded_trials.wording import count, or_zero, shown
 
 if TYPE_CHECKING:
     from grounded.engine import Engine
@@ -126,7 +126,8 @@ def _parameters(found: Fit) -> str:
     rows = []
     for name, e in found.params.items():
         digits = _digits(e) if e.identified else DIGITS
-        low, high, start, value = (number(v, digits) for v in (e.low, e.high, e.start, e.value))
+        own = (e.low, e.high, e.start, e.value)
+        low, high, start, value = (number(or_zero(v, *own), digits) for v in own)
         interval = f"{low} .. {high}" if e.identified else "not identified"
         interval = "at its bound" if name in found.at_bounds else interval
         rows.append((name, start, value, interval, shown(e.unit)))

@@ -21,7 +21,7 @@ from grounded_cli.console.terminal import (
     table,
 )
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
-from grounded_trials.wording import with_unit
+from grounded_trials.wording import extent, with_unit
 
 if TYPE_CHECKING:
     from grounded.model import Model
@@ -156,7 +156,7 @@ def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
                 f"{1e3 * s.largest_gap_s:.0f}",
                 "-" if s.skew_s is None else f"{1e3 * s.skew_s:.1f}",
                 str(s.bridged),
-                with_unit(f"{s.low:.3g} .. {s.high:.3g}", units[s.name]),
+                with_unit(" .. ".join(f"{v:.3g}" for v in extent(s.low, s.high)), units[s.name]),
             )
             for s in one.signals
         ]

@@ -9,7 +9,7 @@ import click
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import number, progress, remark, show, show_json, table
 from grounded_cli.console.workspace_option import given, in_workspace, next_line, typed
-from grounded_trials.wording import count
+from grounded_trials.wording import count, extent
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -86,7 +86,10 @@ def _rows(fields: Sequence[FieldReport]) -> list[tuple[str, str, str]]:
     rows = []
     for one in fields:
         if one.path not in folded:
-            rows.append((f"  {one.path}", number(one.low), number(one.high)))
+            low, high = one.low, one.high
+            if low is not None and high is not None:
+                low, high = extent(low, high)
+            rows.append((f"  {one.path}", number(low), number(high)))
         elif same := many.pop(one.path.rpartition("[")[0], []):
             values = [each.low for each in same if each.low is not None]
             name = f"  {one.path.rpartition('[')[0]}[...], {len(same)} constants"

@@ -82,6 +82,7 @@ def verify(json_: bool) -> None:
 def summary(status: Status) -> str:
     """Return the history as a table, the utilities as bars, and the certainty of the last gain."""
     from grounded.search.certainty import beyond_one_trial, last_improvement
+    from grounded_trials.workspace.next_step import outlook
 
     standing, lines = status.standing, []
     if standing.history:
@@ -103,7 +104,7 @@ def summary(status: Status) -> str:
             small = beyond_one_trial(waiting, standing.incumbent, standing.missing)
             certainty = "; ".join(filter(None, (certainty, small)))
         lines.append(field("certainty", certainty))
-    lines.append(field("phase", f"{standing.outcome}: {standing.sentence}"))
+    lines.append(field("phase", f"{standing.outcome}: {outlook(standing, status.then)}"))
     return "\n".join(lines)
 
 

@@ -12,7 +12,7 @@ from grounded.result import listed
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import field, number, remark, sentence, show, show_json
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
-from grounded_trials.wording import misread, with_unit
+from grounded_trials.wording import extent, misread, with_unit
 
 if TYPE_CHECKING:
     from grounded.frozen import Array
@@ -153,6 +153,7 @@ def command(
     if tightest < STRAIGHT * size:
         show(field("driven", f"at up to {fastest:.3g} m/s, turning radius {tightest:.3g} m", "  "))
     for name, (low, high) in ranges.items():
+        low, high = extent(low, high)
         span = f"{number(low)} to {number(high)}" if low < high else f"stays at {number(low)}"
         text = with_unit(span, model.states[name])
         show(field(name, text, "  "))

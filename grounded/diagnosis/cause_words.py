@@ -6,11 +6,12 @@ import itertools
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from grounded.diagnosis.report import Changed, Estimate, TrialValue
 from grounded.model import Model
-from grounded.result import listed, number, percent, spread, with_unit
+from grounded.result import figure, listed, number, or_zero, percent, seen, spread, with_unit
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.error_report import Credit
@@ -21,6 +22,7 @@ TURNED = (
     ": flip its sign in model.py, or, if only the log has it so, set {log} scale = -1, discard the "
     "trials and ingest their logs again"
 )
+LARGE = 1e3  # values from here on have no power of ten that a few digits would give them
 MOST_DIGITS = 6  # significant digits of a value
 DISAGREE = "but the trials disagree"
 KNOWN = 2.0  # standard deviations from zero that a value needs to be worded
@@ -36,10 +38,14 @@ def give_or_take(estimate: Estimate) -> str:
     value, std = estimate.value, estimate.std
     if not (0 < std < math.inf and math.isfinite(value)):
         return quantity(estimate)
+    if or_zero(std, value) == 0:
+        return quantity(replace(estimate, std=0.0))
+    value = seen(value, std)
     places = math.floor(math.log10(max(abs(value), std))) - math.floor(math.log10(std)) + 2
     digits = min(max(places, 3), MOST_DIGITS)
-    scatter = spread(std) if 1e-6 <= std < 1e-4 else f"{std:#.2g}".rstrip(".")
-    shown = f"{value:#.{digits}g}".rstrip(".")  # with zeros at its end, which count
+    scatter = spread(std)
+    shown = figure(value, digits) if abs(value) >= LARGE else f"{value:#.{digits}g}".rstrip(".")
+    shown = shown if value else "0"
     return with_unit(f"{shown} +- {scatter}", estimate.unit)
 
 

@@ -11,6 +11,7 @@ from grounded.result import Document, measured_alike, number, with_unit
 
 ABOVE = 1.3  # times the noise floor, above which a leftover is stated
 SURE = 3.0  # the same in standard deviations of the floor, since many channels are compared
+CALIBRATION = "calibration"  # the cause that is the calibrated parameters, in `Credit.of`
 BRIEF: dict[str, Any] = {"brief": True}  # marks a field whose key is omitted if it is empty
 
 

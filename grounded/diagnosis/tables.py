@@ -7,13 +7,13 @@ from collections.abc import Iterable
 from html import escape
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.cause_words import OWN, times_of
-from grounded.diagnosis.error_report import RulerRow, furthest
+from grounded.diagnosis.cause_words import OWN, give_or_take, times_of
+from grounded.diagnosis.error_report import CALIBRATION, RulerRow, furthest
 from grounded.diagnosis.ruler_words import told_row
-from grounded.result import figure, html_table, percent, shown, spread, with_unit
+from grounded.result import figure, html_table, or_zero, percent, shown, with_unit
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.report import Diagnosis, Ranked
+    from grounded.diagnosis.report import Diagnosis, Estimate, Ranked
     from grounded.instruments.finding import Finding
 
 Cells = tuple[str, ...]
@@ -72,7 +72,7 @@ def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[lis
 
 
 def _cell(row: RulerRow, column: str, name: str) -> str:
-    value = getattr(row, column).get(name, math.nan)
+    value = or_zero(getattr(row, column).get(name, math.nan), row.crude.get(name, 0.0))
     if not row.tells(name, column):
         return "diverges"
     return figure(value, 3) if math.isfinite(value) else "-"
@@ -135,11 +135,11 @@ def effect_table(diagnosis: Diagnosis, *, rivals: bool = True) -> tuple[list[Cel
             ("* " if r.claimed else "  ") + r.effect,
             credit_of(diagnosis, r.effect),
             *((_evidence(r), "") if r in own else ("", _evidence(r)))[:columns],
-            _values(r),
+            values_of(r),
         )
         for r in (*own, *others)
     ]
-    if rows and (share := credit_of(diagnosis, "calibration")):
+    if rows and (share := credit_of(diagnosis, CALIBRATION)):
         blank = ("", "")[:columns]
         rows.insert(0, ("  (calibration)", share, *blank, OWN))
     evidence = ("evidence [nats]", "alone [nats]")[:columns]
@@ -174,7 +174,7 @@ def _evidence(row: Ranked) -> str:
     return "-" if math.isnan(row.evidence) else f"{row.evidence:,.{decimals}f}"
 
 
-def _values(row: Ranked) -> str:
+def values_of(row: Ranked) -> str:
     """Format the quantities of an effect with their standard deviations and units."""
     unknown = {
         name
@@ -184,9 +184,7 @@ def _values(row: Ranked) -> str:
     if unknown and unknown == set(row.params):
         return "its values are not determined"
     return ", ".join(
-        f"{name} is not determined"
-        if name in unknown
-        else with_unit(f"{name} = {figure(e.value, 3)}{_spread(e.std)}", e.unit)
+        f"{name} is not determined" if name in unknown else f"{name} = {_value(e)}"
         for name, e in row.params.items()
     )
 
@@ -196,10 +194,10 @@ def undetermined(width: float, value: float) -> bool:
     return width > max(WIDEST * abs(value), UNBOUNDED)
 
 
-def _spread(std: float) -> str:
-    if not math.isfinite(std):
-        return " (any value fits)"
-    return f" +- {spread(std)}" if std else ""
+def _value(e: Estimate) -> str:
+    if not math.isfinite(e.std):
+        return with_unit(f"{figure(e.value, 3)} (any value fits)", e.unit)
+    return give_or_take(e) if e.std else with_unit(figure(e.value, 3), e.unit)
 
 
 def as_html(diagnosis: Diagnosis, everything: str) -> str:

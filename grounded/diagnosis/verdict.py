@@ -103,8 +103,7 @@ def verdict(
     """
     from grounded.effects import like_a_load
 
-    rare = [one for one in seen if not one.repeats] + [one for one in seen if one.repeats][:1]
-    once = [sentence([one.sentence()]) for one in rare]
+    once = [sentence([one.sentence()]) for one in told_of(seen)]
     left = remainder[0].sentence() if remainder else ""
     others = len(remainder) - 1
     left += also_off(others)
@@ -173,6 +172,11 @@ def verdict(
         parameters=off,
     )
     return replace(said, look_for=more if more > most else 0, again=0 < more <= most)
+
+
+def told_of(seen: Sequence[Unconfirmed]) -> list[Unconfirmed]:
+    """Return the unconfirmed effects that are told: one at most of those that repeat a motion."""
+    return [one for one in seen if not one.repeats] + [one for one in seen if one.repeats][:1]
 
 
 def interrupted(said: Verdict) -> Verdict:

@@ -39,6 +39,7 @@ from grounded.effects.family import (
 )
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.result import per_second
 
 LONGEST_DELAY = 0.5  # longest delay of a scan [s]; four steps if these are longer
 NEARBY = (0.05, 0.15, 0.4, 0.8, 1.3, 2.0)  # scanned changes of an adopted delay, in steps
@@ -344,7 +345,7 @@ rate_limit = MemoryFamily(
     equation="|u_eff'| <= r",
     sentence="{target} can't change faster than {r}",
     targets=_one_or_alike,
-    quantities=lambda site: speed_limit(site, f"{site.unit(site.target)}/s"),
+    quantities=lambda site: speed_limit(site, per_second(site.unit(site.target))),
     lookalikes=("slew_limit", "first_order_lag", "delay", "saturation"),
     advance=_advance_rate,
     along=_along_rate,

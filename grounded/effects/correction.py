@@ -20,8 +20,8 @@ from grounded.effects.family import (
     Values,
     coupled,
     from_source,
-    per,
 )
+from grounded.result import per_second
 
 KNOTS = 7
 WIDTH = 0.7  # standard deviation of a bell, in distances between knots
@@ -46,7 +46,7 @@ def _targets(model: Any) -> list[str]:
 def _quantities(site: Site) -> tuple[Quantity, ...]:
     target, source = coupled(site)
     ends = [Quantity(n, site.unit(source), fixed=True) for n in ("lo", "hi")]
-    unit = per(site.unit(target))
+    unit = per_second(site.unit(target))
     return (*ends, *[Quantity(f"w{k}", unit, fixed=True) for k in range(KNOTS)])
 
 

@@ -128,13 +128,6 @@ class Site:
         return self.model.states.get(name) or self.model.inputs.get(name) or "1"
 
 
-def per(unit: str, by: str = "s") -> str:
-    """Return a unit divided by another in readable form: m/s by s is m/s^2."""
-    if unit == "1":
-        return f"1/{by}"
-    return f"{unit}^2" if unit.endswith(f"/{by}") else f"{unit}/{by}"
-
-
 def coupled(site: Site) -> tuple[str, str]:
     """Return the two sides of a target `v<-delta`: the driven signal and its source."""
     target, _, source = site.target.partition("<-")

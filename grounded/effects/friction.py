@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 
 from grounded import places
-from grounded.effects.family import Quantity, RateFamily, Site, Values, beyond, per, width
+from grounded.effects.family import Quantity, RateFamily, Site, Values, beyond, width
+from grounded.result import per_second
 
 HALTS = 2.0  # most that friction may take off in a control step, in units of the largest speed
 
@@ -55,7 +56,7 @@ def _viscous(site: Site) -> tuple[Quantity, ...]:
 
 
 def _coulomb(site: Site) -> tuple[Quantity, ...]:
-    dry = _opposing(site, "c", per(site.unit(site.target)), 0)
+    dry = _opposing(site, "c", per_second(site.unit(site.target)), 0)
     return (dry, width(site, site.target))
 
 
@@ -69,7 +70,7 @@ def _stiction(site: Site) -> tuple[Quantity, ...]:
     unit, peak = site.unit(site.target), site.scales.peak(site.target)
     grid = tuple(float(v) for v in np.geomspace(0.05, 4.0, 8) * peak)
     return (
-        Quantity("c", per(unit), grid, 0.0, np.inf, places=6),
+        Quantity("c", per_second(unit), grid, 0.0, np.inf, places=6),
         Quantity("v_s", unit, fixed=True, start=0.05 * peak),
     )
 

@@ -29,14 +29,14 @@ from grounded.effects.family import (
     beyond,
     coupled,
     from_source,
-    per,
     two_axes,
 )
 from grounded.model import Model
+from grounded.result import per_second
 
 
 def _two_drifts(site: Site) -> tuple[Quantity, ...]:
-    return two_axes(per(site.unit(site.target)))
+    return two_axes(per_second(site.unit(site.target)))
 
 
 def _heading(site: Site) -> str:
@@ -70,7 +70,7 @@ def _patch(site: Site) -> tuple[Quantity, ...]:
     where = places.position(site.model)
     count = 6 if len(where) == 2 else 12
     spreads = [site.scales.spread(name) for name in where]
-    found = [Quantity("c", per(site.unit(site.target)))]
+    found = [Quantity("c", per_second(site.unit(site.target)))]
     for name, spread in zip(where, spreads, strict=True):
         low = site.scales.low.get(name, -1.0)
         grid = tuple(float(low + spread * (i + 0.5) / count) for i in range(count))
@@ -225,7 +225,7 @@ cornering_drag = RateFamily(
     equation="v' = model - k |delta| v   (v<-delta)",
     sentence="{driven} is braked by {k} times itself and the size of {source}",
     targets=_corners,
-    quantities=lambda site: (Quantity("k", per("1", "s") + "/" + site.unit(coupled(site)[1])),),
+    quantities=lambda site: (Quantity("k", per_second("1") + "/" + site.unit(coupled(site)[1])),),
     lookalikes=("viscous_friction", "quadratic_drag", "coupling", "coulomb_friction"),
     rate=_drag_rate,
     brakes=True,

@@ -35,11 +35,11 @@ from grounded.effects.family import (
     Scales,
     Site,
     Values,
-    per,
     two_axes,
 )
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.result import per_second
 
 SAME = 1e-6  # relative difference of squared lengths of equivalent effects
 FELT = 1e-4  # [1/s^2] smallest change of a velocity's rate by a medium that moves by 0.2
@@ -136,7 +136,7 @@ push_world = RateFamily(
     equation="u' = model + a cos(psi) + b sin(psi), v' = model - a sin(psi) + b cos(psi)",
     sentence="something pushes it, by {a} along {axis_1} and {b} along {axis_2}",
     targets=_pushed,
-    quantities=lambda site: two_axes(per(site.unit(site.target))),
+    quantities=lambda site: two_axes(per_second(site.unit(site.target))),
     lookalikes=("current", "offset", "slope", "patch"),
     rate=lambda s, a, own, t, c, site: _in_its_axes(s, c, site),
 )

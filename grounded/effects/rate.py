@@ -29,16 +29,16 @@ from grounded.effects.family import (
     beyond,
     coupled,
     from_source,
-    per,
     speed_limit,
 )
+from grounded.result import per_second
 
 PERIODS = 1.5  # fewest periods of a wave in the longest trial
 
 
 def _coupling(site: Site) -> tuple[Quantity, ...]:
     target, source = coupled(site)
-    return (Quantity("k", f"{per(site.unit(target))} per {site.unit(source)}"),)
+    return (Quantity("k", f"{per_second(site.unit(target))} per {site.unit(source)}"),)
 
 
 def _periodic(site: Site) -> tuple[Quantity, ...]:
@@ -56,7 +56,7 @@ def _periodic(site: Site) -> tuple[Quantity, ...]:
     grid = tuple(float(2 * np.pi * f) for f in np.linspace(lowest, highest, count))
     slowest = grid[0] if scales.high else 0.0
     fastest = 2 * np.pi * max(0.45 / scales.dt, lowest)
-    unit = per(site.unit(site.target))
+    unit = per_second(site.unit(site.target))
     omega = Quantity("omega", "rad/s", grid, slowest, fastest, places=bins)
     return (Quantity("A", unit), Quantity("B", unit), omega)
 
@@ -82,7 +82,7 @@ offset = RateFamily(
     equation="s' = model + c",
     sentence="{target} drifts by {c}",
     targets=places.states,
-    quantities=lambda site: (Quantity("c", per(site.unit(site.target))),),
+    quantities=lambda site: (Quantity("c", per_second(site.unit(site.target))),),
     lookalikes=("input_bias", "trend", "drift_world", "sensor_bias", "parameter"),
     rate=lambda s, a, own, t, c, site: {site.target: c["c"] + 0.0 * s[site.target]},
 )
@@ -105,7 +105,7 @@ trend = RateFamily(
     equation="s' = model + k t",
     sentence="{target} drifts more and more, by {k}",
     targets=places.dynamic,
-    quantities=lambda site: (Quantity("k", per(per(site.unit(site.target)))),),
+    quantities=lambda site: (Quantity("k", per_second(per_second(site.unit(site.target)))),),
     lookalikes=("input_fade", "offset", "periodic"),
     vague=0.5,
     rate=lambda s, a, own, t, c, site: {site.target: c["k"] * t + 0.0 * s[site.target]},
@@ -154,7 +154,7 @@ slew_limit = RateFamily(
     equation="s' = clip(model, -r, r)",
     sentence="{target} can't change faster than {r}",
     targets=places.following,
-    quantities=lambda site: speed_limit(site, per(site.unit(site.target))),
+    quantities=lambda site: speed_limit(site, per_second(site.unit(site.target))),
     lookalikes=("rate_limit", "first_order_lag", "saturation"),
     rate=_slew_rate,
     needs_own=True,

@@ -14,6 +14,7 @@ from grounded.frozen import Array
 from grounded.instruments.finding import Finding
 from grounded.instruments.lag import LEAST_S, SURE, Lag, alike, lag_between, reach_of
 from grounded.model import Model
+from grounded.result import extent
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -80,7 +81,8 @@ def limits_of(task: Task, j: int) -> str:
 
 def span(values: Array) -> str:
     """Return the range of all values as text, such as `-1.2 to 2.15`."""
-    return f"{np.nanmin(values):.4g} to {np.nanmax(values):.4g}"
+    low, high = extent(float(np.nanmin(values)), float(np.nanmax(values)))
+    return f"{low:.4g} to {high:.4g}"
 
 
 def judge_inputs(subject: Task | Model, trials: Sequence[Trial]) -> Iterator[Finding]:

@@ -157,11 +157,11 @@ def test_a_stage_that_lasts_is_not_said_twice_in_the_same_words(capsys, monkeypa
 
 
 def test_errors_of_what_falls_over_by_itself_are_said_to_tell_little_farther_ahead():
-    from grounded_cli.diagnose import _held_out
+    from grounded_trials.report.diagnosis_notes import held_out
 
     rows = (RulerRow(0.1), RulerRow(0.5), RulerRow(1.0))
-    assert "0.5 s" not in _held_out(Diagnosis(Verdict("none"), prediction_error=rows))
+    assert "0.5 s" not in held_out(Diagnosis(Verdict("none"), prediction_error=rows))
     fallen = Diagnosis(
         Verdict("none"), prediction_error=(*rows[:2], replace(rows[2], drowned=True))
     )
-    assert "beyond 0.5 s" in _held_out(fallen)
+    assert "beyond 0.5 s" in held_out(fallen)

@@ -166,6 +166,17 @@ def test_a_carriage_is_no_wider_than_its_way_and_what_hangs_from_it_is_no_tip():
     assert "load" in _body(crane).watched
 
 
+def test_a_robot_on_wheels_is_watched_at_its_position_not_at_a_tip():
+    """A balancing robot's page showed the "Error of the tip", l above its axle."""
+    roles = {"rail": "x", "upright": ("theta",), "speed": "x_vel"}
+    body = _body(replace(cart_pole.model, roles=roles))
+    states = np.array([[0.3, 0.4, 0.0, 0.0], [0.5, -0.2, 0.0, 0.0]])
+    rail = cart_pole.model.state_names.index("x")
+    assert "tip" not in body.watched
+    np.testing.assert_allclose(body.path(states)[:, 0], states[:, rail])
+    assert not body.path(states)[:, 2].any() and reach(body, states)[:, 2].max() > 0.1
+
+
 def test_a_rope_is_thin_and_its_load_is_at_its_end():
     """The rope of a crane of 0.55 m was a rod, 6.6 cm thick."""
     params = {"L": Param(0.55, "m")}

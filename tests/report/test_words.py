@@ -1,11 +1,22 @@
 """Numbers and units as people read them."""
 
+import math
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 
+from grounded.diagnosis.cause_words import give_or_take
+from grounded.diagnosis.report import Estimate
+from grounded.result import measured_alike
+from grounded_trials.report.findings import by_state
 from grounded_trials.wording import (
     count,
+    extent,
     glued,
     labelled,
+    moved,
+    or_zero,
     per_second,
     percent,
     ranges,
@@ -23,7 +34,51 @@ def test_the_unit_one_is_not_printed():
     assert shown("1") == "" and shown("m/s") == "m/s"
     assert with_unit("0.146", "1") == "0.146" and with_unit("0.3", "m") == "0.3 m"
     assert labelled("throttle", "1") == "throttle" and labelled("v", "m/s") == "v [m/s]"
-    assert per_second("1") == "1/s" and per_second("rad") == "rad/s"
+
+
+@pytest.mark.parametrize(
+    ("unit", "rate"),
+    [
+        ("1", "1/s"),
+        ("rad", "rad/s"),
+        ("rad/s", "rad/s^2"),
+        ("m/s^2", "m/s^3"),
+        ("V", "V/s"),
+        ("N m", "N m/s"),
+        ("kg/h", "kg/h per s"),
+    ],
+)
+def test_a_rate_has_the_unit_of_its_state_per_second(unit, rate):
+    assert per_second(unit) == rate
+
+
+def test_what_rounding_left_of_zero_reads_zero():
+    assert extent(-1e-18, 0.3) == (0.0, 0.3) and extent(-0.3, 7e-17) == (-0.3, 0.0)
+    assert extent(-1e-18, 2e-18) == (-1e-18, 2e-18)  # small in itself, not beside anything
+    assert or_zero(1e-12, math.inf) == 1e-12 and math.isnan(or_zero(math.nan, 1.0))
+    assert moved(1.0, -7e-17, "m").startswith("1.00 -> 0 ")
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "text"),
+    [
+        (7e-17, 0.01, "0 +- 0.010 N"),
+        (-2e-5, 0.01, "0 +- 0.010 N"),
+        (2e-4, 0.01, "0.000200 +- 0.010 N"),
+        (0.3, 1e-18, "0.3 N"),
+        (1234.0, 300.0, "1,234 +- 300 N"),
+        (0.018089, 0.00088, "0.01809 +- 0.00088 N"),
+    ],
+)
+def test_a_value_is_zero_where_its_deviation_shows_no_digit_of_it(value, std, text):
+    assert give_or_take(Estimate(value, std, unit="N")) == text
+
+
+def test_an_error_that_is_rounding_noise_beside_its_row_is_zero():
+    errors = [np.array([0.3, 2e-17]), np.array([-1e-18, 3e-17])]
+    model = SimpleNamespace(states={"x": "m", "v": "m/s"}, n=2)
+    x, v = by_state(model, errors)
+    assert x[-1] == "0" != v[-1] and measured_alike([0.1, 2e-16], "m") == ["100 mm", "0 mm"]
 
 
 @pytest.mark.parametrize(

@@ -214,7 +214,7 @@ def test_how_a_start_moves_is_told_of_the_robot_not_of_a_filter(tmp_path):
     file.write_text(file.read_text() + lag)
     notes = Workspace(w.folder).propose().proposal.notes
     (note,) = [one for one in notes if "the plan assumes" in one]
-    assert "v changes at once, by 0.07 m/s per second" in note
+    assert "v changes at once, by 0.07 m/s^2" in note
 
 
 FAN = """

@@ -36,6 +36,7 @@ from grounded_trials.workspace.next_step import (
     EXPORT,
     after_diagnosis,
     nothing_to_do,
+    outlook,
     to_adopt,
     to_look_deeper,
 )
@@ -72,6 +73,17 @@ def two_claimed(folder: Path) -> list[str]:
 @pytest.mark.parametrize("command", ["status", "report", "learn", "propose"])
 def test_every_command_says_the_same_once_the_search_has_ended(cart, command):
     assert last(grounded("-C", cart, command)) == "grounded adopt viscous_friction:v"
+
+
+def test_the_result_of_a_search_is_that_of_its_model_if_another_is_to_be_adopted():
+    """ "c0007 is the result" stood above the command that adopts effects and goes on."""
+    done = NS(phase="converged", sentence="no step gains: c0007 is the result")
+    lost, waiting = (NS(phase=p, sentence="c0007") for p in ("stopped", "await-trial"))
+    adopt = NextCommand("adopt", ("delay:u",))
+    assert holds(outlook(done, adopt), done.sentence, "as it is", "adopt")
+    assert holds(outlook(lost, adopt), "adopt") and "as it is" not in outlook(lost, adopt)
+    assert outlook(done, NextCommand("export")) == done.sentence
+    assert outlook(waiting, adopt) == waiting.sentence
 
 
 def test_all_claimed_effects_are_adopted_at_once(cart, tmp_path):

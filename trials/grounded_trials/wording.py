@@ -10,7 +10,10 @@ from itertools import pairwise
 from textwrap import TextWrapper
 
 from grounded.errors import NextCommand
+from grounded.result import extent as extent
 from grounded.result import figure as figure
+from grounded.result import or_zero as or_zero
+from grounded.result import per_second as per_second
 from grounded.result import percent as percent
 from grounded.result import shown as shown
 from grounded.result import spread as spread
@@ -32,7 +35,7 @@ _GLUE = re.compile(
     r"(?<=[<>]) (?=[\d.-])| (?=[<>] )| (?=-> )| (?=%)"
     r"| (?=(?:\+-|±) )|(?<= (?:\+-)) |(?<= ±) |^ |(?<=^[ *]) "
     r"|(?<=\d) (?=(?:[mµc]?(?:m|s|rad)|deg|kg|N|Nm|V|A|Hz|nats)\b)| (?=[+-]\d[\d.]* %)"
-    r"|(?<=noise:) |(?<=\bN) (?=m\b)|(?<=\bN m) (?=s\b)"
+    r"| (?== -?\d)|(?<= =) (?=-?\d)|(?<=noise:) |(?<=\bN) (?=m\b)|(?<=\bN m) (?=s\b)"
 )  # blanks at which a line must not be broken
 
 
@@ -78,6 +81,7 @@ def moved(old: float, new: float, unit: str, least: int = 3) -> str:
 
 def in_digits_apart(one: float, other: float, least: int = 3) -> tuple[str, str]:
     """Format two numbers with enough digits to distinguish them, at least `least`."""
+    one, other = extent(one, other)
     for digits in range(least, 9):
         if float(f"{one:.{digits}g}") != float(f"{other:.{digits}g}"):
             return figure(one, digits), figure(other, digits)
@@ -98,13 +102,6 @@ def labelled(name: str, unit: str) -> str:
 def misread(bias: float, unit: str) -> str:
     """Return by how much a biased sensor reads wrong: `0.0044 rad too high`."""
     return f"{with_unit(f'{abs(bias):.3g}', unit)} too {'low' if bias < 0 else 'high'}"
-
-
-def per_second(unit: str) -> str:
-    """Return the unit of a rate of change: rad/s for rad, m/s^2 for m/s."""
-    if found := re.fullmatch(r"(.*)/s(?:\^(\d))?", unit):
-        return f"{found[1]}/s^{int(found[2] or 1) + 1}"
-    return f"{unit} per s" if set(unit) & set("/ ") else f"{unit}/s"
 
 
 def wrapped(text: str, first: str, rest: str) -> list[str]:

@@ -22,8 +22,8 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.prediction_error import Horizon, errors
 from grounded.effects import Library
 from grounded.effects.correction import KNOTS, bells
-from grounded.effects.family import per
 from grounded.frozen import Array
+from grounded.result import per_second
 
 MOST = 2  # most variables
 LEAST = 0.02  # smallest relative reduction of the held-out squared error to be adoptable
@@ -121,7 +121,7 @@ def _judged(
         gains.append(1 - after / before)
     gain = float(np.mean(gains))
     scatter = float(np.std(gains, ddof=1) / np.sqrt(len(gains))) if len(gains) > 1 else np.inf
-    unit, shapes = per(data.model.states[channel]), []
+    unit, shapes = per_second(data.model.states[channel]), []
     for k, one in enumerate(curves):
         whole = weights[-1][k * KNOTS : (k + 1) * KNOTS]
         apart = weights[:-1, k * KNOTS : (k + 1) * KNOTS]

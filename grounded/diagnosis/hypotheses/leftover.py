@@ -23,9 +23,9 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.linearise import gains_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.ruler import folds
-from grounded.effects.family import per
 from grounded.filter import kalman
 from grounded.frozen import Array
+from grounded.result import per_second
 
 CLAIM = 5.0  # nats gained on held-out trials from which a leftover is stated
 PENALTIES = (3.0, 30.0)  # ridge: relative prior variances of the weights
@@ -59,7 +59,7 @@ def leftovers(predictor: Predictor, fit: Fitted) -> list[Leftover]:
         if gain > CLAIM:
             size = float(np.sqrt((correction**2 * data.valid.T).sum() / data.valid.sum()))
             unit = data.model.states[name]
-            found.append(Leftover(name, gain, size, per(unit), correction, step_gain))
+            found.append(Leftover(name, gain, size, per_second(unit), correction, step_gain))
     return sorted(found, key=lambda left: -left.gain)
 
 

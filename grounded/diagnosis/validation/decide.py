@@ -33,6 +33,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from grounded.diagnosis.error_report import CALIBRATION
 from grounded.diagnosis.hypotheses.counterpart import counterparts
 from grounded.diagnosis.hypotheses.explored import CLAIM, TIE, parametric
 from grounded.diagnosis.hypotheses.leftover import leftovers
@@ -48,7 +49,6 @@ from grounded.diagnosis.validation.single_steps import borne_out
 from grounded.diagnosis.validation.visits import acting, few_trials
 from grounded.effects import ParamFamily, SensorFamily
 
-CALIBRATION = "calibration"
 RIVALS = 8  # likeliest hypotheses that are measured
 LEAST = 0.01  # smallest log gain of a cause in its best channel
 PAYS = (2.0, LEAST)  # scatters and log gain that a cause must reach

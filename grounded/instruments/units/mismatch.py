@@ -24,7 +24,7 @@ from grounded.instruments.units.odd_trial import Odd, spread
 from grounded.instruments.units.other_units import FACTORS, described
 from grounded.model import Model
 from grounded.places import integrals
-from grounded.result import listed
+from grounded.result import listed, per_second, with_unit
 from grounded.trial import Trial
 
 BAD, GROSS = 0.5, 0.7  # unexplained share of the motion: examined, and reported
@@ -310,8 +310,9 @@ def unexplained(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> I
         name, *by = (model.state_names[i] for i in (row.i, *row.by))
         rate = float(np.median([gap.rate for gap in some]))
         what = listed(by)
+        off = with_unit(f"{rate:.3g}", per_second(model.states[name]))
         text = (
             f"does not move as {what} {'imply' if len(by) > 1 else 'implies'} (its rate is off by "
-            f"{rate:.3g} {model.states[name]} per second): check units, axes and signs"
+            f"{off}): check units, axes and signs"
         )
         yield Finding(name, text, "mismatch")

@@ -135,3 +135,15 @@ def test_a_line_names_no_twenty_parameters():
     said = held_sentence(SimpleNamespace(identifiable=parts, parameters=known))
     assert "20 others" in said and "+0.9 to +0.92 % with 1 % more J" in said and "C3" not in said
     assert "C0" in held_sentence(SimpleNamespace(identifiable=parts[:2], parameters=known))
+
+
+def test_a_sum_in_a_sentence_has_its_largest_terms_and_on_the_page_all():
+    given = {"a": 0.1, "b": -2.0, "c": 0.3, "d": 1.0}
+    parts = [Identifiable("k", "weak", 1.0, 0.01, given)]
+    known = SimpleNamespace(identifiable=parts, parameters={"k": Estimate(1.0, 0.1, "N")})
+    short, whole = held_sentence(known), held_sentence(known, whole=True)
+    terms = ["-2 % with 1 % more b", "+1 % with 1 % more d", "more c", "more a"]
+    assert [term in short for term in terms] == [True, True, False, False] and "smaller" in short
+    assert all(term in whole for term in terms) and "smaller" not in whole
+    known.identifiable = [Identifiable("k", "weak", 1.0, 0.01, dict([*given.items()][:3]))]
+    assert "smaller" not in held_sentence(known)

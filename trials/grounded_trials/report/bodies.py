@@ -3,7 +3,8 @@
     position                    a car from above, or an aircraft, along its path
     hanging, upright, level     a chain of links in a vertical plane: the angles of their joints,
                                 where the first is zero downwards, upwards, or along x
-    rail                        the position of a carriage that carries the links
+    rail                        the position of a carriage that carries the links; with a speed,
+                                of the wheels of a vehicle that balances
     altitude, without position  a cabin that moves up and down
     a MuJoCo model              the geometry of its file
     none of these               a dot in the plane of the first two states
@@ -70,7 +71,8 @@ def body_of(model: Model, scene: Scene, size: float) -> Body:
             drawn = tuple(length or 1.0 for length in lengths)
             rail = _columns(model, "rail")
             wide = min(CARRIAGE[0] * sum(drawn), size) if unit else CARRIAGE[0] * sum(drawn)
-            return Links(angles, drawn, zero, sign, unit, rail, wide)
+            drives = bool(rail) and bool(_columns(model, "speed"))
+            return Links(angles, drawn, zero, sign, unit, rail, wide, drives)
     if not scene.spatial and (height := _columns(model, "altitude")):
         return Cabin(height[0], size, list(model.states.values())[height[0]])
     return Vehicle(scene, size)
@@ -137,6 +139,7 @@ class Links:
     unit: str
     rail: tuple[int, ...] = ()  # index of the carriage's state, or empty
     wide: float = CARRIAGE[0]  # half width of the carriage
+    drives: bool = False  # whether the carriage is a vehicle's wheels, as of a balancing robot
 
     @property
     def hangs(self) -> bool:
@@ -145,7 +148,9 @@ class Links:
 
     @property
     def watched(self) -> str:
-        """The end of the last link."""
+        """The end of the last link; of a vehicle, whose link ends nowhere, its position."""
+        if self.drives:
+            return "the position"
         return "the load, at the end of the rope" if self.hangs else "the tip"
 
     @property
@@ -177,7 +182,12 @@ class Links:
         return [*found, *load, *[(joints[0], still)] * bool(self.rail)]
 
     def path(self, states: Array) -> Array:
-        """Return the positions of the tip (T, 3)."""
+        """Return the positions of the watched point (T, 3)."""
+        chain = self._chain(states)[0]
+        return chain[0] if self.drives else chain[-1]
+
+    def end(self, states: Array) -> Array:
+        """Return the positions of the last link's end (T, 3)."""
         return self._chain(states)[0][-1]
 
     def _chain(self, states: Array) -> tuple[list[Array], list[Array]]:
@@ -227,4 +237,5 @@ def reach(body: Body, states: Array) -> Array:
         return path[np.isfinite(path).all(axis=1)]
     chosen = filled[np.unique(np.linspace(0, len(filled) - 1, 60).astype(int))]
     origins = [origin for origin, _ in body.poses(chosen)]
-    return np.vstack([path[np.isfinite(path).all(axis=1)], *origins])
+    ends = [body.end(chosen)] if isinstance(body, Links) and body.drives else []
+    return np.vstack([path[np.isfinite(path).all(axis=1)], *origins, *ends])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from grounded.diagnosis.cause_words import ended, furthest_apart, value_of, with_worth
+from grounded.diagnosis.cause_words import ended, furthest_apart, give_or_take, value_of, with_worth
 from grounded.diagnosis.error_report import Correction, Gap
 from grounded.diagnosis.report import Changed, Diagnosis, Estimate
 from grounded.result import listed
@@ -16,15 +16,17 @@ from grounded_trials.wording import (
     figure,
     percent,
     ranges,
-    spread,
     with_unit,
 )
 
 DIVERGED = 100.0  # times the spread of measured utilities: larger errors are not stated
+TERMS = 2  # of a sum in a sentence, the largest; a third is told if it is the last
 MOST = 3  # parameters whose dependence on held ones is stated one by one
 
 
-def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple[str, str]]:
+def error_lines(
+    diagnosis: Diagnosis, before: Mapping[str, float], *, whole: bool = False
+) -> list[tuple[str, str]]:
     """Return (title, text) of the details: calibrated parameters, utility, look-alikes.
 
     Empty if there were too few data to name a cause: what was fitted then is not a finding.
@@ -32,13 +34,14 @@ def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple
     Args:
         diagnosis: the result.
         before: values of the model's parameters before it.
+        whole: whether to give all terms of long sums, as a page does.
     """
     if diagnosis.no_cause:
         return []
     found = []
     if text := calibrated_sentence(diagnosis, before):
         found.append(("parameters", text))
-    if text := held_sentence(diagnosis):
+    if text := held_sentence(diagnosis, whole=whole):
         found.append(("held", text))
     if text := utility_sentence(diagnosis):
         found.append(("utility", text))
@@ -85,14 +88,14 @@ def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         rows = [
             (
                 "changed",
-                f"{value_of(one, adopted)} = {_with_spread(one.first)} in the first trials, "
-                f"{_with_spread(one.second)} in the second ({figure(one.evidence, 3)} nats)",
+                f"{value_of(one, adopted)} = {give_or_take(one.first)} in the first trials, "
+                f"{give_or_take(one.second)} in the second ({figure(one.evidence, 3)} nats)",
             )
             for one in diagnosis.changed
         ]
         rows = rows or [("changed", "nothing that these trials could show")]
         same = [
-            f"{value_of(one, adopted)}, by {_with_spread(_difference(one))}"
+            f"{value_of(one, adopted)}, by {give_or_take(_difference(one))}"
             for one in diagnosis.unchanged
         ]
         return [*rows, ("unchanged", f"within +-: {'; '.join(same)}")] if same else rows
@@ -103,7 +106,7 @@ def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
             values = [v for v in values if v.quantity == one.quantity]
             low, high = furthest_apart(values)
             ends = (Estimate(v.value, v.std, unit=one.estimate.unit) for v in (low, high))
-            lowest, highest = map(_with_spread, ends)
+            lowest, highest = map(give_or_take, ends)
             text = (
                 f"trials disagree on {one.quantity} of {one.effect}: {lowest} in {low.trial}, "
                 f"{highest} in {high.trial}"
@@ -115,11 +118,6 @@ def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 def _difference(one: Changed) -> Estimate:
     by, std = one.second.value - one.first.value, math.hypot(one.first.std, one.second.std)
     return Estimate(by, std, unit=one.first.unit)
-
-
-def _with_spread(estimate: Estimate) -> str:
-    text = f"{figure(estimate.value, 3)} +- {spread(estimate.std)}"
-    return with_unit(text, estimate.unit)
 
 
 def gap_sentence(gap: Gap) -> str:
@@ -157,8 +155,21 @@ def _between(some: Sequence[float]) -> str:
     return " to ".join(dict.fromkeys(f"{one:+.2g}" for one in (min(some), max(some))))
 
 
-def held_sentence(diagnosis: Diagnosis) -> str:
-    """Say which calibrated parameters depend on others that these trials cannot identify."""
+def _largest(given: Mapping[str, float], most: int) -> list[str]:
+    """Return the terms of a sum, the largest first; more than `most` and one end with a remark."""
+    order = sorted(given, key=lambda name: -abs(given[name]))
+    shown = order if len(order) <= most + 1 else order[:most]
+    parts = [f"{given[name]:+.2g} % with 1 % more {name}" for name in shown]
+    return parts if len(shown) == len(order) else [*parts, "smaller terms"]
+
+
+def held_sentence(diagnosis: Diagnosis, *, whole: bool = False) -> str:
+    """Say which calibrated parameters depend on others that these trials cannot identify.
+
+    Args:
+        diagnosis: the result.
+        whole: whether to give all terms of a sum; else the largest.
+    """
     said, held = [], dict[str, list[float]]()
     for one in (one for one in diagnosis.identifiable if one.given):
         e = diagnosis.parameters.get(one.parameter)
@@ -166,7 +177,7 @@ def held_sentence(diagnosis: Diagnosis) -> str:
             continue
         for name, by in one.given.items():
             held.setdefault(name, []).append(by)
-        parts = [f"{by:+.2g} % with 1 % more {name}" for name, by in one.given.items()]
+        parts = _largest(one.given, len(one.given) if whole else TERMS)
         free = with_unit(f"+- {figure(one.prior * one.left, 2)}", e.unit)
         said.append(f"{one.parameter} changes by {listed(parts)} ({free} if all are free)")
     if len(said) > MOST:

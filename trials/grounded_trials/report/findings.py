@@ -24,9 +24,10 @@ from grounded.search.standing import Standing
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.report.forecast import SECONDS
-from grounded_trials.wording import figure, rendered, shown
+from grounded_trials.wording import figure, or_zero, rendered, shown
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.last_diagnosis import Since
+from grounded_trials.workspace.next_step import outlook
 from grounded_trials.workspace.off_target import (
     WITHIN,
     rates_among,
@@ -110,6 +111,11 @@ class Findings:
     def next_command(self) -> str:
         """The next command, with the workspace as the user named it."""
         return rendered(self.then, self.folder)
+
+    @property
+    def outlook(self) -> str:
+        """The sentence on the search, and whether another model may go on with it."""
+        return outlook(self.standing, self.then)
 
     @property
     def next_trial(self) -> str:
@@ -298,10 +304,14 @@ def utility_terms(findings: Findings) -> tuple[list[tuple[str, ...]], tuple[str,
 def by_state(
     model: Model, columns: Sequence[Array], unit: Callable[[str], str] = shown
 ) -> list[tuple[str, ...]]:
-    """Return table rows: each state's name, its unit, and its number in each column (n,)."""
+    """Return table rows: each state's name, its unit, and its number in each column (n,).
+
+    A number that is rounding noise beside another one of its row is 0.
+    """
+    table = np.array(columns, dtype=np.float64).reshape(-1, model.n).T
     return [
-        (name, unit(each), *(figure(float(column[i]), 3) for column in columns))
-        for i, (name, each) in enumerate(model.states.items())
+        (name, unit(each), *(figure(or_zero(value, *values), 3) for value in values))
+        for (name, each), values in zip(model.states.items(), table.tolist(), strict=True)
     ]
 
 

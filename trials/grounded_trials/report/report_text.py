@@ -112,7 +112,7 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
         if findings.optimum is not None:
             text += f", optimum {figure(findings.optimum)}"
         lines += _wrapped(text, "  ")
-    lines += _wrapped(f"{findings.standing.outcome}: {findings.standing.sentence}", "  ")
+    lines += _wrapped(f"{findings.standing.outcome}: {findings.outlook}", "  ")
     return "\n".join(lines)
 
 

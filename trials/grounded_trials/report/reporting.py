@@ -69,7 +69,7 @@ class Report(Result):
             "paths": {_kind(path): str(path) for path in self.paths if path.suffix != ".png"},
             "utilities": findings.standing.utilities,
             "phase": findings.standing.phase,
-            "sentence": findings.standing.sentence,
+            "sentence": findings.outlook,
             "ending": findings.standing.ending or None,
             "optimum": findings.optimum,
             "lost": [vars(one) for one in findings.lost],

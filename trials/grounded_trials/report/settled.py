@@ -48,7 +48,11 @@ class Settled:
     @property
     def lines(self) -> list[str]:
         """The sentences, one per line."""
-        found = [f"Found and adopted: {'; '.join(self.adopted)}.", self.gained, self.left]
+        return self.told("; ".join(self.adopted))
+
+    def told(self, adopted: str) -> list[str]:
+        """Return the sentences, one per line, with these words on what was adopted."""
+        found = [f"Found and adopted: {adopted}.", self.gained, self.left]
         return [line for line in found if line]
 
 
@@ -105,7 +109,14 @@ def _last(workspace: Folder) -> tuple[Diagnosis | None, Since]:
     return found, since_diagnosis(workspace, found, usable_ids(workspace)) if found else Since()
 
 
-def told(diagnosis: Diagnosis, task: Task, since: Since, settled: Settled | None) -> list[str]:
+def told(
+    diagnosis: Diagnosis,
+    task: Task,
+    since: Since,
+    settled: Settled | None,
+    *,
+    causes_below: bool = False,
+) -> list[str]:
     """Return a diagnosis as lines of text, after the lines on what has been adopted since.
 
     Args:
@@ -113,18 +124,23 @@ def told(diagnosis: Diagnosis, task: Task, since: Since, settled: Settled | None
         task: the task, whose weighed states are reported.
         since: changes since the diagnosis.
         settled: what was adopted.
+        causes_below: whether lists of what was adopted and of all causes follow.
     """
-    lines = so_far(diagnosis, since, settled)
+    lines = so_far(diagnosis, since, settled, causes_below=causes_below)
     if settled is not None and settled.closed:
         return lines[:-1]
     part = not since.newer and 0 < since.used < since.usable
     some = [f"Diagnosed with {since.used} of {since.usable} trials."] * part
-    return [*lines, *three_lines(diagnosis, task), *some]
+    return [*lines, *three_lines(diagnosis, task, causes_below=causes_below), *some]
 
 
-def so_far(diagnosis: Diagnosis, since: Since, settled: Settled | None) -> list[str]:
+def so_far(
+    diagnosis: Diagnosis, since: Since, settled: Settled | None, *, causes_below: bool = False
+) -> list[str]:
     """Return the lines before a diagnosis: what was adopted, and why it may be outdated."""
     lines = [] if settled is None else settled.lines
+    if settled is not None and causes_below and len(settled.adopted) > 1:
+        lines = settled.told(f"{len(settled.adopted)} changes, listed below")
     if settled is not None and settled.left and not since.changed:
         lines = lines[:-1]  # the diagnosis itself follows
     if text := since.sentence:

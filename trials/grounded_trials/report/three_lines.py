@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from grounded.diagnosis.cause_words import with_worth
+from grounded.diagnosis.error_report import CALIBRATION
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.ruler_words import COMPARABLE, in_doubt, open_noise, rest, telling, worsened
-from grounded.diagnosis.verdict import also_off, told_apart
+from grounded.diagnosis.verdict import OPEN, also_off, told_apart, told_of
 from grounded.result import listed, measured_alike
 from grounded.task import Task
 from grounded_trials.wording import shown
@@ -16,19 +18,21 @@ from grounded_trials.workspace.off_target import rates_among, weighed_groups
 FEW = 2  # states in the second line
 
 
-def three_lines(diagnosis: Diagnosis, task: Task) -> list[str]:
+def three_lines(diagnosis: Diagnosis, task: Task, *, causes_below: bool = False) -> list[str]:
     """What was wrong, what predictions gain, what is still open; fewer where no cause is known.
 
     Args:
         diagnosis: what was found.
         task: whose weighed states the second line speaks of.
+        causes_below: whether a list of all causes follows, so that the first line gives the largest
+            of several and counts the others.
     """
     if not diagnosis.verdict.causes:
         return list(diagnosis.verdict.lines)
     better = [gained(diagnosis, task), worsened(diagnosis.prediction_error)]
     lines = [
         diagnosis.verdict.comparison,
-        _wrong(diagnosis),
+        _largest(diagnosis) if causes_below else _wrong(diagnosis),
         " ".join(filter(None, better)),
         still_open(diagnosis),
     ]
@@ -38,6 +42,19 @@ def three_lines(diagnosis: Diagnosis, task: Task) -> list[str]:
 def _wrong(diagnosis: Diagnosis) -> str:
     """The causes, largest first, without what they are worth, which the bars show."""
     text = "; ".join(diagnosis.verdict.causes)
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def _largest(diagnosis: Diagnosis) -> str:
+    """The largest cause, without values of calibrated parameters, and how many more there are."""
+    causes, credit = diagnosis.verdict.causes, diagnosis.credit
+    if len(causes) < 2 or not credit:
+        return _wrong(diagnosis)
+    first = causes[0]
+    if credit[0].of == CALIBRATION:
+        first = f"{first.partition(': ')[0]}{OPEN * (OPEN in first)}"
+    more = "one smaller cause is" if len(causes) == 2 else f"{len(causes) - 1} smaller causes are"
+    text = f"{with_worth(first, credit[:1])}; {more} listed below"
     return f"{text[:1].upper()}{text[1:]}."
 
 
@@ -108,7 +125,7 @@ def still_open(diagnosis: Diagnosis, *, ties: bool = True) -> str:
     groups = diagnosis.indistinguishable if ties else ()
     alike = [told_apart(group, same, claimed) for group in groups]
     found = [f"{text[:1].lower()}{text[1:]}" for text in alike]
-    found += [one.sentence() for one in diagnosis.unconfirmed[:1]]
+    found += [one.sentence() for one in told_of(diagnosis.unconfirmed)]
     if diagnosis.leftover:
         more = also_off(len(diagnosis.leftover) - 1)
         found.append(f"still unexplained: {diagnosis.leftover[0].sentence()}{more}")

@@ -58,6 +58,17 @@ def next_command(
     return to_plan(workspace) if then == PROPOSE else then
 
 
+def outlook(now: Standing, then: NextCommand) -> str:
+    """Return the sentence on the search; of one that has ended, also that the model may change.
+
+    Else "c0007 is the result" stood above a command that adopts effects and goes on.
+    """
+    if then.verb != "adopt" or now.phase in ("propose", "await-trial"):
+        return now.sentence
+    of = " of the model as it is" * now.sentence.endswith("is the result")
+    return f"{now.sentence}{of}; adopt what it lacks to go on"
+
+
 def to_plan(workspace: Folder) -> NextCommand:
     """Return `propose`, or `target` if no candidate was made and no manoeuvre was drawn yet."""
     with suppress(GroundedError):  # `propose` reports an unreadable target

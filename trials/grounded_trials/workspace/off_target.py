@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded.frozen import Array, white_noise
 from grounded.model import Model
-from grounded.result import Document, measured_alike
+from grounded.result import Document, measured_alike, or_zero
 from grounded.search.scatter import beyond_noise
 from grounded.task import Task
 from grounded.trial import Trial
@@ -99,6 +99,7 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
         running, terminal = task.reward.state[states], task.reward.terminal[states]
         cost = sum(float((e**2 @ running).sum() + e[-1] ** 2 @ terminal) for e in each)
         values = {"noise": single_sample_noise(whole, states)}
+        size = np.abs(task.target[:, states]).max()  # that the errors are differences of
         if running.any() or ended:
             far = [np.linalg.norm(e, axis=1) for e in each]
             worst = max(far, key=lambda d: float(d.max()))
@@ -107,6 +108,7 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
         if (terminal.any() or arrives) and not ended:
             values["end"] = float(np.sqrt(np.mean([e[-1] @ e[-1] for e in each])))
         ranked.append((rates[k], -cost, k))
+        values = {key: v if key == "at_s" else or_zero(v, size) for key, v in values.items()}
         found[k] = OffTarget(what.removeprefix("the "), units[k], **values)
     told = sorted(k for *_, k in sorted(ranked)[:FEW])
     dear = MOST * sum(cost for _, cost, _ in ranked)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from grounded.result import extent
 from grounded_trials.logs.inspection.inspect_guess import FEW, Guess
 from grounded_trials.toml_table import key
 
@@ -39,8 +40,10 @@ def _table(kind: str, guess: Guess, clock: str) -> list[str]:
         return [f"# {head}  # {what}", f"# path = {_quote(guess.others[0])}{rest}", *more]
     lines = [head if guess.sure else f"{head}  # unsure{others}"]
     lines.append(f"path = {_quote(guess.path)}")
-    if guess.field is not None and guess.field.low is not None:
-        lines[-1] += f"  # {guess.field.low:.4g} to {guess.field.high:.4g} in this log"
+    field = guess.field
+    if field is not None and field.low is not None and field.high is not None:
+        low, high = extent(field.low, field.high)
+        lines[-1] += f"  # {low:.4g} to {high:.4g} in this log"
     if guess.reasons:
         lines.insert(1, f"# {'; '.join(guess.reasons)}")
     if scale := _scale(guess):

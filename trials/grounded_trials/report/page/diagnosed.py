@@ -48,7 +48,8 @@ def gap_section(findings: Findings) -> list[Block]:
         return [Block("text", words), command, *ahead, *forecast_table(findings), *lacking]
     causes, others = verdict_lines(diagnosis)
     shown = so_far(diagnosis, findings.since, findings.settled)
-    verdict = Block("verdict", lines=[*shown, *causes, *others])
+    items = frozenset(range(len(shown), len(shown) + len(causes)))
+    verdict = Block("verdict", lines=[*shown, *causes, *others], strong=items)
     if diagnosis.no_cause:  # with too little data, what was fitted is no finding
         return [verdict, *ahead, *forecast_table(findings), *lacking]
     proof = drawn(accuracy_figure(diagnosis), title=True)

@@ -26,7 +26,7 @@ from grounded.figures.figure import Bars, Panel, typeset
 from grounded.figures.interactive import label_lines, packed, palette, plotted
 from grounded.search.candidate import SURE
 from grounded.search.pictures import search_figure
-from grounded_trials.report.diagnosis_words import error_lines
+from grounded_trials.report.diagnosis_notes import note_lines
 from grounded_trials.report.figures.paths import crash, path_figure
 from grounded_trials.report.figures.runs import (
     bias_figure,
@@ -35,6 +35,7 @@ from grounded_trials.report.figures.runs import (
     state_figure,
 )
 from grounded_trials.report.findings import Findings, compared, improvements_in, utility_terms
+from grounded_trials.report.page.causes import adopted, causes
 from grounded_trials.report.page.diagnosed import gap_section
 from grounded_trials.report.page.tables import (
     Block,
@@ -47,7 +48,7 @@ from grounded_trials.report.page.tables import (
 )
 from grounded_trials.report.settled import told
 from grounded_trials.report.three_lines import gained_most
-from grounded_trials.wording import count, figure, glued, placed, rendered
+from grounded_trials.wording import count, figure, glued, percent, placed, rendered
 from grounded_trials.workspace.candidates.proposing import not_counted
 from grounded_trials.workspace.next_step import DIAGNOSE
 
@@ -243,12 +244,12 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
         gain = ""
         if -math.inf < first.utility < 0 and best.utility <= 0:
             share = 1 - best.utility / first.utility
-            gain = f": cost reduced by {100 * share:.1f} %"
+            gain = f": cost reduced by {percent(share)}"
             tried = {one.candidate.id: one for one in findings.history}
             two = tried[first.candidate.id], tried[best.candidate.id]
             if start := owed_to_start(*two, findings.history):
-                part = -100 * start / first.utility
-                gain += f", {part:.1f} % due to different start states, as the model predicts"
+                part = percent(-start / first.utility)
+                gain += f", {part} due to different start states, as the model predicts"
             if _probability(findings) < SURE:
                 gain += ", which the scatter of repeats may explain"
         moved = f"{figure(first.utility)} → {figure(best.utility)}"
@@ -279,20 +280,23 @@ def _tiles(findings: Findings) -> list[str]:
 
 
 def _why(findings: Findings) -> dict[str, Any]:
-    """Return the verdict, the lines that quantify it, and the credit figure; {} if undiagnosed."""
+    """Return the verdict, its causes and notes, and the credit figure; {} if undiagnosed."""
     diagnosis = findings.diagnosis
     if diagnosis is None:
         return {}
     before = {} if findings.since.changed else findings.values
+    closed = findings.settled is not None and findings.settled.closed
     groups = gained_most(diagnosis, findings.task)
     credit = worth_figure(diagnosis, groups) or credit_figure(diagnosis)
-    shown = {"held"} if credit else {"held", "parameters"}
-    lines = [line for line in error_lines(diagnosis, before) if line[0] in shown]
     return {
         "kind": diagnosis.kind,
-        "verdict": told(diagnosis, findings.task, findings.since, findings.settled),
+        "verdict": told(
+            diagnosis, findings.task, findings.since, findings.settled, causes_below=True
+        ),
+        "adopted": adopted(findings.settled),
+        "causes": [] if closed else causes(diagnosis),
         "preflight": instrument_lines(diagnosis.preflight),
-        "lines": lines,
+        "notes": note_lines(diagnosis, before),
         "credit": credit,
     }
 

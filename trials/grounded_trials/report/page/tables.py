@@ -24,9 +24,11 @@ from grounded_trials.report.findings import (
 )
 from grounded_trials.report.forecast import forecast_error
 from grounded_trials.wording import (
+    extent,
     figure,
     labelled,
     legend,
+    or_zero,
     percent,
     rendered,
     shown,
@@ -45,7 +47,7 @@ class Block:
 
     text, soft, heading    a sentence
     command                a command to copy; `name` is its id
-    verdict                `lines`, one below the other
+    verdict                `lines`, one below the other; `strong` ones are the items of a list
     table                  `name`, `header` (text columns end with a blank), `rows`; `strong` rows
                            are bold
     figure                 `figure`; with `wide` two panels per row
@@ -182,8 +184,10 @@ def _interval(v: Estimate) -> str:
     if v.interval is None:
         return figure(v.value)
     low, high = v.interval
+    value = or_zero(v.value, low, high)
     known = low <= v.value <= high and not undetermined(high - low, v.value)
-    return f"{figure(v.value)} ({figure(low, 3)} to {figure(high, 3)})" if known else UNKNOWN
+    low, high = extent(low, high)
+    return f"{figure(value)} ({figure(low, 3)} to {figure(high, 3)})" if known else UNKNOWN
 
 
 def leftover_table(diagnosis: Diagnosis) -> list[Block]:
@@ -251,6 +255,8 @@ def channel_table(findings: Findings) -> Block:
 
 
 def _range(low: float | None, high: float | None) -> str:
+    if low is not None and high is not None:
+        low, high = extent(low, high)
     a = "−∞" if low is None or not math.isfinite(low) else f"{low:g}"
     b = "∞" if high is None or not math.isfinite(high) else f"{high:g}"
     return f"{a} to {b}"

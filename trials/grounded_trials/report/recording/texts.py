@@ -68,6 +68,6 @@ def summary(findings: Findings) -> str:
         lines[-1] += f"; yellow: limits, and the bias that the model {findings.better.name} leaves"
     if any(crash(run) is not None for run in findings.runs):
         lines[-1] += "; crosses: where and when a run ended early"
-    lines += ["", f"**{findings.standing.outcome}**: {_marked(findings.standing.sentence)}", ""]
+    lines += ["", f"**{findings.standing.outcome}**: {_marked(findings.outlook)}", ""]
     lines += [f"**left out**: {one.file}: {one.reason}\n" for one in findings.lost]
     return "\n".join(lines)

@@ -21,7 +21,7 @@ from grounded.model import Model, is_clock
 from grounded.places import integrals, true_values
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.wording import with_unit
+from grounded_trials.wording import per_second, with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.user_files.config import FILE
 
@@ -98,7 +98,7 @@ def held_before(workspace: Folder, again: bool = False) -> list[str]:
     told = ", ".join(f"{name} = {whole[name]}" for name in units if name in whole)
     return [
         f"the plan assumes {held} before the start, under which {states[k]} changes at once, by "
-        f"{with_unit(f'{rate[k]:.3g}', units[states[k]])} per second; after its end the runner "
+        f"{with_unit(f'{rate[k]:.3g}', per_second(units[states[k]]))}; after its end the runner "
         "holds that input again. If the robot is at rest before the run, put what holds it into "
         f"[task] of {FILE} and propose again (if not, just propose again): start = {{ {told} }}"
     ]
