@@ -43,6 +43,7 @@ Ending = Literal[
     "model diverges",  # when grounded on the best trial
     "crashed",  # every first policy crashed
     "not allowed",  # the next candidate violates [limits] or [safety]
+    "gains too large",  # of the next candidate: a state that hardly moves, or weights
     "too little gained",  # by the last candidates
     "below the noise",  # steps lost, and the next promises less than a trial can show
     "trials used up",
