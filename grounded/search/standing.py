@@ -50,6 +50,7 @@ Ending = Literal[
 ]
 PATIENCE = 4  # candidates in a row that may gain less than the tolerance each
 LOST = 2  # steps in a row without improvement after which a diagnosis is suggested
+AGAIN = 2  # runs of the best candidate after which a search that doubts its model ends
 WILD = 100.0  # a first trial worse than predicted by this factor suggests a diagnosis
 MAX_CAUTION = 3  # times the first policy is made again, each time more gently, after a crash
 
@@ -80,6 +81,12 @@ class Standing(Result):
             return self
         sentence = self.sentence.removesuffix(self.missed)
         return replace(self, sentence=sentence, then=None, doubt="", missed="")
+
+    @property
+    def asks_again(self) -> bool:
+        """Whether another run of the best candidate may settle the doubt that ended the search."""
+        few = self.incumbent is not None and len(self.incumbent.trials) < AGAIN
+        return self.ending == "too doubtful" and few
 
     @property
     def utilities(self) -> list[float]:
