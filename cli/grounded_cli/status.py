@@ -97,8 +97,8 @@ def summary(status: Status) -> str:
         lines.append(field("best", text + noise_share(best)))
     if status.off_target:
         lines.append(field("off target", "; ".join(one.summary() for one in status.off_target)))
-    then = ", then" if status.again.verb == "next" else ":"  # its file was exported
-    again = f"run the best one again{then} `{rendered(status.again)}`"
+    exported = "then " * (status.again.verb == "next")
+    again = f" ({exported}`{rendered(status.again)}`)"
     if certainty := last_improvement(standing.history, again):
         if (waiting := standing.outstanding) is not None and standing.incumbent is not None:
             small = beyond_one_trial(waiting, standing.incumbent, standing.missing)

@@ -15,6 +15,8 @@ from grounded_cli.console.workspace_option import in_workspace, next_line, open_
 from grounded_trials.wording import extent, misread, with_unit
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from grounded.frozen import Array
     from grounded.model import Model
     from grounded_trials import Workspace
@@ -47,7 +49,8 @@ TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
     "--to",
     multiple=True,
     metavar="STATE=VALUE",
-    help="Where a line, step or swing-up ends; what a state keeps along a path (a height).",
+    help="Where a line, step or swing-up ends; what a state keeps along a path (a height). "
+    "A velocity along a line or path follows it, and must end at this value.",
 )
 @click.option(
     "--seconds", type=float, help="Duration of a step or swing-up (5), or of a line to a STATE."
@@ -74,7 +77,8 @@ def command(
     --speed and --accel set its pace. A step begins at [task] start. A swing-up brings the first
     angle that hangs under its weight upright; --to names another angle, or more states. A path
     begins at the position in [task] start, along x; what --to names, such as the height of a drone,
-    keeps its value. With --hold a path ends at rest and stays there.
+    keeps its value, but a velocity that moves the robot along the path follows it. With --hold a
+    path ends at rest and stays there.
 
     The previous target is kept as target.csv.bak, and grounded.toml as grounded.toml.bak. If
     [task] start is empty and a stored trial begins at rest, it is set to where. [task] horizon is
@@ -82,6 +86,7 @@ def command(
     inputs with [limits] if it is still what `init` wrote. Earlier trials stay available to fit and
     diagnose; the search starts again.
     """
+    from grounded.places import velocities
     from grounded_trials.starting.shapes import (
         PATHS,
         Drive,
@@ -159,9 +164,8 @@ def command(
         show(field(name, text, "  "))
     if free:
         resting = _rest_of(model, free) * (shape == "line")
-        show(
-            field("free", _free(free, reward, resting, _reading_at_rest(workspace, resting)), "  ")
-        )
+        reading = _reading_at_rest(workspace, resting)
+        show(field("free", _free(free, reward, resting, reading, velocities(model)), "  "))
     if ran:
         _tell_undo(old, before, reward, rows - 1)
     if rest:
@@ -265,7 +269,13 @@ def _reading_at_rest(workspace: Workspace, name: str) -> float:
     return biases.get(f"sensor_bias:{name}", 0.0)
 
 
-def _free(names: list[str], reward: dict[str, dict[str, float]], rest: str, at: float) -> str:
+def _free(
+    names: list[str],
+    reward: dict[str, dict[str, float]],
+    rest: str,
+    at: float,
+    rates: Sequence[str],
+) -> str:
     """Explain what it means that the target has no column for some states.
 
     Args:
@@ -273,14 +283,16 @@ def _free(names: list[str], reward: dict[str, dict[str, float]], rest: str, at: 
         reward: the tables of [reward].
         rest: the state to suggest bringing to rest with --to, "" for no suggestion.
         at: what its sensor shows there.
+        rates: the model's velocities, which end at 0 where a line comes to rest.
     """
     weighed = [n for n in names if any(reward.get(k, {}).get(n) for k in ("state", "terminal"))]
     it = "them" if len(names) > 1 else "it"
+    ends = [f"--to {n}={'0' if rest and n in rates else 'VALUE'}" for n in weighed]
     text = f"{listed(names)}: no column in the target, so a run may take {it} anywhere"
     if weighed:
         text += (
             f". [reward] weighs {listed(weighed)}, and `propose` refuses weights without a column: "
-            f"add a column (`--to {weighed[0]}=VALUE`), or remove the weight"
+            f"add a column (`{' '.join(ends)}`), or remove the weight"
         )
     if rest:
         text += f". Add `--to {rest}={at:.3g}` to ask for rest there"

@@ -173,11 +173,15 @@ def chance(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
     return student(gain / error, freedom) if error else float(gain > 0)
 
 
-def last_improvement(history: Sequence[Tried], again: str = "run the best one again") -> str:
+def last_improvement(history: Sequence[Tried], again: str = "") -> str:
     """Return a sentence on how certain the last accepted improvement is; "" before there is one.
 
     Student's t-test with the scatter of all repeats at a similar utility (`scatter`), which also
-    gives the standard errors in the table.
+    gives the standard errors in the table. It asks for no run: what to do is decided elsewhere.
+
+    Args:
+        history: all candidates with their trials.
+        again: the command that runs the best one again, in brackets.
     """
     accepted = [t for t in history if t.accepted]
     if len(accepted) < 2:
@@ -188,8 +192,8 @@ def last_improvement(history: Sequence[Tried], again: str = "run the best one ag
         return (
             f"the last gain is {gain:.3g}: according to the model, {start:.3g} of it is due to "
             f"the different start states of {before.candidate.id} and {after.candidate.id}, and "
-            f"{gain - start:.3g} to the policy; run {before.candidate.id} again from [task] start "
-            "to be sure"
+            f"{gain - start:.3g} to the policy; another run of {before.candidate.id}, from [task] "
+            "start, would show it"
         )
     error, freedom = error_between(before, after, history)
     if freedom and error and _start_unknown(before, after, history):
@@ -201,7 +205,7 @@ def last_improvement(history: Sequence[Tried], again: str = "run the best one ag
     if not freedom:
         return (
             f"the last gain is {gain:.3g}; candidates of similar utility were run only once, so "
-            f"the noise of a trial is unknown: {again}"
+            f"the noise of a trial is unknown; another run of the best one would show it{again}"
         )
     if error == 0:
         return f"the last gain is {gain:.3g}; repeated trials agree exactly"

@@ -36,7 +36,15 @@ from grounded.search.certainty import one_trial_error, runs_to_show
 from grounded.search.making import About, Maker
 from grounded.search.original import keeping_promises
 from grounded.search.planner import Planner
-from grounded.search.standing import Ending, Phase, Proposal, Standing, let_down, standing
+from grounded.search.standing import (
+    AGAIN,
+    Ending,
+    Phase,
+    Proposal,
+    Standing,
+    let_down,
+    standing,
+)
 from grounded.search.step.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
 from grounded.trial import Trial
@@ -333,11 +341,12 @@ def _ended(
             "is the result"
         )
     elif ruinous is not None:
-        ending, asked = "too doubtful", " or diagnose the model"
+        ending, asked = "too doubtful", "; diagnose the model"
+        if len(incumbent.trials) < AGAIN:
+            asked = f"; run {own} again or diagnose the model"
         sentence = (
             f"the model promises a gain of {figure(ruinous.predicted_gain)} from a step, but its "
-            f"likely error is larger than the whole cost of {own}: no trial is spent on it; run "
-            f"{own} again"
+            f"likely error is larger than the whole cost of {own}: no trial is spent on it"
         )
     elif promised and not finite:
         ending, asked = "model diverges", "; a diagnosis may show what it lacks"

@@ -18,9 +18,9 @@ from grounded.search.feedback.margin import steadied
 from grounded.search.feedback.oscillation import Quiet, between_limits, limit_cycle, quiet_gains
 from grounded.search.feedback.sample_age import sample_age
 from grounded.search.planner import Planner, predicted
-from grounded.search.safety import objections, spread
+from grounded.search.safety import objections, spread, too_strong
 from grounded.search.scatter import beyond_noise
-from grounded.search.standing import LOST, Proposal, Standing, wild
+from grounded.search.standing import LOST, Ending, Proposal, Standing, wild
 from grounded.search.step.directions import base_columns, direction
 from grounded.search.step.step_size import KEPT, SearchOptions, Step, losers_of
 from grounded.solve import ddp
@@ -520,7 +520,8 @@ class Maker:
         task, history = self.planner.task, self.now.history
         if not (found := objections(task, made, spread(task, history, self.fingerprint))):
             return Proposal(self.now, made, is_new=True)
-        stopped = replace(self.now, phase="stopped", sentence=found[0], ending="not allowed")
+        ending: Ending = "gains too large" if found[0] == too_strong(task, made) else "not allowed"
+        stopped = replace(self.now, phase="stopped", sentence=found[0], ending=ending)
         return Proposal(stopped, None, is_new=False, notes=tuple(found), refused=made)
 
 

@@ -109,13 +109,35 @@ def objections(task: Task, candidate: Candidate, strays: Strays | None = None) -
                 f"(step {t}): the model diverges there; check it with a shorter horizon"
             ]
     found = [_outside(task, candidate, strays, i) for i in range(task.model.n)]
-    if policy.gain is not None and np.abs(policy.gain).max() > MAX_GAIN:
-        t = int(np.argmax(np.abs(policy.gain).max(axis=(1, 2))))
-        found.append(
-            f"a gain of {candidate.id} reaches {np.abs(policy.gain).max():.3g} at t = "
-            f"{t * task.dt:g} s, more than {MAX_GAIN:g}: raise the input weights"
+    return [sentence for sentence in (*found, too_strong(task, candidate)) if sentence]
+
+
+def too_strong(task: Task, candidate: Candidate) -> str:
+    """Return which gain of a candidate is beyond reason, and what would make it smaller; or ""."""
+    policy, model = candidate.policy, task.model
+    if policy.gain is None or not np.abs(policy.gain).max() > MAX_GAIN:
+        return ""
+    t, j, i = np.unravel_index(int(np.argmax(np.abs(policy.gain))), policy.gain.shape)
+    sent, fed = policy.input_names[j], policy.z_names[i]
+    units = {**model.inputs, **model.states}
+    of = units.get(fed, units[sent])  # else an input of an earlier step
+    size = f"{abs(policy.gain[t, j, i]):.3g} {units[sent]} per {of}"
+    lower, moves = f"raise [reward] input_change of {sent}", ""
+    if fed in model.states:
+        k = model.state_names.index(fed)
+        weight = float(max(task.reward.state[k], task.reward.terminal[k]))
+        moved = float(np.ptp(candidate.predicted_states[:, k]))
+        moves = f". The plan moves {fed} by {moved:.3g} {of} in all"
+        lower = (
+            f"weigh {fed} less in [reward] (now {weight:g}), or {lower}"
+            if weight
+            else f"{fed} has no weight in [reward], so check its unit and what it drives in the "
+            f"model, or {lower}"
         )
-    return [sentence for sentence in found if sentence]
+    return (
+        f"the gain of {sent} on {fed} reaches {size} in {candidate.id}, at t = {t * task.dt:g} s, "
+        f"more than {MAX_GAIN:g}{moves}: {lower} (now {task.reward.input_change[j]:g})"
+    )
 
 
 def _outside(task: Task, candidate: Candidate, strays: Strays | None, i: int) -> str:

@@ -43,12 +43,14 @@ Ending = Literal[
     "model diverges",  # when grounded on the best trial
     "crashed",  # every first policy crashed
     "not allowed",  # the next candidate violates [limits] or [safety]
+    "gains too large",  # of the next candidate: a state that hardly moves, or weights
     "too little gained",  # by the last candidates
     "below the noise",  # steps lost, and the next promises less than a trial can show
     "trials used up",
 ]
 PATIENCE = 4  # candidates in a row that may gain less than the tolerance each
 LOST = 2  # steps in a row without improvement after which a diagnosis is suggested
+AGAIN = 2  # runs of the best candidate after which a search that doubts its model ends
 WILD = 100.0  # a first trial worse than predicted by this factor suggests a diagnosis
 MAX_CAUTION = 3  # times the first policy is made again, each time more gently, after a crash
 
@@ -79,6 +81,12 @@ class Standing(Result):
             return self
         sentence = self.sentence.removesuffix(self.missed)
         return replace(self, sentence=sentence, then=None, doubt="", missed="")
+
+    @property
+    def asks_again(self) -> bool:
+        """Whether another run of the best candidate may settle the doubt that ended the search."""
+        few = self.incumbent is not None and len(self.incumbent.trials) < AGAIN
+        return self.ending == "too doubtful" and few
 
     @property
     def utilities(self) -> list[float]:

@@ -1,6 +1,7 @@
 """A workspace from somebody else's log: what is found, what is asked, and that it then works."""
 
 import json
+import math
 import re
 import tomllib
 from pathlib import Path
@@ -785,6 +786,50 @@ def test_of_a_target_that_stays_at_a_sensors_offset_the_weight_is_to_be_chosen(t
         "-C", w.folder, "target", "line", "--to", f"{angle}=0.01738", "--to", f"{rate}=1"
     )
     assert holds(done.err, f"{angle} stays at 0.01738", "choose the weight"), done.err
+
+
+@pytest.mark.parametrize("more", [(), ("--to", "psi=0")])
+def test_a_velocity_asked_to_end_at_rest_follows_a_line(tmp_path, more):
+    """It was held at 0 all along, against the position that moved."""
+    w = tmp_path / "w"
+    grounded("init", w, "--example", "car-circle")
+    done = grounded("-C", w, "target", "line", "--to", "x=2", "--to", "v=0", *more, "--json")
+    assert done.json["columns"]["v"] == pytest.approx([0.0, 1.0], abs=1e-3)
+    names, rows = read_target(w / "target.csv")
+    x, v = rows[:, names.index("x")], rows[:, names.index("v")]
+    assert v[0] == 0 and v[-1] == 0
+    assert np.abs(np.diff(x) / 0.05 - (v[1:] + v[:-1]) / 2).max() < 0.01
+    moving = grounded("-C", w, "target", "line", "--to", "x=2", "--to", "v=1")
+    assert moving.code == 1 and "--to v=0" in moving.err
+    nowhere = grounded("-C", w, "target", "line", "--to", "v=0")
+    assert nowhere.code == 1 and "--to x=" in nowhere.err
+
+
+def test_a_velocity_ends_at_rest_on_a_path_with_hold():
+    """Also of a robot whose velocities are those of its coordinates, without roles."""
+    point = Model(
+        states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "side": "m/s"},
+        inputs={"ax": "m/s^2", "ay": "m/s^2"},
+        roles={"position": ("x", "y")},
+        derivative=lambda s, a, p: {"x": s.vx, "y": s.vy, "vx": a.ax, "vy": a.ay, "side": 0.0},
+    )
+    to = {"vx": 0.0, "vy": 0.0, "side": 0.0}
+    columns = path_target("circle", Drive(hold=1.0), point, 0.02, to)
+    for place, rate in (("x", "vx"), ("y", "vy")):
+        assert np.abs(np.gradient(columns[place], 0.02) - columns[rate]).max() < 0.02
+        assert columns[rate][-1] == pytest.approx(0.0, abs=1e-6)
+    assert (columns["side"] == 0).all()  # moves nothing
+    with pytest.raises(GroundedError, match="--hold"):
+        path_target("circle", Drive(), point, 0.02, to)
+
+
+def test_a_swing_up_does_not_hold_the_rate_of_its_angle():
+    from grounded.models.pendulum import model
+
+    angle, rate = model.state_names
+    assert swing_up(model, 0.02, 2.0, {angle: math.pi})
+    with pytest.raises(GroundedError, match=rate):
+        swing_up(model, 0.02, 2.0, {rate: 0.0})
 
 
 def test_a_path_keeps_to_its_speeds_and_starts_from_rest(tmp_path):

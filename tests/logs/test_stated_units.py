@@ -277,11 +277,11 @@ def test_names_in_other_languages_are_found_with_their_units(tmp_path, names):
 
 def test_a_path_that_is_only_offered_has_its_scale_beside_it(tmp_path):
     """With the # removed as it said, degrees were stored as radians."""
-    names = ["a_deg", "b_deg", "c_dps", "d_dps", "e", "f"]
+    names = ["a_deg", "b_deg", "c_deg", "d_dps", "e_dps", "f_dps"]
     out, text = helicopter(tmp_path, names, linked=False)
     assert "UNSURE" in out
     table = text[text.index("[log]") :]
-    assert "remove all 3 #" in table and "remove both #" in table  # u_pitch has no unit
+    assert "remove all 3 #" in table
     log = tomllib.loads(
         table.replace("# [", "[").replace("# path", "path").replace("# scale", "scale")
     )
@@ -299,6 +299,67 @@ def test_states_of_one_s_own_model_are_found_by_their_derivatives_if_no_name_fit
     assert out.count("UNSURE") == 7 and "or /csv.f" in out  # 6, and a sentence that says so
     done = grounded("-C", tmp_path / "w", "ingest", "--data", tmp_path / "a.csv")
     assert done.code == 0, done.err  # a model without parameters brought a traceback
+
+
+FURUTA = """from grounded import Model
+model = Model(
+    states={"arm": "rad", "arm_rate": "rad/s", "pend": "rad", "pend_rate": "rad/s"},
+    inputs={"volt": "V"}, params={},
+    derivative=lambda s, a, p: {"arm": s.arm_rate, "pend": s.pend_rate,
+        "arm_rate": 30 * a.volt - 8 * s.arm_rate, "pend_rate": -60 * s.pend - 20 * a.volt})
+"""
+
+
+def furuta(folder, names):
+    """What `init` finds for a model with rates that the log of these names lacks."""
+    t = np.arange(0, 8, 0.02)
+    volt = 2 * np.sin(4.4 * t) + np.sin(12 * t + 1)
+    rate = np.zeros(len(t))
+    for k in range(len(t) - 1):
+        rate[k + 1] = rate[k] + 0.02 * (30 * volt[k] - 8 * rate[k])
+    arm, pend = np.degrees(np.cumsum(rate) * 0.02), 40 * np.sin(7 * t)
+    rows = np.column_stack([t, arm, pend, volt, 12.1 + 0.01 * np.sin(3 * t)])
+    rows = rows[:, : 1 + len(names)]
+    header = ",".join(["t", *names])
+    np.savetxt(folder / "a.csv", rows, "%.5f", ",", header=header, comments="")
+    (folder / "m.py").write_text(FURUTA)
+    files = ("--from", folder / "a.csv", "--model", folder / "m.py")
+    made = grounded("init", folder / "w", *files, "--json")
+    assert made.code == 0, made.err
+    text = (folder / "w" / "grounded.toml").read_text()
+    return {one["name"]: one for one in made.json["signals"]}, made.json["notes"], text
+
+
+@pytest.mark.parametrize(
+    "names, sure, volt",
+    [
+        (("arm_deg", "pend_deg", "volt"), True, "/csv.volt"),
+        (("arm_deg", "pend_deg", "motor_cmd"), True, "/csv.motor_cmd"),
+        (("armAngle", "pendAngle", "volt"), True, "/csv.volt"),
+        (("theta_deg", "alpha_deg", "volt"), False, "/csv.volt"),
+        (("arm_deg", "pend_deg", "u", "battery"), True, None),
+    ],
+)
+def test_states_without_a_column_are_estimated_beside_those_found(tmp_path, names, sure, volt):
+    """A voltage was taken for the rate that it drives, and two angles were not taken at all."""
+    found, notes, text = furuta(tmp_path, names)
+    for name, column in zip(("arm", "pend"), names, strict=False):
+        assert found[name]["path"] == f"/csv.{column}" and found[name]["sure"] == sure
+        assert found[name]["scale"] == pytest.approx(np.pi / 180 if "_deg" in column else 1.0)
+    assert found["arm_rate"]["path"] is None and found["pend_rate"]["path"] is None
+    assert found["volt"]["path"] == volt
+    assert set(tomllib.loads(text)["estimate"]["measured"]) == {"arm", "pend"}
+    unused = [f"/csv.{name}" for name in names if name in ("u", "battery")]
+    assert all(path in " ".join(notes) for path in unused)
+
+
+def test_a_log_in_which_nothing_is_found_says_what_need_not_be_in_it(tmp_path):
+    found, notes, text = furuta(tmp_path, ("enc1", "enc2", "pwm"))
+    assert not any(one["path"] for one in found.values())
+    assert any("[estimate]" in note and "arm_rate" in note for note in notes)
+    assert any("/csv.enc1" in note for note in notes)
+    mapped = text.replace("# [estimate]", "[estimate]").replace("# measured", "measured")
+    assert set(tomllib.loads(mapped)["estimate"]["measured"]) == {"arm", "pend"}
 
 
 def test_words_are_translated_only_if_all_parts_are_known():

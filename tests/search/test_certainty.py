@@ -37,7 +37,7 @@ def test_nothing_to_say_before_the_first_improvement():
 def test_single_trials_say_nothing_about_noise():
     found = last_improvement([tried(-5.0), tried(-4.0)])
     assert holds(found, 1, "once") and "+-" not in found and "probability" not in found
-    assert last_improvement([tried(-5.0), tried(-4.0)], "do it").endswith("unknown: do it")
+    assert last_improvement([tried(-5.0), tried(-4.0)], " (do it)").endswith(" (do it)")
 
 
 def test_the_probability_is_the_t_tests():

@@ -45,6 +45,18 @@ def test_a_gain_beyond_reason(made):
     gain[3, 0, 1] = -2 * MAX_GAIN
     found = objections(cart_task(), replace(made, policy=replace(made.policy, gain=gain)))
     assert len(found) == 1 and holds(found[0], "gain", "c0001", "2e+06", "t = 0.15 s", "1e+06")
+    assert holds(found[0], "force on v", "N per m/s", "[reward] input_change of force")
+    assert "weigh v less" not in found[0]  # it has no weight
+    gain[3, 0, 1], gain[3, 0, 0] = 0.0, 3 * MAX_GAIN
+    (found,) = objections(cart_task(), replace(made, policy=replace(made.policy, gain=gain)))
+    assert holds(found, "force on x", "N per m in", "weigh x less in [reward] (now 10)")
+
+
+def test_a_search_that_stops_for_a_gain_does_not_speak_of_safety(monkeypatch):
+    monkeypatch.setattr("grounded.search.safety.MAX_GAIN", 1e-3)
+    found = propose(cart_task(), [], [], SearchOptions())
+    assert found.standing.ending == "gains too large" and found.candidate is None
+    assert "safety" not in " ".join(found.notes)
 
 
 def test_a_predicted_run_outside_the_safe_region_names_state_time_and_bound():

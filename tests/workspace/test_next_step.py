@@ -634,7 +634,7 @@ def test_a_rerun_after_the_end_goes_on_as_status_does(cart, tmp_path):
 def test_a_single_run_asks_for_another_by_its_command(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     out = " ".join(grounded("-C", folder, "status").out.split())
-    assert f"run the best one again: `grounded -C {folder} run best`" in out
+    assert f"(`grounded -C {folder} run best`)" in out
     config = folder / "grounded.toml"
     config.write_text(config.read_text().partition("[system]")[0])
     out = " ".join(plain(grounded("-C", folder, "status").out).split())
@@ -737,7 +737,7 @@ def test_what_was_diagnosed_and_adopted_is_not_diagnosed_again(
     doubtful = replace(
         now,
         phase="stopped",
-        sentence=f"run it again{asked}",
+        sentence=f"no trial is spent on it{asked}",
         ending="too doubtful",
         incumbent=best,
         then=DIAGNOSE,
@@ -752,6 +752,32 @@ def test_what_was_diagnosed_and_adopted_is_not_diagnosed_again(
         done = grounded("-C", folder, "status")
         assert last(done) == ("grounded diagnose" if newer else f"grounded {then}")
         assert ("diagnose the model" in plain(done.out)) is newer
+        again = "; run " in plain(done.out)  # as `next:`, not beside `export best`
+        assert again == (not newer and runs == 1)
+
+
+@pytest.mark.parametrize(("runs", "claimed", "then"), [(1, True, "adopt"), (2, False, "export")])
+def test_no_run_is_asked_for_beside_another_next_command(
+    cart, tmp_path, monkeypatch, runs, claimed, then
+):
+    """`run c0005 again`, and below it `next: grounded export best`."""
+    folder = copied(cart, tmp_path / "w")
+    now = Workspace(folder).status().standing
+    assert now.incumbent is not None
+    best = replace(now.incumbent, trials=now.incumbent.trials[:1] * runs)
+    kept = {"ending": "too doubtful", "incumbent": best, "then": DIAGNOSE}
+    asked = "; run it again or diagnose the model"
+    ended = replace(now, phase="stopped", sentence=f"no trial{asked}", missed=asked, **kept)
+    for module in ("standing", "improve"):
+        monkeypatch.setattr(f"grounded.search.{module}.standing", lambda *_, **__: ended)
+    seen = taken_in(folder, *range(1, len(list(folder.glob("trials/*.mcap"))) + 1))
+    nothing = {} if claimed else {"verdict": {"kind": "none", "effects": [], "sentence": "None."}}
+    diagnosed(folder, diagnosed=seen, **nothing)
+    for command in ("status", "propose"):
+        done = grounded("-C", folder, command)
+        assert last(done).startswith(f"grounded {then}")
+        _, found, phase = plain(done.out).partition("no trial")
+        assert found and "again" not in phase and "diagnose" not in phase
 
 
 def test_after_an_unknown_verdict_a_search_that_has_ended_says_so(cart, tmp_path, monkeypatch):

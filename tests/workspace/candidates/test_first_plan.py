@@ -12,6 +12,7 @@ from grounded_trials import Workspace
 from grounded_trials.starting.begin import begin
 from grounded_trials.workspace.candidates.first_plan import in_another_unit
 from grounded_trials.workspace.folder import Folder
+from workspaces import make
 
 LIFTED = """
 from grounded import Model, Param
@@ -498,3 +499,12 @@ def test_a_target_start_or_safety_in_another_unit_than_the_model_s_is_told(tmp_p
     np.savetxt(folder / "target.csv", values, "%.5f", ",", header=",".join(names), comments="")
     (note,) = told()
     assert note.startswith("the target of th is 22.9")
+
+
+def test_a_first_plan_that_is_refused_for_its_gains_says_nothing_of_safety(tmp_path, monkeypatch):
+    """`draw a target whose run stays inside [safety]` was said of a gain of 1e7."""
+    monkeypatch.setattr("grounded.search.safety.MAX_GAIN", 1e-3)
+    proposed = Workspace(make(tmp_path / "w").folder).propose()
+    assert proposed.candidate is None and proposed.standing.ending == "gains too large"
+    assert not any("[safety]" in note for note in proposed.proposal.notes)
+    assert proposed.then.verb == "propose"  # of other weights

@@ -9,7 +9,7 @@ import pytest
 from facts import holds
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.remarks.after_run import afterwards, kicked
+from grounded_trials.workspace.intake.remarks.after_run import kicked, moved_on
 from small_tasks import rover_task
 from workspaces import CONFIG, make
 
@@ -53,6 +53,6 @@ def test_a_heading_that_turns_after_the_run_is_told_if_the_end_would_cost_more(t
     inputs = np.zeros((len(states) - 1, 2))
     names = task.model.state_names, task.model.input_names
     run = Trial(states, inputs, task.dt, *names)
-    told = afterwards(SimpleNamespace(task=task), run)
+    told = moved_on(SimpleNamespace(task=task), run)
     assert len(told) == bool(turned)
     assert not told or holds(told[0], "psi was 0.0080 rad from its target", "[reward]")

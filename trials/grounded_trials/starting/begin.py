@@ -28,6 +28,7 @@ from grounded_trials.logs.inspection.inspect_evidence import (
     weigh,
 )
 from grounded_trials.logs.inspection.inspect_guess import (
+    PARTS,
     Guess,
     clock_of,
     guess_mapping,
@@ -227,6 +228,8 @@ def _begin(
     units = {**found.states, **found.inputs}
     both = from_the_rest((*states, *inputs), units, report, joint_units(joints))
     states, inputs = both[: found.n], only_commands(both[: found.n], both[found.n :], report)
+    if own:
+        inputs = _last_number(report, found, states, inputs)
     if chosen == "balance" and not own:
         states = tuple(by_encoders(states, report, joints, found.params["r"].value))
     if ask is not None:
@@ -246,7 +249,10 @@ def _begin(
         ranges |= {
             g.name: (min(r[0], 0.0), max(r[1], 0.0)) for g in inputs if (r := ranges[g.name])
         }
-    table = mapping_toml(states, inputs, simulated=is_simulated(report))
+    if own:
+        notes = (*notes, *_unused(report, (*states, *inputs)), *_unmeasured(states, found))
+    rates = velocities(found)
+    table = mapping_toml(states, inputs, simulated=is_simulated(report), rates=rates)
 
     def write(columns: Mapping[str, Array], rows: int, sent: Mapping[str, Array] = NONE) -> None:
         name, held = Path(log).name, held_first(found, columns, sent, step, ranges)
@@ -351,6 +357,52 @@ def _left_out(report: LogReport, model: Model) -> tuple[str, ...]:
             f"the inputs, such as --inputs {last}"
         )
     return tuple(found)
+
+
+def _last_number(
+    report: LogReport, model: Model, states: Sequence[Guess], inputs: Sequence[Guess]
+) -> tuple[Guess, ...]:
+    """Return the inputs; the only one without a name in the log gets the only number left.
+
+    If rates are missing, too, it is no rate: those were sought by the derivatives.
+    """
+    lost = [guess.name for guess in inputs if not guess.path]
+    known = {guess.name for guess in states if guess.path}
+    beside = [w for q, w in velocities(model).items() if q in known]
+    used = {guess.path for guess in (*states, *inputs)}
+    left = [field.path for field in moving(report).values() if field.path not in used]
+    if len(lost) != 1 or len(left) != 1 or not {*model.states} <= {*known, *beside}:
+        return tuple(inputs)
+    topic, field = next((t, f) for t in report.topics for f in t.fields if f.path == left[0])
+    said = Stated.by(report.files).unit(left[0])
+    if said and factor_between(said, model.inputs[lost[0]]) is None:
+        return tuple(inputs)
+    why, clock = ("no name matches; the only number left",), clock_of(report, topic)
+    one = Guess(lost[0], left[0], clock, sure=False, others=(), field=field, reasons=why)
+    one = as_stated(Stated.by(report.files), model.inputs[lost[0]], one)
+    return tuple(one if guess.name == lost[0] else guess for guess in inputs)
+
+
+def _unused(report: LogReport, guesses: Sequence[Guess]) -> tuple[str, ...]:
+    """Return a note that names the changing numbers of which the model uses none."""
+    used = {guess.path for guess in guesses}
+    left = [f.path for f in reversed(moving(report).values()) if f.path not in used]
+    left = [path for path in left if not PARTS.search(path)]
+    more = f" and {len(left) - NAMED} more" * (len(left) > NAMED)
+    named = f"{', '.join(left[:NAMED])}{more}" if more else listed(left)
+    return (f"not used of the log: {named}",) * bool(left)
+
+
+def _unmeasured(states: Sequence[Guess], model: Model) -> tuple[str, ...]:
+    """Return a note on what estimates the rates of a log in which no state was found."""
+    pairs = {q: w for q, w in velocities(model).items() if q not in velocities(model).values()}
+    if not pairs or any(guess.path for guess in states):
+        return ()
+    return (
+        f"the log need not hold {listed(pairs.values())}: once {listed(pairs)} "
+        f"{'have paths' if len(pairs) > 1 else 'has a path'} in [log], use [estimate] in "
+        "grounded.toml, and the smoother finds the rest",
+    )
 
 
 def _in_seconds(report: LogReport) -> tuple[str, ...]:

@@ -17,6 +17,8 @@ from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import integrals
+from grounded.places import velocities as velocities_of
+from grounded.result import listed
 from grounded.task import MAX_HORIZON
 from grounded_trials.logs.inspection.inspect_pairs import velocities
 from grounded_trials.workspace.off_target import position_names
@@ -26,6 +28,8 @@ SHAPES = (*PATHS, "step", "swing-up")
 FEWEST = 5  # control steps of a target; at most MAX_HORIZON
 FINE = 2000  # number of points of a path
 AROUND = 720  # angles at which a hinge is tried
+NEAR = 1e-6  # of a velocity: two are the same
+CARRIES = 0.02  # of a path's highest rate: a velocity that makes up for less does not carry it
 BRIEF, SLIGHT = 1e-4, 1e-3  # [s] of the step there; [rad/s^2] smallest pull of its weight
 
 
@@ -56,7 +60,9 @@ def path_target(
         drive: size and speeds of the path.
         model: its roles name the states.
         dt: control interval [s].
-        to: further states, each with the value that it keeps along the path: a drone's height.
+        to: further states, each with the value that it keeps along the path: a drone's height. A
+            velocity that carries the robot along follows the path instead, and must end at its
+            value: 0 with `drive.hold`.
         start: [task] start: where the path begins, and the height unless `to` gives one.
 
     Raises:
@@ -76,7 +82,7 @@ def path_target(
     limit = np.minimum(drive.speed, np.sqrt(drive.lateral / np.maximum(curvature, 1e-9)))
     limit[-1] *= not drive.hold
     speed = _reachable(along, limit, drive.accel)
-    t, far, pace = _driven(along, speed, drive.hold, dt)
+    _, far, pace = _driven(along, speed, drive.hold, dt)
     columns = {
         name: start.get(name, 0.0) + np.interp(far, along, way)
         for name, way in zip(position, (x, y), strict=False)
@@ -87,7 +93,8 @@ def path_target(
         played = model.roles.get(role)
         if isinstance(played, str) and played in model.states:
             columns[played] = values
-    return columns | _kept(shape, model, to, start, columns, len(t))
+    rates = dict(zip(position, (pace * np.cos(turned), pace * np.sin(turned)), strict=False))
+    return columns | _kept(shape, model, to, start, columns, rates)
 
 
 def _driven(
@@ -116,14 +123,16 @@ def _kept(
     to: Mapping[str, float],
     start: Mapping[str, float],
     drawn: Mapping[str, Array],
-    rows: int,
+    rates: Mapping[str, Array],
 ) -> dict[str, Array]:
-    """Return the columns of states that keep a value along a path."""
+    """Return the columns of states that keep a value along a path, or carry the robot along it."""
     _check_states(to, model)
+    held, speeds = dict(to), velocities_of(model)
     for name in to:
-        if name in drawn:
+        if name in drawn and name not in speeds:
             raise GroundedError(f"the {shape} itself sets '{name}': omit --to {name}")
-    held = dict(to)
+    for name in [n for n in to if n in drawn]:
+        _check_end(shape, name, held.pop(name), drawn[name][-1], model)
     for height in model.roles["position"][2:]:
         if height not in {**start, **to}:
             raise GroundedError(
@@ -131,7 +140,64 @@ def _kept(
                 f"--to {height}=1.5, in {model.states[height]}"
             )
         held.setdefault(height, start.get(height, 0.0))
-    return {name: np.full(rows, value) for name, value in held.items()}
+    rows = len(next(iter(drawn.values())))
+    columns = {name: np.full(rows, value) for name, value in held.items()}
+    carrying = _carrying(model, {**drawn, **columns}, rates, [*to])
+    for name, column in carrying.items():
+        _check_end(shape, name, to[name], column[-1], model)
+    return columns | carrying
+
+
+def _check_end(shape: str, name: str, asked: float, end: float, model: Model) -> None:
+    """Raise if a path ends with another velocity than --to asks for."""
+    if abs(end - asked) > NEAR * max(abs(asked), 1.0):
+        unit = model.states[name]
+        rest = "--hold 1 lets it end at rest and stay there" if asked == 0 else "it can't be chosen"
+        raise GroundedError(
+            f"--to {name}={asked:g}: the {shape} moves the robot, so {name} follows from the path, "
+            f"which ends at {end:.3g} {unit}. Omit --to {name}; {rest}"
+        )
+
+
+def _carrying(
+    model: Model, columns: Mapping[str, Array], rates: Mapping[str, Array], names: list[str]
+) -> dict[str, Array]:
+    """Return the columns of velocities that a path can't hold, since they move the robot along it.
+
+    A velocity s carries the robot if, with s at its column, the model's rates q' of the drawn
+    states miss the path's by d, and s could make up for that: with g = dq'/ds, g.d is not 0. Then
+    s + g.d / g.g is what the path needs. The sideways velocity of a car that drives along its
+    heading has g.d = 0, and stays as it is.
+
+    Args:
+        model: the model of the states.
+        columns: all columns of the target, (H + 1,) each.
+        rates: the rates of states that the path moves, (H + 1,) each.
+        names: the states that may carry the robot.
+    """
+    index = {name: i for i, name in enumerate(model.state_names)}
+    x = np.zeros((len(next(iter(columns.values()))), model.n))
+    for name, column in columns.items():
+        x[:, index[name]] = column
+    moved = [index[name] for name in rates]
+    wanted = np.stack([*rates.values()], axis=1)
+
+    def rate(x: Array) -> Array:
+        u = np.zeros((len(x), model.m))
+        with np.errstate(all="ignore"):
+            after = model.system.step(x, u, model.values, BRIEF)
+        return np.asarray((after - x)[:, moved] / BRIEF)
+
+    found = {}
+    for name in [n for n in names if n in velocities_of(model) and n not in rates]:
+        more = x.copy()
+        more[:, index[name]] += 1.0
+        missed, g = wanted - rate(x), rate(more) - rate(x)
+        size = np.maximum((g**2).sum(axis=1), NEAR)
+        needed = (g * missed).sum(axis=1) / size
+        if np.abs(needed * np.sqrt(size)).max() > CARRIES * np.abs(wanted).max():
+            found[name] = x[:, index[name]] + needed
+    return found
 
 
 def _check(drive: Drive) -> None:
@@ -171,7 +237,8 @@ def line_target(
 ) -> dict[str, Array]:
     """Return the columns, (H + 1,) each, of a straight line from rest to rest, with their rates.
 
-    If one coordinate of a position is named, the others stay at their start values.
+    If one coordinate of a position is named, the others stay at their start values. A velocity that
+    carries the robot along the line follows it, and ends at 0.
 
     Args:
         to: end value by state; empty: `drive.size` further along the model's only axis.
@@ -184,8 +251,9 @@ def line_target(
             computed; "": both are computed.
 
     Raises:
-        GroundedError: for an unknown state, a line of zero length, an ambiguous axis, or a
-            duration that is not possible with the speed or acceleration kept.
+        GroundedError: for an unknown state, a line of zero length, an ambiguous axis, a duration
+            that is not possible with the speed or acceleration kept, or a velocity of what the line
+            moves that is not to end at 0.
     """
     _check(drive)
     to = to or {(name := _axis(model)): start.get(name, 0.0) + drive.size}
@@ -194,7 +262,10 @@ def line_target(
     length = max(map(abs, way.values()))
     if not 0 < length < np.inf:
         there = ", ".join(f"{name} = {value:g}" for name, value in to.items())
-        raise GroundedError(f"the line ends where it starts, at {there}: change --to")
+        still = {*to} <= {*velocities_of(model)}
+        goes = next((q for q in (*position_names(model), *velocities(model)) if q not in to), "")
+        more = f"it ends at rest; say where, such as --to {goes}=1.0" if still and goes else ""
+        raise GroundedError(f"the line ends where it starts, at {there}: {more or 'change --to'}")
     if seconds is not None:
         drive = _in_time(drive, length, seconds, kept)
         _grid(seconds + drive.hold, dt)
@@ -208,7 +279,16 @@ def line_target(
     rates, place = velocities(model), position_names(model)
     way |= dict.fromkeys([q for q in place if q not in way and not {*place}.isdisjoint(way)], 0.0)
     columns |= {q: np.full(len(t), start.get(q, 0.0)) for q in way if q not in columns}
-    return columns | {rates[q]: rate * far for q, far in way.items() if rates.get(q, q) not in way}
+    columns |= {rates[q]: rate * far for q, far in way.items() if rates.get(q, q) not in way}
+    moved = {q: rate * far for q, far in way.items() if far and q not in velocities_of(model)}
+    carrying = _carrying(model, columns, moved, [*to]) if moved else {}
+    for name in carrying:
+        if to[name]:
+            raise GroundedError(
+                f"--to {name}={to[name]:g}: the line brings {listed([*moved])} to rest at its end, "
+                f"where {name} is 0: `--to {name}=0` gives it that column"
+            )
+    return columns | carrying
 
 
 def _in_time(drive: Drive, length: float, seconds: float, kept: str) -> Drive:
@@ -378,8 +458,8 @@ def swing_up(
         start: [task] start.
 
     Raises:
-        GroundedError: if no angle of the model hangs under its weight and `to` names none, or for
-            an unusable number of steps.
+        GroundedError: if no angle of the model hangs under its weight and `to` names none, if `to`
+            names the rate of one that swings up, or for an unusable number of steps.
     """
     hung = hinges(model, start)
     chosen = [one for one in hung if one.angle in to] or hung[:1]
@@ -389,8 +469,13 @@ def swing_up(
             "the angle and its value, such as --to q=3.1416"
         )
     first = np.arange(in_steps(seconds, dt, np.round(seconds / dt)) + 1) < 1
-    columns = {}
+    columns, rates = {}, velocities(model)
     for one in chosen:
+        if (rate := rates.get(one.angle, "")) in to:
+            raise GroundedError(
+                f"--to {rate}={to[rate]:g} would hold {rate} there during the swing: omit it, "
+                f"since {one.angle} that stays upright is at rest"
+            )
         hangs = start.get(one.angle, one.hangs)
         columns[one.angle] = np.where(first, hangs, to.get(one.angle, one.stands))
     others = {name: value for name, value in to.items() if name not in columns}

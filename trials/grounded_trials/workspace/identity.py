@@ -119,6 +119,7 @@ class Noted:
     ran: dict[str, str] = field(default_factory=dict)  # trial without a policy -> SHA-256 of it
     hand_outs: list[tuple[str, str]] = field(default_factory=list)  # candidate, last trial by then
     since: list[str] = field(default_factory=list)  # handed out since a trial was last set aside
+    told: dict[str, str] = field(default_factory=dict)  # what was told once -> of which trial
 
     @property
     def last(self) -> set[str]:
@@ -159,6 +160,8 @@ def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
             found.since.append(note["candidate"])
         elif kind == "run":
             found.ran[note["trial"]] = note["sha256"]
+        elif kind == "told":
+            found.told.setdefault(note["what"], note["trial"])
     return found
 
 

@@ -37,7 +37,6 @@ DIAGNOSE = NextCommand("diagnose")
 EXPORT = NextCommand("export", ("best", "--runner"))
 REPORT = NextCommand("report", ("--html",))
 TARGET = NextCommand("target", ("SHAPE",))
-AGAIN = 2  # runs of the best candidate after which a search that doubts its model ends
 TRUE = 0.05  # of a utility: a prediction that misses by less came true
 
 
@@ -114,7 +113,7 @@ def _follows(
         return DIAGNOSE if due or doubted(now, since, usable) else PROPOSE
     if not since.settled and not _came_true(workspace, now, diagnosis):
         return DIAGNOSE
-    if now.ending == "too doubtful" and now.incumbent and len(now.incumbent.trials) < AGAIN:
+    if now.asks_again and now.incumbent:
         return to_run(workspace, now.incumbent.candidate.id, "best")
     return another_trial(workspace, now) if diagnosis.no_cause else EXPORT
 

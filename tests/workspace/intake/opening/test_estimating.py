@@ -207,6 +207,29 @@ def test_trials_that_another_model_estimated_stay_and_are_told(tmp_path):
     assert not anew.known and anew.trial != first.trial
 
 
+def test_that_a_column_only_identifies_runs_is_told_once(tmp_path):
+    """It is what docs/robot.md recommends, and each log was warned of it."""
+    lines = [
+        f'[log.{k}.{n}]\npath = "/csv.{n}"'
+        for k, n in (("state", "x"), ("input", "force"), ("state", "v"))
+    ]
+    config, keys = CONFIG, ["[estimate]", "measured = { x = 0.002 }"]
+    file = make(tmp_path / "w", config=config + "\n".join([*lines[:2], *keys])).config.file
+    told = []
+    for k in range(3):
+        logged, _, _ = disturbed(0.0, 0.8, until=4.0 + k)
+        x = logged["x"].values
+        t, force = logged["x"].t * 1e-9 + 100 * k, logged["force"].values
+        table = np.column_stack([t, x, np.gradient(x, 0.01), force])
+        log = tmp_path / f"{k}.csv"
+        np.savetxt(log, table, "%.5f", ",", header="t,x,v,force", comments="")
+        if k == 1:  # from now on v is mapped
+            file.write_text(config + "\n".join([*lines, *keys]))
+        said = Workspace(tmp_path / "w").ingest(log, data=True).warnings
+        told.append(any("[estimate] measured" in one for one in said))
+    assert told == [False, True, False]
+
+
 def test_a_late_sensor_that_was_adopted_leaves_estimates_as_they_are(tmp_path):
     """The speed of a position that is told 40 ms late is as late; it was 20 times worse."""
     lines = [f'[log.{k}.{n}]\npath = "/csv.{n}"' for k, n in (("state", "x"), ("input", "force"))]

@@ -5,6 +5,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -214,6 +215,28 @@ def test_how_old_the_samples_were_is_found_and_what_that_costs(ladder, tmp_path)
     assert not old_samples(w, made, replace(run, states=near), np.zeros(2))
     far = near + 10.0
     assert not old_samples(w, made, replace(run, states=far), old)
+
+
+@pytest.mark.parametrize("late", ["v", "x+v"])
+def test_only_the_speeds_are_named_if_only_they_are_old(ladder, late):
+    """In a table all samples have the stamps of their row, and a program may filter its speeds."""
+    w, by_alpha = ladder
+    made, task, dt = by_alpha[1], w.task, w.task.dt
+    t = dt * np.arange(task.horizon + 1)
+    states = task.target.copy()
+    states[:, 0] += 0.05 * np.sin(5 * t)
+    states[:, 1] = np.gradient(states[:, 0], dt)
+    aged = states - 0.03 * np.gradient(states, dt, axis=0) * [late == "x+v", 1]
+    sent = made.policy.commands(aged[None, :-1], made.policy.past)[0]
+    names = {"state_names": task.model.state_names, "input_names": task.model.input_names}
+    run = Trial(dt=dt, states=states, inputs=sent, **names)
+    weighs = replace(task.reward, state=np.array([10.0, 1.0]))
+    target = np.column_stack([task.target[:, 0], states[:, 1] - 0.05])
+    here = SimpleNamespace(task=replace(task, reward=weighs, target=target), config=w.config)
+    (note,) = old_samples(here, made, run, np.full(2, 0.02))
+    assert "v by" in note and ("x by" in note) == (late == "x+v")
+    age = float(re.search(r"(\d+) ms old", note)[1])
+    assert age == pytest.approx(30 if late == "v" else 20, abs=2)
 
 
 def test_ingest_names_the_candidate_that_ran_and_both_ways_on(ladder, tmp_path):

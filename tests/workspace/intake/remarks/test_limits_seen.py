@@ -159,12 +159,30 @@ def test_a_robot_that_moves_on_after_its_run_did_not_come_to_rest(tmp_path, roll
     assert not told or holds(told[0], " mm from its target", "--hold")
 
 
+def test_that_a_robot_moves_on_after_its_runs_is_told_once_a_task(tmp_path):
+    """It is the target, [reward] or the program that is to be changed, not the run."""
+    w = waiting(tmp_path)
+    _, table, beyond = driven_on(w, tmp_path)
+    table[beyond > 0, 1] = table[beyond <= 0, 1][-1] + 0.4 * beyond[beyond > 0]
+    told = []
+    for k in range(2):
+        again = tmp_path / f"again{k}.csv"
+        table[:, 1] += 1e-6 * k
+        np.savetxt(again, table, "%.7f", ",", header="t,x,v,force", comments="")
+        said = Workspace(w.folder).ingest(again, candidate="c0002").warnings
+        told.append(any("after the run" in one for one in said))
+    assert told == [True, False]
+    same = Workspace(w.folder).ingest(tmp_path / "again0.csv").warnings
+    assert any("after the run" in one for one in same)  # of the log that it was told of
+
+
 @pytest.mark.parametrize("knows", [True, False])
 def test_a_robot_that_its_held_input_lets_go_is_told_so(tmp_path, knows):
     """A helicopter fell under 0 V after every run: terminal weights and --hold were advised."""
     model = MODEL.replace("a.force - p", "a.force - 1.5 * s.x - p") if knows else MODEL
     made = Workspace(make(tmp_path / "w", config=LOGGED, model=model).folder)
-    record(made, tmp_path / "first.csv", made.propose().candidate.policy, 0.0, seed=9)
+    first = made.propose().candidate.policy
+    record(made, tmp_path / "first.csv", first, 0.0, seed=9, after=0.0)
     made.ingest(tmp_path / "first.csv")
     made.propose()
     file, table, beyond = driven_on(made, tmp_path)

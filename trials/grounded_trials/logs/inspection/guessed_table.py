@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 from grounded.result import extent
 from grounded_trials.logs.inspection.inspect_guess import FEW, Guess
@@ -12,9 +13,20 @@ DRIFT = 2e-4  # of a signal's range: the smallest standard deviation proposed fo
 
 
 def mapping_toml(
-    states: Sequence[Guess], inputs: Sequence[Guess], *, simulated: bool = False
+    states: Sequence[Guess],
+    inputs: Sequence[Guess],
+    *,
+    simulated: bool = False,
+    rates: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """Format guesses as a [log] table, with comments where a person should check."""
+    """Format guesses as a [log] table, with comments where a person should check.
+
+    Args:
+        states: one guess for each state.
+        inputs: one guess for each input.
+        simulated: whether header stamps are on another clock than the log.
+        rates: the states whose rate is another state, {q: w}.
+    """
     clock = "log" if simulated else "header"
     lines = ["[log]", f'clock = "{clock}"']
     if simulated:
@@ -22,7 +34,7 @@ def mapping_toml(
     for kind, guesses in (("state", states), ("input", inputs)):
         for guess in guesses:
             lines += ["", *_table(kind, guess, clock)]
-    lines += _estimate(states)
+    lines += _estimate(states, rates)
     return "\n".join(lines) + "\n"
 
 
@@ -63,9 +75,19 @@ def _unwrap(path: str) -> str:
     return "unwrap = true" * path.endswith("@rpy.yaw")
 
 
-def _estimate(states: Sequence[Guess]) -> list[str]:
-    """Return an [estimate] table for the states that the log does not contain."""
+def _estimate(states: Sequence[Guess], rates: Mapping[str, str]) -> list[str]:
+    """Return an [estimate] table for the states that the log does not contain.
+
+    It is commented out if no state was found: that is for logs that lack the rates.
+    """
     missing, known = [guess.name for guess in states if not guess.path], estimating(states)
+    if not known and (later := [q for q in rates if q not in rates.values()]):
+        deviations = ", ".join(f"{name} = 0.01" for name in later)
+        return [
+            "",
+            f"# [estimate]  # if the log lacks {', '.join(rates[q] for q in later)}: remove both #",
+            f"# measured = {{ {deviations} }}  # standard deviations, in the model's units",
+        ]
     if not missing or not known:
         return []
     deviations = ", ".join(

@@ -19,7 +19,8 @@ A model whose input is a state's own number explains that state by itself, and n
 Signals without a matching name get candidates among the numbers that are left (`from_the_rest`). A
 unit in a table's header, such as `boom_angle [deg]`, fits a state in rad, but not an input in N m.
 If exactly one number fits the unit of exactly one state or input, it is proposed; unsure, unless
-nothing else is left of either.
+nothing else is left of either. As many numbers as names of one unit are proposed in the log's
+order, unsure.
 """
 
 from __future__ import annotations
@@ -336,10 +337,13 @@ def from_the_rest(
         for name, paths in fits.items()
         if len(paths) == 1 and sum(paths[0] in some for some in fits.values()) == 1
     }
+    ordered = _in_logs_order(fits)
     found = []
     for guess in guesses:
         name = guess.name
-        if name in alone:
+        if name in ordered:
+            found.append(as_stated(stated, units[name], _ordered(guess, *ordered[name], log)))
+        elif name in alone:
             one = replace(_alone_by_unit(guess, alone[name], log), sure=len(lost) == len(left) == 1)
             found.append(as_stated(stated, units[name], one))
         elif name in fits:
@@ -349,11 +353,31 @@ def from_the_rest(
 
             unsaid = [path for path in left if not stated.unit(path) and named(path)]
             known = [path for path in unsaid if unit_of(path, joints)]
-            rest = tuple(p for p in fits[name] or known or unsaid if p not in alone.values())
+            given = {*alone.values(), *(path for path, _ in ordered.values())}
+            rest = tuple(p for p in fits[name] or known or unsaid if p not in given)
             found.append(replace(guess, others=rest[:MOST]))
         else:
             found.append(guess)
     return tuple(_offering(guess, units[guess.name], stated, log) for guess in found)
+
+
+def _in_logs_order(fits: Mapping[str, list[str]]) -> dict[str, tuple[str, tuple[str, ...]]]:
+    """Return (number, the others) for names that share exactly as many numbers of their unit."""
+    found = {}
+    for name, paths in fits.items():
+        alike = [other for other, some in fits.items() if some == paths]
+        sole = all(some == paths or not {*some} & {*paths} for some in fits.values())
+        if sole and 1 < len(paths) == len(alike):
+            path = paths[alike.index(name)]
+            found[name] = (path, tuple(p for p in paths if p != path))
+    return found
+
+
+def _ordered(guess: Guess, path: str, others: tuple[str, ...], log: LogReport) -> Guess:
+    topic, field = next((t, f) for t in log.topics for f in t.fields if f.path == path)
+    why = f"no name matches; {listed((path, *others))} have a unit that fits, in the log's order"
+    clock = clock_of(log, topic)
+    return replace(guess, path=path, field=field, clock=clock, others=others, reasons=(why,))
 
 
 def _offering(guess: Guess, wanted: str, stated: Stated, log: LogReport) -> Guess:

@@ -91,6 +91,7 @@ _NO_WHEELS = re.compile(  # topics with odometry messages that is not from wheel
     "mocap|vicon|optitrack|qualisys|truth|filter|fused|ekf|gps|gnss|slam|lidar|visual|vio"
 )
 _WORD = re.compile(r"[a-z]+")
+_HUMP = re.compile(r"(?<=[a-z])(?=[A-Z][a-z])")  # between the words of armAngle
 
 
 @dataclass(frozen=True)
@@ -305,7 +306,8 @@ def _score(
     inside = field.path[len(topic.topic) :].lower().strip('".')
     plain = bare_command if is_input else without_unit
     bare = plain(field.path)[len(topic.topic) :].lower().strip('".')
-    ways = {inside, bare, in_english(inside), in_english(bare)}
+    apart = _HUMP.sub("_", field.path[len(topic.topic) :]).lower().strip('".')
+    ways = {inside, bare, apart, in_english(inside), in_english(bare)}
     best = max(_fit(called, one, topic.topic.lower()) for one in ways)
     folders = topic.topic.lower().split("/")[:-1]  # /thrusters/left/command is the input `left`
     if is_input and inside in ("data", "value") and set(called) & set(folders):

@@ -80,8 +80,9 @@ def paired(
     known = len(bare) == 1 and all(own[name].sure for name in pair if name not in bare)
     why = "no name matches" + "; only this pair of the rest fits" * (len(bare) == 2)
     for name in bare:
-        reasons = (why, *found[name].reasons)
-        found[name] = replace(found[name], sure=known and found[name].scale == 1, reasons=reasons)
+        one = found[name]
+        same = one.scale == 1 and (name == pair[0] or one.sure)
+        found[name] = replace(one, sure=known and same, reasons=(why, *one.reasons))
     return found
 
 
@@ -153,6 +154,8 @@ def _derivative(q: Guess, w: Guess, signals: Signals, units: Mapping[str, str]) 
         else:
             found_q = replace(found_q, scale=by[1], sure=False)
             found_w = replace(found_w, scale=scale, sure=False)
+    elif not (q.path and w.path) and abs(best.correlation) < SURELY:
+        return {}  # neither name nor size fits: a voltage follows the speed that it drives
     else:
         why += f", but {best.slope:.3g} times as large"
         found_w = replace(found_w, sure=False)

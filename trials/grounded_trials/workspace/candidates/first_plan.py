@@ -16,6 +16,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from grounded.errors import NextCommand
 from grounded.frozen import Array
@@ -111,7 +112,8 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
     found += held
     loose = _not_held(workspace, proposal.refused) if proposal.refused is not None else []
     found += loose
-    if proposal.standing.ending == "not allowed" and not held and not loose:
+    leaves = proposal.refused is not None and _leaving(task, proposal.refused).any()
+    if leaves and not held and not loose:
         found.append(
             "nothing was run yet: draw a target whose run stays inside [safety] (`target`) and "
             "propose again; widen [safety] only if the robot may really go there"
@@ -194,9 +196,8 @@ def _of_other_limits(workspace: Folder) -> list[str]:
 def _not_held(workspace: Folder, refused: Candidate) -> list[str]:
     """Return notes on states that leave [safety] and have no target, or no weight on it."""
     task = workspace.task
-    assert task.safety_low is not None and task.safety_high is not None
-    states, weight = refused.predicted_states, task.reward.state + task.reward.terminal
-    out = np.any((states < task.safety_low) | (states > task.safety_high), axis=0)
+    out = _leaving(task, refused)
+    weight = task.reward.state + task.reward.terminal
     given, names = np.isfinite(task.target).any(axis=0), task.model.state_names
     bare = [names[i] for i in np.flatnonzero(out & ~given)]
     free = [names[i] for i in np.flatnonzero(out & given & (weight == 0))]
@@ -221,6 +222,16 @@ def _not_held(workspace: Folder, refused: Candidate) -> list[str]:
             "has no weight for the target there: add one"
         )
     return found
+
+
+def _leaving(task: Task, plan: Candidate) -> NDArray[np.bool_]:
+    """Return which states leave [safety] in a plan, (n,)."""
+    assert task.safety_low is not None and task.safety_high is not None
+    states = plan.predicted_states
+    out: NDArray[np.bool_] = np.any(
+        (states < task.safety_low) | (states > task.safety_high), axis=0
+    )
+    return out
 
 
 def _drawn(task: Task) -> NextCommand | None:

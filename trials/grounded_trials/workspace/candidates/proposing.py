@@ -153,8 +153,9 @@ def propose_in(workspace: Folder) -> Proposed:
     proposal = replace(proposal, notes=(*proposal.notes, *notes))
     if candidate is None:
         asked, then = unanswered(workspace)
+        ended = replace(proposal, standing=status.standing, notes=(*proposal.notes, *asked))
         then = PROPOSE if held else then or status.then  # after [task] start is changed, as noted
-        return Proposed(replace(proposal, notes=(*proposal.notes, *asked)), None, then)
+        return Proposed(ended, None, then)
     path = workspace.candidate_path(candidate.id)
     # the user should first correct the held input; a second `propose` hands the candidate out
     then = PROPOSE if held else to_run(workspace, candidate.id)
@@ -267,9 +268,10 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
     usable = usable_ids(workspace)
     found = readable_diagnosis(workspace.reports)
     since = since_diagnosis(workspace, found, usable) if found else None
+    then = next_command(workspace, standing, found, usable)
     return Status(
-        standing,
-        next_command(workspace, standing, found, usable),
+        _asking(workspace, standing, then),
+        then,
         again_best(workspace, standing),
         since.sentence if since else "",
         (
@@ -283,6 +285,15 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
         found,
         since,
     )
+
+
+def _asking(workspace: Folder, now: Standing, then: NextCommand) -> Standing:
+    """Return the standing, which asks for another run of the best one if `then` is that run."""
+    if not now.asks_again or now.missed or now.incumbent is None:
+        return now
+    own = now.incumbent.candidate.id
+    runs = then == to_run(workspace, own, "best")
+    return replace(now, sentence=f"{now.sentence}; run {own} again") if runs else now
 
 
 def status_in(workspace: Folder) -> Status:

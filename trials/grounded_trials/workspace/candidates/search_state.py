@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from grounded.search.standing import Proposal
 
 KIND = ".ended"
+UNSAID = ("not allowed", "gains too large")  # ends that are told with the refused candidate
 SAID = ("phase", "sentence", "ending", "doubt", "missed")
 
 
@@ -111,7 +112,7 @@ def known_end(workspace: Folder, contents: Contents, now: Standing) -> Standing 
 
 def remember_end(workspace: Folder, contents: Contents, ended: Standing) -> None:
     """Keep the end of a search, unless it goes on or a candidate was refused, with its reasons."""
-    if ended.phase not in ("converged", "stopped") or ended.ending == "not allowed":
+    if ended.phase not in ("converged", "stopped") or ended.ending in UNSAID:
         return
     then = ended.then and [ended.then.verb, *ended.then.arguments]
     said = {name: getattr(ended, name) for name in SAID}

@@ -9,7 +9,7 @@ second ingest finds the first.
 from __future__ import annotations
 
 import math
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ from grounded_trials.workspace.intake.opening.stored_before import (
     what_repeats,
 )
 from grounded_trials.workspace.intake.recognising.recognise import by_its_commands, recognised
-from grounded_trials.workspace.intake.remarks.after_run import afterwards
+from grounded_trials.workspace.intake.remarks.after_run import left_afterwards, moved_on
 from grounded_trials.workspace.intake.remarks.control_loop import steps_skipped, swung
 from grounded_trials.workspace.intake.remarks.gone_wrong import ended_early, gone_wrong
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
@@ -173,7 +173,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         said = (early.said,)  # after what is doubtful about the log, which may be why
         warnings, wrong = (*warnings, *said) if read.doubted else (*said, *warnings), early.aside
     if trial.candidate and not wrong and (whole := _whole(read, workspace.task)):
-        warnings = (*warnings, *afterwards(workspace.planner, whole))
+        left = left_afterwards(workspace.task, whole)
+        warnings = (*warnings, *(left or _told_once(workspace, added, whole)))
     if not (odd or wrong or aside):
         warnings = (*warnings, *swung(workspace.task, tried, trial, history))
     if ahead and verdict == "run again":
@@ -215,6 +216,22 @@ def _whole(read: Read, task: Task) -> Trial | None:
         return None
     more = replace(log, steps=task.horizon + math.ceil(COASTS / task.dt))
     return more.trial_from(1e-9 * (read.cut.start_ns - log.whole.origin_ns))
+
+
+def _told_once(workspace: Folder, added: Added, whole: Trial) -> list[str]:
+    """Return how the robot moved on after its run, unless a run of this task told it before.
+
+    What is then to be changed is the target, [reward] or the robot's program, not the run.
+    """
+    what, own = f"moved on, {workspace.task.hash}", added.sha256[:DIGITS]
+    if workspace.noted.told.get(what, own) != own:
+        return []
+    found = moved_on(workspace.planner, whole)
+    if found and what not in workspace.noted.told:
+        with suppress(GroundedError):  # a folder that can't be written: it is told again
+            workspace.notes.add({"note": "told", "trial": own, "what": what}, again=False)
+        vars(workspace).pop("noted", None)
+    return found
 
 
 def _undo(identity: str) -> str:

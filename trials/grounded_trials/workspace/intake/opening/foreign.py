@@ -5,6 +5,7 @@ States that are not measured are estimated along the whole log, see `estimating`
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -27,7 +28,7 @@ from grounded_trials.logs.signals import Series, read_signals
 from grounded_trials.wording import count
 from grounded_trials.workspace.adopted import but_late_sensors, planner_of
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, StoredTrial
+from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, StoredTrial
 from grounded_trials.workspace.intake.locating.run_start import Recording, recording
 from grounded_trials.workspace.intake.opening.estimating import (
     EstimateTable,
@@ -168,12 +169,23 @@ class ForeignLog:
 
     @property
     def unread(self) -> tuple[str, ...]:
-        """Warnings that such states only identify a run, while its trial has estimates."""
+        """Warnings that such states only identify a run, while its trial has estimates.
+
+        That is so by the set-up, so it is told of the first log that was read like this.
+        """
+        known = [
+            one.meta
+            for one in self.workspace.whole_trials()
+            if READ_BY in one.meta and one.meta.get("source_sha256") != self.source["source_sha256"]
+        ]
+        last = known[-1] if known else {}
+        guessed, columns = last.get("estimated", "").split(","), last.get(READ_BY, "")
         return tuple(
             f"{name} is in [log], but not in [estimate] measured: it is used to identify a run, "
             f"but the trial has an estimate in its place. To use the logged one add {name} = its "
             "scatter at standstill there"
             for name in self._beside
+            if name not in guessed or f"{json.dumps(name)}:" not in columns
         )
 
     @cached_property

@@ -39,16 +39,6 @@ GROWS = 1.5  # of a push, not of a speed: the second half of the drift exceeds t
 FASTER = 2.0  # and the drift exceeds by this what the speed at the end gives
 
 
-def afterwards(planner: Planner, whole: Trial) -> list[str]:
-    """Return warnings on what the robot did after the run: it left [safety], or moved on.
-
-    Args:
-        planner: the task, and the model with adopted effects.
-        whole: the run with the seconds that follow it.
-    """
-    return _left_afterwards(planner.task, whole) or _moved_on(planner, whole)
-
-
 def kicked(planner: Planner, run: Trial, held: Array) -> str:
     """Return a warning if a plan reaches its target only by a last command at its limit; or "".
 
@@ -84,7 +74,7 @@ def kicked(planner: Planner, run: Trial, held: Array) -> str:
     )
 
 
-def _moved_on(planner: Planner, whole: Trial) -> list[str]:
+def moved_on(planner: Planner, whole: Trial) -> list[str]:
     """Return a warning if a robot that was to reach a point drifts away from it after the run.
 
     Only if the inputs are constant after the run, so that nobody drove it. What counts is how far
@@ -211,7 +201,7 @@ def _to_stay(task: Task, states: Sequence[int]) -> str:
     return ", or ".join(ways) or "let the target rest for longer (target --hold)"
 
 
-def _left_afterwards(task: Task, whole: Trial) -> list[str]:
+def left_afterwards(task: Task, whole: Trial) -> list[str]:
     """Return a warning if the robot left [safety] after a run that stayed inside."""
     assert task.safety_low is not None and task.safety_high is not None
     states = whole.states[: whole.finite_steps + 1]

@@ -7,6 +7,8 @@ at half the rate runs every other step and holds each command twice as long.
 A policy takes what it is given for where the robot is now. At 1.8 m/s a pose that is 6.8 ms old is
 12 mm behind, so the robot runs 12 mm ahead of its target, in every run. The first plan doesn't know
 that; later ones allow for the age that the commands show (`grounded.search.feedback.sample_age`).
+Samples with the same stamps have one age by these, also if a program filters its speeds: whether
+only the velocities are late shows in the commands.
 """
 
 from __future__ import annotations
@@ -16,10 +18,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from grounded.frozen import Array
+from grounded.places import velocities
 from grounded.result import figure, listed, measured_alike
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.feedback.oscillation import SWINGS, calm_ranges, swings
-from grounded.search.feedback.sample_age import sample_age
+from grounded.search.feedback.sample_age import PROBED, rates, sample_age
 from grounded.search.returned.who_drove import LEAST
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
@@ -28,6 +31,7 @@ from grounded_trials.workspace.folder import Folder
 
 CHANGES = 2e-3  # smallest change of a command by its step alone, relative to its size, that tells
 MOST = 0.3  # share of the steps that tell which may be lost in a run
+RATHER = 0.7  # of the commands' squared errors: velocities alone are late if they leave less
 LEADS = 0.3  # share of a state's error over the run: a smaller motion since the sample is not told
 
 
@@ -87,9 +91,13 @@ def old_samples(workspace: Folder, own: Candidate, trial: Trial, old: Array) -> 
     states = trial.states[: task.horizon + 1]
     if own.policy.gain is None or own.sample_age or len(states) < 2:
         return []
+    by, what = "by the stamps", "samples"
+    if old.any() and not np.ptp(old):
+        old = _late_velocities(task, own, trial, old)
+        by, what = ("by its commands", "velocities") if np.ptp(old) else (by, what)
     error = task.model.difference(states, task.target[: len(states)])
-    rates = task.model.difference(states[1:], states[:-1]) / task.dt
-    off, speed = (rms(e) for e in (error, rates))
+    moved_on = task.model.difference(states[1:], states[:-1]) / task.dt
+    off, speed = (rms(e) for e in (error, moved_on))
     fed = np.abs(own.policy.gain[..., : states.shape[1]]).max(axis=(0, 1)) > 0  # not past inputs
     counts = fed & (task.reward.state > 0) & (old > 0) & (old * speed > LEADS * off)
     told = [i for i in np.flatnonzero(counts) if task.model.state_names[i] not in allowed]
@@ -107,9 +115,40 @@ def old_samples(workspace: Folder, own: Candidate, trial: Trial, old: Array) -> 
     if sample_age(task, own, [trial]):
         then = f"{own.id} does not allow for that, the next candidates do; better still are {fresh}"
     return [
-        f"by the stamps, its program acted on samples that were {span} ms old on average; by then "
+        f"{by}, its program acted on {what} that were {span} ms old on average; by then "
         f"{listed(cost)} had moved on. {then}"
     ]
+
+
+def _late_velocities(task: Task, own: Candidate, trial: Trial, old: Array) -> Array:
+    """Return the ages of a run's samples, all of one age by their stamps: perhaps of rates only.
+
+    The commands are compared with those on samples an age ago, to first order, of all states and of
+    the velocities alone. A program that filters its speeds sends the latter.
+
+    Args:
+        task: the manoeuvre.
+        own: the candidate that was run.
+        trial: its run.
+        old: the age of each state's samples [s], (n,).
+    """
+    index, T = {n: i for i, n in enumerate(task.model.state_names)}, task.horizon
+    late = [index[name] for name in velocities(task.model)]
+    known = np.isfinite(trial.states[: T + 1]).all() and len(trial.states) > T
+    if not late or len(late) == len(old) or not known:
+        return old
+    angles = tuple(map(bool, task.model.angle_mask))
+    policy = own.policy.laid_out(task.model.state_names, angles, own.policy.depths)
+    x, sent = trial.states[:T], trial.inputs[:T]
+    past = policy.past if trial.start_inputs is None else trial.start_inputs
+    back, some = PROBED * task.dt * rates(task, trial), np.isin(np.arange(len(old)), late)
+    seen = np.stack([x, x - back, x - back * some])
+    now, *later = policy.commands(seen, past, sent[None])
+    size = np.abs(policy.feedforward).max(axis=0) + 1e-12
+    e, by_age = (sent - now) / size, [(one - now) / (PROBED * task.dt) / size for one in later]
+    ages = [float(np.vdot(g, e) / (np.vdot(g, g) + 1e-300)) for g in by_age]
+    left = [float(np.sum((e - age * g) ** 2)) for age, g in zip(ages, by_age, strict=True)]
+    return np.where(some, ages[1], 0.0) if left[1] < RATHER * left[0] else old
 
 
 def swung(task: Task, tried: Tried | None, trial: Trial, history: Sequence[Tried]) -> list[str]:
