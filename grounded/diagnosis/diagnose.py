@@ -119,7 +119,7 @@ def diagnose(
         compare: a second group of trials. Both groups are diagnosed together, and `changed` lists
             the values that differ between them.
         engine: workers that fit hypotheses; the result does not depend on their number.
-        progress: called with the stage and the time taken, for a display.
+        progress: called with the stage, the time taken and the time left, for a display.
 
     Returns:
         The diagnosis, with its verdict, ranking of effects and prediction errors.
@@ -142,7 +142,7 @@ def diagnose(
         )
     if not isinstance(options, DiagnosisOptions | None):
         raise GroundedError(f"options must be DiagnosisOptions(...), got a {type_of(options)}")
-    options, tick = options or DiagnosisOptions(), Stages(progress)
+    options, tick = options or DiagnosisOptions(), Stages(progress, MOST)
     model = subject.model if isinstance(subject, Task) else subject
     if model.n + model.m > MOST_NAMES:
         raise GroundedError(
@@ -274,3 +274,4 @@ def _again(effect: Effect, known: float, data: Data) -> Effect:
 
 
 MOST_NAMES = 50  # 36 states and 12 inputs already give 1,649 effects, each of which is filtered
+MOST = 1000  # progress ticks that few diagnoses exceed: stages, and blocks of hypotheses refined

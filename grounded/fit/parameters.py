@@ -60,7 +60,7 @@ def fit(
         horizon_s: prediction horizon on held-out time [s].
         rng: draws the records used to estimate the noise if there are very many.
         engine: workers for the records' likelihoods; the result does not depend on them.
-        progress: called with a line on the stage and the time taken.
+        progress: called with a line on the stage, the time taken and the time left.
 
     Returns:
         A `Fit`: values with intervals, the model with these values, and prediction errors on
@@ -98,7 +98,7 @@ def fit(
     if max(r.steps for r in records) < 3:
         raise GroundedError("a fit needs a trial of at least 3 steps")
     rng = np.random.default_rng(0) if rng is None else rng
-    held, tick = unknowns, Stages(progress)
+    held, tick = unknowns, Stages(progress, MOST)
     with interruptible(lambda: tick.so_far), running(engine):
         while True:
             found = _fitted(model, records, measurement, unknowns, hold_out, horizon_s, rng, tick)
@@ -116,6 +116,7 @@ def _of(found: Fit, model: Model) -> Fit:
     return replace(found, model=model.with_values(values))
 
 
+MOST = 50  # rounds and scans of a fit that few exceed
 MOST_STATES = 50  # with twice as many, 200 steps take minutes
 
 

@@ -65,25 +65,38 @@ def test_a_threshold_is_worth_the_same_on_the_records_it_acts_on(trials):
     assert replace(data, records=data.records[:1]).batch(at.theta).count < at.count
 
 
-def test_a_stage_tells_the_time_taken_and_none_that_is_not_known(monkeypatch):
-    """`up to about 20 s left`, three minutes before the end: the work to come is not known."""
+def clocked(monkeypatch, most, calls, exponent):
+    """What is told at each call, and the time that was left then [s]."""
     clock, told = [0.0], []
     monkeypatch.setattr("grounded.progress.time.monotonic", lambda: clock[0])
-    stages = Stages(told.append, began=0.0)
-    for clock[0] in (5.0, 50.0, 240.0):
+    stages = Stages(told.append, most=most, began=0.0)
+    times = [240 * (k / calls) ** exponent for k in range(1, calls + 1)]
+    for clock[0] in times:
         stages("refine")
-    stages.beside = "one more effect"
-    stages("scan")
-    assert "5 s" in told[0] and "50 s" in told[1] and "4.0 min" in told[2]
-    assert told[3].startswith("scan") and "one more effect" in told[3]
-    assert not any("left" in text for text in told)
+    return told, [times[-1] - at for at in times]
 
 
-def test_a_fit_tells_how_many_rounds_it_has_at_most(trials):
-    told = []
-    fit(MODEL, trials, progress=told.append)
-    rounds = [re.search(r"(\d+) of at most (\d+)", text) for text in told]
-    assert next(int(one[1]) for one in rounds if one) == 1
+@pytest.mark.parametrize("calls", [60, 200, 390])
+@pytest.mark.parametrize("exponent", [0.9, 1.0, 1.1])
+def test_no_more_time_is_left_than_is_told(monkeypatch, calls, exponent):
+    """A diagnosis had `at most 45 s left`, and took three minutes more. `8 s to 8 min` is none."""
+    told, left = clocked(monkeypatch, 400, calls, exponent)
+    inside = []
+    for text, true in zip(told, left, strict=True):
+        ends = [float(n) * {"s": 1, "min": 60}[u] for n, u in re.findall(r"([\d.]+) (s|min)", text)]
+        assert text.startswith("refine, ") and "at most" not in text
+        if text.endswith("left"):
+            assert " up to about " in text and len(ends) == 2
+            inside.append(true <= ends[1] * 1.3 + 30)  # whole minutes
+    assert len(inside) == len(told) - 10 and sum(inside) > 0.9 * len(inside)
+
+
+def test_of_what_takes_more_calls_than_most_no_end_is_told(monkeypatch):
+    """`up to about 10 s left`, and then 4 minutes `longer than usual`."""
+    told, _ = clocked(monkeypatch, 20, 30, 1.3)
+    assert not any("left" in text for text in told[:10]) and "left" in told[12]
+    assert not any("left" in text for text in told[20:])
+    assert told[-1] == "refine, 4.0 min so far"
 
 
 @pytest.mark.parametrize("after", [3, 25])
