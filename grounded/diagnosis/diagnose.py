@@ -274,4 +274,4 @@ def _again(effect: Effect, known: float, data: Data) -> Effect:
 
 
 MOST_NAMES = 50  # 36 states and 12 inputs already give 1,649 effects, each of which is filtered
-MOST = 1000  # progress ticks that few diagnoses exceed: stages, and blocks of hypotheses refined
+MOST = 2000  # progress ticks, more than diagnoses take: their later ones last longer
