@@ -115,6 +115,21 @@ def test_a_log_that_somebody_named_a_run_of_a_candidate_says_that_it_counts(w, t
     assert not any("counts" in one for one in w.ingest(own, candidate="c0002").notes)
 
 
+def test_which_part_of_a_longer_log_is_the_run_is_not_assumed(w, tmp_path):
+    """A robot balanced, began its run and fell at once: the quiet part was judged, 99.9 % better."""
+
+    def balanced(table):
+        t = table[:, 0] - table[0, 0]
+        table[:, 1], table[:, 2], table[:, 3] = 0.0, 0.0, 0.01 * np.sin(20 * t)
+
+    path = edited(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 3.0), balanced)
+    with pytest.raises(GroundedError, match=r"lasts .* no start of c0002 .*\[log.span\] start"):
+        w.ingest(path, candidate="c0002")
+    file = w.folder / "grounded.toml"
+    file.write_text(file.read_text() + "[log.span]\nstart = 3.0\n")
+    assert w.ingest(path, candidate="c0002").candidate == "c0002"
+
+
 def test_a_speed_that_stays_at_zero_is_the_reason_that_is_given(w, tmp_path):
     def stuck(table):
         table[:, 2] = 0.0

@@ -144,6 +144,8 @@ def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None)
         also = gone or misled(None if other else log, task, own)
         doubts = [seem if units else pace or also or why]
         if log and not (found and found.opens_alike):
+            if not (units or pace or also or other):
+                _refuse_any_start(path, ran, log, task)
             doubts.append(
                 f"no start of {ran} was found in it: the run is assumed to begin with the first "
                 f"command, at {log.first:.3f} s; set another with [log.span] start = SECONDS"
@@ -205,6 +207,21 @@ def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None)
     )
 
 
+def _refuse_any_start(path: Path, ran: str, log: Recording, task: Task) -> None:
+    """Refuse a log that is longer than a run, if nothing tells which part of it is the run.
+
+    Of a robot that balanced until its run began, and fell at once, the quiet part was judged.
+    """
+    lasts, run = _lasting_s(log), task.horizon * task.dt
+    if lasts * WHOLE > run:
+        raise GroundedError(
+            f"{path} lasts {lasts:.3g} s from its first command, a run {run:.3g} s, and no start of "
+            f"{ran} was found in it: set where the run begins with [log.span] start = SECONDS in "
+            "grounded.toml (after the log's first sample), or ingest the log with --data",
+            NextCommand("ingest", (str(path), "--data")),
+        )
+
+
 def _in_programs_unit(model: Model, names: Sequence[str], by: float) -> bool:
     """Return whether rather the robot's program than its log has states in another unit.
 
@@ -229,14 +246,19 @@ def _misused(path: Path, own: Candidate, told: str) -> GroundedError:
 
 def _lasting(log: Recording, task: Task) -> str:
     """Return a sentence on a log that is too short for a run of the task, or ""."""
-    end = min(int(one.t.max()) for one in log.logged.values())
-    lasts = 1e-9 * (end - log.whole.origin_ns) - log.first
+    lasts = _lasting_s(log)
     if not lasts < WHOLE * task.horizon * task.dt:
         return ""
     return (
         f" It ends {max(lasts, 0.0):.2g} s after its first command, while a run lasts "
         f"{task.horizon * task.dt:.3g} s: was its beginning or its end cut off?"
     )
+
+
+def _lasting_s(log: Recording) -> float:
+    """Return how long a log lasts after its first command [s]."""
+    end = min(int(one.t.max()) for one in log.logged.values())
+    return 1e-9 * (end - log.whole.origin_ns) - log.first
 
 
 def _guessed(log: Recording | None) -> set[str]:
