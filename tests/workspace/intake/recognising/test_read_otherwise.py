@@ -116,7 +116,7 @@ def test_a_log_that_somebody_named_a_run_of_a_candidate_says_that_it_counts(w, t
 
 
 def test_which_part_of_a_longer_log_is_the_run_is_not_assumed(w, tmp_path):
-    """A robot balanced, began its run and fell at once: the quiet part was judged, 99.9 % better."""
+    """A robot balanced, ran and fell at once: the quiet part was judged, and called better."""
 
     def balanced(table):
         t = table[:, 0] - table[0, 0]
