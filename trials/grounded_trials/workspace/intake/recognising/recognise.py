@@ -216,8 +216,8 @@ def _refuse_any_start(path: Path, ran: str, log: Recording, task: Task) -> None:
     if lasts * WHOLE > run:
         raise GroundedError(
             f"{path} lasts {lasts:.3g} s from its first command, a run {run:.3g} s, and no start "
-            f"of {ran} was found in it: set where the run begins with [log.span] start = SECONDS in "
-            "grounded.toml (after the log's first sample), or ingest the log with --data",
+            f"of {ran} was found in it: set where the run begins with [log.span] start = SECONDS "
+            "in grounded.toml (after the log's first sample), or ingest the log with --data",
             NextCommand("ingest", (str(path), "--data")),
         )
 
