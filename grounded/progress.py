@@ -29,38 +29,42 @@ def interruptible(so_far: Callable[[], str]) -> Iterator[None]:
 
 @dataclass
 class Stages:
-    """Reports each stage with the time taken and the time that is left, from the number of calls.
+    """Reports each stage with the time taken, and the most time that may be left.
 
-    The number of calls is known within wide limits only: it grows with the data, and whether a
-    diagnosis looks for one more effect depends on what the last one left. So only the most time
-    that may be left is told, and none after more calls than most computations take.
+    How many stages follow is not known: whether a diagnosis looks for one more effect depends on
+    what the last one left. But a stage begins when at least a known share of the whole is done. So
+    the most time that may be left is told, once `SEEN` of the whole is surely done.
 
     Args:
         tell: shows a line; None for no output.
-        most: the number of calls that few computations of this kind exceed.
+        done: the least share of the whole that is done when a stage begins for the k-th time.
     """
 
     tell: Callable[[str], None] | None
-    most: int
+    done: Callable[[str, int], float]
     began: float = field(default_factory=time.monotonic)
-    count: int = 0
     so_far: str = "nothing was found yet"  # the result so far, for Ctrl-C
     beside: str = ""  # what all further stages are for
+    begun: dict[str, int] = field(default_factory=dict)  # how often each stage began
+    last: str = ""  # the stage of the last call
+    end: float | None = None  # the latest end that was told, seconds after the start
 
-    def __call__(self, stage: str) -> None:
-        """Report that a stage begins or continues."""
-        self.count += 1
+    def __call__(self, stage: str, part: str = "") -> None:
+        """Report that a stage, or a part of it (`, round 2 of at most 8`), begins or continues."""
+        taken = time.monotonic() - self.began
+        if stage + part != self.last:
+            self.begun[stage], self.last = self.begun.get(stage, 0) + 1, stage + part
+            share = self.done(stage, self.begun[stage])
+            self.end = taken / share if share >= SEEN else self.end
         if self.tell is None:
             return
-        taken = time.monotonic() - self.began
-        text = f"{stage}{f' ({self.beside})' * bool(self.beside)}, {duration(taken)} so far"
-        if SEEN < self.count <= self.most:  # beyond, nothing is known of what is left
-            left = _round(taken * (self.most / self.count - 1))
-            text += f", up to about {duration(left).replace('.0 ', ' ')} left" * (left > 0)
+        text = f"{stage}{part}{f' ({self.beside})' * bool(self.beside)}, {duration(taken)} so far"
+        if self.end is not None and (left := _round(self.end - taken)) > 0:
+            text += f", up to about {duration(left).replace('.0 ', ' ')} left"
         self.tell(text)
 
 
-SEEN = 10  # calls from which on the time left is told
+SEEN = 0.05
 
 
 def _round(seconds: float) -> float:

@@ -142,7 +142,7 @@ def diagnose(
         )
     if not isinstance(options, DiagnosisOptions | None):
         raise GroundedError(f"options must be DiagnosisOptions(...), got a {type_of(options)}")
-    options, tick = options or DiagnosisOptions(), Stages(progress, MOST)
+    options, tick = options or DiagnosisOptions(), Stages(progress, _done)
     model = subject.model if isinstance(subject, Task) else subject
     if model.n + model.m > MOST_NAMES:
         raise GroundedError(
@@ -274,4 +274,14 @@ def _again(effect: Effect, known: float, data: Data) -> Effect:
 
 
 MOST_NAMES = 50  # 36 states and 12 inputs already give 1,649 effects, each of which is filtered
-MOST = 2000  # progress ticks, more than diagnoses take: their later ones last longer
+# The least share of a diagnosis that was done when it scanned for the k-th time or reached a stage,
+# in nine blind cases of four systems (7 s in the mean).
+SCANS = (0.05, 0.10, 0.19, 0.29, 0.35, 0.43, 0.50)
+REACHED = {"more effects": 0.35, "predict": 0.76, "leftover": 0.83, "gap": 0.87, "utility": 0.96}
+
+
+def _done(stage: str, time: int) -> float:
+    """Return the least share of a diagnosis that is done when a stage begins for the k-th time."""
+    if stage == "scan":
+        return SCANS[min(time, len(SCANS)) - 1]
+    return REACHED.get(stage, 0.0)

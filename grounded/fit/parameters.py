@@ -17,7 +17,7 @@ from grounded.estimate import Measurement, NoiseStd, Record, of_states
 from grounded.estimate.record import part, records_of
 from grounded.fit.prediction import PredictionError, prediction_error
 from grounded.fit.result import Fit, least_known, report
-from grounded.fit.search import SearchEnd, data_of, first_search, search_parameters
+from grounded.fit.search import ROUNDS, SearchEnd, data_of, first_search, search_parameters
 from grounded.fit.unknowns import Latency, Unknowns, unknowns_of
 from grounded.frozen import Array
 from grounded.model import Model
@@ -98,7 +98,7 @@ def fit(
     if max(r.steps for r in records) < 3:
         raise GroundedError("a fit needs a trial of at least 3 steps")
     rng = np.random.default_rng(0) if rng is None else rng
-    held, tick = unknowns, Stages(progress, MOST)
+    held, tick = unknowns, Stages(progress, _done)
     with interruptible(lambda: tick.so_far), running(engine):
         while True:
             found = _fitted(model, records, measurement, unknowns, hold_out, horizon_s, rng, tick)
@@ -116,7 +116,14 @@ def _of(found: Fit, model: Model) -> Fit:
     return replace(found, model=model.with_values(values))
 
 
-MOST = 50  # rounds and scans of a fit that few exceed
+CLIMBS = 0.8  # share of a fit that its rounds take
+
+
+def _done(stage: str, time: int) -> float:
+    """Return the least share of a fit that is done when a stage begins for the k-th time."""
+    return CLIMBS * min(time - 1, ROUNDS) / ROUNDS if stage.startswith("fit") else 0.0
+
+
 MOST_STATES = 50  # with twice as many, 200 steps take minutes
 
 

@@ -92,7 +92,7 @@ def search_parameters(
         at = _delays(data, at)
     status = "still rising"
     for round_ in range(ROUNDS):
-        _tell(tick, data, at)
+        _tell(tick, data, at, f", round {round_ + 1} of at most {ROUNDS}")
         before = at.loglik
         slopes = linear(data, at)
         still = quiet(data, slopes) | thresholds
@@ -119,12 +119,12 @@ def search_parameters(
     return SearchEnd(data, found, noise, start_noise, thresholds, status)
 
 
-def _tell(tick: Stages, data: FitData, at: Point) -> None:
+def _tell(tick: Stages, data: FitData, at: Point, part: str) -> None:
     """Report that a round begins, and set the text for an interruption."""
     values = zip(data.unknowns.names, at.theta, data.unknowns.units, strict=True)
     told = ", ".join(f"{name} = {value:.5g} {unit}" for name, value, unit in values)
     tick.so_far = f"so far, not converged yet: {told}"
-    tick(f"fit, {at.count} samples")
+    tick(f"fit, {at.count} samples", part)
 
 
 def _stopped(at: Point) -> Climb:

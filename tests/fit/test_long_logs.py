@@ -65,38 +65,35 @@ def test_a_threshold_is_worth_the_same_on_the_records_it_acts_on(trials):
     assert replace(data, records=data.records[:1]).batch(at.theta).count < at.count
 
 
-def clocked(monkeypatch, most, calls, exponent):
-    """What is told at each call, and the time that was left then [s]."""
+def clocked(monkeypatch, stages):
+    """What is told at each (stage, time) by `Stages` that know the least share done."""
     clock, told = [0.0], []
     monkeypatch.setattr("grounded.progress.time.monotonic", lambda: clock[0])
-    stages = Stages(told.append, most=most, began=0.0)
-    times = [240 * (k / calls) ** exponent for k in range(1, calls + 1)]
-    for clock[0] in times:
-        stages("refine")
-    return told, [times[-1] - at for at in times]
+    tell = Stages(told.append, lambda stage, k: {"scan": (0.01, 0.1, 0.3)[k - 1]}.get(stage, 0.0))
+    tell.began = 0.0
+    for name, clock[0] in stages:
+        tell(name)
+    return told
 
 
-@pytest.mark.parametrize("calls", [60, 200, 390])
-@pytest.mark.parametrize("exponent", [0.9, 1.0, 1.1])
-def test_no_more_time_is_left_than_is_told(monkeypatch, calls, exponent):
-    """A diagnosis had `at most 45 s left`, and took three minutes more. `8 s to 8 min` is none."""
-    told, left = clocked(monkeypatch, 400, calls, exponent)
-    inside = []
-    for text, true in zip(told, left, strict=True):
-        ends = [float(n) * {"s": 1, "min": 60}[u] for n, u in re.findall(r"([\d.]+) (s|min)", text)]
-        assert text.startswith("refine, ") and "at most" not in text
-        if text.endswith("left"):
-            assert " up to about " in text and len(ends) == 2
-            inside.append(true <= ends[1] * 1.3 + 30)  # whole minutes
-    assert len(inside) == len(told) - 10 and sum(inside) > 0.9 * len(inside)
+def test_the_most_time_that_may_be_left_follows_from_the_least_share_done(monkeypatch):
+    """`up to about 9 min left`, 8 s before the end; and 45 s, three minutes before it."""
+    run = [("scan", 2), ("refine", 4), ("scan", 10), ("refine", 20), ("scan", 24), ("refine", 79)]
+    told = clocked(monkeypatch, [*run, ("refine", 90)])
+    assert told[0] == "scan, 2 s so far" and "left" not in told[1]
+    assert told[2] == "scan, 10 s so far, up to about 90 s left"
+    assert told[3].endswith("up to about 80 s left")
+    assert told[4].endswith("up to about 60 s left")  # 24 / 0.3 - 24
+    assert told[5].endswith("up to about 1 s left")
+    assert told[6] == "refine, 90 s so far"  # it took longer: nothing is known
 
 
-def test_of_what_takes_more_calls_than_most_no_end_is_told(monkeypatch):
-    """`up to about 10 s left`, and then 4 minutes `longer than usual`."""
-    told, _ = clocked(monkeypatch, 20, 30, 1.3)
-    assert not any("left" in text for text in told[:10]) and "left" in told[12]
-    assert not any("left" in text for text in told[20:])
-    assert told[-1] == "refine, 4.0 min so far"
+def test_a_part_of_a_stage_counts_as_another_one():
+    told = []
+    stages = Stages(told.append, lambda stage, k: 0.2 * (k - 1))
+    for k in (1, 1, 2):
+        stages("fit", f", round {k} of at most 8")
+    assert stages.begun == {"fit": 2} and told[-1].startswith("fit, round 2 of at most 8, 0 s")
 
 
 @pytest.mark.parametrize("after", [3, 25])
