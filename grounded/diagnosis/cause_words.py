@@ -279,13 +279,20 @@ def clauses(
     return tuple(found)
 
 
+ORDER = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth")
+
+
 def with_worth(clause: str, credit: Sequence[Credit]) -> str:
     """Append to a clause on one or more causes how much larger errors are without them."""
-    times = math.prod(one.times for one in credit)
-    if math.isnan(times):  # a document of an older version
+    if any(math.isnan(one.times) for one in credit):  # a document of an older version
         return clause
-    these = "these" if len(credit) > 1 else "this"
-    return f"{clause} (without {these}, errors are {as_large(times)})"
+    sizes = [as_large(one.times) for one in credit]
+    if len(sizes) == 1:
+        return f"{clause} (without this, errors are {sizes[0]})"
+    if len({*sizes}) == 1:
+        return f"{clause} (without one of these, errors are {sizes[0]})"
+    each = [f"{size} without the {nth}" for nth, size in zip(ORDER, sizes, strict=False)]
+    return f"{clause} (errors are {listed(each)})"
 
 
 def as_large(times: float) -> str:

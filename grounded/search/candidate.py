@@ -104,8 +104,14 @@ class Candidate(Result):
 
         If the model's utility of the base differs clearly from the real one, this is the gain
         within the model, unless that would exceed the largest possible gain (no utility is above
-        0).
+        0). It is never more than what of the best one's cost is not sensor noise, of which a plan
+        that replays single runs seems to remove some.
         """
+        gain, noise = self._gain_over(best), best.noise_cost
+        return min(gain, -best.utility - noise) if 0 < noise < -best.utility else gain
+
+    def _gain_over(self, best: Tried) -> float:
+        """Return the predicted gain over the best so far, noise included."""
         own = best.candidate.id == self.base and self.predicted_gain <= -best.utility
         if own and self.unlike(best.utility):
             return self.predicted_gain
@@ -115,7 +121,7 @@ class Candidate(Result):
         """Return a sentence that says why a `doubtful` candidate may lose."""
         gain = self.predicted_gain if best is None else self.promised_over(best)
         over = self.base if best is None else best.candidate.id
-        if best is not None and self.promised_over(best) != self.predicted_utility - best.utility:
+        if best is not None and self._gain_over(best) != self.predicted_utility - best.utility:
             over = f"the {self.expected_of_base:.4g} that the model predicts for {over} itself"
         cost = self.predicted_gain - self.predicted_utility  # of its base
         off = f"{self.likely_off:.3g}"  # beyond the base's whole cost the size means nothing

@@ -259,7 +259,7 @@ def _start_unknown(before: Tried, after: Tried, history: Sequence[Tried]) -> boo
 
 def _of_start(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
     """Return the model's part of a gain that is due to the start; 0 if alike, NaN if unknown."""
-    if not (before.trials and after.trials and _began_apart(before, after)):
+    if not (before.trials and after.trials and began_apart(before, after)):
         return 0.0
 
     def worth(one: Tried) -> float:
@@ -275,7 +275,7 @@ def _of_start(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
     return worth(before) - worth(after)
 
 
-def _began_apart(one: Tried, other: Tried) -> bool:
+def began_apart(one: Tried, other: Tried) -> bool:
     """Return whether the trials of two candidates began apart.
 
     That is by more than the sensors' noise, and more than the scatter of where repeats begin, which

@@ -161,7 +161,9 @@ def noise_missed(task: Task, made: Candidate, noise: Array) -> float:
         noise: standard deviations of the sensors' white noise, (n,), in the states' units.
     """
     shown = white_noise(made.predicted_states) if made.grounded else np.zeros_like(noise)
-    return noise_cost(task, made.policy, np.sqrt(np.maximum(noise**2 - shown**2, 0.0)))
+    least = noise_cost(task, made.policy, noise) + made.predicted_utility
+    missed = noise_cost(task, made.policy, np.sqrt(np.maximum(noise**2 - shown**2, 0.0)))
+    return max(missed, least)
 
 
 class Repeats:

@@ -50,7 +50,8 @@ def test_the_friction_of_all_joints_is_told_together():
     friction = next(text for text in found if "dry friction" in text)
     assert friction.startswith("the input t1 loses 0.3 N m to dry friction and 0.2 N m s/rad")
     assert friction.endswith(
-        ", the input t2 0.1 N m and 0.05 N m s/rad (without these, errors are 74 % larger)"
+        ", the input t2 0.1 N m and 0.05 N m s/rad (errors are 52 % larger without the first and "
+        "15 % larger without the second)"
     )
     assert "12 % weaker" in found[2]  # a percentage with its direction stands alone
 

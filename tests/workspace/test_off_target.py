@@ -218,17 +218,20 @@ def test_a_better_candidate_that_is_farther_off_says_what_it_gained_by():
     here = task(state=np.array([1.0, 1.0, 0.0, 0.0]))
     rough = np.tile([[1.0, 0.0], [0.0, 1.0]], (H // 2, 1))
 
-    def tried(name, off, inputs):
+    def tried(name, off, inputs, start=0.0):
         states = np.zeros((H + 1, 4))
-        states[:, 0] = off
+        states[1:, 0], states[0, 1] = off, start
         trial = Trial(states, inputs, DT, ROVER.state_names, ROVER.input_names)
         utility = here.utility(trial)
-        return SimpleNamespace(candidate=SimpleNamespace(id=name), trials=(trial,), utility=utility)
+        made = SimpleNamespace(id=name, predicted_states=np.zeros((H + 1, 4)))
+        return SimpleNamespace(candidate=made, trials=(trial,), utility=utility)
 
     before, best = tried("c0001", 0.01, rough), tried("c0002", 0.02, 0 * rough)
     assert best.utility > before.utility
     assert holds(traded(here, best, before), "c0002", "c0001", "inputs cost less", "20 mm")
     assert traded(here, tried("c0003", 0.01, 0 * rough), before) == ""
+    # 3.3 mm and 4.5 mm, after a start 10 mm beside the path: the plan was no worse
+    assert traded(here, tried("c0002", 0.02, 0 * rough, start=0.03), before) == ""
 
 
 def test_a_better_candidate_that_is_farther_off_names_the_state_that_came_nearer():
@@ -237,9 +240,9 @@ def test_a_better_candidate_that_is_farther_off_names_the_state_that_came_nearer
 
     def tried(name, off, psi, end):
         states = np.zeros((H + 1, 4))
-        states[:, 0], states[:-1, 2], states[-1, 2] = off, psi, end
+        states[1:, 0], states[1:-1, 2], states[-1, 2] = off, psi, end
         own = run(states)
-        candidate = SimpleNamespace(id=name)
+        candidate = SimpleNamespace(id=name, predicted_states=np.zeros((H + 1, 4)))
         return SimpleNamespace(candidate=candidate, trials=(own,), utility=here.utility(own))
 
     ends = traded(here, tried("c0002", 0.02, 0.1, 0.11), tried("c0001", 0.01, 0.1, 0.23))

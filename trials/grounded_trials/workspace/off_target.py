@@ -16,6 +16,7 @@ import numpy as np
 from grounded.frozen import Array, white_noise
 from grounded.model import Model
 from grounded.result import Document, measured_alike, or_zero
+from grounded.search.certainty import began_apart
 from grounded.search.scatter import beyond_noise
 from grounded.task import Task
 from grounded.trial import Trial
@@ -206,8 +207,10 @@ def traded(task: Task, best: Tried, before: Tried) -> str:
     """Return why a better candidate is farther from its target than the one before; else "".
 
     Utility also counts inputs and other states. On a path that is followed to a centimetre they may
-    be all that is left to gain.
+    be all that is left to gain. Runs that began apart are farther off for that reason alone.
     """
+    if began_apart(before, best):
+        return ""
     pair = [off_target_of(task, tried.trials)[:1] for tried in (before, best)]
     if not all(pair) or pair[0][0].what != pair[1][0].what:
         return ""
