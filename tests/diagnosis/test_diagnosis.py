@@ -17,7 +17,7 @@ from grounded.diagnosis.hypotheses.leftover import whiteness
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.report import Estimate, Ranked
 from grounded.diagnosis.ruler_words import rest
-from grounded.diagnosis.validation.blame import Blame, loss
+from grounded.diagnosis.validation.blame import ENOUGH, Blame, fewest, loss, still
 from grounded.diagnosis.validation.claims import has_size
 from grounded.diagnosis.validation.prediction_error import _stump
 from grounded.diagnosis.verdict import MOST_EFFECTS, _moved, sentence, verdict
@@ -176,6 +176,17 @@ def test_parameters_that_are_off_are_named_most_important_first():
     same = {group[0]: group[1:] for group in found.indistinguishable}
     assert "input_gain:u" in same.get("parameter:k", ()), found.sentence
     assert "viscous_friction:v" in same.get("parameter:tau", ()), found.sentence
+
+
+def test_a_parameter_that_did_not_move_is_not_blamed_for_those_that_did():
+    """A motor's gain was right to 0.2 %, and blamed: mass and inertia were 12 % and 14 % off."""
+    ratios = np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])  # K, m, I: K / m and K / I are known
+    H, b = 30 * ratios.T @ ratios + np.eye(3), np.array([-0.02, 1.2, 1.4])
+    free, left = fewest(H, b, range(3))
+    assert free == [0] and left < ENOUGH and still(b, free) == [0]
+    free, left = fewest(H, b, [1, 2])
+    assert {*free} == {1, 2} and left < ENOUGH and still(b, free) == []
+    assert still(np.array([0.2, 1.2]), [0]) == []
 
 
 def test_of_two_parameters_that_are_one_only_one_is_blamed():

@@ -14,6 +14,7 @@ constant), not both are blamed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +28,7 @@ from grounded.diagnosis.validation.ruler import Ruler
 from grounded.frozen import Array
 
 ENOUGH = 3.0  # nats that the parameters not named may still gain
+STILL = 0.1  # of the largest shift of those: one that is named moves at least by that, in priors
 
 
 @dataclass(frozen=True)
@@ -65,17 +67,18 @@ def moved_parameters(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> tup
     H = G[k:, k:] - across @ np.linalg.pinv(G[:k, :k], hermitian=True) @ across.T
     H = H + np.diag(fit.prior[k:])
     b = h.shift[which] / param_scale(data.model)[which]
-    free: list[int] = []
-    now = loss(H, b, free)
-    while len(free) < len(b) and (now > ENOUGH or not free):
-        losses = {i: loss(H, b, [*free, i]) for i in range(len(b)) if i not in free}
-        i = min(losses, key=lambda j: losses[j])
-        free, now = [*free, i], losses[i]
+    free, now = fewest(H, b, range(len(b)))
+    held = still(b, free)
+    if held:
+        fewer, then = fewest(H, b, [i for i in range(len(b)) if i not in held])
+        free, now, held = (fewer, then, held) if then <= ENOUGH else (free, now, [])
     nats = {i: loss(H, b, [j for j in free if j != i]) - now for i in free}
     if ruler.held_out:
         least = SLIGHT * ruler.since_outset(fit)
-        gains = {i: ruler.gain(unmoved(data, fit, k + i), fit).mean for i in free}
         rest = fit
+        for i in held:
+            rest = unmoved(data, rest, k + i)
+        gains = {i: ruler.gain(unmoved(data, rest, k + i), fit).mean for i in free}
         for i in sorted(free, key=lambda i: gains[i])[:-1]:
             less = unmoved(data, rest, k + i)  # beside those left out already, which may hide it
             if gains[i] < least and ruler.gain(less, fit).mean < least:
@@ -84,6 +87,23 @@ def moved_parameters(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> tup
     whole = max(search.score(fit) - search.score(search.exact_null()), 0.0)
     worth = {i: min(search.tempering.factor * nats[i], whole) for i in free}
     return tuple(Blame(int(which[i]), worth[i]) for i in sorted(free, key=lambda i: -nats[i]))
+
+
+def fewest(H: Array, b: Array, allowed: Sequence[int]) -> tuple[list[int], float]:
+    """Select as few of the allowed shifts as possible; return them and what the others lose."""
+    free: list[int] = []
+    now = loss(H, b, free)
+    while len(free) < len(allowed) and (now > ENOUGH or not free):
+        losses = {i: loss(H, b, [*free, i]) for i in allowed if i not in free}
+        i = min(losses, key=lambda j: losses[j])
+        free, now = [*free, i], losses[i]
+    return free, now
+
+
+def still(b: Array, free: Sequence[int]) -> list[int]:
+    """Return the selected shifts that are small beside one that was not selected."""
+    most = max((abs(b[i]) for i in range(len(b)) if i not in free), default=0.0)
+    return [i for i in free if abs(b[i]) < STILL * most]
 
 
 def unmoved(data: Data, fit: Fitted, column: int) -> Fitted:
