@@ -68,7 +68,8 @@ def by_its_commands(workspace: Folder, path: Path, error: NoneWaits) -> Grounded
     if not error.best:
         return error
     try:
-        recognised(workspace, path, read_log_file(workspace, path, error.best, False), None)
+        read = read_log_file(workspace, path, error.best, False)
+        recognised(workspace, path, read, None, remedies=False)
     except OfEarlierTask as refused:
         return refused
     except GroundedError as refused:
@@ -76,10 +77,19 @@ def by_its_commands(workspace: Folder, path: Path, error: NoneWaits) -> Grounded
     return error
 
 
-def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None) -> Read:
+def recognised(
+    workspace: Folder, path: Path, read: Read, candidate: str | None, *, remedies: bool = True
+) -> Read:
     """Refuse a log whose commands are not its candidate's; only warn if the user named a candidate.
 
     A foreign log without a [log.span] may begin before the run: it is cut where the run begins.
+
+    Args:
+        workspace: the workspace with the candidates.
+        path: the log, for messages.
+        read: what it contains.
+        candidate: the candidate that the user named, if any.
+        remedies: find out why it seems to be nobody's run, which takes a minute for a long log.
 
     Raises:
         GroundedError: if it is not a run of its candidate, with what it is instead if known.
@@ -122,6 +132,9 @@ def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None)
         if fell:
             read = cut_short(read, fell.steps, fell.told)
         return replace(read, warnings=(*read.warnings, *told))
+    if not remedies and why and not (other or fell):
+        _refuse_earlier(workspace, path, log, whole)
+        raise GroundedError(why, NextCommand("ingest", (str(path), "--data")))
     passed = exactly_misused(log, task, own) if log and why and not other else ""
     if passed and candidate is None:
         raise _misused(path, own, passed)
@@ -166,13 +179,8 @@ def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None)
             f"diagnosis, or with --candidate {ran} anyway",
             NextCommand("ingest", (str(path), "--data")),
         )
-    if not other and (left := of_earlier_task(workspace, log, whole)):
-        raise OfEarlierTask(
-            f"{path} ran {left}, which was made for an earlier task (other target, reward, limits, "
-            "start or horizon): its utility can't be compared. Ingest it with --data for fitting "
-            "and diagnosis, and run a candidate of this task",
-            NextCommand("ingest", (str(path), "--data")),
-        )
+    if not other:
+        _refuse_earlier(workspace, path, log, whole)
     known = replace(read.trial, id="").until(read.trial.known_steps)
     odd = []
     if not seen.silent:  # without them the model can't tell what moves the robot
@@ -207,17 +215,30 @@ def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None)
     )
 
 
+def _refuse_earlier(workspace: Folder, path: Path, log: Recording | None, trial: Trial) -> None:
+    """Raise OfEarlierTask if a log is the run of a candidate of an earlier task."""
+    if left := of_earlier_task(workspace, log, trial):
+        raise OfEarlierTask(
+            f"{path} ran {left}, which was made for an earlier task (other target, reward, limits, "
+            "start or horizon): its utility can't be compared. Ingest it with --data for fitting "
+            "and diagnosis, and run a candidate of this task",
+            NextCommand("ingest", (str(path), "--data")),
+        )
+
+
 def _refuse_any_start(path: Path, ran: str, log: Recording, task: Task) -> None:
     """Refuse a log that is longer than a run, if nothing tells which part of it is the run.
 
     Of a robot that balanced until its run began, and fell at once, the quiet part was judged.
     """
     lasts, run = _lasting_s(log), task.horizon * task.dt
+    moved = log.changes[log.changes > log.first]
+    first = f" (its commands first change at {moved.min():.3f} s)" if len(moved) else ""
     if lasts * WHOLE > run:
         raise GroundedError(
             f"{path} lasts {lasts:.3g} s from its first command, a run {run:.3g} s, and no start "
             f"of {ran} was found in it: set where the run begins with [log.span] start = SECONDS "
-            "in grounded.toml (after the log's first sample), or ingest the log with --data",
+            f"in grounded.toml, after the log's first sample{first}, or ingest the log with --data",
             NextCommand("ingest", (str(path), "--data")),
         )
 

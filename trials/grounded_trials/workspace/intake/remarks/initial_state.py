@@ -26,6 +26,7 @@ from grounded_trials.workspace.folder import Folder
 FAR = 0.1
 SURE = 3.0  # the start must also be off by this many std of sensor noise and of earlier starts
 MUCH = 1.0  # share of a mean step's cost from which earlier starts that scatter are no excuse
+WORSE = 10.0  # times the promised cost: beside a worse run every offset would seem small
 SPOILT = 0.2  # share of the run's cost by which the start changes it too much
 FEWEST = 2  # smallest number of earlier runs from which the scatter of starts is estimated
 
@@ -47,7 +48,8 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     """Return in which states a run did not start at s_0, beyond sensor noise; None if in none.
 
     A state that [reward] weighs along the way is judged by the cost of its offset relative to a
-    mean step of the run, the most costly first; another state relative to its range in the run.
+    mean step of the run (of one much worse than promised, WORSE times a promised step), the most
+    costly first; another state relative to its range in the run.
     Offsets within the scatter of earlier starts are unavoidable, and tolerated unless they spoil
     the utility by the model: by much of it, or by more than the run lost to the best candidate. A
     change below the scatter of single runs spoils nothing. Of a run that left [safety], only the
@@ -71,6 +73,8 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     known = -task.rewards(trial)[: len(states)]
     known = known[np.isfinite(known)]
     usually = known.sum() / max(len(known), 1)
+    promised = -_promised(workspace, trial) / max(task.horizon, 1)
+    usually = min(usually, WORSE * promised) if promised > 0 else usually
     weight = task.reward.state
     with np.errstate(all="ignore"):
         share = np.where(weight > 0, weight * off**2 / usually, np.abs(off) / usual)
