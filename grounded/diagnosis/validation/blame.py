@@ -28,7 +28,7 @@ from grounded.diagnosis.validation.ruler import Ruler
 from grounded.frozen import Array
 
 ENOUGH = 3.0  # nats that the parameters not named may still gain
-STILL = 0.1  # of the largest shift of those: one that is named moves at least by that, in priors
+STILL, MOVED = 1.0, 2.0  # standard deviations within which a shift is none; from which it is one
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def moved_parameters(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> tup
     H = H + np.diag(fit.prior[k:])
     b = h.shift[which] / param_scale(data.model)[which]
     free, now = fewest(H, b, range(len(b)))
-    held = still(b, free)
+    held = still(H, b, free)
     if held:
         fewer, then = fewest(H, b, [i for i in range(len(b)) if i not in held])
         free, now, held = (fewer, then, held) if then <= ENOUGH else (free, now, [])
@@ -100,10 +100,11 @@ def fewest(H: Array, b: Array, allowed: Sequence[int]) -> tuple[list[int], float
     return free, now
 
 
-def still(b: Array, free: Sequence[int]) -> list[int]:
-    """Return the selected shifts that are small beside one that was not selected."""
-    most = max((abs(b[i]) for i in range(len(b)) if i not in free), default=0.0)
-    return [i for i in free if abs(b[i]) < STILL * most]
+def still(H: Array, b: Array, free: Sequence[int]) -> list[int]:
+    """Return the selected shifts that may be none, if one that was not selected clearly is one."""
+    sizes = np.abs(b) / np.sqrt(np.diag(np.linalg.pinv(H, hermitian=True)) + 1e-300)
+    most = max((sizes[i] for i in range(len(b)) if i not in free), default=0.0)
+    return [i for i in free if sizes[i] < STILL] if most > MOVED else []
 
 
 def unmoved(data: Data, fit: Fitted, column: int) -> Fitted:
