@@ -68,10 +68,13 @@ def moved_parameters(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> tup
     H = H + np.diag(fit.prior[k:])
     b = h.shift[which] / param_scale(data.model)[which]
     free, now = fewest(H, b, range(len(b)))
-    held = still(H, b, free)
-    if held:
+    held = still(H, b, free)  # at nominal; the others do their work
+    while held:
         fewer, then = fewest(H, b, [i for i in range(len(b)) if i not in held])
-        free, now, held = (fewer, then, held) if then <= ENOUGH else (free, now, [])
+        if then <= ENOUGH:
+            free, now = fewer, then
+            break
+        held = held[1:]
     nats = {i: loss(H, b, [j for j in free if j != i]) - now for i in free}
     if ruler.held_out:
         least = SLIGHT * ruler.since_outset(fit)
@@ -101,10 +104,10 @@ def fewest(H: Array, b: Array, allowed: Sequence[int]) -> tuple[list[int], float
 
 
 def still(H: Array, b: Array, free: Sequence[int]) -> list[int]:
-    """Return the selected shifts that may be none, if one that was not selected clearly is one."""
+    """Return the selected shifts that may be none, the smallest last, if another one clearly is."""
     sizes = np.abs(b) / np.sqrt(np.diag(np.linalg.pinv(H, hermitian=True)) + 1e-300)
-    most = max((sizes[i] for i in range(len(b)) if i not in free), default=0.0)
-    return [i for i in free if sizes[i] < STILL] if most > MOVED else []
+    none = [i for i in sorted(free, key=lambda i: -sizes[i]) if sizes[i] < STILL]
+    return none if sizes.max(initial=0.0) > MOVED else []
 
 
 def unmoved(data: Data, fit: Fitted, column: int) -> Fitted:
