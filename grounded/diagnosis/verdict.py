@@ -154,7 +154,9 @@ def verdict(
                 f" {left}; adopt these effects and diagnose again."
             )
         else:
-            words.append(f"A gap remains: {left}; no more than {most} effects were looked for.")
+            words.append(
+                f"A gap remains: {left}; no more than {most} effect{'s were' * (most > 1) or ' was'} looked for."
+            )
     elif remainder:
         words.append(unexplained)
     elif above := rest(rows):
@@ -408,7 +410,8 @@ def _others(claims: Claims, identified: Sequence[Identifiable], adopted: Collect
     one = len(old) == 1
     much = ""
     if len(by) == len(old):
-        much = f" by {'' if one else 'at most '}{percent(max(map(abs, by.values())))}"
+        most = percent(max(map(abs, by.values())))
+        much = f" by {'' if one or most.startswith('<') else 'at most '}{most}"
     are = "is" if one else "are"
     names = listed(value_called(name, adopted) for name in old)
     return f"; {names} {are} adjusted with {it}{much}, but need not be wrong"

@@ -301,7 +301,7 @@ def _probe(
         if not worth:
             return "", f"{said.rstrip('.')}.{' No probe is written.' * write}"
         if not offer:
-            return "", f"{said} (`{rendered(PROBE)}` makes the candidate)"
+            return "", f"{said.rstrip('.')} (`{rendered(PROBE)}` makes the candidate)."
         candidate = _candidate_of(workspace, planner.narrowed(made.policy), best.candidate.id)
         reasons = (*outside_limits(task, candidate.policy), *objections(task, candidate, strays))
         if not reasons:
