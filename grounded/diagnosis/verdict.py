@@ -154,9 +154,8 @@ def verdict(
                 f" {left}; adopt these effects and diagnose again."
             )
         else:
-            words.append(
-                f"A gap remains: {left}; no more than {most} effect{'s were' * (most > 1) or ' was'} looked for."
-            )
+            looked = "effects were" if most > 1 else "effect was"
+            words.append(f"A gap remains: {left}; no more than {most} {looked} looked for.")
     elif remainder:
         words.append(unexplained)
     elif above := rest(rows):
@@ -410,8 +409,8 @@ def _others(claims: Claims, identified: Sequence[Identifiable], adopted: Collect
     one = len(old) == 1
     much = ""
     if len(by) == len(old):
-        most = percent(max(map(abs, by.values())))
-        much = f" by {'' if one or most.startswith('<') else 'at most '}{most}"
+        size = percent(max(map(abs, by.values())))
+        much = f" by {'' if one or size.startswith('<') else 'at most '}{size}"
     are = "is" if one else "are"
     names = listed(value_called(name, adopted) for name in old)
     return f"; {names} {are} adjusted with {it}{much}, but need not be wrong"
