@@ -38,7 +38,7 @@ SIMULATED_S = 1.0  # header stamps further from the log's clock are simulation t
 _YAW = ("@rpy.yaw", "yaw", "heading", "theta", "psi")
 _TURN = ("@rpy.pitch", "@rpy.yaw", "theta", "angle", "pitch", "tilt", "lean")
 _MEANINGS: dict[str, tuple[str, ...]] = {
-    "x": ("position.x", "translation.x", "x", "north", "northing", "east", "easting", "x0"),
+    "x": ("position.x", "translation.x", "x", "north", "northing", "east", "easting", "x0", "pos"),
     "y": ("position.y", "translation.y", "y", "east", "easting", "north", "northing", "y0"),
     "z": ("position.z", "translation.z", "z", "altitude", "height"),
     "psi": _YAW,
