@@ -162,6 +162,8 @@ def propose_in(workspace: Folder) -> Proposed:
     noise = sensor_noise(workspace.task_trials(), workspace.base_model.n)
     cost = noise_missed(workspace.task, candidate, noise)
     off_target = off_target_of(workspace.task, [candidate.predicted_run])
+    if not candidate.grounded:  # a run that no sensor measured
+        off_target = tuple(replace(one, noise=0.0) for one in off_target)
     return Proposed(proposal, path, then, cost, off_target, lacks)
 
 

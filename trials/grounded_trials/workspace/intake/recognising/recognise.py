@@ -194,12 +194,14 @@ def recognised(
         raise GroundedError(f"{path} can't be read as a run of {ran}: {'; '.join(named)}", again)
     if log and not other and whole.inputs.any() and (how := misused_in(log, task, own)):
         raise _misused(path, own, how)
-    said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
-    if guessed := sorted(_guessed(log)):
-        said += (
-            f" Or {listed(guessed)}, which [estimate] finds here, {_is(guessed)} not what "
-            "its program used: make it log its own estimate, and map that in [log] too."
+    if guessed := sorted(_guessed(log)):  # the likeliest reason
+        differs, _, looks = why.partition("; ")
+        why = (
+            f"{differs}. Perhaps {listed(guessed)}, which [estimate] finds here, {_is(guessed)} "
+            "not what its program used: let it log its own, and map that in [log] too"
+            f"{'. Or ' * bool(looks)}{looks}"
         )
+    said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
     said += read.hole + (_lasting(log, task) if log else "")
     if other:
         raise GroundedError(
