@@ -36,6 +36,7 @@ from grounded_trials.workspace.intake.locating.run_start import Recording, Start
 from grounded_trials.workspace.intake.opening.reading import (
     NoneWaits,
     Read,
+    cut_log,
     cut_short,
     is_stored,
     misread,
@@ -157,11 +158,14 @@ def recognised(
         also = gone or misled(None if other else log, task, own)
         doubts = [seem if units else pace or also or why]
         if log and not (found and found.opens_alike):
-            if not (units or pace or also or other):
-                _refuse_any_start(path, ran, log, task)
+            read, assumed = _from_first_change(read, log, task)
+            run = task.horizon * task.dt
+            longer = f", though the log goes on for {_lasting_s(log) - run:.3g} s longer than a run"
             doubts.append(
-                f"no start of {ran} was found in it: the run is assumed to begin with the first "
-                f"command, at {log.first:.3f} s; set another with [log.span] start = SECONDS"
+                f"no start of {ran} was found in it: the run is assumed to begin where the "
+                f"commands first change, at {assumed:.3f} s"
+                f"{longer * (WHOLE * _lasting_s(log) > run)}; set another with [log.span] start = "
+                "SECONDS"
             )
         return replace(read, warnings=(*read.warnings, *doubts), doubted=True)
     if units:
@@ -228,21 +232,18 @@ def _refuse_earlier(workspace: Folder, path: Path, log: Recording | None, trial:
         )
 
 
-def _refuse_any_start(path: Path, ran: str, log: Recording, task: Task) -> None:
-    """Refuse a log that is longer than a run, if nothing tells which part of it is the run.
+def _from_first_change(read: Read, log: Recording, task: Task) -> tuple[Read, float]:
+    """Cut a run of unknown start where the commands first change, if a whole run follows.
 
-    Of a robot that balanced until its run began, and fell at once, the quiet part was judged.
+    Returns:
+        The run, and where it begins, in seconds after the log's first sample.
     """
-    lasts, run = _lasting_s(log), task.horizon * task.dt
-    moved = log.changes[log.changes > log.first]
-    first = f" (its commands first change at {moved.min():.3f} s)" if len(moved) else ""
-    if lasts * WHOLE > run:
-        raise GroundedError(
-            f"{path} lasts {lasts:.3g} s from its first command, a run {run:.3g} s, and no start "
-            f"of {ran} was found in it: set where the run begins with [log.span] start = SECONDS "
-            f"in grounded.toml, after the log's first sample{first}, or ingest the log with --data",
-            NextCommand("ingest", (str(path), "--data")),
-        )
+    changes, run = log.changes[log.changes > log.first], task.horizon * task.dt
+    begins = float(changes.min(initial=np.inf))
+    late = begins - log.first
+    if read.log is None or not task.dt <= late <= _lasting_s(log) - WHOLE * run:
+        return read, log.first
+    return cut_log(read.log, read.trial.candidate, begins), begins
 
 
 def _in_programs_unit(model: Model, names: Sequence[str], by: float) -> bool:
