@@ -199,11 +199,11 @@ def recognised(
     if log and not other and whole.inputs.any() and (how := misused_in(log, task, own)):
         raise _misused(path, own, how)
     if guessed := sorted(_guessed(log)):  # the likeliest reason
-        differs, _, looks = why.partition("; ")
+        differs, _, rather = why.partition("; ")
         why = (
             f"{differs}. Perhaps {listed(guessed)}, which [estimate] finds here, {_is(guessed)} "
             "not what its program used: let it log its own, and map that in [log] too"
-            f"{'. Or ' * bool(looks)}{looks}"
+            f"{'. Or ' * bool(rather)}{rather}"
         )
     said = f"{path} did not run {ran}: {why}{'' if why.endswith('?') else '.'}"
     said += read.hole + (_lasting(log, task) if log else "")
