@@ -106,5 +106,6 @@ def test_a_run_is_known_by_the_speeds_that_its_program_made_itself(tmp_path, bef
 def test_who_is_refused_where_speeds_are_estimated_is_told_to_log_them(tmp_path):
     w = waiting(tmp_path, ONLY_POSITIONS)
     path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.8, noise=ROUGH)
-    with pytest.raises(GroundedError, match=r"Perhaps v, which \[estimate\] finds here, is not what"):
+    why = r"Perhaps v, which \[estimate\] finds here, is not what"
+    with pytest.raises(GroundedError, match=why):
         w.ingest(path)
