@@ -203,7 +203,8 @@ def _what(candidate: Candidate, standing: Standing, task: Task) -> str:
         by += ", with derivatives corrected step by step" * (candidate.way == BY_STEP)
         by += ", its gains as low as ran without oscillating" * (candidate.caution > 0)
         if candidate.of_original:
-            by += ", by the model without the adopted effects, which broke their promises"
+            by += ", by the model without the adopted effects, whose steps kept too little"
+            by += " of what they promised"
         return f"iteration {candidate.iteration}: {step} from {candidate.base}{by}, {seconds}"
     crashes = round(candidate.caution)  # crashes of earlier first policies
     gently = f", made gentler after {count(crashes, 'crash', 'crashes')}" * bool(crashes)

@@ -10,7 +10,8 @@ self-balancing robot whose adopted effects were right nearly fell by a step of t
 Nor is a promise broken by a loss that the scatter of repeats may explain, or by a run that ended
 early on its path, because somebody stopped it: the promises count as kept as far as two standard
 errors allow. The original model must also give the incumbent's own run about the utility that it
-had.
+had, and it must foretell the motion of the runs that broke the promises better than the adopted one
+does: losses by noise, or at an optimum, say nothing against effects that those runs confirm.
 """
 
 from __future__ import annotations
@@ -21,14 +22,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from grounded.frozen import Array
 from grounded.search.candidate import LITTLE, Tried
 from grounded.search.certainty import LUCK, error_between
 from grounded.search.making import FORETOLD, About
 from grounded.search.planner import Planner
 from grounded.search.step.step_size import BROKEN
+from grounded.solve.bias import residuals
 from grounded.task import Task
 from grounded.trial import Trial
 
+BLOCK = 10  # steps over which misses are summed
 ON_PATH = 2.0  # a run that ended early was on its path if it cost at most this times the best one
 
 
@@ -73,10 +77,41 @@ def keeping_promises(about: About) -> About:
     if not (much and adopted.broken and adopted.share < original.share):
         return about
     bare = Planner(planner.task, planner.task)
+    own = [t for t in history if _by_adopted(t, make.fingerprint)]
+    if confirmed(planner, bare, [trial for t in own for trial in t.trials]):
+        return about
     crude = replace(make, planner=bare.feeding_back(t.candidate.policy for t in history))
     original_one = About(crude, about.incumbent, about.options, about.way, original=True)
     off = abs(original_one.already - about.incumbent.utility)
     return original_one if off < FORETOLD * -about.incumbent.utility else about
+
+
+def confirmed(adopted: Planner, bare: Planner, trials: Sequence[Trial]) -> bool:
+    """Return whether the adopted effects tell the motion in these runs better than none do.
+
+    Both models are compared by what they miss, summed up over `BLOCK` steps, as far as noise of the
+    samples cancels in the sum; of each state, the difference counts as a share of both.
+    """
+
+    def missed(planner: Planner) -> Array:
+        found = np.zeros(planner.task.model.n)
+        for trial in trials:
+            if not trial.finite_steps:
+                continue
+            whole = planner.lift(trial.until(trial.finite_steps))
+            off = residuals(planner.plan, whole)[:, : len(found)]
+            blocks = np.add.reduceat(off, np.arange(0, len(off), BLOCK))
+            found += np.sum(np.square(blocks), axis=0)
+        return found
+
+    ours, theirs = missed(adopted), missed(bare)
+    both = ours + theirs
+    return bool(np.sum((theirs - ours)[both > 0] / both[both > 0]) > 0)
+
+
+def _by_adopted(tried: Tried, model: str) -> bool:
+    """Return whether a candidate's step is one of the adopted model."""
+    return tried.candidate.model == model and not tried.candidate.of_original
 
 
 def stopped_on_path(task: Task, tried: Tried, history: Sequence[Tried]) -> bool:
@@ -119,7 +154,7 @@ def promises(
         base = judged[made.base]
         error, known = error_between(base, tried, history)
         gained = promised, tried.utility - base.utility, error if known else 0.0
-        if made.model == model and not made.of_original:
+        if _by_adopted(tried, model):
             adopted = adopted.and_of(*gained)
         else:
             original = original.and_of(*gained)
