@@ -97,7 +97,7 @@ def speed_weights(model: Model, target: str) -> Mapping[str, float]:
 def speed(effect: Effect, values: Any) -> Any:
     """Return the speed that a loss depends on, given values by state, or their changes."""
     total: Any = 0.0
-    for name, weight in speed_weights(effect.site.model, "+".join(effect.site.targets)).items():
+    for name, weight in speed_weights(effect.site.model, effect.site.joined).items():
         total = total + (values[name] if weight == 1.0 else weight * values[name])
     return total
 
@@ -105,5 +105,5 @@ def speed(effect: Effect, values: Any) -> Any:
 def motion_of(effect: Effect) -> str:
     """Return the motion that an effect opposes: a state, or the whole target of a combination."""
     if len(effect.site.targets) > 1 and "<-" in effect.site.target:
-        return "+".join(effect.site.targets)
+        return effect.site.joined
     return effect.site.target.rpartition("<-")[2]

@@ -123,6 +123,11 @@ class Site:
         """The first target, for effects with a single one."""
         return self.targets[0]
 
+    @property
+    def joined(self) -> str:
+        """All targets, as an effect's name has them."""
+        return "+".join(self.targets)
+
     def unit(self, name: str) -> str:
         """Return the unit of a state or an input."""
         return self.model.states.get(name) or self.model.inputs.get(name) or "1"
@@ -316,7 +321,7 @@ class Effect:
     @property
     def name(self) -> str:
         """`family:target`."""
-        return f"{self.family.name}:{'+'.join(self.site.targets)}"
+        return f"{self.family.name}:{self.site.joined}"
 
     @property
     def free(self) -> tuple[Quantity, ...]:

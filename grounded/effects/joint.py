@@ -43,7 +43,7 @@ def _friction(site: Site) -> tuple[Quantity, ...]:
     tau, w = coupled(site)
     unit, most = site.unit(tau), _strongest(site)
     by = f"{unit} s/{site.unit(w).removesuffix('/s')}".removeprefix("1 ")
-    viscous = Quantity("b", by, low=0.0, fixed=has_viscous(site.model, "+".join(site.targets)))
+    viscous = Quantity("b", by, low=0.0, fixed=has_viscous(site.model, site.joined))
     return (Quantity("c", unit, low=0.0, high=most), viscous, width(site, w))
 
 

@@ -327,7 +327,7 @@ class Predictor(SentOnce):
         driving, at = [coupled(effect.site)[0] for effect, _ in pairs], self.loads(h, x, u)
         base = solved(pairs, at, self.data.dt)
         for i, (effect, _) in enumerate(pairs):
-            weights = speed_weights(effect.site.model, "+".join(effect.site.targets))
+            weights = speed_weights(effect.site.model, effect.site.joined)
             size = 1e-6 * self.data.scales.peak(next(iter(weights)))
             more = [value + size if j == i else value for j, value in enumerate(at.w)]
             ends = [value + size if j == i else value for j, value in enumerate(at.free)]

@@ -92,9 +92,9 @@ def too_long(model: Model, states: Array, inputs: Array, dt: float) -> TooLong |
     if not len(known):
         return None
     x, u = states[known], inputs[known]
-    runs, enough = [_after(model, x, u, dt, 1)], False
+    runs, enough = [after_a_step(model, x, u, dt, 1)], False
     for parts in PARTS:
-        runs.append(_after(model, x, u, dt, parts))
+        runs.append(after_a_step(model, x, u, dt, parts))
         enough = bool(_missed(model, x, runs[-2], runs[-1]).max() <= FINE)
         if enough:
             break
@@ -107,7 +107,7 @@ def too_long(model: Model, states: Array, inputs: Array, dt: float) -> TooLong |
     return TooLong(name, float(missed[worst]), dt / own, wanted)
 
 
-def _after(model: Model, x: Array, u: Array, dt: float, parts: int) -> Array:
+def after_a_step(model: Model, x: Array, u: Array, dt: float, parts: int) -> Array:
     """Return the states (N, n) after a control step that is made in so many parts."""
     with np.errstate(all="ignore"):
         for _ in range(parts):

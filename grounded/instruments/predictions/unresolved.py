@@ -13,6 +13,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.instruments.finding import Finding
+from grounded.instruments.predictions.time_step import after_a_step
 from grounded.model import Model
 from grounded.trial import Trial
 
@@ -67,8 +68,7 @@ def _extent(trial: Trial) -> tuple[Array, Array]:
 
 def _error_of_a_step(model: Model, trial: Trial, shown: Sequence[int]) -> Array:
     """Return the difference of one step from two half steps at each sample, (T, n)."""
-    x, u, half = np.array(trial.states[:-1]), trial.inputs, trial.dt / 2
+    x = np.array(trial.states[:-1])
     x[:, [i for i in range(model.n) if i not in shown]] = 0.0  # unknown
-    step, p = model.system.step, model.values
-    twice = step(step(x, u, p, half), u, p, half)
-    return np.asarray(np.abs(model.difference(step(x, u, p, trial.dt), twice)))
+    once, twice = (after_a_step(model, x, trial.inputs, trial.dt, parts) for parts in (1, 2))
+    return np.asarray(np.abs(model.difference(once, twice)))
