@@ -36,6 +36,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from grounded.diagnosis.cause_words import value_called
 from grounded.diagnosis.hypotheses.explored import TIE
 from grounded.diagnosis.likelihood.data import Data, prepare
 from grounded.diagnosis.likelihood.fitted import calibrated
@@ -234,21 +235,23 @@ def _teaching(
     now = float(spreads[name].std)
     then, little = now * shrunk, False
     about = "perhaps to about" if shrunk == MOST else "to"
-    tells = f"would determine {name} {about} +- {then:.2g}{unit} (now +- {now:.2g}{unit})"
+    made = diagnosis.made or Made()
+    called = value_called(name, made.effects)
+    tells = f"would determine {called} {about} +- {then:.2g}{unit} (now +- {now:.2g}{unit})"
     sentence = f"{words}{', run twice,' if again else ':'} {tells}"
     if diagnosis.motions == 1 < len(trials) and words != BASE:
-        sentence = f"{words}: would show whether {name}, so far from one motion, holds in another"
+        sentence = f"{words}: would show whether {called}, so far from one motion, holds in another"
     elif shrunk > 1 - TEACHES:
         ends = f"+- {then:.2g}{unit}", f"+- {now:.2g}{unit}"
         same = "as now" if ends[0] == ends[1] else f"now {ends[1]}"
         way = f"{words}{', run twice' * again}"
         sentence = (
-            f"no candidate inside the limits teaches much: after the best, {way}, {name} would be "
+            f"no candidate inside the limits teaches much: after the best, {way}, {called} would be "
             f"known to {ends[0]} ({same})"
         )
         little = True
     elif well[k]:
-        sentence = f"the value that a probe would tell most about, {name}, is well known already"
+        sentence = f"the value that a probe would tell most about, {called}, is well known already"
         little = True
     return Probe(chosen, gain, (name,), sentence, little, then, 1 + again)
 

@@ -151,7 +151,7 @@ class Links:
         """The end of the last link; of a vehicle, whose link ends nowhere, its position."""
         if self.drives:
             return "the position"
-        return "the load, at the end of the rope" if self.hangs else "the tip"
+        return "the load" if self.hangs else "the tip"
 
     @property
     def parts(self) -> Sequence[Part]:

@@ -232,5 +232,5 @@ def _shaded(findings: Findings, view: View) -> list[Panel]:
     (x, y), (a, b) = view.place(states).T, view.place(target).T
     path = Curve(x, y, "other", "", 1.0, times, far, name)
     wanted = Curve(a, b, "desired", "desired", 1.0)
-    title = f"Error of {body.watched.partition(',')[0]}, {run.label}"
+    title = f"Error of {body.watched}, {run.label}"
     return [Panel(title, *view.names, (path, wanted), equal=True, kind="path")]
