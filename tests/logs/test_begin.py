@@ -428,7 +428,8 @@ def test_a_robot_whose_wheels_have_a_command_each_gets_its_equations(wheels, tmp
     u = np.array([[at[name] for name in model.input_names]])
     x = model.system.step(np.zeros((1, 5)), u, model.values, 0.01)[0]
     moved = dict(zip(model.states, x, strict=True))
-    assert moved["v"] > 0 > moved["omega"] and {"gain", "track", "tau"} == set(model.params)
+    assert moved["v"] > 0 > moved["omega"]
+    assert {"gain", "track", "tau_v", "tau_w"} == set(model.params)
 
 
 WHEEL = """

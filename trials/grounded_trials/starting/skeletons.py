@@ -110,17 +110,17 @@ ROVER = Skeleton(
 )
 DIFFERENTIAL = Skeleton(
     "differential",
-    "A robot on two driven wheels, each following its own speed command with a lag",
+    "A robot on two driven wheels, one command each: speed and turn rate follow with their lags",
     ROVER.states,
     {"left": "1", "right": "1"},
     {
         "gain": '1.0, "m/s", 0.02, 20.0',
         "track": '0.3, "m", 0.05, 2.0',
-        "tau": '0.2, "s", 0.01, 2.0',
+        **{"tau_v": ROVER.params["tau_v"], "tau_w": ROVER.params["tau_w"]},
     },
     (
-        '"v": (p.gain * (a.right + a.left) / 2 - s.v) / p.tau',
-        '"omega": (p.gain * (a.right - a.left) / p.track - s.omega) / p.tau',
+        '"v": (p.gain * (a.right + a.left) / 2 - s.v) / p.tau_v',
+        '"omega": (p.gain * (a.right - a.left) / p.track - s.omega) / p.tau_w',
         *ROVER.lines[2:],
     ),
     ROVER.angles,
