@@ -76,9 +76,10 @@ def command(
     robot with one axis, goes from [task] start to rest, in the states' own units; --seconds,
     --speed and --accel set its pace. A step begins at [task] start. A swing-up brings the first
     angle that hangs under its weight upright; --to names another angle, or more states. A path
-    begins at the position in [task] start, along x; what --to names, such as the height of a drone,
-    keeps its value, but a velocity that moves the robot along the path follows it. With --hold a
-    path ends at rest and stays there.
+    begins at the position in [task] start, along x, and a figure-8 at its crossing: its length lies
+    45 degrees to the right of x. What --to names, such as the height of a drone, keeps its value,
+    but a velocity that moves the robot along the path follows it. With --hold a path ends at rest
+    and stays there.
 
     The previous target is kept as target.csv.bak, and grounded.toml as grounded.toml.bak. If
     [task] start is empty and a stored trial begins at rest, it is set to where. [task] horizon is
