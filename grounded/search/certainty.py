@@ -33,6 +33,7 @@ PART = 0.3  # share of a gain due to different start states from which on it is 
 ANOTHER = 99.0  # ratio of a state's costs in two runs that is no scatter, see `another_kind`
 LUCK = 2.0  # standard errors that a loss must exceed to break a promise
 SHOWN = 1.645  # standard errors of a gain that is one with probability SURE, 0.95
+MANY = 50  # runs of a candidate; that more would be needed is said, but not how many
 FEW = 4.0  # degrees of freedom below which the sentence mentions the few repeats
 
 
@@ -226,18 +227,23 @@ def runs_to_show(gain: float, best: Tried) -> int:
     return math.ceil(2 * (SHOWN * best.deviation / gain) ** 2)
 
 
+def runs_needed(gain: float, best: Tried) -> str:
+    """Say how many runs show a gain: "22 runs", or that it takes more than anyone makes."""
+    runs = runs_to_show(gain, best)
+    return f"{runs} runs" if runs <= MANY else f"more than {MANY} runs"
+
+
 def beyond_one_trial(made: Candidate, best: Tried, repeats: int = 1) -> str:
     """Return a sentence saying that a trial can't show what a candidate promises; "" if it can."""
     own, least = best.candidate.id, SHOWN * one_trial_error(best, repeats)
     gain = made.promised_over(best) if made.base == own else 0.0
     if not 0 < gain < least:
         return ""
-    runs = runs_to_show(gain, best)
     stop = f". If that is too many, stop with {own}" * (not made.doubtful)  # else `doubt` says it
     return (
         f"{made.id} promises {gain:.2g} over {own}, less than its trial can show: the utilities of "
         f"single runs scatter by {best.deviation:.2g}, so a gain below {least:.2g} may be luck. To "
-        f"show it takes {runs} runs of each of the two{stop}"
+        f"show it takes {runs_needed(gain, best)} of each of the two{stop}"
     )
 
 
