@@ -128,7 +128,8 @@ def _parameters(found: Fit) -> str:
         digits = _digits(e) if e.identified else DIGITS
         own = (e.low, e.high, e.start, e.value)
         low, high, start, value = (number(or_zero(v, *own), digits) for v in own)
-        interval = f"{low} .. {high}" if e.identified else "not identified"
+        given = f", given {listed(e.only_with)}" * bool(e.only_with)
+        interval = f"{low} .. {high}{given}" if e.identified else "not identified"
         interval = "at its bound" if name in found.at_bounds else interval
         rows.append((name, start, value, interval, shown(e.unit)))
     return table(rows, ("parameter", "before", "fitted", "95 % interval", "unit"))

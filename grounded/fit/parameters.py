@@ -16,7 +16,7 @@ from grounded.errors import GroundedError, type_of
 from grounded.estimate import Measurement, NoiseStd, Record, of_states
 from grounded.estimate.record import part, records_of
 from grounded.fit.prediction import PredictionError, prediction_error
-from grounded.fit.result import Fit, least_known, report
+from grounded.fit.result import Fit, least_known, report, unidentified
 from grounded.fit.search import ROUNDS, SearchEnd, data_of, first_search, search_parameters
 from grounded.fit.unknowns import Latency, Unknowns, unknowns_of
 from grounded.frozen import Array
@@ -98,13 +98,19 @@ def fit(
     if max(r.steps for r in records) < 3:
         raise GroundedError("a fit needs a trial of at least 3 steps")
     rng = np.random.default_rng(0) if rng is None else rng
-    held, tick = unknowns, Stages(progress, _done)
+    asked, tick = unknowns, Stages(progress, _done)
+    tied: dict[str, list[str]] = {}  # of what is held, those that are identified since
+    before: list[str] = []
     with interruptible(lambda: tick.so_far), running(engine):
         while True:
             found = _fitted(model, records, measurement, unknowns, hold_out, horizon_s, rng, tick)
+            if tied:
+                tied[[*tied][-1]] += [n for n in before if n not in unidentified(found)]
             least = least_known(model, found)
             if least is None or unknowns.k == 1:
-                return _of(found.beside(held), given)
+                return _of(found.beside(asked, tied), given)
+            before = [name for name in unidentified(found) if name != least]
+            tied[least] = []
             unknowns = unknowns.less(unknowns.names.index(least))
 
 

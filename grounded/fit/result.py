@@ -13,7 +13,7 @@ Source: White, Estimation, Inference and Specification Analysis (1994); Newey & 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
@@ -28,12 +28,16 @@ from grounded.fit.search import SearchEnd, likelihood_interval, quiet
 from grounded.fit.unknowns import Unknowns
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.result import Result, document
+from grounded.result import Result, document, listed
 
 
 @dataclass(frozen=True, eq=False)
 class FittedValue:
-    """A fitted quantity with its 95 % interval; `std` is infinite if it is not identified."""
+    """A fitted quantity with its 95 % interval; `std` is infinite if it is not identified.
+
+    `only_with` names what was held because the data tell only combinations of it with this one: the
+    interval holds if those values are right.
+    """
 
     value: float
     std: float
@@ -42,6 +46,7 @@ class FittedValue:
     unit: str
     identified: bool
     start: float
+    only_with: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -67,8 +72,13 @@ class Fit(Result):
     def __post_init__(self) -> None:
         object.__setattr__(self, "params", MappingProxyType(dict(self.params)))
 
-    def beside(self, asked: Unknowns) -> Fit:
-        """Return the fit with the unknowns added that were held because they are unidentified."""
+    def beside(self, asked: Unknowns, tied: Mapping[str, Sequence[str]]) -> Fit:
+        """Return the fit with the unknowns added that were held because they are unidentified.
+
+        Args:
+            asked: all unknowns.
+            tied: of each held one, those that the data tell once it is held.
+        """
         lost = [i for i, name in enumerate(asked.names) if name not in self.params]
         if not lost:
             return self
@@ -80,12 +90,24 @@ class Fit(Result):
             params[asked.names[i]] = FittedValue(
                 start, np.inf, low, high, asked.units[i], False, start
             )
-        names = ", ".join(asked.names[i] for i in lost)
+        for held, others in tied.items():
+            for name in others:
+                both = (*params[name].only_with, held)
+                params[name] = replace(params[name], only_with=both)
+        alone = [asked.names[i] for i in lost if not tied.get(asked.names[i])]
+        sentence = self.sentence
+        if alone:
+            sentence += f"; the data do not identify {', '.join(alone)}, held as before"
+        for held in (name for name, others in tied.items() if others):
+            sentence += (
+                f"; the data tell only combinations of {listed([held, *tied[held]])}: {held} is "
+                "held as before, and what is fitted of the others is right only if that is"
+            )
         return replace(
             self,
             params={name: params[name] for name in asked.names},
             covariance=covariance,
-            sentence=f"{self.sentence}; the data do not identify {names}, held as before",
+            sentence=sentence,
         )
 
     @property
@@ -135,6 +157,11 @@ class Fit(Result):
         return found
 
 
+def unidentified(found: Fit) -> list[str]:
+    """Return the names of the unknowns that the data do not tell."""
+    return [name for name, e in found.params.items() if not e.identified]
+
+
 def least_known(model: Model, found: Fit) -> str | None:
     """Return the unidentified unknown with the narrowest relative prior; None if there is none."""
     if not np.isfinite(found.loglik):
@@ -144,7 +171,7 @@ def least_known(model: Model, found: Fit) -> str | None:
         param = model.params.get(name)
         return 0.0 if param is None else param.spread / max(abs(param.value), 1e-9)
 
-    lost = [name for name, e in found.params.items() if not e.identified]
+    lost = unidentified(found)
     return min(lost, key=sure) if lost else None
 
 
