@@ -27,6 +27,7 @@ from grounded.diagnosis.validation.decide import Decision
 from grounded.diagnosis.validation.gain import BETTER
 from grounded.diagnosis.validation.held_out import gaps_of, held_out_errors
 from grounded.diagnosis.validation.limits import Limits, constant_inputs
+from grounded.diagnosis.validation.own_numbers import with_mechanism
 from grounded.diagnosis.validation.prediction_error import normalised
 from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.effects import Effect
@@ -299,7 +300,8 @@ class Claims:
         (mainly those of the parameters) differ by less than TIE.
         """
         score, best = self.search.score, self.best
-        if score(best) - score(fit) < TIE:  # predictions may have refused one that is likelier
+        imitated = fit is with_mechanism(self.search, best)
+        if score(best) - score(fit) < TIE or imitated:  # predictions may have refused one that is likelier
             likelier = score(fit) - score(best) > TIE and self.ruler.held_out
             return not (likelier and self.ruler.gain(fit, best).beyond(*BETTER))
         if not self.ruler.held_out or not self._one_thing(name, other):

@@ -43,7 +43,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.validation.gain import BETTER, Gain
 from grounded.diagnosis.validation.motions import of_no_size, repeats
-from grounded.diagnosis.validation.own_numbers import SURE, equations, own_numbers
+from grounded.diagnosis.validation.own_numbers import SURE, equations, own_numbers, with_mechanism
 from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.diagnosis.validation.single_steps import borne_out
 from grounded.diagnosis.validation.visits import acting, few_trials
@@ -119,7 +119,8 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
     white = search.tempering.factor > WHITE
     ruler.beside(crude)
     search, proposed = _proposed(search, best, crude, ruler, most, white)
-    proposed = own_numbers(search, _plainest(search, proposed, ruler, white), ruler)
+    proposed = _by_mechanism(search, _plainest(search, proposed, ruler, white), ruler, white)
+    proposed = own_numbers(search, proposed, ruler)
     fit, without, doubtful = _pruned(search, proposed, ruler, white)
     if proposed.hypothesis.spread > 0 and (other := _likelier(search, fit, ruler)):
         fit, without, more = _pruned(search, other, ruler, white)
@@ -153,6 +154,14 @@ def _plainest(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool) 
         if tied or not _pays(search, ruler, plain_form, fit, white):
             return _plainest(search, plain_form, ruler, white)
     return fit
+
+
+def _by_mechanism(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool) -> Fitted:
+    """Replace a coupling by a cause with a mechanism that predicts as well (`with_mechanism`)."""
+    other = with_mechanism(search, fit)
+    if other is None or ruler.gain(other, fit).beyond(*BETTER):
+        return fit
+    return other if _pays(search, ruler, search.exact_null(), other, white) else fit
 
 
 def _likelier(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted | None:

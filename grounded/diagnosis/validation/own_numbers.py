@@ -1,4 +1,7 @@
-"""The model's own numbers in place of effects, where these tie and predict as well."""
+"""The model's own numbers in place of effects, where these tie and predict as well.
+
+And a cause that has a mechanism in place of a coupling, which has none.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from grounded.diagnosis.validation.gain import BETTER
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import ParamFamily
 
+COUPLING = "coupling"
 SURE = 8.0  # nats (odds of 3,000 to 1) above which an effect counts as certain by evidence
 
 
@@ -37,6 +41,27 @@ def own_numbers(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
         if ties and not ruler.gain(other, fit).beyond(*BETTER):
             return own_numbers(search, other, ruler)
     return _calibrated_instead(search, fit, ruler)
+
+
+def with_mechanism(search: HypothesisSearch, fit: Fitted) -> Fitted | None:
+    """Return the likeliest fit with a mechanism in place of a coupling, if that is not far likelier.
+
+    A state may act on any rate, so there are many couplings, and they imitate other causes: a
+    position that is measured d late is, to first order, a coupling of -d times the model's own
+    slope. A ball's camera, 30 ms late, was such a coupling, by 5 nats.
+    """
+    h, found = fit.hypothesis, []
+    for effect in h.effects:
+        if effect.family.name == COUPLING:
+            rest = {*h.names} - {effect.name}
+            found += [
+                f
+                for f in search.fits.values()
+                if len(f.hypothesis.names) == len(h.names) and rest <= {*f.hypothesis.names}
+                if f.hypothesis.spread == h.spread and search.score(fit) - search.score(f) < SURE
+                if not any(e.family.loose for e in f.hypothesis.effects if e.name not in rest)
+            ]
+    return max(found, key=search.score, default=None)
 
 
 def _calibrated_instead(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
