@@ -41,6 +41,7 @@ from grounded.diagnosis.hypotheses.plainest import plainer
 from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
+from grounded.diagnosis.validation.agreement import is_nowhere
 from grounded.diagnosis.validation.gain import BETTER, Gain
 from grounded.diagnosis.validation.motions import of_no_size, repeats
 from grounded.diagnosis.validation.own_numbers import SURE, equations, own_numbers, with_mechanism
@@ -342,6 +343,7 @@ def _pruned(
         idle = (
             undone
             or [n for n, count in repeated.items() if count]
+            or [n for n in equations(fit) if is_nowhere(fit, search.data, n)]
             or of_no_size(search.predictor, fit, folds(search.data))
             or [
                 name
