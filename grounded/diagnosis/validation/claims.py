@@ -48,6 +48,17 @@ def has_size(effect: Effect, known: Mapping[str, Estimate], least: float = LEAST
     return not all(abs(known[n].value) < least * known[n].std for n in strengths)
 
 
+def _restated(name: str, other: str, rest: set[str]) -> bool:
+    """Check whether another effect says the same beside the rest: `f:a+b` and `f:b` for f:a, f:b.
+
+    A delay of all inputs, and a further one of each input but one, is a delay of each.
+    """
+    family, _, own = name.partition(":")
+    like, _, targets = other.partition(":")
+    others = {f"{family}:{target}" for target in targets.split("+")} - {name}
+    return like == family and own in targets.split("+") and bool(others) and others <= rest
+
+
 class Claims:
     """The effects that the decision claims, or the parameters if calibration is enough."""
 
@@ -287,7 +298,7 @@ class Claims:
             # not if parameters that predictions refused make it likelier, or make all of it
             as_likely = abs(score(f) - score(self.best)) < TIE and score(f) > without + CLAIM
             needed = (h.spread > 0) == free or as_likely
-            beyond = other in no_limits(self.data, h)
+            beyond = other in no_limits(self.data, h) or _restated(name, other, rest)
             if other not in (name, *found) and needed and not beyond and self._ties(name, other, f):
                 found[other] = f
         return list(found.items())[:2]

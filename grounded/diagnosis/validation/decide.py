@@ -36,6 +36,7 @@ import numpy as np
 from grounded.diagnosis.error_report import CALIBRATION
 from grounded.diagnosis.hypotheses.counterpart import counterparts
 from grounded.diagnosis.hypotheses.explored import CLAIM, TIE, parametric
+from grounded.diagnosis.hypotheses.joint_model import split
 from grounded.diagnosis.hypotheses.leftover import leftovers
 from grounded.diagnosis.hypotheses.plainest import plainer
 from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, HypothesisSearch
@@ -120,6 +121,9 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
     white = search.tempering.factor > WHITE
     ruler.beside(crude)
     search, proposed = _proposed(search, best, crude, ruler, most, white)
+    apart = split(search, proposed)
+    if apart is not proposed and not ruler.gain(apart, proposed).beyond(*BETTER):
+        proposed = apart
     proposed = _by_mechanism(search, _plainest(search, proposed, ruler, white), ruler, white)
     proposed = own_numbers(search, proposed, ruler)
     fit, without, doubtful = _pruned(search, proposed, ruler, white)
