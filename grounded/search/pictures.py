@@ -125,7 +125,7 @@ def _dots(tried: Tried, at: int, became: str) -> list[Dot]:
     real = figure(tried.utility)
     note = (
         f"{candidate.id}, iteration {candidate.iteration}, α = {candidate.alpha:g}\n"
-        f"utility {real}, predicted {figure(candidate.predicted_utility)}\n{became}"
+        f"utility {real}, predicted {figure(tried.promised)}\n{became}"
     )
     error = tried.standard_error
     if math.isfinite(error):
@@ -134,8 +134,8 @@ def _dots(tried: Tried, at: int, became: str) -> list[Dot]:
         return [Dot(at, math.nan, "model", f"{note}: the run failed", "cross")]
     shape, role = _look(tried, became)
     dots = [Dot(at, tried.utility, role, note, shape, error if math.isfinite(error) else 0.0)]
-    if math.isfinite(candidate.predicted_utility):
-        dots.insert(0, Dot(at, candidate.predicted_utility, "predicted", note, "dash"))
+    if math.isfinite(tried.promised):
+        dots.insert(0, Dot(at, tried.promised, "predicted", note, "dash"))
     return dots
 
 

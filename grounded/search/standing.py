@@ -187,7 +187,7 @@ def _row(tried: Tried, verdict: str) -> tuple[str, ...]:
         str(tried.candidate.iteration),
         f"{tried.candidate.alpha:g}",
         figure(tried.candidate.damping, 2) if tried.candidate.base else "-",
-        figure(tried.candidate.predicted_utility),
+        figure(tried.promised),
         figure(tried.utility),
         spread(tried.standard_error),
         str(len(tried.trials)),

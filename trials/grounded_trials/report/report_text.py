@@ -121,7 +121,7 @@ def _candidate(tried: Tried, verdict: str) -> tuple[str, ...]:
         tried.candidate.id,
         str(tried.candidate.iteration),
         f"{tried.candidate.alpha:g}",
-        figure(tried.candidate.predicted_utility),
+        figure(tried.promised),
         figure(tried.utility),
         spread(tried.standard_error),
         str(len(tried.trials)),
