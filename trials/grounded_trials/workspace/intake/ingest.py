@@ -163,7 +163,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     verdict = ASIDE if aside else _verdict(trial, tried, workspace.config.search.repeats)
     slow = "" if read.doubted else steps_skipped(workspace, trial)
     warnings = (*filter(None, [slow]), *warnings)
-    wrong = bool(slow) or (elsewhere is not None and elsewhere.again)
+    wrong = bool(slow) or read.aside or (elsewhere is not None and elsewhere.again)
     if not (odd or wrong or aside):
         asked = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
         if asked:
