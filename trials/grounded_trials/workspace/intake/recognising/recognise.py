@@ -64,18 +64,29 @@ NEAR = 0.05  # largest mean difference from the policy's commands, relative to a
 LOOSE = 0.1  # uncertainty of a start, in steps, above which a warning is given
 
 
-def by_its_commands(workspace: Folder, path: Path, error: NoneWaits) -> GroundedError:
-    """Return the error with the command that fits the log: the best, another candidate, or data."""
+def best_run_again(workspace: Folder, path: Path, error: NoneWaits) -> Read:
+    """Return a log as another run of the best candidate, if it clearly is one.
+
+    Raises:
+        GroundedError: `error` if it is not, with the command that fits the log: another candidate,
+            or data.
+    """
     if not error.best:
-        return error
+        raise error
     try:
         read = read_log_file(workspace, path, error.best, False)
-        recognised(workspace, path, read, None, remedies=False)
-    except OfEarlierTask as refused:
-        return refused
+        seen = recognised(workspace, path, read, None, remedies=False)
+    except OfEarlierTask:
+        raise
     except GroundedError as refused:
-        return GroundedError(str(error), refused.then)
-    return error
+        raise GroundedError(str(error), refused.then) from None
+    if set(seen.warnings) - {*read.warnings}:  # where it begins, or whose it is, is in doubt
+        raise error
+    note = (
+        f"no candidate is waiting for a trial; its commands are those of {error.best}, the best: "
+        "it counts as another run of it"
+    )
+    return replace(read, notes=(note, *read.notes))
 
 
 def recognised(
