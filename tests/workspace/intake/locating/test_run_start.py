@@ -708,3 +708,18 @@ def test_another_run_of_the_best_is_taken_without_its_name(w, tmp_path):
         w.ingest(log)
     assert error.value.then == NextCommand("ingest", (str(log), "--candidate", other))
     assert len(w.trials()) == 3
+
+
+def test_a_stored_log_says_so_first_and_a_discard_what_to_run(w, tmp_path, monkeypatch):
+    """An old log's result looked new; after `discard`, one had to remember which file to run."""
+    monkeypatch.chdir(w.folder)
+    toml = w.folder / "grounded.toml"
+    toml.write_text(re.sub(r"\[system\]\n(?:\w.*\n)*", "", toml.read_text()))
+    log = record(w, w.folder / "a.csv", w.candidate("c0002")[0].policy, 0.5)
+    assert grounded("ingest", log.name).out.startswith("a.csv is stored as t0002")
+    before = "a.csv was stored before as t0002: nothing is new. Its result again:"
+    again = grounded("ingest", log.name).out
+    assert again.startswith(before) and "is stored as" not in again
+    assert grounded("export", "c0002", "--runner").code == 0
+    done = grounded("discard", "t0002").out
+    assert done.endswith("\nrun c0002, record a log, then\nnext: grounded next LOG\n")
